@@ -1,0 +1,137 @@
+"""What can go wrong, and nothing else.
+
+Every transaction that fails raises one fresh instance of a `BusError` subclass. It carries the node, the
+command and the number of attempts, and its text says in one sentence what happened, where, and what to try.
+A wrong argument is not a bus error: it raises `InvalidCommand` when the command is built.
+"""
+
+from __future__ import annotations
+
+
+class InvalidCommand(ValueError):
+    """An argument is out of range or cannot be written as the protocol demands. Nothing was sent."""
+
+
+class BusError(Exception):
+    """A transaction did not end with a value.
+
+    `what` is the happening ("no reply within 100 ms"), `hint` what to try, `node` the node's label ("node 5")
+    or None for the whole line, `command` the command as text, `attempts` how often it was on the wire.
+    """
+
+    hint = ""
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        node: str | None = None,
+        command: str | None = None,
+        attempts: int = 0,
+        hint: str | None = None,
+    ) -> None:
+        super().__init__(what)
+        self.what = what
+        self.node = node
+        self.command = command
+        self.attempts = attempts
+        if hint is not None:
+            self.hint = hint
+
+    def __str__(self) -> str:
+        text = self.what if self.node is None else f"{self.node}: {self.what}"
+        if self.attempts:
+            text += f", {self.attempts} attempt{'' if self.attempts == 1 else 's'}"
+        if self.command:
+            text += f" ({self.command})"
+        return f"{text}; {self.hint}" if self.hint else text
+
+
+class NoReply(BusError, TimeoutError):
+    """Nothing came within the reply window, at any attempt."""
+
+    hint = "check the node's address, power, baud rate and wiring"
+
+
+class GarbledReply(BusError):
+    """Bytes came, but no valid reply to this command: a bad checksum, a cut frame, a wrong echo."""
+
+    hint = "check wiring, termination and baud rate, and that no two nodes share an address"
+
+
+class Refused(BusError):
+    """The node understood and said no (NAK; EOT in Mentor II).
+
+    A protocol's exchange raises it with `what` alone, and with `confirm=False` where asking again would say
+    nothing new (MSC has already sent it four times; a multi-value write may have stored a prefix). The arbiter
+    fills in the rest, and asks once more where `confirm` is True.
+    """
+
+    hint = "check that it exists, is writable and within the node's limits"
+
+    def __init__(
+        self,
+        what: str = "refused",
+        *,
+        confirm: bool = True,
+        node: str | None = None,
+        command: str | None = None,
+        attempts: int = 0,
+        hint: str | None = None,
+    ) -> None:
+        super().__init__(what, node=node, command=command, attempts=attempts, hint=hint)
+        self.confirm = confirm
+
+
+class NoSuchParameter(Refused):
+    """The node has no such parameter (Mentor II answers EOT)."""
+
+    hint = "check the parameter number against the drive's parameter list"
+
+
+class WriteUnconfirmed(BusError):
+    """A write was sent and its answer never came or was garbled: the node may or may not have taken it."""
+
+    hint = "read the value back before you write again"
+
+
+class Superseded(BusError):
+    """A queued write was dropped because an urgent write to the same node overtook it."""
+
+    hint = "decide again after the urgent command"
+
+
+class NodeDown(BusError):
+    """The node is known to be dead and this request was not worth line time."""
+
+    hint = "it is probed by itself; node.probe() asks at once"
+
+
+class NotStarted(BusError, TimeoutError):
+    """The request had not been sent when its `start_within` ran out. Nothing was sent."""
+
+    hint = "the line is busy: see bus.statistics() or busmaster plan"
+
+
+class BacklogFull(BusError):
+    """Too many requests are waiting. Nothing was queued."""
+
+    hint = "the line cannot keep up: ask less often, or see busmaster plan"
+
+
+class LineNoisy(BusError):
+    """The line has not been silent for a second, so nothing can be sent safely."""
+
+    hint = "look for a babbling node, a second master, a wrong baud rate or missing biasing"
+
+
+class LineDown(BusError, ConnectionError):
+    """The port is gone or not yet open. It is opened again by itself."""
+
+    hint = "check the port or adapter; the bus reconnects by itself"
+
+
+class BusClosed(BusError):
+    """The bus was closed."""
+
+    hint = "use the bus inside `async with`"

@@ -1,0 +1,255 @@
+"""The contract between the protocols and the arbiter.
+
+A `Command` is an immutable value ("read element 100"). For each attempt it opens a fresh `Exchange`: the bytes to
+send and a reader for what comes back. The arbiter owns the clock and the line; an exchange owns only its frame.
+
+One exchange has one or more *legs*: something is said by the host, something is awaited. Most protocols need one.
+MSC needs two (ACK, then the packet) and more when a packet must be sent again.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, Protocol, TypeAlias, TypeVar
+
+from busmaster.errors import InvalidCommand, Refused
+
+T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class ReplyTiming:
+    """When a reply is awaited, in seconds from the request's last byte on the wire.
+
+    Raises `InvalidCommand` unless 0 <= nominal <= window <= lateness and byte_gap > 0, turnaround >= 0.
+    """
+
+    nominal: float
+    """A reply begun by then is on time."""
+    window: float
+    """A reply begun by then is accepted, and counted late after `nominal`."""
+    lateness: float
+    """What has not begun by then never comes: the promise R3 rests on it."""
+    byte_gap: float
+    """The longest pause between two bytes of one frame."""
+    turnaround: float = 0.0
+    """The node's driver holds the line this long after its reply."""
+
+    def __post_init__(self) -> None:
+        times = (self.nominal, self.window, self.lateness, self.byte_gap, self.turnaround)
+        if not all(math.isfinite(t) for t in times):
+            raise InvalidCommand("reply times must be finite numbers of seconds")
+        if not 0 <= self.nominal <= self.window <= self.lateness:
+            raise InvalidCommand(
+                f"reply times must satisfy 0 <= nominal <= window <= lateness, "
+                f"not {self.nominal:g}, {self.window:g}, {self.lateness:g} s"
+            )
+        if self.byte_gap <= 0 or self.turnaround < 0:
+            raise InvalidCommand("byte_gap must be above 0 s and turnaround at least 0 s")
+
+    def with_window(self, window: float) -> ReplyTiming:
+        """The same with another reply window; nominal and lateness move only as far as they must."""
+        return replace(self, nominal=min(self.nominal, window), window=window, lateness=max(self.lateness, window))
+
+    def with_lateness(self, lateness: float) -> ReplyTiming:
+        """The same with at least this lateness."""
+        return self if lateness <= self.lateness else replace(self, lateness=lateness)
+
+
+@dataclass(frozen=True, slots=True)
+class Timings:
+    """The reply times of one node: `read` and `write` for the first leg, `packet` for a packet after its ACK (MSC)."""
+
+    read: ReplyTiming
+    write: ReplyTiming
+    packet: ReplyTiming
+
+    @classmethod
+    def uniform(cls, timing: ReplyTiming) -> Timings:
+        return cls(timing, timing, timing)
+
+    def with_window(self, window: float) -> Timings:
+        """Another reply window for every first leg; a packet's window is only ever lengthened."""
+        packet = self.packet.with_window(max(window, self.packet.window))
+        return Timings(self.read.with_window(window), self.write.with_window(window), packet)
+
+    def with_lateness(self, lateness: float) -> Timings:
+        return Timings(
+            self.read.with_lateness(lateness), self.write.with_lateness(lateness), self.packet.with_lateness(lateness)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Sizes:
+    """Bytes of one reply leg: `typical` for planning, `longest` for the published bounds."""
+
+    typical: int
+    longest: int
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """One later leg of an undisturbed exchange, for planning: what the host says first, then what is awaited."""
+
+    timing: ReplyTiming
+    sizes: Sizes
+    sent: int = 0
+
+
+class Need(enum.Enum):
+    """`MORE`: not a whole frame yet; the byte gap is re-armed."""
+
+    MORE = "more"
+
+
+MORE = Need.MORE
+
+
+@dataclass(slots=True)
+class Expect:
+    """This leg is over and another follows: MSC's packet after its ACK, a NAKed packet sent again.
+
+    The arbiter sends `send`, then calls `feed(b"")` at once, for bytes that came in the same chunk.
+    """
+
+    timing: ReplyTiming
+    sizes: Sizes
+    send: bytes = b""
+
+
+@dataclass(slots=True)
+class Done(Generic[T_co]):
+    """The reply is complete.
+
+    `send` is the host's closing ACK (MSC): the line is free when it has left. `rest` is what came after the reply:
+    those bytes are strays and the line settles.
+    """
+
+    value: T_co
+    send: bytes = b""
+    rest: bytes = b""
+
+
+Step: TypeAlias = Need | Expect | Done[T_co]
+
+
+class FrameError(Exception):
+    """This is no reply: the attempt failed. Never reaches a caller.
+
+    `whole` is True only for a whole frame with the right echo and a bad checksum: then nothing more can follow and
+    the line need not wait for stragglers (R3). `send` is a closing ACK owed to the device all the same (MSC), else
+    it retransmits into other exchanges.
+    """
+
+    def __init__(self, what: str, *, whole: bool = False, send: bytes = b"") -> None:
+        super().__init__(what)
+        self.what = what
+        self.whole = whole
+        self.send = send
+
+
+class Exchange(Protocol[T_co]):
+    """One attempt at one command: the bytes to send and a reader for what comes back. Fresh per attempt."""
+
+    @property
+    def request(self) -> bytes: ...
+
+    @property
+    def timing(self) -> ReplyTiming:
+        """Of the first leg."""
+        ...
+
+    @property
+    def sizes(self) -> Sizes:
+        """Of the first reply leg."""
+        ...
+
+    @property
+    def later(self) -> Sequence[Leg]:
+        """The legs after the first, when nothing goes wrong. Empty for most protocols."""
+        ...
+
+    @property
+    def closing(self) -> int:
+        """Bytes of the host's closing ACK. 0 for most protocols."""
+        ...
+
+    @property
+    def starts(self) -> bytes:
+        """The legal first bytes of the first reply leg; anything else is a FrameError."""
+        ...
+
+    @property
+    def answered(self) -> bool:
+        """False for a broadcast: no reply will come, and `expired(False)` is called when the line is free again."""
+        ...
+
+    def feed(self, data: bytes, /) -> Step[T_co]:
+        """Take the next bytes of the line. Raises FrameError or Refused; anything else is a bug."""
+        ...
+
+    def expired(self, started: bool, /) -> Expect | Done[T_co]:
+        """The window (`started` False) or a byte gap (True) ran out.
+
+        Raises FrameError to fail the attempt, or returns Expect (NAK a cut packet) or Done (a broadcast).
+        """
+        ...
+
+
+class Command(Protocol[T_co]):
+    """What to ask of a node: an immutable, hashable value, checked when it is built (InvalidCommand).
+
+    Encoding cannot fail. `str(command)` is how messages name it: "read element 100".
+    """
+
+    @property
+    def writes(self) -> bool:
+        """True if it changes the node: then it is never retried unasked, and never overtakes another write."""
+        ...
+
+    @property
+    def idempotent(self) -> bool:
+        """It may be repeated without asking the caller: reads yes; Comms writes no; levels (a reference) yes."""
+        ...
+
+    def open(self, address: int, timings: Timings, /) -> Exchange[T_co]: ...
+
+
+class Listener(Protocol):
+    """A reader for what arrives while nothing is asked (MSC: a stale packet is ACKed and dropped)."""
+
+    def feed(self, data: bytes, /) -> Need | Done[None]:
+        """Raises FrameError for what cannot be a stale packet; its `send` is honoured too."""
+        ...
+
+    def expired(self) -> Done[None]:
+        """A byte gap ran out in mid-frame."""
+        ...
+
+
+def no_reply() -> FrameError:
+    """The one failure that every exchange shares: the window ran out before a byte came."""
+    return FrameError("no reply")
+
+
+__all__ = [
+    "MORE",
+    "Command",
+    "Done",
+    "Exchange",
+    "Expect",
+    "FrameError",
+    "Leg",
+    "Listener",
+    "Need",
+    "Refused",
+    "ReplyTiming",
+    "Sizes",
+    "Step",
+    "Timings",
+    "no_reply",
+]

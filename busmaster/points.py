@@ -1,0 +1,74 @@
+"""Points: the named readable, perhaps writable, quantities of a node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from busmaster.errors import InvalidCommand
+from busmaster.exchange import Command
+
+if TYPE_CHECKING:
+    from busmaster.node import Node, Priority
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Point(Generic[T]):
+    """One quantity of one node: how it is read, what its value means, and how it is written if it may be.
+
+    `item` names it as the command line does ("axis0.position", "1.17"); `command` is the exchange behind it;
+    `decode` makes its value of what the command returns (a number into an IntFlag, a scaled integer into a
+    float); `encode` builds the write command of a value and raises InvalidCommand for one out of range.
+    Two points are equal if node, item and command are, so a point may be made anew each time it is asked for.
+    """
+
+    node: Node
+    item: str
+    command: Command[Any]
+    unit: str = field(default="", compare=False)
+    decode: Callable[[Any], T] | None = field(default=None, compare=False)
+    encode: Callable[[T], Command[None]] | None = field(default=None, compare=False)
+
+    @property
+    def key(self) -> str:
+        """ "5/axis0.position": node and item, as JSON output names a sample."""
+        return f"{self.node.address}/{self.item}"
+
+    @property
+    def writable(self) -> bool:
+        return self.encode is not None
+
+    async def read(
+        self,
+        *,
+        max_age: float | None = None,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+    ) -> T:
+        """Its value now, or, with `max_age` in seconds, a poll group's latest sample if that is young enough."""
+        if max_age is not None:
+            sample = self.node.bus.latest(self)
+            if sample is not None and sample.error is None and sample.age(self.node.bus.now()) <= max_age:
+                value: T = sample.value
+                return value
+        raw = await self.node.request(self.command, priority=priority, start_within=start_within, retries=retries)
+        return self.decode(raw) if self.decode else raw
+
+    async def write(
+        self,
+        value: T,
+        *,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+    ) -> None:
+        """Raises InvalidCommand, before anything is sent, if it is read-only or the value cannot be sent."""
+        if self.encode is None:
+            raise InvalidCommand(f"{self.node.label}: {self.item} is read-only")
+        await self.node.request(
+            self.encode(value), priority=priority, start_within=start_within, retries=retries, touches=self
+        )
