@@ -1,0 +1,29 @@
+"""The checksums of the five protocols. Which bytes they cover is the protocol's business."""
+
+from __future__ import annotations
+
+from functools import reduce
+from operator import xor as _xor
+
+FIRST_PRINTABLE = 0x20
+
+
+def xor(data: bytes) -> int:
+    """HCP, HCP2: exclusive-or of all bytes. Half of all frames get a control character, so never search for it."""
+    return reduce(_xor, data, 0)
+
+
+def bcc(data: bytes) -> int:
+    """Mentor II: exclusive-or of all bytes, plus 32 where that would be a control character."""
+    check = reduce(_xor, data, 0)
+    return check if check >= FIRST_PRINTABLE else check + FIRST_PRINTABLE
+
+
+def sum16(data: bytes) -> int:
+    """MSC: sum of all bytes, 16 bits. No legal packet overflows them."""
+    return sum(data) & 0xFFFF
+
+
+def sum8(data: bytes) -> int:
+    """DC104: sum of all bytes modulo 256."""
+    return sum(data) & 0xFF
