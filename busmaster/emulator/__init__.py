@@ -1,0 +1,1 @@
+"""A line with physics and the slaves on it, told the time: what cannot be tried on real drives is tried here."""

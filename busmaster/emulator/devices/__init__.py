@@ -1,0 +1,1 @@
+"""The emulated slaves, a module a protocol or a product."""

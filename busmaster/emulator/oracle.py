@@ -1,0 +1,44 @@
+"""Values that give themselves away: each encodes its node, its element and how often that element was written.
+
+A campaign reads such a value and knows whose it is, so that a wrong one is recognised whatever its cause. It writes
+such values too: a device counts the writes that it took and those that were never meant for it.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+SPREAD = 10_007
+"""A prime, so that values still lie far apart when they wrap in a narrow range. Counts up to it stay exact."""
+
+
+def oracle_value(node: int, element: int, writes: int, modulus: int = 10**12) -> int:
+    """From 0 to modulus - 1: who is asked (`node`), for what (`element`), and after how many writes to it.
+
+    `modulus` is how many values the protocol can carry: 10**12 for HCP and HCP2 (exact as text), 2**31 for MSC,
+    10**4 for Mentor II, 2**16 for DC104.
+    """
+    return (((node << 16) + element) * SPREAD + writes) % modulus
+
+
+class Oracle:
+    """The memory of one device in a campaign: in place of values it keeps the number of writes to each element."""
+
+    def __init__(self, node: int, modulus: int = 10**12) -> None:
+        self.node = node
+        self.modulus = modulus
+        self.writes: defaultdict[int, int] = defaultdict(int)
+        self.strays = 0
+        """Writes taken whose value was meant for another node or element, or was garbled unnoticed."""
+
+    def read(self, element: int) -> int:
+        return oracle_value(self.node, element, self.writes[element], self.modulus)
+
+    def write(self, element: int, value: float, slack: int = 64) -> None:
+        """Counts it. The writer is to send `oracle_value(node, element, n)` with n within `slack` of the count."""
+        count = self.writes[element]
+        self.writes[element] = count + 1
+        base = oracle_value(self.node, element, 0, self.modulus)
+        sent = (round(value) - base) % self.modulus
+        if abs(sent - count) > slack:
+            self.strays += 1
