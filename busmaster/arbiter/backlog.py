@@ -1,0 +1,173 @@
+"""What waits for the line: four strict classes, and one slot in eight for the lower ones (R9)."""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Iterator
+from itertools import count
+
+from busmaster.arbiter.transaction import Phase, Priority, Transaction
+
+SHARE = 7
+"""Consecutive exchanges of higher classes after which a waiting lower class gets one slot."""
+SLACK = 64
+"""Entries of ended transactions that a queue may hold beside as many live ones."""
+
+
+class _Fifo:
+    """First in, first out. Ended transactions are skipped, and swept out before they pile up."""
+
+    __slots__ = ("_entries", "live")
+
+    def __init__(self) -> None:
+        self._entries: deque[Transaction] = deque()
+        self.live = 0
+
+    def push(self, transaction: Transaction) -> None:
+        self._entries.append(transaction)
+        self.live += 1
+
+    def push_front(self, transaction: Transaction) -> None:
+        self._entries.appendleft(transaction)
+        self.live += 1
+
+    def pop(self) -> Transaction:
+        while True:
+            transaction = self._entries.popleft()
+            if transaction.phase is Phase.QUEUED:
+                self.live -= 1
+                return transaction
+
+    def discard(self) -> None:
+        self.live -= 1
+        if len(self._entries) > 2 * self.live + SLACK:
+            self._entries = deque(self)
+
+    def remove(self, transaction: Transaction) -> None:
+        self._entries.remove(transaction)
+        self.live -= 1
+
+    def __iter__(self) -> Iterator[Transaction]:
+        return (t for t in self._entries if t.phase is Phase.QUEUED)
+
+
+class _EarliestDeadlineFirst:
+    """By `Transaction.deadline`, then in the order of arrival."""
+
+    __slots__ = ("_entries", "_order", "live")
+
+    def __init__(self) -> None:
+        self._entries: list[tuple[float, int, Transaction]] = []
+        self._order = count()
+        self.live = 0
+
+    def push(self, transaction: Transaction) -> None:
+        heapq.heappush(self._entries, (transaction.deadline, next(self._order), transaction))
+        self.live += 1
+
+    def push_front(self, transaction: Transaction) -> None:
+        transaction.deadline = self._entries[0][0] if self._entries else transaction.deadline
+        heapq.heappush(self._entries, (transaction.deadline, -next(self._order), transaction))
+        self.live += 1
+
+    def pop(self) -> Transaction:
+        while True:
+            transaction = heapq.heappop(self._entries)[2]
+            if transaction.phase is Phase.QUEUED:
+                self.live -= 1
+                return transaction
+
+    def discard(self) -> None:
+        self.live -= 1
+        if len(self._entries) > 2 * self.live + SLACK:
+            self._entries = [entry for entry in self._entries if entry[2].phase is Phase.QUEUED]
+            heapq.heapify(self._entries)
+
+    def remove(self, transaction: Transaction) -> None:
+        self._entries = [entry for entry in self._entries if entry[2] is not transaction]
+        heapq.heapify(self._entries)
+        self.live -= 1
+
+    def __iter__(self) -> Iterator[Transaction]:
+        return (t for _, _, t in sorted(self._entries, key=lambda e: e[:2]) if t.phase is Phase.QUEUED)
+
+
+class Backlog:
+    """The waiting transactions of all classes. A transaction in it has the phase QUEUED."""
+
+    __slots__ = ("_queues", "_rotated", "_streak")
+
+    def __init__(self) -> None:
+        self._queues = (_Fifo(), _Fifo(), _EarliestDeadlineFirst(), _EarliestDeadlineFirst())
+        self._streak = 0
+        self._rotated = Priority.BACKGROUND
+
+    def __len__(self) -> int:
+        urgent, command, poll, background = self._queues
+        return urgent.live + command.live + poll.live + background.live
+
+    def waiting(self, priority: Priority) -> int:
+        return self._queues[priority].live
+
+    def push(self, transaction: Transaction) -> None:
+        """At the back of its class (of its deadline, in POLL and BACKGROUND)."""
+        transaction.phase = Phase.QUEUED
+        self._queues[transaction.priority].push(transaction)
+
+    def push_front(self, transaction: Transaction) -> None:
+        """At the front of its class: for a write whose turn had come while an earlier one was not over."""
+        transaction.phase = Phase.QUEUED
+        self._queues[transaction.priority].push_front(transaction)
+
+    def discard(self, transaction: Transaction, phase: Phase) -> None:
+        """Take a queued transaction out and give it another phase."""
+        transaction.phase = phase
+        self._queues[transaction.priority].discard()
+
+    def promote(self, transaction: Transaction, priority: Priority) -> None:
+        """To the front of a higher class: a write that a write of that class must not overtake."""
+        self._queues[transaction.priority].remove(transaction)
+        transaction.priority = priority
+        self.push_front(transaction)
+
+    def pop(self) -> Transaction | None:
+        """The next to go, or None. URGENT first, always; below it a waiting lower class gets every eighth slot."""
+        urgent, command, poll, background = self._queues
+        if urgent.live:
+            return urgent.pop()
+        if command.live:
+            if not poll.live and not background.live:
+                self._streak = 0
+            elif self._streak >= SHARE:
+                return self._lower_slot()
+            else:
+                self._streak += 1
+            return command.pop()
+        if poll.live:
+            if not background.live:
+                self._streak = 0
+            elif self._streak >= SHARE:
+                self._streak = 0
+                return background.pop()
+            else:
+                self._streak += 1
+            return poll.pop()
+        self._streak = 0
+        return background.pop() if background.live else None
+
+    def _lower_slot(self) -> Transaction:
+        """POLL and BACKGROUND in turn, if both wait."""
+        self._streak = 0
+        _, _, poll, background = self._queues
+        if poll.live and (self._rotated is Priority.BACKGROUND or not background.live):
+            self._rotated = Priority.POLL
+            return poll.pop()
+        self._rotated = Priority.BACKGROUND
+        return background.pop()
+
+    def drain(self) -> list[Transaction]:
+        """Everything that waits, in order of class; the backlog is empty afterwards."""
+        drained = [transaction for queue in self._queues for transaction in queue]
+        self._queues = (_Fifo(), _Fifo(), _EarliestDeadlineFirst(), _EarliestDeadlineFirst())
+        return drained

@@ -1,0 +1,154 @@
+"""What is counted, and the immutable snapshots of it that users get."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from busmaster.arbiter.histogram import Histogram
+
+
+@dataclass(frozen=True, slots=True)
+class Quantiles:
+    """A distribution of times, in seconds."""
+
+    count: int
+    mean: float
+    p50: float
+    p99: float
+    highest: float
+
+    @classmethod
+    def of(cls, histogram: Histogram) -> Quantiles:
+        return cls(
+            histogram.count, histogram.mean, histogram.quantile(0.5), histogram.quantile(0.99), histogram.highest
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStatistics:
+    """Counts of one node since the last reset. `attempts` = ok + no_reply + garbled + refused + those cut off by the
+    loss of the line; `failed` counts transactions that ended with an error, retries and all."""
+
+    attempts: int
+    ok: int
+    late: int
+    no_reply: int
+    garbled: int
+    refused: int
+    retries: int
+    unheard: int
+    failed: int
+    probes: int
+    lateness: float
+    latency: Quantiles
+    """From the start of the request to the end of its reply, of attempts that succeeded."""
+
+
+@dataclass(frozen=True, slots=True)
+class LineStatistics:
+    """Counts of the line since the last reset; times in seconds."""
+
+    elapsed: float
+    exchanges: int
+    completed: int
+    cancelled: int
+    stray_bytes: int
+    noise_bytes: int
+    tainted: int
+    collisions: int
+    settles: int
+    settling: float
+    busy: float
+    noisy: int
+    losses: int
+    backlog: int
+    waits: tuple[Quantiles, Quantiles, Quantiles, Quantiles]
+    """From being queued to being started, for URGENT, COMMAND, POLL and BACKGROUND."""
+
+    @property
+    def utilisation(self) -> float:
+        """The share of the time in which the line was in use, settling included."""
+        return min(1.0, (self.busy + self.settling) / self.elapsed) if self.elapsed > 0 else 0.0
+
+
+class NodeCounters:
+    __slots__ = (
+        "attempts",
+        "failed",
+        "garbled",
+        "late",
+        "latency",
+        "no_reply",
+        "ok",
+        "probes",
+        "refused",
+        "retries",
+        "unheard",
+    )
+
+    def __init__(self) -> None:
+        self.attempts = self.ok = self.late = self.no_reply = self.garbled = self.refused = 0
+        self.retries = self.unheard = self.failed = self.probes = 0
+        self.latency = Histogram()
+
+    def snapshot(self, lateness: float) -> NodeStatistics:
+        return NodeStatistics(
+            self.attempts,
+            self.ok,
+            self.late,
+            self.no_reply,
+            self.garbled,
+            self.refused,
+            self.retries,
+            self.unheard,
+            self.failed,
+            self.probes,
+            lateness,
+            Quantiles.of(self.latency),
+        )
+
+
+class LineCounters:
+    __slots__ = (
+        "busy",
+        "cancelled",
+        "collisions",
+        "completed",
+        "exchanges",
+        "losses",
+        "noise_bytes",
+        "noisy",
+        "settles",
+        "settling",
+        "since",
+        "stray_bytes",
+        "tainted",
+        "waits",
+    )
+
+    def __init__(self, since: float) -> None:
+        self.since = since
+        self.exchanges = self.completed = self.cancelled = self.stray_bytes = self.noise_bytes = 0
+        self.tainted = self.collisions = self.settles = self.noisy = self.losses = 0
+        self.settling = self.busy = 0.0
+        self.waits = (Histogram(), Histogram(), Histogram(), Histogram())
+
+    def snapshot(self, now: float, busy: float, settling: float, backlog: int) -> LineStatistics:
+        first, second, third, fourth = self.waits
+        return LineStatistics(
+            now - self.since,
+            self.exchanges,
+            self.completed,
+            self.cancelled,
+            self.stray_bytes,
+            self.noise_bytes,
+            self.tainted,
+            self.collisions,
+            self.settles,
+            settling,
+            busy,
+            self.noisy,
+            self.losses,
+            backlog,
+            (Quantiles.of(first), Quantiles.of(second), Quantiles.of(third), Quantiles.of(fourth)),
+        )

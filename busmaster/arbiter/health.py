@@ -1,0 +1,163 @@
+"""Which nodes live, and how much line time the dead ones may cost (R11)."""
+
+from __future__ import annotations
+
+import enum
+from collections import deque
+from collections.abc import Callable
+from math import inf
+
+from busmaster.arbiter.counters import NodeCounters
+from busmaster.arbiter.transaction import Transaction
+from busmaster.exchange import Timings
+from busmaster.profile import Profile
+
+DOWN_AFTER_FAILURES = 3
+DOWN_AFTER_SILENCE = 1.0
+FIRST_PROBE_DELAY = 0.5
+LONGEST_PROBE_DELAY = 30.0
+PROBE_JITTER = 0.2
+STEADY = 30.0
+"""Seconds a node must stay up before its next death starts with the first probe delay again: no flapping."""
+
+BUDGET_SHARE = 0.02
+BUDGET_IDLE_SHARE = 0.25
+BUDGET_SHARE_AFTER_RETURN = 0.2
+BUDGET_RETURN_PERIOD = 30.0
+BUDGET_CAPACITY = 1.0
+"""Seconds of line time that may be saved up."""
+LONGEST_BUDGET_WAIT = 1.0
+
+
+class Health(enum.Enum):
+    """UNKNOWN was never heard; SUSPECT failed lately; DOWN is probed, and its polls are parked."""
+
+    UNKNOWN = "unknown"
+    UP = "up"
+    SUSPECT = "suspect"
+    DOWN = "down"
+
+
+class NodeRecord:
+    """What the arbiter knows of one node. Changed by the arbiter alone."""
+
+    __slots__ = (
+        "address",
+        "counters",
+        "failures",
+        "has_hook",
+        "health",
+        "held",
+        "label",
+        "last_reply",
+        "probe_at",
+        "probe_delay",
+        "profile",
+        "retries",
+        "suspended_until",
+        "timings",
+        "up_since",
+        "waiter",
+        "writes",
+    )
+
+    def __init__(self, profile: Profile, address: int, timings: Timings, retries: int) -> None:
+        self.profile = profile
+        self.address = address
+        self.label = profile.label(address)
+        self.timings = timings
+        self.retries = retries
+        self.health = Health.UNKNOWN
+        self.failures = 0
+        self.last_reply = -inf
+        self.up_since = -inf
+        self.writes: deque[Transaction] = deque()
+        self.counters = NodeCounters()
+        self.probe_delay = FIRST_PROBE_DELAY
+        self.probe_at = inf
+        self.suspended_until = -inf
+        self.has_hook = False
+        self.held = False
+        self.waiter: object = None
+
+    @property
+    def lateness(self) -> float:
+        """The longest lateness of its timings, in seconds."""
+        timings = self.timings
+        return max(timings.read.lateness, timings.write.lateness, timings.packet.lateness)
+
+
+class ProbeBudget:
+    """A token bucket of line time, in seconds."""
+
+    __slots__ = ("_earned_at", "_generous_until", "tokens")
+
+    def __init__(self, now: float) -> None:
+        self.tokens = BUDGET_CAPACITY
+        self._earned_at = now
+        self._generous_until = -inf
+
+    def idle(self, seconds: float) -> None:
+        self.tokens = min(BUDGET_CAPACITY, self.tokens + BUDGET_IDLE_SHARE * seconds)
+
+    def node_returned(self, now: float) -> None:
+        self._earn(now)
+        self._generous_until = now + BUDGET_RETURN_PERIOD
+
+    def take(self, cost: float, now: float) -> bool:
+        """Pay for a probe, if the bucket holds it (a full bucket pays for anything)."""
+        self._earn(now)
+        if self.tokens < min(cost, BUDGET_CAPACITY):
+            return False
+        self.tokens -= cost
+        return True
+
+    def refund(self, seconds: float) -> None:
+        self.tokens = min(BUDGET_CAPACITY, self.tokens + seconds)
+
+    def wait_for(self, cost: float, now: float) -> float:
+        """Seconds until the bucket will hold `cost` at the current share; asked again by then at the latest."""
+        share = BUDGET_SHARE_AFTER_RETURN if now < self._generous_until else BUDGET_SHARE
+        missing = min(cost, BUDGET_CAPACITY) - self.tokens
+        return min(max(missing / share, 0.001), LONGEST_BUDGET_WAIT)
+
+    def _earn(self, now: float) -> None:
+        generous = max(0.0, min(now, self._generous_until) - self._earned_at)
+        usual = max(0.0, now - self._earned_at - generous)
+        earned = BUDGET_SHARE_AFTER_RETURN * generous + BUDGET_SHARE * usual
+        self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)
+        self._earned_at = now
+
+
+def note_success(node: NodeRecord, now: float) -> None:
+    """A reply came. The caller reports the change of health."""
+    if node.health is Health.DOWN:
+        node.probe_at = inf
+        node.held = node.has_hook
+    if node.health is not Health.SUSPECT:
+        node.up_since = now
+    node.health = Health.UP
+    node.failures = 0
+
+
+def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> None:
+    """A transaction failed without a valid reply. The caller reports the change of health."""
+    node.failures += 1
+    node.held = False
+    if node.health is Health.DOWN:
+        node.probe_delay = min(2 * node.probe_delay, LONGEST_PROBE_DELAY)
+        node.probe_at = _jittered(node.probe_delay, now, jitter)
+        return
+    never_heard = node.health is Health.UNKNOWN
+    silent = now - node.last_reply >= DOWN_AFTER_SILENCE
+    if never_heard or (node.failures >= DOWN_AFTER_FAILURES and silent):
+        flapped = not never_heard and now - node.up_since < STEADY
+        node.probe_delay = min(2 * node.probe_delay, LONGEST_PROBE_DELAY) if flapped else FIRST_PROBE_DELAY
+        node.health = Health.DOWN
+        node.probe_at = _jittered(node.probe_delay, now, jitter)
+    else:
+        node.health = Health.SUSPECT
+
+
+def _jittered(delay: float, now: float, jitter: Callable[[], float]) -> float:
+    return now + delay * (1 + PROBE_JITTER * (2 * jitter() - 1))

@@ -1,0 +1,145 @@
+"""Transactions: a command with its caller, priority and retries."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from math import inf
+from typing import TYPE_CHECKING, Any
+
+from busmaster.errors import BusError
+from busmaster.exchange import Command
+
+if TYPE_CHECKING:
+    from busmaster.arbiter.health import NodeRecord
+    from busmaster.arbiter.schedule import Poll
+
+
+class Priority(enum.IntEnum):
+    """The classes of R9, strict: a lower number goes first."""
+
+    URGENT = 0
+    COMMAND = 1
+    POLL = 2
+    BACKGROUND = 3
+
+
+class Phase(enum.Enum):
+    """Where a transaction is. A write is PARKED while an earlier write to its node is not over (R7)."""
+
+    IDLE = "idle"
+    QUEUED = "queued"
+    PARKED = "parked"
+    ON_WIRE = "on wire"
+    ENDED = "ended"
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """Why it took as long as it did. Times are the bus's clock, in seconds; None for what did not happen."""
+
+    queued: float
+    started: float | None
+    """When its last attempt began to be sent."""
+    first_byte: float | None
+    last_byte: float | None
+    attempts: int
+    exchanges_ahead: int
+    """Exchanges of others that went first while it waited."""
+    settling_ahead: float
+    """Seconds of that wait in which the line was settling after somebody's uncertain outcome."""
+
+
+class Transaction:
+    """One command on its way. Made by the caller, changed by the arbiter alone, ended exactly once (R8)."""
+
+    __slots__ = (
+        "attempts",
+        "command",
+        "deadline",
+        "ended_at",
+        "error",
+        "exchanges_ahead",
+        "first_byte",
+        "heard",
+        "idempotent",
+        "last_byte",
+        "late",
+        "node",
+        "phase",
+        "poll",
+        "priority",
+        "probe",
+        "queued",
+        "refusals",
+        "refused_until",
+        "retries",
+        "settling_ahead",
+        "start_by",
+        "started",
+        "superseded",
+        "value",
+        "waiter",
+        "writes",
+    )
+
+    def __init__(
+        self,
+        node: NodeRecord,
+        command: Command[Any],
+        *,
+        priority: Priority = Priority.COMMAND,
+        start_by: float = inf,
+        retries: int | None = None,
+        idempotent: bool | None = None,
+        waiter: Any = None,
+        poll: Poll | None = None,
+        probe: bool = False,
+    ) -> None:
+        self.node = node
+        self.command = command
+        self.priority = priority
+        self.writes = command.writes
+        self.idempotent = command.idempotent if idempotent is None else idempotent
+        if retries is not None:
+            self.retries = retries
+        elif probe or (self.writes and not self.idempotent):
+            self.retries = 0
+        else:
+            self.retries = node.retries
+        self.start_by = start_by
+        self.waiter = waiter
+        self.poll = poll
+        self.probe = probe
+        self.refused_until = -inf
+        self.reset()
+
+    def reset(self) -> None:
+        """Fresh for its (next) run: a poll's transaction lives as long as the poll."""
+        self.phase = Phase.IDLE
+        self.attempts = 0
+        self.refusals = 0
+        self.heard = True
+        self.superseded = False
+        self.late = False
+        self.deadline = inf
+        self.value: Any = None
+        self.error: BusError | None = None
+        self.queued = 0.0
+        self.started = self.first_byte = self.last_byte = self.ended_at = -inf
+        self.exchanges_ahead = 0
+        self.settling_ahead = 0.0
+
+    def timeline(self) -> Timeline:
+        def known(time: float) -> float | None:
+            return None if time == -inf else time
+
+        return Timeline(
+            self.queued,
+            known(self.started),
+            known(self.first_byte),
+            known(self.last_byte),
+            self.attempts,
+            self.exchanges_ahead,
+            self.settling_ahead,
+        )
