@@ -1,0 +1,73 @@
+"""Numbers as the HCP and HCP2 documents write them: decimal text with at most 4 decimals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from decimal import ROUND_HALF_UP, Decimal
+from functools import lru_cache
+from typing import SupportsFloat
+
+from busmaster.errors import InvalidCommand
+from busmaster.exchange import FrameError
+
+LONGEST_NUMBER = 20
+"""Characters of one value. A controller returns no more, so a longer one could never be read back."""
+LONGEST_LIST = 60
+"""Characters of a telegram's data field, commas included."""
+
+_FOURTH_DECIMAL = Decimal("0.0001")
+_TOO_BIG = 10**LONGEST_NUMBER
+_NUMBER_CHARACTERS = b"0123456789+-.eE "
+
+
+def format_number(value: SupportsFloat) -> str:
+    """The shortest text with at most 4 decimals: "123.456", ".5", "-.0001", "0"; no exponent, no "-0".
+
+    The fifth decimal rounds half away from zero, on the decimal text that Python shows for the value. Raises
+    InvalidCommand for NaN, infinity, what is no number, and what takes more than 20 characters.
+    """
+    if not hasattr(value, "__float__"):
+        raise InvalidCommand(f"{value!r} is not a number")
+    number = int(value) if isinstance(value, int) else float(value)
+    if -_TOO_BIG < number < _TOO_BIG:
+        text = str(number) if isinstance(number, int) else _format_float(number)
+        if len(text) <= LONGEST_NUMBER:
+            return text
+    raise InvalidCommand(f"a value must be a finite number of at most {LONGEST_NUMBER} characters")
+
+
+@lru_cache(maxsize=1024)
+def _format_float(value: float) -> str:
+    text = f"{Decimal(repr(value)).quantize(_FOURTH_DECIMAL, ROUND_HALF_UP):f}".rstrip("0").rstrip(".")
+    if text.startswith("0."):
+        return text[1:]
+    if text.startswith("-0"):
+        return "-" + text[2:] if len(text) > len("-0") else "0"
+    return text
+
+
+def format_list(values: Iterable[SupportsFloat]) -> str:
+    """Values for consecutive elements, separated by commas. Raises InvalidCommand for more than 60 characters."""
+    text = ",".join(map(format_number, values))
+    if len(text) > LONGEST_LIST:
+        raise InvalidCommand(
+            f"{len(text)} characters of data do not fit one telegram of {LONGEST_LIST}: write fewer values at a time"
+        )
+    return text
+
+
+def parse_number(field: bytes) -> float:
+    """The value of a reply's data field: sign, digits, fraction, and an exponent if there is one.
+
+    Spaces around it are dropped. Raises FrameError for anything else, such as "nan", "1_0" or an empty field.
+    """
+    if not field.translate(None, _NUMBER_CHARACTERS):
+        try:
+            value = float(field)
+        except ValueError:
+            pass
+        else:
+            if math.isfinite(value):
+                return value
+    raise FrameError(f"{field!r} is not a number")

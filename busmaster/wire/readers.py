@@ -1,0 +1,138 @@
+"""Readers for the replies of the character protocols: HCP, HCP2 and Mentor II.
+
+A telegram is STX, the echoed element or parameter, data, ETX and a checksum. Reading is positional: data is printable,
+so the first ETX ends it, and the byte after that ETX is the checksum, whatever its value. Acknowledgements are one
+byte. The first byte tells the two apart, and every request has one legal set of first bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar, Generic, NoReturn, TypeVar
+
+from busmaster.errors import Refused
+from busmaster.exchange import MORE, Done, Expect, FrameError, Leg, Need, ReplyTiming, Sizes, no_reply
+from busmaster.wire.checks import xor
+
+T = TypeVar("T")
+
+STX = b"\x02"
+ETX = b"\x03"
+EOT = b"\x04"
+ENQ = b"\x05"
+ACK = b"\x06"
+BEL = b"\x07"
+NAK = b"\x15"
+
+_PRINTABLE = bytes(range(0x20, 0x7F))
+_ENVELOPE = len(STX + ETX) + 1
+_REFUSALS: Mapping[int, type[Refused]] = {NAK[0]: Refused}
+
+
+def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes], int]) -> int:
+    """Where the ETX of a whole and valid telegram is; 0 if more bytes are needed.
+
+    `header` is STX and the echo, `longest` the most data characters. Raises FrameError as soon as the bytes cannot
+    become such a telegram; `whole` only if nothing but the checksum is wrong, and nothing follows.
+    """
+    start = len(header)
+    if not buffer.startswith(header):
+        if header.startswith(buffer):
+            return 0
+        raise FrameError(f"wrong echo: {buffer[:start].hex(' ')} in place of {header.hex(' ')}")
+    etx = buffer.find(ETX, start, start + longest + 1)
+    field = buffer[start : etx if etx > 0 else start + longest + 1]
+    if field.translate(None, _PRINTABLE):
+        raise FrameError("a control character within the data")
+    if etx < 0:
+        if len(field) > longest:
+            raise FrameError(f"more than {longest} characters of data")
+        return 0
+    if len(buffer) <= etx + 1:
+        return 0
+    if buffer[etx + 1] != check(buffer[1 : etx + 1]):
+        raise FrameError("bad checksum", whole=len(buffer) == etx + 2)
+    return etx
+
+
+def telegram_sizes(echo: int, typical: int, longest: int) -> Sizes:
+    """Bytes of a telegram from the characters of its echo and of its data."""
+    return Sizes(_ENVELOPE + echo + typical, _ENVELOPE + echo + longest)
+
+
+class SingleLeg:
+    """What the exchanges of the character protocols share."""
+
+    __slots__ = ("request", "timing")
+
+    refusals: ClassVar[Mapping[int, type[Refused]]] = _REFUSALS
+    later: ClassVar[Sequence[Leg]] = ()
+    closing: ClassVar[int] = 0
+    answered: ClassVar[bool] = True
+
+    def __init__(self, request: bytes, timing: ReplyTiming) -> None:
+        self.request = request
+        self.timing = timing
+
+    def reject(self, first: int) -> NoReturn:
+        """Raise what a first byte means that begins no answer: Refused, or FrameError."""
+        refusal = self.refusals.get(first)
+        if refusal is not None:
+            raise refusal
+        raise FrameError(f"a reply cannot begin with {first:02x}")
+
+
+class TelegramReader(SingleLeg, Generic[T]):
+    """One read: a telegram, or a refusal.
+
+    A protocol sets the class attributes. `parse` makes the value of the data field, or raises FrameError.
+    """
+
+    __slots__ = ("_buffer", "_header")
+
+    check = staticmethod(xor)
+    longest: ClassVar[int]
+    sizes: ClassVar[Sizes]
+    starts: ClassVar[bytes] = STX + NAK
+
+    def __init__(self, request: bytes, echo: bytes, timing: ReplyTiming) -> None:
+        super().__init__(request, timing)
+        self._header = STX + echo
+        self._buffer = b""
+
+    def parse(self, field: bytes) -> T:
+        raise NotImplementedError
+
+    def feed(self, data: bytes) -> Need | Expect | Done[T]:
+        buffer = self._buffer = self._buffer + data if self._buffer else data
+        if not buffer:
+            return MORE
+        if buffer[0] != STX[0]:
+            self.reject(buffer[0])
+        header = self._header
+        etx = find_etx(buffer, header, self.longest, self.check)
+        if not etx:
+            return MORE
+        return Done(self.parse(buffer[len(header) : etx]), rest=buffer[etx + 2 :])
+
+    def expired(self, started: bool) -> Expect | Done[T]:
+        raise FrameError(f"reply cut short after {len(self._buffer)} bytes") if started else no_reply()
+
+
+class AcknowledgeReader(SingleLeg):
+    """One write: a lone ACK, or a refusal."""
+
+    __slots__ = ()
+
+    sizes: ClassVar[Sizes] = Sizes(1, 1)
+    starts: ClassVar[bytes] = ACK + NAK
+
+    def feed(self, data: bytes) -> Need | Expect | Done[None]:
+        if not data:
+            return MORE
+        if data[0] != ACK[0]:
+            self.reject(data[0])
+        return Done(None, rest=data[1:])
+
+    def expired(self, started: bool) -> Expect | Done[None]:
+        raise no_reply()
