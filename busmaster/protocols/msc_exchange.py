@@ -1,0 +1,264 @@
+"""MSC packets, and what the host and a controller say to each other about them (IB-11A002 rev E).
+
+    packet    STX unit length16 sequence16 body checksum16     big-endian; the sum of all bytes from unit to body
+
+The conversation ("Data transfer sequence"):
+
+    host: request packet   ->  ACK: it arrived whole, and a write is done
+                               NAK: send it again, at most three times
+    (reads)                    then a packet with the same command name
+    host: ACK              ->  done
+    host: NAK              ->  the packet again, at most five times
+
+Any byte can stand anywhere in a packet, so a reader counts from STX and never searches. Where the count itself is
+in doubt (a damaged header, bytes where none belong) the reader is lost: it swallows what comes until the line
+pauses for a byte gap, and speaks only then. So it never talks into a packet, and never takes a byte from the middle
+of one for an ACK.
+
+A reply names its command but no data address. So a packet that comes before the request's ACK is never a reply:
+it answers something older; it is ACKed and dropped, and the ACK still awaited.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from busmaster.exchange import (
+    MORE,
+    Done,
+    Expect,
+    FrameError,
+    Leg,
+    Need,
+    Refused,
+    Sizes,
+    Step,
+    Timings,
+    no_reply,
+)
+from busmaster.wire.checks import sum16
+from busmaster.wire.readers import ACK, NAK, STX
+
+T = TypeVar("T")
+
+HEADER = 6
+FRAMING = 8
+LONGEST_BODY = 240
+LONGEST_PACKET = LONGEST_BODY + FRAMING
+UNITS = range(1, 16)
+
+RESENDS = 3
+HOST_NAKS = 5
+STALE_PACKETS = 6
+
+
+def packet(unit: int, body: bytes) -> bytes:
+    """`body` as a packet to `unit`. The block sequence number "is not presently used": 0."""
+    counted = bytes((unit, 0, len(body), 0, 0)) + body
+    return STX + counted + sum16(counted).to_bytes(2, "big")
+
+
+def packet_size(data: bytes | bytearray) -> int | None:
+    """Bytes of the packet that `data` begins with: 0 while that cannot be told, None if no packet begins so."""
+    if data[0] != STX[0]:
+        return None
+    if len(data) < 4:
+        return 0
+    length = int.from_bytes(data[2:4], "big")
+    return length + FRAMING if data[1] in UNITS and length <= LONGEST_BODY else None
+
+
+def is_sound(whole: bytes) -> bool:
+    """The checksum of a whole packet is right."""
+    return sum16(whole[1:-2]) == int.from_bytes(whole[-2:], "big")
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """The packet that answers a read: from `unit`, `name` with its comma, then `payload` bytes.
+
+    Other payloads of at least `shortest` bytes are accepted too, if that is given.
+    """
+
+    unit: int
+    name: bytes
+    payload: int
+    shortest: int | None = None
+
+    @property
+    def size(self) -> int:
+        return FRAMING + len(self.name) + self.payload
+
+    def echoed_by(self, whole: bytes) -> bool:
+        """This packet has the length, the unit and the command name of the reply."""
+        payload = len(whole) - FRAMING - len(self.name)
+        right_length = payload == self.payload if self.shortest is None else payload >= self.shortest
+        return right_length and whole[1] == self.unit and whole.startswith(self.name, HEADER)
+
+    def payload_of(self, whole: bytes) -> bytes:
+        return whole[HEADER + len(self.name) : -2]
+
+
+class PacketExchange(Generic[T]):
+    """One request packet on the wire; then its ACK; then, if a `reply` is due, that packet and the host's ACK.
+
+    `decode` makes the value of the reply's payload, or of nothing for a write; it may raise FrameError.
+    """
+
+    __slots__ = (
+        "_acked",
+        "_buffer",
+        "_decode",
+        "_failure",
+        "_lost",
+        "_naks",
+        "_packet_timing",
+        "_reply",
+        "_resends",
+        "_stale",
+        "closing",
+        "later",
+        "request",
+        "timing",
+    )
+    sizes = Sizes(1, LONGEST_PACKET)
+    starts = ACK + NAK + STX
+    answered = True
+
+    def __init__(self, request: bytes, timings: Timings, reply: Reply | None, decode: Callable[[bytes], T]) -> None:
+        self.request = request
+        self.timing = timings.write if reply is None else timings.read
+        self.later: Sequence[Leg] = () if reply is None else (Leg(timings.packet, Sizes(reply.size, LONGEST_PACKET)),)
+        self.closing = 0 if reply is None else len(ACK)
+        self._packet_timing = timings.packet
+        self._reply = reply
+        self._decode = decode
+        self._buffer = bytearray()
+        self._acked = self._lost = False
+        self._resends = self._naks = self._stale = 0
+        self._failure: FrameError | Refused = no_reply()
+
+    def feed(self, data: bytes, /) -> Step[T]:
+        buffer = self._buffer
+        buffer += data
+        if not buffer:
+            return MORE
+        if self._lost:
+            return self._swallow()
+        if not self._acked:
+            if buffer[0] == ACK[0]:
+                del buffer[0]
+                return self._accepted()
+            if buffer == NAK:
+                buffer.clear()
+                return self._resend()
+        size = packet_size(buffer)
+        if size is None:
+            return self._swallow()
+        if not size or len(buffer) < size:
+            return MORE
+        return self._take(bytes(buffer[:size]))
+
+    def expired(self, started: bool, /) -> Expect:
+        arrived = len(self._buffer)
+        if not self._acked and not arrived:
+            raise no_reply()
+        what = f"the packet was cut short after {arrived} bytes"
+        if self._lost:
+            what = f"{arrived} bytes that are no packet, the first of them {self._buffer[0]:02X}"
+        if not self._acked:
+            raise FrameError(what, send=ACK)
+        if not arrived:
+            raise FrameError("no packet followed the ACK", send=ACK)
+        return self._ask_again(FrameError(what, send=ACK))
+
+    def abandon(self) -> FrameError | Refused:
+        """What to fail the attempt with in place of the last Expect's `send`, which must not have been sent.
+
+        For an Expect that would say something again (its `send` is not empty) where the exchange has lasted too
+        long or something urgent waits. A FrameError's own `send` leaves the device with nothing unacknowledged.
+        """
+        return self._failure
+
+    def _accepted(self) -> Step[T]:
+        if self._reply is None:
+            return Done(self._decode(b""), rest=bytes(self._buffer))
+        self._acked = True
+        return Expect(self._packet_timing, self.later[0].sizes)
+
+    def _resend(self) -> Expect:
+        if self._resends == RESENDS:
+            raise Refused(f"refused {1 + RESENDS} times", confirm=False)
+        self._resends += 1
+        self._failure = Refused()
+        return Expect(self.timing, self.sizes, self.request)
+
+    def _swallow(self) -> Need:
+        self._lost = True
+        if len(self._buffer) > LONGEST_PACKET:
+            raise FrameError("more bytes without a pause than any packet has")
+        return MORE
+
+    def _take(self, whole: bytes) -> Step[T]:
+        reply = self._reply if self._acked else None
+        mine = reply is not None and reply.echoed_by(whole)
+        if not is_sound(whole):
+            if reply is None or len(whole) != reply.size or len(self._buffer) > len(whole):
+                return self._swallow()
+            return self._ask_again(FrameError("bad checksum", whole=mine, send=ACK))
+        del self._buffer[: len(whole)]
+        if reply is not None and mine:
+            return Done(self._decode(reply.payload_of(whole)), send=ACK, rest=bytes(self._buffer))
+        if whole == self.request:
+            raise FrameError("the request came back: if this line echoes, declare echo=True", send=ACK)
+        return self._drop()
+
+    def _ask_again(self, failure: FrameError) -> Expect:
+        if self._naks == HOST_NAKS:
+            raise failure
+        self._naks += 1
+        self._failure = failure
+        self._buffer.clear()
+        self._lost = False
+        return Expect(self._packet_timing, self.later[0].sizes, NAK)
+
+    def _drop(self) -> Expect:
+        failure = FrameError("a packet that answers something else", send=ACK)
+        if self._stale == STALE_PACKETS:
+            raise failure
+        self._stale += 1
+        self._failure = failure
+        if self._acked:
+            return Expect(self._packet_timing, self.later[0].sizes, ACK)
+        return Expect(self.timing, self.sizes, ACK)
+
+
+class StalePacketListener:
+    """Reads what arrives while nothing is asked: a packet whose ACK was lost. It is ACKed and dropped, a bad one too.
+
+    Otherwise the controller would send it again, up to five times, into the exchanges of others.
+    """
+
+    __slots__ = ("_buffer",)
+
+    def __init__(self) -> None:
+        self._buffer = b""
+
+    def feed(self, data: bytes, /) -> Need | Done[None]:
+        self._buffer += data
+        buffer = self._buffer
+        if not buffer:
+            return MORE
+        if buffer[0] != STX[0]:
+            raise FrameError(f"a stray {buffer[0]:02X}")
+        size = packet_size(buffer)
+        if size and len(buffer) >= size and is_sound(buffer[:size]):
+            return Done(None, send=ACK, rest=buffer[size:])
+        if len(buffer) > LONGEST_PACKET:
+            raise FrameError("more stray bytes without a pause than any packet has")
+        return MORE
+
+    def expired(self) -> Done[None]:
+        return Done(None, send=ACK)
