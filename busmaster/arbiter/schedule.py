@@ -9,7 +9,7 @@ from math import floor, inf
 from typing import Any
 
 from busmaster.arbiter.histogram import Histogram
-from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Exchange
 
@@ -50,6 +50,7 @@ class Poll:
         "demanded",
         "due",
         "finished",
+        "fresh",
         "jitter",
         "late_cycles",
         "missed",
@@ -74,6 +75,7 @@ class Poll:
         self.phase = phase
         self.cost = cost
         self.results: Sequence[Transaction] = ()
+        self.fresh: Sequence[Transaction] | None = None
         self.waiter: Any = None
         self.base = 0.0
         self.number = 0
@@ -158,6 +160,8 @@ class Schedule:
 
 def begin_cycle(poll: Poll, now: float) -> list[Transaction]:
     """Make the poll's transactions fresh; returns them, ready to be queued."""
+    if poll.fresh is not None:
+        poll.results, poll.fresh = poll.fresh, None
     poll.remaining = len(poll.results)
     poll.started = -inf
     poll.cycles += 1
@@ -169,14 +173,13 @@ def begin_cycle(poll: Poll, now: float) -> list[Transaction]:
     return list(poll.results)
 
 
-def members_of(poll: Poll, members: Iterable[Transaction], priority: Priority = Priority.POLL) -> None:
-    """Give a poll its transactions. A cycle that is running keeps those it started with."""
+def set_members(poll: Poll, members: Iterable[Transaction], priority: Priority = Priority.POLL) -> None:
+    """Give a poll its transactions, from its next cycle on."""
     fresh = tuple(members)
     for transaction in fresh:
         transaction.poll = poll
         transaction.priority = priority
-        transaction.phase = Phase.IDLE
-    poll.results = fresh
+    poll.fresh = fresh
 
 
 def quietest_offset(poll: Poll, others: Sequence[Poll], now: float) -> float:

@@ -66,13 +66,16 @@ class Transaction:
         "last_byte",
         "late",
         "node",
+        "paid",
         "phase",
         "poll",
         "priority",
         "probe",
         "queued",
         "refusals",
+        "refused_cycles",
         "refused_until",
+        "retried",
         "retries",
         "settling_ahead",
         "start_by",
@@ -112,13 +115,16 @@ class Transaction:
         self.poll = poll
         self.probe = probe
         self.refused_until = -inf
+        self.refused_cycles = 0
         self.reset()
 
     def reset(self) -> None:
         """Fresh for its (next) run: a poll's transaction lives as long as the poll."""
         self.phase = Phase.IDLE
         self.attempts = 0
+        self.retried = 0
         self.refusals = 0
+        self.paid = 0.0
         self.heard = True
         self.superseded = False
         self.late = False
