@@ -133,4 +133,4 @@ PROFILE = Profile(
     timings=Timings(_READ_TIMING, _WRITE_TIMING, packet=_READ_TIMING),
     probe=Read(1),
 )
-"""The document gives no times. A drive answers a write when it is completed, EEPROM included: hence the longer window."""
+"""The document gives no times. A write is answered when it is completed, EEPROM included: hence its longer window."""
