@@ -1,0 +1,169 @@
+"""What the system knows of a serial port: who holds it, who may open it, what its driver does to the timing.
+
+Nothing here needs the port open. Each finding says what to do about it. Linux only: elsewhere there are no findings.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import grp
+import os
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+PROC = Path("/proc")
+SYS = Path("/sys")
+
+SLOW_LATENCY_TIMER = 2
+"""Milliseconds; above that, an FTDI adapter's batching shows in every reply."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing about a port. `ok` False: it should be changed, and `advice` says how."""
+
+    topic: str
+    ok: bool
+    what: str
+    advice: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """A process that has the port open."""
+
+    pid: int
+    command: str
+
+    def __str__(self) -> str:
+        return "this program" if self.pid == os.getpid() else f"{self.command} (process {self.pid})"
+
+
+def inspect(path: str, *, proc: Path = PROC, sys: Path = SYS) -> tuple[Finding, ...]:
+    """Everything that can be said of the port at `path` without opening it."""
+    found = [_existence(path)]
+    if found[0].ok:
+        found += [_permission(path), _holders(path, proc), *_driver(path, sys), *_latency_timer(path, sys)]
+    return tuple(found)
+
+
+def holders(path: str, *, proc: Path = PROC) -> tuple[Holder, ...]:
+    """Who has it open, of the processes that we may look into (root sees all)."""
+    device = os.path.realpath(path)
+    return tuple(_holder(pid, proc) for pid in _pids(proc) if device in _open_files(proc / str(pid)))
+
+
+def lock_owner(path: str, *, proc: Path = PROC) -> Holder | None:
+    """Who has locked it (flock), by the kernel's own table."""
+    try:
+        inode = os.stat(path)
+        table = (proc / "locks").read_text()
+    except OSError:
+        return None
+    place = f"{os.major(inode.st_dev):02x}:{os.minor(inode.st_dev):02x}:{inode.st_ino}"
+    for line in table.splitlines():
+        fields = line.split()
+        if fields[1:2] == ["FLOCK"] and place in fields:
+            pid = int(fields[4])
+            return _holder(pid, proc) if pid > 0 else None  # 0 or -1: in another container
+    return None
+
+
+def owning_group(path: str) -> str:
+    """The group that may open it, by name where it has one."""
+    gid = os.stat(path).st_gid
+    try:
+        return grp.getgrgid(gid).gr_name
+    except KeyError:
+        return str(gid)
+
+
+def latency_timer(path: str, *, sys: Path = SYS) -> int | None:
+    """Milliseconds for which an FTDI adapter gathers bytes before it passes them on; None for other adapters."""
+    try:
+        return int((_device(path, sys) / "latency_timer").read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def _existence(path: str) -> Finding:
+    if not os.path.exists(path):
+        if os.path.islink(path):
+            return Finding("port", False, f"{path} points to {os.readlink(path)}, which is gone", "plug it in again")
+        return Finding("port", False, f"{path} does not exist", "see `python -m serial.tools.list_ports`")
+    if not stat.S_ISCHR(os.stat(path).st_mode):
+        return Finding("port", False, f"{path} is no device", "give the path of a serial port")
+    return Finding("port", True, f"{path} is {os.path.realpath(path)}" if os.path.islink(path) else f"{path} exists")
+
+
+def _permission(path: str) -> Finding:
+    if os.access(path, os.R_OK | os.W_OK):
+        return Finding("permission", True, "it may be opened")
+    group = owning_group(path)
+    return Finding(
+        "permission",
+        False,
+        f"you may not open it: it belongs to the group {group}",
+        f"run `sudo usermod -aG {group} $USER`, then log in again",
+    )
+
+
+def _holders(path: str, proc: Path) -> Finding:
+    found = [str(holder) for holder in holders(path, proc=proc)]
+    if not found:
+        return Finding("holders", True, "no other program has it open")
+    return Finding(
+        "holders",
+        False,
+        f"open in {', '.join(found)}",
+        "end it: two masters on one line garble each other (ModemManager and gpsd open ports unasked)",
+    )
+
+
+def _driver(path: str, sys: Path) -> Iterator[Finding]:
+    driver = _device(path, sys) / "driver"
+    if driver.exists():
+        yield Finding("driver", True, f"its driver is {driver.resolve().name}")
+
+
+def _latency_timer(path: str, sys: Path) -> Iterator[Finding]:
+    timer = latency_timer(path, sys=sys)
+    if timer is None:
+        return
+    what = f"the adapter gathers received bytes for up to {timer} ms (latency_timer)"
+    if timer <= SLOW_LATENCY_TIMER:
+        yield Finding("latency", True, what)
+    else:
+        file = _device(path, sys) / "latency_timer"
+        yield Finding("latency", False, what, f"open it with low_latency=True, or write 1 to {file}")
+
+
+def _device(path: str, sys: Path) -> Path:
+    return sys / "class/tty" / os.path.basename(os.path.realpath(path)) / "device"
+
+
+def _pids(proc: Path) -> list[int]:
+    try:
+        return sorted(int(entry) for entry in os.listdir(proc) if entry.isdigit())
+    except OSError:
+        return []
+
+
+def _open_files(process: Path) -> set[str]:
+    """The paths of its open files; none where we may not look, or it has just ended."""
+    found = set()
+    with contextlib.suppress(OSError):
+        for link in os.scandir(process / "fd"):
+            with contextlib.suppress(OSError):
+                found.add(os.readlink(link.path))
+    return found
+
+
+def _holder(pid: int, proc: Path) -> Holder:
+    try:
+        command = (proc / str(pid) / "comm").read_text().strip()
+    except OSError:
+        command = "another program"
+    return Holder(pid, command)

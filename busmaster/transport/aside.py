@@ -1,0 +1,31 @@
+"""Work that may block for ever, done where it can hold up neither the loop nor the end of the program."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def aside(work: Callable[[], T], name: str) -> Future[T]:
+    """Run `work` in a daemon thread of its own, and return the future of its result.
+
+    A pool will not do: its threads are joined at exit, and a driver can keep one blocked for minutes.
+    """
+    future: Future[T] = Future()
+
+    def run() -> None:
+        if not future.set_running_or_notify_cancel():
+            return
+        try:
+            result = work()
+        except BaseException as error:
+            future.set_exception(error)
+        else:
+            future.set_result(result)
+
+    threading.Thread(target=run, name=name, daemon=True).start()
+    return future

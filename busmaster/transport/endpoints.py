@@ -1,0 +1,163 @@
+"""What an endpoint is, and the URLs that name one."""
+
+from __future__ import annotations
+
+import asyncio
+import difflib
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, Protocol
+from urllib.parse import SplitResult, parse_qsl, urlsplit
+
+from busmaster.errors import InvalidCommand
+from busmaster.profile import LineSettings
+from busmaster.transport.serial_port import SerialPort
+from busmaster.transport.tcp import TcpPort
+
+
+class Endpoint(Protocol):
+    """A way to a line: a frozen value that can be opened again and again."""
+
+    @property
+    def name(self) -> str:
+        """How messages call it: the path, or "host:port"."""
+        ...
+
+    @property
+    def settings(self) -> LineSettings | None:
+        """Where tau comes from. None where nobody said: a TCP port without `baudrate`."""
+        ...
+
+    @property
+    def echo(self) -> bool:
+        """What is sent comes back as received (two-wire adapters)."""
+        ...
+
+    @property
+    def receive_latency(self) -> float:
+        """Seconds that received bytes may lie in an adapter or a server before they get here."""
+        ...
+
+    @property
+    def paced(self) -> bool | None:
+        """Bytes leave at the baud rate. None: not known before it is open (see `is_paced`)."""
+        ...
+
+    def identity(self) -> Hashable | None:
+        """Changes when the device behind the name is another or came back. None: absent, or not to be seen."""
+        ...
+
+    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> asyncio.Transport:
+        """Open it; `connection_made` has been called when this returns. Raises LineDown.
+
+        The transport writes at once when nothing is buffered, and calls `pause_writing` and `resume_writing` as soon
+        as anything is. It calls `connection_lost` exactly once: with None only if it was closed from here (or by a
+        TCP peer in good order), else with the cause.
+        """
+        ...
+
+
+def is_paced(endpoint: Endpoint, transport: asyncio.BaseTransport) -> bool:
+    """Whether bytes leave `transport` at the line's baud rate, so that an earlier reply cannot be one (R4)."""
+    return bool(transport.get_extra_info("paced", False) if endpoint.paced is None else endpoint.paced)
+
+
+def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | TcpPort:
+    """The endpoint that `url` names: "/dev/ttyUSB0", "/dev/ttyUSB0?baudrate=9600&parity=E", "socket://host:port".
+
+    `defaults` fills the line settings that the URL leaves open (a TCP port takes the baud rate alone).
+    Raises InvalidCommand, naming the nearest option, for anything that it does not understand.
+    """
+    if "://" not in url:
+        path, _, query = url.partition("?")
+        return _serial_port(path, _options(query, SERIAL_OPTIONS), defaults)
+    parts = urlsplit(url)
+    if parts.scheme == "rfc2217":
+        raise InvalidCommand(
+            "rfc2217:// does not work with any asyncio serial library: let the server pass raw TCP with the line "
+            f"settings fixed there, and use socket://{parts.netloc}"
+        )
+    if parts.scheme != "socket":
+        raise InvalidCommand(f"no such kind of port: {parts.scheme}://; use a device path or socket://HOST:PORT")
+    return _tcp_port(parts, defaults)
+
+
+def _serial_port(path: str, options: dict[str, Any], defaults: LineSettings | None) -> SerialPort:
+    if defaults is not None:
+        for key in ("baudrate", "bytesize", "parity", "stopbits"):
+            options.setdefault(key, getattr(defaults, key))
+    if "baudrate" not in options:
+        raise InvalidCommand(f"{path}: no baud rate given; write for example {path}?baudrate=57600")
+    return SerialPort(path, **options)
+
+
+def _tcp_port(parts: SplitResult, defaults: LineSettings | None) -> TcpPort:
+    options = _options(parts.query, TCP_OPTIONS)
+    try:
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if not host or port is None or parts.path not in ("", "/"):
+        raise InvalidCommand(f"{parts.geturl()!r} is not of the form socket://HOST:PORT")
+    if defaults is not None:
+        options.setdefault("baudrate", defaults.baudrate)
+    return TcpPort(host, port, **options)
+
+
+def _options(query: str, known: Mapping[str, Callable[[str], object]]) -> dict[str, Any]:
+    """Parse `a=1&b=2` by the table of what is known."""
+    options: dict[str, Any] = {}
+    for key, text in parse_qsl(query, keep_blank_values=True):
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            guess = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(known)}"
+            raise InvalidCommand(f"no such port option {key!r}: {guess}")
+        try:
+            options[key] = known[key](text)
+        except (ValueError, KeyError):
+            raise InvalidCommand(f"port option {key}={text!r}: {MEANT[known[key]]}") from None
+    return options
+
+
+def _flag(text: str) -> bool:
+    return {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False, "no": False, "off": False}[
+        text.lower()
+    ]
+
+
+def _parity(text: str) -> str:
+    names = {"none": "N", "even": "E", "odd": "O", "mark": "M", "space": "S"}
+    return names.get(text.lower()) or {letter: letter for letter in names.values()}[text.upper()]
+
+
+def _stopbits(text: str) -> float:
+    return {"1": 1, "1.5": 1.5, "2": 2}[text]
+
+
+SERIAL_OPTIONS: dict[str, Callable[[str], object]] = {
+    "baudrate": int,
+    "bytesize": int,
+    "parity": _parity,
+    "stopbits": _stopbits,
+    "rtscts": _flag,
+    "rs485": _flag,
+    "echo": _flag,
+    "low_latency": _flag,
+    "receive_latency": float,
+    "exclusive": _flag,
+    "paced": _flag,
+}
+
+TCP_OPTIONS: dict[str, Callable[[str], object]] = {
+    "baudrate": int,
+    "echo": _flag,
+    "receive_latency": float,
+    "paced": _flag,
+}
+
+MEANT: dict[Callable[[str], object], str] = {
+    int: "use a whole number",
+    float: "use a number of seconds, such as 0.016",
+    _flag: "use 1 or 0, true or false",
+    _parity: "use N, E, O, M or S",
+    _stopbits: "use 1, 1.5 or 2",
+}

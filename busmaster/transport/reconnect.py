@@ -1,0 +1,161 @@
+"""Keeps one endpoint connected."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Callable, Hashable
+
+from busmaster.errors import LineDown
+from busmaster.transport.endpoints import Endpoint
+
+FIRST_DELAY = 0.1
+LONGEST_DELAY = 5.0
+CLOSE_DEADLINE = 1.0
+LOOK_EVERY = 0.2
+"""Seconds between two looks at whether the device is back."""
+
+
+class Connection:
+    """Gives `protocol` one transport after another, for as long as `run` runs.
+
+    The protocol hears `connection_made`, `data_received` and `connection_lost` as any asyncio protocol, the first and
+    the last once per connection; `connection_lost(None)` means closed from here, else the cause is a LineDown.
+
+    Between attempts it waits `first_delay` seconds, doubled up to `longest_delay` and spread by a quarter (`jitter`
+    is where that comes from), and begins anew after a connection that lasted longer than that. A device that comes
+    back is noticed at once. `on_failed` hears of each attempt in the background that failed.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        protocol: asyncio.Protocol,
+        *,
+        on_failed: Callable[[LineDown], None] | None = None,
+        first_delay: float = FIRST_DELAY,
+        longest_delay: float = LONGEST_DELAY,
+        jitter: random.Random | None = None,
+    ) -> None:
+        self.endpoint = endpoint
+        self._protocol = protocol
+        self._on_failed = on_failed
+        self._first_delay = first_delay
+        self._longest_delay = longest_delay
+        self._jitter = jitter or random.Random()
+        self._tap: _Tap | None = None
+        self._seen: Hashable | None = None
+        self._closing = asyncio.Event()
+
+    @property
+    def connected(self) -> bool:
+        return self._tap is not None and not self._tap.lost.is_set()
+
+    async def open(self) -> None:
+        """Open it once, now. Raises LineDown."""
+        self._seen = self.endpoint.identity()
+        tap = _Tap(self.endpoint.name, self._protocol, self._closing)
+        await self.endpoint.open(lambda: tap)
+        self._tap = tap
+        if self._closing.is_set():
+            await self.close()
+
+    async def run(self) -> None:
+        """Stay connected, opening as often as it takes, until `close` is called or this is cancelled."""
+        delay = self._first_delay
+        while True:
+            lasted = await self._stay()
+            if self._closing.is_set():
+                return
+            if lasted > self._longest_delay:
+                delay = self._first_delay
+            returned = await self._wait(delay)
+            delay = self._first_delay if returned else min(2 * delay, self._longest_delay)
+
+    async def close(self) -> None:
+        """Close it and return when that is done, within CLOSE_DEADLINE whatever the driver or the network does."""
+        self._closing.set()
+        tap = self._tap
+        if tap is None or tap.transport is None or tap.lost.is_set():
+            return
+        tap.transport.close()
+        try:
+            async with asyncio.timeout(CLOSE_DEADLINE):
+                await tap.lost.wait()
+        except TimeoutError:
+            pass
+        finally:
+            if not tap.lost.is_set():
+                tap.transport.abort()
+        await asyncio.sleep(0)  # an aborted transport says so at the next turn of the loop
+
+    async def _stay(self) -> float:
+        """Open it unless it is, and wait for the loss. Returns for how many seconds it was open."""
+        loop = asyncio.get_running_loop()
+        since = loop.time()
+        if self._tap is None:
+            try:
+                await self.open()
+            except LineDown as cause:
+                if self._on_failed is not None:
+                    self._on_failed(cause)
+        if self._tap is None:
+            return 0.0
+        await self._tap.lost.wait()
+        self._tap = None
+        return loop.time() - since
+
+    async def _wait(self, delay: float) -> bool:
+        """Wait that long, spread by the jitter. True, and earlier, if the device is seen to come back."""
+        loop = asyncio.get_running_loop()
+        until = loop.time() + delay * self._jitter.uniform(0.75, 1.25)
+        seen = self._seen
+        while (left := until - loop.time()) > 0:
+            try:
+                async with asyncio.timeout(min(left, LOOK_EVERY)):
+                    await self._closing.wait()
+                return False
+            except TimeoutError:
+                now = self.endpoint.identity()
+                if now is not None and now != seen:
+                    return True
+                seen = now
+        return False
+
+
+class _Tap(asyncio.Protocol):
+    """Stands between a transport and the protocol, to learn of the loss and to put it into words."""
+
+    def __init__(self, name: str, protocol: asyncio.Protocol, closing: asyncio.Event) -> None:
+        self.lost = asyncio.Event()
+        self.transport: asyncio.Transport | None = None
+        self._name = name
+        self._protocol = protocol
+        self._closing = closing
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self.transport = transport
+        self._protocol.connection_made(transport)
+
+    def data_received(self, data: bytes) -> None:
+        self._protocol.data_received(data)
+
+    def pause_writing(self) -> None:
+        self._protocol.pause_writing()
+
+    def resume_writing(self) -> None:
+        self._protocol.resume_writing()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        try:
+            self._protocol.connection_lost(None if self._closing.is_set() else self._cause(exc))
+        finally:
+            self.lost.set()
+
+    def _cause(self, exc: Exception | None) -> LineDown:
+        if isinstance(exc, LineDown):
+            return exc
+        if exc is None:
+            return LineDown(f"{self._name} was closed by the other end")
+        return LineDown(f"{self._name} was lost: {getattr(exc, 'strerror', None) or exc}")

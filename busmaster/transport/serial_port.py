@@ -1,0 +1,339 @@
+"""A serial port, on pyserial and pyserial-asyncio with the latter's traps mended.
+
+What is mended, and why, stands at each method of `PortTransport`. Nothing that can block (opening, configuring,
+draining, closing) ever runs on the loop's thread: a driver may take seconds, or for ever.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import fcntl
+import functools
+import math
+import os
+import termios
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future
+from dataclasses import KW_ONLY, dataclass
+from typing import TYPE_CHECKING, Any
+
+import serial
+from serial.rs485 import RS485Settings
+
+from busmaster.errors import InvalidCommand, LineDown
+from busmaster.profile import LineSettings
+from busmaster.transport import adapters
+from busmaster.transport.aside import aside
+
+if TYPE_CHECKING:
+
+    class _SerialTransport(asyncio.Transport):
+        """What we use of pyserial-asyncio, which has no types."""
+
+        _loop: asyncio.AbstractEventLoop
+        _protocol: asyncio.Protocol
+        _serial: serial.Serial
+        _closing: bool
+        _write_buffer: list[bytes]
+
+        def __init__(
+            self, loop: asyncio.AbstractEventLoop, protocol: asyncio.Protocol, serial_instance: serial.Serial
+        ) -> None: ...
+        def _ensure_writer(self) -> None: ...
+        def _remove_writer(self) -> None: ...
+        def _remove_reader(self) -> None: ...
+        def _maybe_pause_protocol(self) -> None: ...
+        def _maybe_resume_protocol(self) -> None: ...
+else:
+    from serial_asyncio import SerialTransport as _SerialTransport
+
+OPEN_DEADLINE = 10.0
+"""Seconds after which an opening that does not come back is given up."""
+CLOSE_DEADLINE = 0.5
+"""Seconds for which `close` waits for the driver before it reports the port closed all the same."""
+READ_SIZE = 4096
+
+UNIX98_PTYS = range(136, 144)
+BSD_PTYS = 3
+"""The major device numbers of Linux's pseudo-terminals (Documentation/admin-guide/devices.txt)."""
+
+
+@dataclass(frozen=True, slots=True)
+class SerialPort:
+    """A serial port of this machine, or a pty. Raises InvalidCommand for values that no port can have.
+
+    `rs485`: let the kernel drive the transmitter (RTS high while sending), True or pyserial's `RS485Settings` for
+    other polarities and delays. `echo`: what is sent is received too. `low_latency`: set (True) or clear (False) the
+    driver's flag, None leaves it. `receive_latency`: seconds that the adapter may hold bytes back (FTDI: its
+    latency timer). `exclusive`: nobody else may open it meanwhile. `paced`: bytes leave at the baud rate; None
+    takes it from the device number (a pty is not paced).
+    """
+
+    path: str
+    _: KW_ONLY
+    baudrate: int
+    bytesize: int = 8
+    parity: str = "N"
+    stopbits: float = 1
+    rtscts: bool = False
+    rs485: RS485Settings | bool | None = None
+    echo: bool = False
+    low_latency: bool | None = None
+    receive_latency: float = 0.0
+    exclusive: bool = True
+    paced: bool | None = None
+
+    def __post_init__(self) -> None:
+        if not self.path:
+            raise InvalidCommand("a serial port needs a path, such as /dev/ttyUSB0")
+        if not (math.isfinite(self.receive_latency) and self.receive_latency >= 0):
+            raise InvalidCommand(f"receive_latency must be at least 0 s, not {self.receive_latency}")
+        if self.rtscts and self.rs485:
+            raise InvalidCommand("rtscts and rs485 exclude each other: both drive the RTS line")
+        LineSettings(self.baudrate, self.bytesize, self.parity, self.stopbits)
+
+    @property
+    def name(self) -> str:
+        return self.path
+
+    @property
+    def settings(self) -> LineSettings:
+        return LineSettings(self.baudrate, self.bytesize, self.parity, self.stopbits)
+
+    def identity(self) -> Hashable | None:
+        """Of the device that the path (perhaps a symlink) leads to now; None if it leads nowhere."""
+        try:
+            status = os.stat(self.path)
+        except OSError:
+            return None
+        return status.st_dev, status.st_ino, status.st_rdev, status.st_ctime_ns
+
+    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> PortTransport:
+        """Open and configure it in a thread. Raises LineDown, after OPEN_DEADLINE at the latest."""
+        opening = aside(functools.partial(_open, self), f"open {self.path}")
+        try:
+            async with asyncio.timeout(OPEN_DEADLINE):
+                device, paced = await asyncio.wrap_future(opening)
+        except TimeoutError:
+            opening.add_done_callback(_drop)
+            raise LineDown(f"{self.path} did not open within {OPEN_DEADLINE:g} s", hint="replug the adapter") from None
+        except asyncio.CancelledError:
+            opening.add_done_callback(_drop)
+            raise
+        transport = PortTransport(asyncio.get_running_loop(), protocol_factory(), device, self, paced)
+        try:
+            await asyncio.sleep(0)  # connection_made is called in between
+        except BaseException:
+            transport.abort()
+            raise
+        return transport
+
+
+class PortTransport(_SerialTransport):
+    """pyserial-asyncio's transport, made to write at once, to report every loss and never to block or hang."""
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        protocol: asyncio.Protocol,
+        device: serial.Serial,
+        port: SerialPort,
+        paced: bool,
+    ) -> None:
+        self._fd = device.fileno()
+        self._port = port
+        self._paced = paced
+        self._lost = False
+        self._deadline: asyncio.TimerHandle | None = None
+        device.is_open = False  # the base class sets timeouts, which would configure an open port anew, on the loop
+        super().__init__(loop, protocol, device)
+        device.is_open = True
+        self.set_write_buffer_limits(high=0)  # whatever is buffered pauses the protocol: it has not left yet
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        """`serial` is pyserial's object, `paced` whether bytes leave at the baud rate."""
+        return {"serial": self._serial, "paced": self._paced}.get(name, default)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self._port.name}{' closing' if self._closing else ''}>"
+
+    def _read_ready(self) -> None:
+        """From the descriptor: pyserial's read asks select(), which fails above descriptor 1023."""
+        try:
+            data = os.read(self._fd, READ_SIZE)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._lose(error)
+            return
+        if data:
+            self._protocol.data_received(data)
+        else:  # VMIN is 1, so nothing to read would be BlockingIOError: this is a hang-up
+            self._lose(None)
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """At once if nothing is buffered: else the bytes would leave one turn of the loop later than their stamp."""
+        if self._closing:
+            return  # reported already, or asked for
+        if not self._write_buffer:
+            try:
+                sent = os.write(self._fd, data)
+            except BlockingIOError:
+                sent = 0
+            except OSError as error:
+                self._lose(error)
+                return
+            if sent == len(data):
+                return
+            data = data[sent:]
+            self._ensure_writer()
+        self._write_buffer.append(bytes(data))
+        self._maybe_pause_protocol()
+
+    def _write_ready(self) -> None:
+        data = b"".join(self._write_buffer)
+        try:
+            sent = os.write(self._fd, data)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._lose(error)
+            return
+        self._write_buffer[:] = [data[sent:]] if sent < len(data) else []
+        if not self._write_buffer:
+            self._remove_writer()
+            self._maybe_resume_protocol()
+
+    def close(self) -> None:
+        """Discard what has not left, close the device in a thread, then call `connection_lost(None)`.
+
+        That call comes after CLOSE_DEADLINE at the latest: a stopped line never drains, and a driver may wait for it.
+        """
+        if self._closing:
+            return
+        closed = self._detach()
+        self._deadline = self._loop.call_later(CLOSE_DEADLINE, self._report, None)
+        asyncio.wrap_future(closed, loop=self._loop).add_done_callback(lambda _: self._report(None))
+
+    def abort(self) -> None:
+        """As `close`, without waiting for the device."""
+        if not self._closing:
+            self._detach()
+        self._loop.call_soon(self._report, None)
+
+    def _lose(self, error: OSError | None) -> None:
+        """The port is gone: the protocol is told at the next turn of the loop, never from within its own `write`."""
+        self._detach()
+        why = "it hung up" if error is None or error.errno == errno.EIO else error.strerror
+        cause = LineDown(f"{self._port.name} was lost: {why}", hint="plug it in again; the bus reconnects by itself")
+        self._loop.call_soon(self._report, cause)
+
+    def _detach(self) -> Future[None]:
+        self._closing = True
+        self._remove_reader()
+        self._remove_writer()
+        self._write_buffer.clear()
+        release = functools.partial(_release, self._serial, self._port.exclusive)
+        return aside(release, f"close {self._port.path}")
+
+    def _report(self, cause: LineDown | None) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+        if not self._lost:
+            self._lost = True
+            self._protocol.connection_lost(cause)
+
+
+def is_pty(fd: int) -> bool:
+    """By the device number: a name can be a symlink to anything."""
+    major = os.major(os.fstat(fd).st_rdev)
+    return major in UNIX98_PTYS or major == BSD_PTYS
+
+
+def _open(port: SerialPort) -> tuple[serial.Serial, bool]:
+    """Open and configure the device; also says whether it is paced. Blocks. Raises LineDown."""
+    device = serial.Serial()
+    device.port = port.path
+    device.baudrate, device.bytesize = port.baudrate, port.bytesize
+    device.parity, device.stopbits = port.parity, port.stopbits
+    device.rtscts = port.rtscts
+    device.exclusive = True if port.exclusive else None
+    device.timeout = device.write_timeout = 0
+    device.inter_byte_timeout = 0  # sets VMIN to 1, so that an empty read means a hang-up and nothing else
+    try:
+        device.open()
+    except (OSError, ValueError, termios.error) as error:
+        raise _refusal(port, error) from None
+    try:
+        _equip(port, device)
+        return device, (not is_pty(device.fileno()) if port.paced is None else port.paced)
+    except BaseException:
+        _release(device, port.exclusive)
+        raise
+
+
+def _equip(port: SerialPort, device: serial.Serial) -> None:
+    """What only some drivers have is touched only if it is asked for. Raises LineDown where it is refused."""
+    if port.exclusive:  # flock is advisory, and this does not stop root: only both together keep others out
+        fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
+    if port.rs485:
+        try:
+            device.rs485_mode = RS485Settings() if port.rs485 is True else port.rs485
+        except ValueError:
+            raise LineDown(
+                f"the driver of {port.path} has no RS-485 mode",
+                hint="leave rs485 out: most adapters switch direction by themselves",
+            ) from None
+    if port.low_latency is not None:
+        try:
+            device.set_low_latency_mode(port.low_latency)
+        except ValueError:
+            raise LineDown(
+                f"the driver of {port.path} has no low-latency flag",
+                hint="leave low_latency out; `busmaster doctor` tells what the adapter does",
+            ) from None
+
+
+def _refusal(port: SerialPort, error: Exception) -> LineDown:
+    """Why it did not open, in words, and what to try."""
+    path, code = port.path, getattr(error, "errno", None)
+    if code in (errno.EBUSY, errno.EAGAIN):
+        owner = adapters.lock_owner(path) or next(iter(adapters.holders(path)), "another program")
+        return LineDown(
+            f"{path} is in use by {owner}", hint="end that first: two masters on one line garble each other"
+        )
+    if code == errno.ENOENT:
+        target = f": it points to {os.readlink(path)}, which is gone" if os.path.islink(path) else ""
+        return LineDown(f"{path} does not exist{target}", hint="plug it in, or see `python -m serial.tools.list_ports`")
+    if code in (errno.EACCES, errno.EPERM):
+        group = adapters.owning_group(path)
+        return LineDown(f"no permission to open {path}", hint=f"join its group: `sudo usermod -aG {group} $USER`")
+    if isinstance(error, ValueError):
+        return LineDown(f"{path} does not take {port.baudrate} baud, {port.settings.framing}", hint="use another rate")
+    if code in (errno.EIO, errno.ENXIO, errno.ENODEV):
+        return LineDown(f"there is no hardware behind {path}", hint="see `python -m serial.tools.list_ports`")
+    if code is None or code == errno.ENOTTY:
+        return LineDown(f"{path} is no serial port", hint="see `python -m serial.tools.list_ports`")
+    return LineDown(f"cannot open {path}: {os.strerror(code)}")
+
+
+def _release(device: serial.Serial, exclusive: bool) -> None:
+    """Discard what has not left, give both locks back (they would outlive us where a pty stays open), and close."""
+    with contextlib.suppress(OSError, termios.error):
+        termios.tcflush(device.fileno(), termios.TCOFLUSH)
+    if exclusive:
+        with contextlib.suppress(OSError):
+            fcntl.ioctl(device.fileno(), termios.TIOCNXCL)
+        with contextlib.suppress(OSError):
+            fcntl.flock(device.fileno(), fcntl.LOCK_UN)
+    with contextlib.suppress(OSError):
+        device.close()
+
+
+def _drop(opening: Future[tuple[serial.Serial, bool]]) -> None:
+    """Nobody waited for this opening any more."""
+    if not opening.cancelled() and opening.exception() is None:
+        device, _paced = opening.result()
+        _release(device, True)

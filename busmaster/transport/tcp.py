@@ -1,0 +1,100 @@
+"""A serial device server in raw TCP mode."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import math
+import os
+import socket
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+
+from busmaster.errors import InvalidCommand, LineDown
+from busmaster.profile import LineSettings
+
+CONNECT_DEADLINE = 5.0
+"""Seconds, name look-up included."""
+
+# A server that lost power or cable is found out within about 10 s, asked or not.
+KEEP_ALIVE = {"TCP_KEEPIDLE": 4, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3, "TCP_USER_TIMEOUT": 10_000}
+
+
+@dataclass(frozen=True, slots=True)
+class TcpPort:
+    """A serial line behind a device server that passes raw bytes (ser2net, Moxa and the like).
+
+    `baudrate` is the server's, so that reply windows run from the end of the request on the wire; without it they
+    run from the write. `receive_latency` in seconds is how long the server may hold bytes back (ser2net: 0.0033
+    unless `chardelay: false`). `paced` says that the server answers no sooner than the baud rate allows.
+    Raises InvalidCommand for values out of range.
+    """
+
+    host: str
+    port: int
+    _: KW_ONLY
+    baudrate: int | None = None
+    receive_latency: float = 0.0
+    echo: bool = False
+    paced: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.host:
+            raise InvalidCommand("a TCP port needs a host name or address")
+        if not 1 <= self.port <= 65535:
+            raise InvalidCommand(f"a TCP port number is 1 to 65535, not {self.port}")
+        if not (math.isfinite(self.receive_latency) and self.receive_latency >= 0):
+            raise InvalidCommand(f"receive_latency must be at least 0 s, not {self.receive_latency}")
+        if self.paced and self.baudrate is None:
+            raise InvalidCommand("a paced TCP port needs the baud rate that it is paced by")
+        if self.baudrate is not None:
+            LineSettings(self.baudrate)
+
+    @property
+    def name(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{host}:{self.port}"
+
+    @property
+    def settings(self) -> LineSettings | None:
+        """For tau only: the framing is the server's business."""
+        return None if self.baudrate is None else LineSettings(self.baudrate)
+
+    def identity(self) -> None:
+        """Whether a server is there again can only be found out by connecting."""
+        return None
+
+    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> asyncio.Transport:
+        """Connect. Raises LineDown, after CONNECT_DEADLINE at the latest."""
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(CONNECT_DEADLINE):
+                transport, _protocol = await loop.create_connection(protocol_factory, self.host, self.port)
+        except TimeoutError:
+            raise LineDown(
+                f"{self.name} did not answer within {CONNECT_DEADLINE:g} s", hint="check its address, power and network"
+            ) from None
+        except OSError as error:
+            raise self._refusal(error) from None
+        self._tune(transport.get_extra_info("socket"))
+        transport.set_write_buffer_limits(high=0)
+        return transport
+
+    def _refusal(self, error: OSError) -> LineDown:
+        # With several addresses to try, asyncio raises one plain OSError that quotes them all.
+        if isinstance(error, ConnectionRefusedError) or f"[Errno {errno.ECONNREFUSED}]" in str(error):
+            return LineDown(
+                f"{self.name} refused the connection", hint="check that the server runs, and its port number"
+            )
+        if isinstance(error, socket.gaierror):
+            return LineDown(f"no such host: {self.host}", hint="check the name, or use the address")
+        why = os.strerror(error.errno) if error.errno else str(error)
+        return LineDown(f"cannot connect to {self.name}: {why}", hint="check its address and the network")
+
+    @staticmethod
+    def _tune(sock: socket.socket) -> None:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for option, value in KEEP_ALIVE.items():
+            if hasattr(socket, option):  # each system has some of them
+                sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
