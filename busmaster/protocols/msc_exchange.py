@@ -167,7 +167,7 @@ class PacketExchange(Generic[T]):
             raise no_reply()
         what = f"the packet was cut short after {arrived} bytes"
         if self._lost:
-            what = f"{arrived} bytes that are no packet, the first of them {self._buffer[0]:02X}"
+            what = f"{arrived} bytes that are no packet, the first of them {self._buffer[0]:02x}"
         if not self._acked:
             raise FrameError(what, send=ACK)
         if not arrived:
@@ -238,7 +238,8 @@ class PacketExchange(Generic[T]):
 class StalePacketListener:
     """Reads what arrives while nothing is asked: a packet whose ACK was lost. It is ACKed and dropped, a bad one too.
 
-    Otherwise the controller would send it again, up to five times, into the exchanges of others.
+    Otherwise the controller would send it again, up to five times, into the exchanges of others. Ready for the next
+    packet whenever one has ended.
     """
 
     __slots__ = ("_buffer",)
@@ -247,18 +248,18 @@ class StalePacketListener:
         self._buffer = b""
 
     def feed(self, data: bytes, /) -> Need | Done[None]:
-        self._buffer += data
-        buffer = self._buffer
+        buffer = self._buffer + data
+        self._buffer = b""
         if not buffer:
             return MORE
-        if buffer[0] != STX[0]:
-            raise FrameError(f"a stray {buffer[0]:02X}")
         size = packet_size(buffer)
         if size and len(buffer) >= size and is_sound(buffer[:size]):
             return Done(None, send=ACK, rest=buffer[size:])
-        if len(buffer) > LONGEST_PACKET:
-            raise FrameError("more stray bytes without a pause than any packet has")
+        if buffer[0] != STX[0] or len(buffer) > LONGEST_PACKET:
+            raise FrameError(f"{len(buffer)} stray bytes, the first of them {buffer[0]:02x}")
+        self._buffer = buffer
         return MORE
 
     def expired(self) -> Done[None]:
+        self._buffer = b""
         return Done(None, send=ACK)
