@@ -13,20 +13,13 @@ from typing import ClassVar, NoReturn
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.exchange import ReplyTiming, Sizes, Timings
 from busmaster.profile import LineSettings
+from busmaster.wire.integers import whole_number
 from busmaster.wire.numbers import LONGEST_LIST, LONGEST_NUMBER, format_list, format_number, parse_number
 from busmaster.wire.readers import NAK, AcknowledgeReader, TelegramReader, telegram_sizes
 
 LINE = LineSettings(57600)
 TIMINGS = Timings.uniform(ReplyTiming(nominal=0.05, window=0.1, lateness=0.15, byte_gap=0.02))
 """Both documents: "normally within 50ms", but other work "could delay the reply by 100mS"."""
-
-
-def check_element(element: int, last: int) -> None:
-    """Raises InvalidCommand unless `element` is a whole number from 1 to `last`."""
-    if isinstance(element, bool) or not isinstance(element, int):
-        raise InvalidCommand(f"an element is a whole number, not {element!r}")
-    if not 1 <= element <= last:
-        raise InvalidCommand(f"element {element} does not exist: use 1 to {last}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +33,7 @@ class ReadElement:
     idempotent: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check_element(self.element, self.last)
+        object.__setattr__(self, "element", whole_number(self.element, 1, self.last, "element"))
 
     def __str__(self) -> str:
         return f"read element {self.element}"
@@ -67,8 +60,9 @@ class WriteElements:
         values = tuple(self.values)
         if not values:
             raise InvalidCommand("there is no value to write")
-        check_element(self.element, self.last)
-        check_element(self.element + len(values) - 1, self.last)
+        element = whole_number(self.element, 1, self.last, "element")
+        whole_number(element + len(values) - 1, 1, self.last, "the last of the elements")
+        object.__setattr__(self, "element", element)
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "text", format_list(values))
 

@@ -1,0 +1,55 @@
+"""Ask an exchange as the arbiter does, and take the documents' frames from the vectors."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from busmaster.errors import Refused
+from busmaster.exchange import MORE, Done, Exchange, Expect, FrameError
+
+VECTORS = Path(__file__).parent.parent / "vectors" / "frames.json"
+
+
+def vectors(protocol: str) -> dict[str, bytes]:
+    """The frames of one protocol by name."""
+    return {entry["name"]: bytes.fromhex(entry["hex"]) for entry in json.loads(VECTORS.read_text())[protocol]}
+
+
+def answer(exchange: Exchange[Any], *chunks: bytes) -> Any:
+    """The value that these bytes bring, MORE if they bring none yet; whatever `feed` raises is raised.
+
+    Bytes after the reply fail the test: it says so where it wants them.
+    """
+    value: Any = MORE
+    for chunk in chunks:
+        step = exchange.feed(chunk)
+        while isinstance(step, Expect):
+            step = exchange.feed(b"")
+        if isinstance(step, Done):
+            assert not step.rest
+            value = step.value
+    return value
+
+
+def outcome(exchange: Exchange[Any], chunks: Iterable[bytes]) -> object:
+    """What happens first, in a form that can be compared: a value, MORE, or the kind of failure.
+
+    Feeding stops there, as the arbiter's does.
+    """
+    try:
+        for chunk in chunks:
+            step = exchange.feed(chunk)
+            while isinstance(step, Expect):
+                step = exchange.feed(b"")
+            if isinstance(step, Done):
+                return "value", step.value
+    except (FrameError, Refused) as error:
+        return type(error)
+    return MORE
+
+
+def single_bytes(data: bytes) -> list[bytes]:
+    return [data[i : i + 1] for i in range(len(data))]

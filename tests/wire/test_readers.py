@@ -1,0 +1,135 @@
+"""The shared reader, on telegrams as HCP and HCP2 send them: STX, element, data, ETX, exclusive-or."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from busmaster.errors import Refused
+from busmaster.exchange import MORE, Done, FrameError, ReplyTiming
+from busmaster.wire.checks import xor
+from busmaster.wire.readers import AcknowledgeReader, TelegramReader, find_etx, telegram_sizes
+
+TIMING = ReplyTiming(0.05, 0.1, 0.15, 0.02)
+REPLY = bytes.fromhex("02 30 31 31 32 33 2E 34 35 36 03 2B")  # Comms(1) = 123.456
+HEADER = b"\x0201"
+
+
+class Text(TelegramReader[bytes]):
+    __slots__ = ()
+    longest = 20
+    sizes = telegram_sizes(echo=2, typical=7, longest=20)
+
+    def parse(self, field: bytes) -> bytes:
+        return field
+
+
+def reader() -> Text:
+    return Text(b"request", b"01", TIMING)
+
+
+def test_the_data_lies_between_the_echo_and_etx() -> None:
+    assert reader().feed(REPLY) == Done(b"123.456")
+
+
+def test_every_split_of_a_reply_equals_one_chunk() -> None:
+    for cut in range(1, len(REPLY)):
+        exchange = reader()
+        assert exchange.feed(REPLY[:cut]) is MORE
+        assert exchange.feed(REPLY[cut:]) == Done(b"123.456")
+
+
+def test_bytes_after_the_reply_are_handed_back() -> None:
+    assert reader().feed(REPLY + b"\x06x") == Done(b"123.456", rest=b"\x06x")
+    assert AcknowledgeReader(b"", TIMING).feed(b"\x06\x06") == Done(None, rest=b"\x06")
+
+
+def test_an_empty_chunk_changes_nothing() -> None:
+    exchange = reader()
+    assert exchange.feed(b"") is MORE
+    exchange.feed(REPLY[:5])
+    assert exchange.feed(b"") is MORE
+    assert exchange.feed(REPLY[5:]) == Done(b"123.456")
+    assert AcknowledgeReader(b"", TIMING).feed(b"") is MORE
+
+
+@pytest.mark.parametrize("check", [b"\x02", b"\x03", b"\x04", b"\x05", b"\x06", b"\x07", b"\x15"])
+def test_the_byte_after_etx_is_the_checksum_whatever_its_value(check: bytes) -> None:
+    data = bytes([0x41, 0x41 ^ check[0] ^ xor(b"01\x03")])
+    reply = b"\x0201" + data + b"\x03" + check
+    exchange = reader()
+    assert [exchange.feed(reply[i : i + 1]) for i in range(len(reply) - 1)] == [MORE] * (len(reply) - 1)
+    assert exchange.feed(check) == Done(data)
+
+
+def test_a_bad_checksum_is_a_whole_frame_unless_something_follows() -> None:
+    bad = REPLY[:-1] + b"\x2a"
+    with pytest.raises(FrameError, match="checksum") as alone:
+        reader().feed(bad)
+    assert alone.value.whole
+    with pytest.raises(FrameError, match="checksum") as followed:
+        reader().feed(bad + b"\x2b")
+    assert not followed.value.whole
+
+
+@pytest.mark.parametrize(
+    ("reply", "why"),
+    [
+        (b"\x0202", "wrong echo"),
+        (b"\x021", "wrong echo"),
+        (b"\x0201\x04", "control character"),
+        (b"\x02011\x02", "control character"),
+        (b"\x0201\xb1", "control character"),
+        (b"\x0201" + b"1" * 21, "more than 20"),
+        (b"\x06", "cannot begin with 06"),
+        (b"x", "cannot begin with 78"),
+    ],
+)
+def test_a_frame_that_cannot_be_right_fails_at_its_first_wrong_byte(reply: bytes, why: str) -> None:
+    exchange = reader()
+    for i in range(len(reply) - 1):
+        assert exchange.feed(reply[i : i + 1]) is MORE
+    with pytest.raises(FrameError, match=why) as failure:
+        exchange.feed(reply[-1:])
+    assert not failure.value.whole
+    with pytest.raises(FrameError, match=why):
+        reader().feed(reply)
+
+
+def test_20_characters_of_data_are_read() -> None:
+    body = b"01" + b"1" * 20 + b"\x03"
+    assert reader().feed(b"\x02" + body + bytes([xor(body)])) == Done(b"1" * 20)
+
+
+def test_silence_and_a_cut_frame_are_told_apart() -> None:
+    with pytest.raises(FrameError, match="no reply"):
+        reader().expired(started=False)
+    with pytest.raises(FrameError, match="no reply"):
+        AcknowledgeReader(b"", TIMING).expired(started=False)
+    exchange = reader()
+    exchange.feed(REPLY[:5])
+    with pytest.raises(FrameError, match="cut short after 5 bytes"):
+        exchange.expired(started=True)
+
+
+def test_a_value_needs_a_parser() -> None:
+    with pytest.raises(NotImplementedError):
+        TelegramReader.parse(reader(), b"1")
+
+
+@given(st.binary(max_size=30))
+def test_garbage_is_more_or_a_frame_error(garbage: bytes) -> None:
+    try:
+        assert find_etx(HEADER + garbage, HEADER, 20, xor) in range(len(HEADER + garbage))
+    except FrameError:
+        pass
+
+
+def test_a_lone_nak_is_a_refusal() -> None:
+    with pytest.raises(Refused) as read:
+        reader().feed(b"\x15")
+    with pytest.raises(Refused) as write:
+        AcknowledgeReader(b"", TIMING).feed(b"\x15")
+    assert read.value.confirm
+    assert write.value.confirm
