@@ -72,7 +72,7 @@ EARLY = 1e-9
 
 
 class Arbiter:
-    """The arbiter of one line. `byte_time` is tau, in seconds; `paced` lines have a real baud rate (R4)."""
+    """The arbiter of one line. `byte_time` is tau, in seconds."""
 
     def __init__(
         self,
@@ -80,7 +80,6 @@ class Arbiter:
         *,
         now: float = 0.0,
         echo: bool = False,
-        paced: bool = False,
         receive_latency: float = 0.0,
         capacity: int = 1000,
         jitter: Callable[[], float] = lambda: 0.5,
@@ -89,7 +88,7 @@ class Arbiter:
         self.state = LineState.OFFLINE
         self.noisy = False
         self._echo = echo
-        self._paced = paced
+        self._paced = False
         self._receive_latency = receive_latency
         self._deadlines = Deadlines()
         self._counters = LineCounters(now)
@@ -182,10 +181,14 @@ class Arbiter:
 
     # inputs
 
-    def line_up(self, now: float) -> None:
-        """The port is open. What an earlier master asked may still be answered: settle first."""
+    def line_up(self, now: float, *, paced: bool = False) -> None:
+        """The port is open. What an earlier master asked may still be answered: settle first.
+
+        `paced`: bytes leave at the baud rate, so that an earlier reply cannot be one (R4).
+        """
         if self.state is not LineState.OFFLINE or self._closed:
             return
+        self._paced = paced
         self._dispatch.fault = None
         self._events.append(LineChanged(LineChange.UP))
         lateness = max((node.lateness for node in self._dispatch.nodes), default=UNKNOWN_LATENESS)
@@ -246,6 +249,16 @@ class Arbiter:
 
     def poll_timeout(self) -> float:
         return self._deadlines.earliest()
+
+    @property
+    def idle(self) -> bool:
+        """Nothing is on the wire."""
+        return self.state is not LineState.EXCHANGE
+
+    def reset_statistics(self, now: float) -> None:
+        self._counters.reset(now)
+        for node in self._dispatch.nodes:
+            node.counters.reset()
 
     def statistics(self, now: float) -> LineStatistics:
         busy, settling = self._counters.busy, self._counters.settling

@@ -87,6 +87,9 @@ class NodeCounters:
     )
 
     def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
         self.attempts = self.ok = self.late = self.no_reply = self.garbled = self.refused = 0
         self.retries = self.unheard = self.failed = self.probes = 0
         self.latency = Histogram()
@@ -127,6 +130,9 @@ class LineCounters:
     )
 
     def __init__(self, since: float) -> None:
+        self.reset(since)
+
+    def reset(self, since: float) -> None:
         self.since = since
         self.exchanges = self.completed = self.cancelled = self.stray_bytes = self.noise_bytes = 0
         self.tainted = self.collisions = self.settles = self.noisy = self.losses = 0

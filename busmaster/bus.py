@@ -1,0 +1,254 @@
+"""A bus: the object that owns one line."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import warnings
+from collections.abc import Coroutine, Iterable
+from math import inf
+from types import TracebackType
+from typing import Any
+
+import anyio
+
+from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.counters import LineStatistics
+from busmaster.arbiter.events import Event, LineState, NodeChanged, Strayed
+from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.transaction import Priority
+from busmaster.errors import BusError, InvalidCommand
+from busmaster.exchange import Timings
+from busmaster.node import Node
+from busmaster.points import Point
+from busmaster.polling import PollGroup, Sample, Stream
+from busmaster.profile import Profile
+from busmaster.transport.endpoints import Endpoint, is_paced
+from busmaster.transport.pump import Pump, Tap
+from busmaster.transport.reconnect import Connection
+
+BYTE_TIME_UNTIL_KNOWN = 10 / 9600
+EVENT_BUFFER = 256
+
+
+class Bus:
+    """One line and everything on it. Use it in `async with`: entering opens the port, leaving closes it.
+
+    `capacity` bounds the requests that may wait in each priority class (R12). `seed` makes the jitter of probes and
+    reconnects repeatable. `tap` sees every byte (see busmaster.capture). Entering raises LineDown if the port cannot
+    be opened; once open, a lost port fails its callers at once and is opened again by itself (R13).
+    """
+
+    def __init__(
+        self, endpoint: Endpoint, *, capacity: int = 1000, seed: int | None = None, tap: Tap | None = None
+    ) -> None:
+        if capacity < 1:
+            raise InvalidCommand(f"a bus needs room for at least one request, not {capacity}")
+        self.endpoint = endpoint
+        self._random = random.Random(seed)
+        settings = endpoint.settings
+        self._byte_time_known = settings is not None
+        self._arbiter = Arbiter(
+            settings.byte_time if settings is not None else BYTE_TIME_UNTIL_KNOWN,
+            echo=endpoint.echo,
+            receive_latency=endpoint.receive_latency,
+            capacity=capacity,
+            jitter=self._random.random,
+        )
+        self.pump = Pump(
+            self._arbiter,
+            on_cycle=lambda poll: poll.waiter.cycle_finished(),
+            on_event=self._on_event,
+            paced=lambda transport: is_paced(endpoint, transport),
+            tap=tap,
+        )
+        self._nodes: dict[tuple[str, int], Node] = {}
+        self._groups: list[PollGroup] = []
+        self._touched: dict[object, float] = {}
+        self._streams: list[Stream[Event]] = []
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._connection: Connection | None = None
+        self.running = False
+
+    # opening and closing
+
+    async def __aenter__(self) -> Bus:
+        if self.running:
+            raise InvalidCommand("this bus is open already")
+        self.pump.bind(asyncio.get_running_loop())
+        self._arbiter.reset_statistics(self.now())
+        connection = Connection(self.endpoint, self.pump, jitter=self._random)
+        self._connection = connection
+        self.running = True
+        try:
+            await connection.open()
+        except BaseException:
+            self.running = False
+            await connection.close()
+            raise
+        self._start(connection.run())
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Waiting callers get BusClosed at once; the exchange on the wire may end, within its own window."""
+        assert self._connection is not None
+        with anyio.CancelScope(shield=True):
+            for group in list(self._groups):
+                group.close()
+            self._arbiter.close(self.now())
+            self.pump.turn()
+            while self._arbiter.state is LineState.EXCHANGE:
+                await anyio.sleep(min(0.005, max(0.001, self._arbiter.poll_timeout() - self.now())))
+            self.running = False
+            await self._connection.close()
+            self.pump.turn()
+            self.pump.stop()
+            for stream in list(self._streams):
+                stream.close()
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    # nodes and groups
+
+    def node(
+        self, profile: Profile, address: int, *, timings: Timings | None = None, retries: int | None = None
+    ) -> Node:
+        """The node at this address. Raises InvalidCommand for an address that the protocol does not have, and for
+        other timings or retries than it was first asked with."""
+        known = self._nodes.get((profile.name, address))
+        if known is not None:
+            if timings not in (None, known.record.timings) or retries not in (None, known.record.retries):
+                raise InvalidCommand(f"{known.label} is in use with other timings or retries")
+            return known
+        if retries is not None and not 0 <= retries <= 100:
+            raise InvalidCommand(f"retries must be 0 to 100, not {retries}")
+        self._check_framing(profile)
+        node = Node(self, self._arbiter.add_node(profile, address, self.now(), timings, retries))
+        node.record.waiter = node
+        self._nodes[profile.name, address] = node
+        return node
+
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        return tuple(self._nodes.values())
+
+    @property
+    def groups(self) -> tuple[PollGroup, ...]:
+        return tuple(self._groups)
+
+    def poll_group(
+        self,
+        name: str,
+        *,
+        period: float,
+        points: Iterable[Point[Any]],
+        phase: float | None = None,
+        priority: Priority = Priority.POLL,
+    ) -> PollGroup:
+        """Read `points` every `period` seconds, on a fixed grid, from now on (R10).
+
+        `phase` (seconds, below the period) places the group on the grid; without it, it is placed where it meets the
+        other groups least.
+        """
+        if any(group.name == name for group in self._groups):
+            raise InvalidCommand(f"there is a poll group {name!r} already")
+        group = PollGroup(self, name, period, points, phase=phase, priority=priority)
+        self._arbiter.add_poll(group.poll, self.now())
+        self._groups.append(group)
+        self.pump.turn()
+        return group
+
+    def remove_group(self, group: PollGroup) -> None:
+        if group in self._groups:
+            self._groups.remove(group)
+            self._arbiter.remove_poll(group.poll, self.now())
+            self.pump.turn()
+
+    def demand(self, poll: Poll) -> None:
+        self._arbiter.demand(poll, self.now())
+        self.pump.turn()
+
+    def suspend(self, node: Node, seconds: float) -> None:
+        self._arbiter.suspend(node.record, self.now() + seconds)
+        self.pump.turn()
+
+    def latest(self, point: Point[Any]) -> Sample | None:
+        """The youngest good sample of this point in any group, unless a write has made it stale."""
+        samples = [g.latest[point] for g in self._groups if g.latest is not None and point in g.latest]
+        touched = self.touched_at(point)
+        fresh = [s for s in samples if s.error is None and s.started is not None and s.started >= touched]
+        return max(fresh, key=lambda sample: sample.finished, default=None)
+
+    def touched(self, node: Node, point: Point[Any] | None) -> None:
+        """A write to it is over: what was asked before is not newer than the write."""
+        self._touched[node if point is None else point] = self.now()
+
+    def touched_at(self, point: Point[Any]) -> float:
+        return max(self._touched.get(point, -inf), self._touched.get(point.node, -inf)) if self._touched else -inf
+
+    # looking
+
+    def now(self) -> float:
+        """The bus's clock, in seconds: all its times are of this clock."""
+        return self.pump.clock()
+
+    @property
+    def byte_time(self) -> float:
+        """tau: seconds per byte of this line."""
+        return self._arbiter.byte_time
+
+    @property
+    def state(self) -> LineState:
+        return self._arbiter.state
+
+    def statistics(self) -> LineStatistics:
+        """An immutable snapshot of the line's counts since it was opened or reset."""
+        return self._arbiter.statistics(self.now())
+
+    def reset_statistics(self) -> None:
+        """Start all counts of line and nodes again."""
+        self._arbiter.reset_statistics(self.now())
+
+    def events(self) -> Stream[Event]:
+        """What happens to the line and its nodes, from now on (NodeChanged, LineChanged, ...)."""
+        return Stream(self._streams, EVENT_BUFFER)
+
+    # inside
+
+    def _check_framing(self, profile: Profile) -> None:
+        settings = self.endpoint.settings
+        if settings is None:
+            if not self._byte_time_known:
+                self._arbiter.byte_time = profile.line.byte_time
+                self._byte_time_known = True
+        elif settings.framing != profile.line.framing and not any(p == profile.name for p, _ in self._nodes):
+            warnings.warn(
+                f"{profile.name} is meant for {profile.line.framing}, but {self.endpoint.name} is {settings.framing}",
+                stacklevel=4,
+            )
+
+    def _on_event(self, event: Event) -> None:
+        if isinstance(event, NodeChanged) and event.returning and isinstance(event.node.waiter, Node):
+            self._start(self._run_hook(event.node.waiter))
+        if not isinstance(event, Strayed):
+            for stream in self._streams:
+                stream.put(event)
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        """A task of the bus's own: a task group would tie entering and leaving the bus to one task."""
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _run_hook(self, node: Node) -> None:
+        """A hook that fails must not take the bus down: the node's polls resume all the same."""
+        try:
+            if node.on_return is not None:
+                await node.on_return(node)
+        except BusError:
+            pass
+        finally:
+            self._arbiter.release_node(node.record)

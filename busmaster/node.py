@@ -1,0 +1,156 @@
+"""A node: one addressed device of a bus."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from math import inf
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from busmaster.arbiter.counters import NodeStatistics
+from busmaster.arbiter.health import Health, NodeRecord
+from busmaster.arbiter.transaction import Priority, Timeline, Transaction
+from busmaster.errors import BusClosed, BusError, InvalidCommand
+from busmaster.exchange import Command
+from busmaster.profile import Profile
+
+if TYPE_CHECKING:
+    from busmaster.bus import Bus
+    from busmaster.points import Point
+
+T = TypeVar("T")
+
+__all__ = ["Health", "Node", "NodeStatistics", "Priority", "Timeline"]
+
+
+class Node:
+    """One node, made by `Bus.node` or by a handle. Everything that is asked of it goes through `request`."""
+
+    def __init__(self, bus: Bus, record: NodeRecord) -> None:
+        self.bus = bus
+        self.record = record
+        self._on_return: Callable[[Node], Awaitable[None]] | None = None
+
+    @property
+    def profile(self) -> Profile:
+        return self.record.profile
+
+    @property
+    def address(self) -> int:
+        return self.record.address
+
+    @property
+    def label(self) -> str:
+        """ "node 5", as messages call it."""
+        return self.record.label
+
+    @property
+    def health(self) -> Health:
+        return self.record.health
+
+    def __repr__(self) -> str:
+        return f"<Node {self.profile.name} {self.address} {self.health.value}>"
+
+    @property
+    def on_return(self) -> Callable[[Node], Awaitable[None]] | None:
+        """Awaited when the node comes back from DOWN, before its polls resume: re-send its parameters here.
+
+        By default nothing is done: a master that enables a drive or repeats a reference by itself is a danger.
+        """
+        return self._on_return
+
+    @on_return.setter
+    def on_return(self, hook: Callable[[Node], Awaitable[None]] | None) -> None:
+        self._on_return = hook
+        self.record.has_hook = hook is not None
+
+    async def request(
+        self,
+        command: Command[T],
+        *,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+        idempotent: bool | None = None,
+        touches: Point[Any] | None = None,
+    ) -> T:
+        """Run one command and return its value.
+
+        `priority` defaults to COMMAND. `start_within` (seconds) fails the request with NotStarted if it could not be
+        sent by then. `retries` (0 or more) overrides the node's; writes are not retried unless the command or
+        `idempotent` says that they may be repeated (R7). `touches` names the point that a write changes: samples
+        older than the write are marked stale; without it, all of the node's.
+
+        Raises a BusError subclass. Cancelling it frees the caller at once and never disturbs the line (R6).
+        """
+        transaction, future = self._start(command, priority, start_within, retries, idempotent)
+        try:
+            value: T = await future
+        except asyncio.CancelledError:
+            self.bus.pump.cancel(transaction)
+            raise
+        finally:
+            if command.writes:
+                self.bus.touched(self, touches)
+        return value
+
+    async def timed_request(
+        self, command: Command[T], *, priority: Priority | None = None, start_within: float | None = None
+    ) -> tuple[T, Timeline]:
+        """Like `request`, with the timeline that says why it took as long as it did."""
+        transaction, future = self._start(command, priority, start_within, None, None)
+        try:
+            return await future, transaction.timeline()
+        except asyncio.CancelledError:
+            self.bus.pump.cancel(transaction)
+            raise
+        finally:
+            if command.writes:
+                self.bus.touched(self, None)
+
+    def _start(
+        self,
+        command: Command[Any],
+        priority: Priority | None,
+        start_within: float | None,
+        retries: int | None,
+        idempotent: bool | None,
+    ) -> tuple[Transaction, asyncio.Future[Any]]:
+        if retries is not None and not 0 <= retries <= 100:
+            raise InvalidCommand(f"{self.label}: retries must be 0 to 100, not {retries}")
+        if start_within is not None and not 0 <= start_within:
+            raise InvalidCommand(f"{self.label}: start_within must be at least 0 s, not {start_within!r}")
+        if not self.bus.running:
+            raise BusClosed("the bus is not open", node=self.label, command=str(command))
+        transaction = Transaction(
+            self.record,
+            command,
+            priority=Priority.COMMAND if priority is None else priority,
+            start_by=inf if start_within is None else self.bus.now() + start_within,
+            retries=retries,
+            idempotent=idempotent,
+        )
+        return transaction, self.bus.pump.transact(transaction)
+
+    async def probe(self) -> bool:
+        """Ask the node's cheapest read now, once; True if it answered (a refusal is an answer)."""
+        self.record.probe_at = -inf
+        try:
+            await self.request(self.profile.probe, retries=0)
+        except BusError:
+            return self.health is Health.UP
+        return True
+
+    def suspend(self, for_: float) -> None:
+        """For maintenance: its polls rest and its requests fail with NodeDown for so many seconds, 0 to end it now."""
+        if not 0 <= for_ < inf:
+            raise InvalidCommand(f"{self.label}: a suspension lasts 0 s or more, not {for_!r}")
+        self.bus.suspend(self, for_)
+
+    @property
+    def suspended(self) -> bool:
+        return self.bus.now() < self.record.suspended_until
+
+    def statistics(self) -> NodeStatistics:
+        """Counts and latencies since the bus was opened or its statistics were reset."""
+        return self.record.counters.snapshot(self.record.lateness)

@@ -1,0 +1,154 @@
+"""asyncio meets the arbiter: bytes and time in, bytes and events out.
+
+The hot path: a reply arrives, the arbiter completes it and encodes the next request, and that request is written
+in the same callback. Only then are futures resolved. No task runs between a reply and the next request, and no
+user code runs in here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from math import inf
+from typing import Any, Protocol, cast
+
+from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.events import Completed, Event, LineState, Polled
+from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.transaction import Transaction
+
+VIRTUAL = 1.0
+"""A loop whose time differs by more seconds than this from the machine's keeps a time of its own."""
+
+
+class Tap(Protocol):
+    """Sees what passes (a capture). Must not block, nor raise."""
+
+    def transmitted(self, now: float, data: bytes) -> None: ...
+
+    def received(self, now: float, data: bytes) -> None: ...
+
+    def completed(self, transaction: Transaction) -> None: ...
+
+
+class Pump(asyncio.Protocol):
+    """Owns the arbiter of one line. `on_cycle` and `on_event` are the library's own and return at once."""
+
+    def __init__(
+        self,
+        arbiter: Arbiter,
+        *,
+        on_cycle: Callable[[Poll], None],
+        on_event: Callable[[Event], None],
+        paced: Callable[[asyncio.BaseTransport], bool] = lambda _: False,
+        tap: Tap | None = None,
+    ) -> None:
+        self.arbiter = arbiter
+        self.clock: Callable[[], float] = time.monotonic
+        self.tap = tap
+        self._on_cycle = on_cycle
+        self._on_event = on_event
+        self._paced = paced
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._transport: asyncio.Transport | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._armed = inf
+
+    def bind(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Keep this loop's time. Virtual time is the loop's own; else it is the machine's, finer than some loops'."""
+        self._loop = loop
+        self.clock = loop.time if abs(loop.time() - time.monotonic()) > VIRTUAL else time.monotonic
+
+    # what the bus calls
+
+    def submit(self, transaction: Transaction) -> None:
+        self.arbiter.submit(transaction, self.clock())
+        self.turn()
+
+    def cancel(self, transaction: Transaction) -> None:
+        self.arbiter.cancel(transaction, self.clock())
+
+    def turn(self) -> None:
+        """Send what is to be sent, tell what has happened, and arm the one timer."""
+        arbiter = self.arbiter
+        data = arbiter.poll_transmit()
+        if data is not None and self._transport is not None:
+            self._transport.write(data)
+            if self.tap is not None:
+                self.tap.transmitted(self.clock(), data)
+        while (event := arbiter.poll_event()) is not None:
+            kind = type(event)
+            if kind is Completed:
+                self._resolve(cast(Completed, event).transaction)
+            elif kind is Polled:
+                self._on_cycle(cast(Polled, event).poll)
+            else:
+                self._on_event(event)
+        due = arbiter.poll_timeout()
+        if due < self._armed:
+            self._arm(due)
+
+    def stop(self) -> None:
+        """No timer any more: the bus is closed."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    # what asyncio calls
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.Transport, transport)
+        self.arbiter.line_up(self.clock(), paced=self._paced(transport))
+        self.turn()
+
+    def data_received(self, data: bytes) -> None:
+        now = self.clock()
+        if self.tap is not None:
+            self.tap.received(now, data)
+        self.arbiter.data_received(data, now)
+        self.turn()
+
+    def connection_lost(self, cause: Exception | None) -> None:
+        self._transport = None
+        self.arbiter.line_down(str(cause) if cause is not None else "it was closed", self.clock())
+        self.turn()
+
+    # inside
+
+    def _resolve(self, transaction: Transaction) -> None:
+        if self.tap is not None:
+            self.tap.completed(transaction)
+        future = transaction.waiter
+        if future is None or future.done():
+            return
+        if transaction.error is None:
+            future.set_result(transaction.value)
+        else:
+            future.set_exception(transaction.error)
+
+    def _arm(self, due: float) -> None:
+        if self._loop is None:
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._armed = due
+        self._timer = self._loop.call_at(self._loop.time() + max(0.0, due - self.clock()), self._on_time)
+
+    def _on_time(self) -> None:
+        self._timer = None
+        self._armed = inf
+        self.arbiter.handle_timeout(self.clock())
+        self.turn()
+
+    def transact(self, transaction: Transaction) -> asyncio.Future[Any]:
+        """Submit it; the future gets its value or its error."""
+        assert self._loop is not None
+        future: asyncio.Future[Any] = self._loop.create_future()
+        transaction.waiter = future
+        self.submit(transaction)
+        return future
+
+    @property
+    def online(self) -> bool:
+        return self.arbiter.state is not LineState.OFFLINE
