@@ -99,8 +99,7 @@ class Bus:
                 group.close()
             self._arbiter.close(self.now())
             self.pump.turn()
-            while self._arbiter.state is LineState.EXCHANGE:
-                await anyio.sleep(min(0.005, max(0.001, self._arbiter.poll_timeout() - self.now())))
+            await self.pump.run_out()
             self.running = False
             await self._connection.close()
             self.pump.turn()

@@ -118,8 +118,8 @@ class Node:
     ) -> tuple[Transaction, asyncio.Future[Any]]:
         if retries is not None and not 0 <= retries <= 100:
             raise InvalidCommand(f"{self.label}: retries must be 0 to 100, not {retries}")
-        if start_within is not None and not 0 <= start_within:
-            raise InvalidCommand(f"{self.label}: start_within must be at least 0 s, not {start_within!r}")
+        if start_within is not None and not 0 <= start_within < inf:
+            raise InvalidCommand(f"{self.label}: start_within is a time of 0 s or more, not {start_within!r}")
         if not self.bus.running:
             raise BusClosed("the bus is not open", node=self.label, command=str(command))
         transaction = Transaction(

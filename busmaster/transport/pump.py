@@ -13,8 +13,10 @@ from collections.abc import Callable
 from math import inf
 from typing import Any, Protocol, cast
 
+import anyio
+
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, Event, LineState, Polled
+from busmaster.arbiter.events import Completed, Event, Polled
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Transaction
 
@@ -54,6 +56,7 @@ class Pump(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._armed = inf
+        self._run_out: anyio.Event | None = None
 
     def bind(self, loop: asyncio.AbstractEventLoop) -> None:
         """Keep this loop's time. Virtual time is the loop's own; else it is the machine's, finer than some loops'."""
@@ -78,16 +81,23 @@ class Pump(asyncio.Protocol):
             if self.tap is not None:
                 self.tap.transmitted(self.clock(), data)
         while (event := arbiter.poll_event()) is not None:
-            kind = type(event)
-            if kind is Completed:
-                self._resolve(cast(Completed, event).transaction)
-            elif kind is Polled:
-                self._on_cycle(cast(Polled, event).poll)
+            if type(event) is Completed:
+                self._resolve(event.transaction)
+            elif type(event) is Polled:
+                self._on_cycle(event.poll)
             else:
                 self._on_event(event)
         due = arbiter.poll_timeout()
         if due < self._armed:
             self._arm(due)
+        if self._run_out is not None and arbiter.idle:
+            self._run_out.set()
+
+    async def run_out(self) -> None:
+        """Return when nothing is on the wire: within one exchange."""
+        if not self.arbiter.idle:
+            self._run_out = anyio.Event()
+            await self._run_out.wait()
 
     def stop(self) -> None:
         """No timer any more: the bus is closed."""
@@ -98,7 +108,7 @@ class Pump(asyncio.Protocol):
     # what asyncio calls
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)
+        self._transport = cast("asyncio.Transport", transport)
         self.arbiter.line_up(self.clock(), paced=self._paced(transport))
         self.turn()
 
@@ -148,7 +158,3 @@ class Pump(asyncio.Protocol):
         transaction.waiter = future
         self.submit(transaction)
         return future
-
-    @property
-    def online(self) -> bool:
-        return self.arbiter.state is not LineState.OFFLINE
