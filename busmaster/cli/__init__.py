@@ -1,0 +1,25 @@
+"""The operator's tools: what CLI.md says, word for word. `main` is the console script."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Sequence
+
+WRONG_USAGE = 2
+NEEDED = ("click", "rich", "msgspec")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return the exit status. `arguments` are those of the process by default."""
+    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        print(
+            f"busmaster: the command line needs {', '.join(missing)}, which the extra named cli brings: "
+            "pip install 'busmaster[cli]'",
+            file=sys.stderr,
+        )
+        return WRONG_USAGE
+    from busmaster.cli.app import run
+
+    return run(arguments)

@@ -1,0 +1,184 @@
+"""The group of commands, and how each ends: with what status and which one line."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from difflib import get_close_matches
+from typing import Any, TextIO
+
+import click
+
+from busmaster.errors import BusError, InvalidCommand, NoReply
+
+OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+COMMANDS = (
+    "demo",
+    "read",
+    "write",
+    "poll",
+    "scan",
+    "emulate",
+    "run",
+    "plan",
+    "monitor",
+    "doctor",
+    "replay",
+)
+"""One module of this package each, which defines `command`; imported only when it is asked for."""
+
+
+class Commands(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return [name for name in COMMANDS if importlib.util.find_spec(f"busmaster.cli.{name}")]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in self.list_commands(ctx):
+            return None
+        command = importlib.import_module(f"busmaster.cli.{cmd_name}").command
+        assert isinstance(command, click.Command)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        known = self.list_commands(ctx)
+        if args and not args[0].startswith("-") and args[0] not in known:
+            near = get_close_matches(args[0], known, n=1)
+            guess = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+            raise click.UsageError(f"no such command {args[0]!r}: {guess}", ctx)
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (click.ClickException, click.exceptions.Exit, click.Abort):
+            raise
+        except BaseException as error:
+            return status_of(error)
+
+
+def version(ctx: click.Context, _parameter: click.Parameter, asked: bool) -> None:
+    if asked:
+        try:
+            number = importlib.metadata.version("busmaster")
+        except importlib.metadata.PackageNotFoundError:
+            number = "(not installed)"
+        click.echo(f"busmaster {number}")
+        ctx.exit()
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.option("--version", is_flag=True, expose_value=False, is_eager=True, callback=version, help="Print the version.")
+def cli() -> None:
+    """One master for many drives on one serial line.
+
+    PORT is a device path, with options as in a URL (/dev/ttyUSB0?baudrate=9600&parity=E), or socket://HOST:PORT
+    for a serial device server that passes raw TCP.
+    """
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """The exit status: 0 all good, 1 an error from the line, 2 wrong usage, 130 after Ctrl-C. Never raises."""
+    listen_quietly()
+    try:
+        result = cli.main(args=arguments, prog_name="busmaster", standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
+        return WRONG_USAGE
+    except click.UsageError as error:
+        return complain(usage_text(error), WRONG_USAGE)
+    except click.ClickException as error:
+        return complain(error.format_message(), WRONG_USAGE)
+    except (click.Abort, KeyboardInterrupt):
+        return INTERRUPTED
+    return result if isinstance(result, int) else OK
+
+
+def listen_quietly() -> None:
+    """Logs and warnings stay off standard error, where one line says what went wrong; BUSMASTER_DEBUG=1 shows them."""
+    if os.environ.get("BUSMASTER_DEBUG"):
+        logging.basicConfig(level=logging.DEBUG)
+    else:
+        logging.getLogger().addHandler(logging.NullHandler())
+        warnings.showwarning = show_warning
+
+
+def show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    if issubclass(category, UserWarning):
+        print(f"busmaster: warning: {message}", file=file or sys.stderr, flush=True)
+
+
+def usage_text(error: click.UsageError) -> str:
+    text = error.format_message().rstrip(".")
+    text = text[:1].lower() + text[1:]
+    return f"{text}; see {error.ctx.command_path} --help" if error.ctx else text
+
+
+def complain(text: str, status: int) -> int:
+    print("busmaster: " + " ".join(text.split()), file=sys.stderr, flush=True)
+    return status
+
+
+def status_of(error: BaseException) -> int:
+    """Say in one line what went wrong, and with which status the process ends."""
+    error = only_one(error)
+    match error:
+        case KeyboardInterrupt():
+            return INTERRUPTED
+        case SystemExit():
+            return error.code if isinstance(error.code, int) else FAILED
+        case BrokenPipeError():
+            forget_standard_output()
+            return OK
+        case click.ClickException() | InvalidCommand():
+            text = error.format_message() if isinstance(error, click.ClickException) else str(error)
+            return complain(text, WRONG_USAGE)
+        case BusError():
+            return complain(bus_error_text(error), FAILED)
+        case OSError():
+            what = error.strerror or str(error)
+            return complain(f"{error.filename}: {what}" if error.filename else what, FAILED)
+        case _:
+            if os.environ.get("BUSMASTER_DEBUG"):
+                raise error
+            kind = type(error).__name__
+            return complain(f"internal error: {kind}: {error}; BUSMASTER_DEBUG=1 shows where", FAILED)
+
+
+def bus_error_text(error: BusError) -> str:
+    """As the error says it; without the command where only the node matters."""
+    if not isinstance(error, NoReply):
+        return str(error)
+    text = f"{error.node}: {error.what}" if error.node else error.what
+    if error.attempts:
+        text += f", {error.attempts} attempt{'' if error.attempts == 1 else 's'}"
+    return f"{text}; {error.hint}" if error.hint else text
+
+
+def only_one(error: BaseException) -> BaseException:
+    """Out of a task group's wrapping: the first that says something, Ctrl-C before all."""
+    while isinstance(error, BaseExceptionGroup):
+        interrupts = error.subgroup(KeyboardInterrupt)
+        error = (interrupts or error).exceptions[0]
+    return error
+
+
+def forget_standard_output() -> None:
+    """Whoever read it has gone, which is no error: what is left unsaid must not complain at exit."""
+    devnull = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(devnull, sys.stdout.fileno())
+    os.close(devnull)

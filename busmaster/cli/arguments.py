@@ -1,0 +1,228 @@
+"""What the commands have in common on their command lines, checked before anything is sent."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import click
+
+from busmaster.bus import Bus
+from busmaster.errors import InvalidCommand
+from busmaster.exchange import Timings
+from busmaster.handles import HANDLES, Handle
+from busmaster.profile import LineSettings, Profile
+from busmaster.transport.endpoints import endpoint
+from busmaster.transport.serial_port import SerialPort
+from busmaster.transport.tcp import TcpPort
+
+F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
+
+HIGHEST_ADDRESS = 255
+
+
+def option_type(parse: Callable[[str], T]) -> Callable[[str], T]:
+    """For click's `type=`: a value that `parse` refuses with InvalidCommand is wrong usage of that option."""
+
+    def convert(text: str) -> T:
+        try:
+            return parse(text)
+        except InvalidCommand as error:
+            raise click.BadParameter(str(error)) from None
+
+    return convert
+
+
+def parse_nodes(text: str) -> tuple[int, ...]:
+    """The addresses of `1-8,255`. Raises InvalidCommand."""
+    addresses: dict[int, None] = {}
+    for part in text.split(","):
+        first, dash, last = (piece.strip() for piece in part.partition("-"))
+        if not is_decimal(first) or (dash and not is_decimal(last)):
+            raise InvalidCommand(f"a node list is written like 1-8,255, not {text!r}")
+        start, stop = int(first), int(last or first)
+        if start > stop:
+            raise InvalidCommand(f"a range goes upwards: {stop}-{start}, not {part.strip()}")
+        if stop > HIGHEST_ADDRESS:
+            raise InvalidCommand(f"no protocol has a node {stop}")
+        addresses.update(dict.fromkeys(range(start, stop + 1)))
+    return tuple(addresses)
+
+
+def parse_seconds(text: str) -> float:
+    """Seconds above 0. Raises InvalidCommand."""
+    seconds = parse_value(text)
+    if not 0 < seconds < float("inf"):
+        raise InvalidCommand(f"a time is above 0, not {text}")
+    return seconds
+
+
+def parse_milliseconds(text: str) -> float:
+    """Milliseconds above 0, in seconds. Raises InvalidCommand."""
+    return parse_seconds(text) / 1000
+
+
+def parse_items(text: str) -> tuple[str, ...]:
+    """The items of `--items a,b,c`. Raises InvalidCommand for none."""
+    items = tuple(item for item in (part.strip() for part in text.split(",")) if item)
+    if not items:
+        raise InvalidCommand("--items names at least one item")
+    return tuple(dict.fromkeys(items))
+
+
+def parse_assignment(text: str) -> tuple[str, tuple[float, ...]]:
+    """`ITEM=VALUE[,VALUE...]` -> the item and its numbers. Raises InvalidCommand."""
+    item, equals, values = text.partition("=")
+    if not equals or not item.strip() or not values.strip():
+        raise InvalidCommand(f"an assignment is written ITEM=VALUE, like 1=123.456, not {text!r}")
+    return item.strip(), tuple(parse_value(part) for part in values.split(","))
+
+
+def parse_value(text: str) -> float:
+    """A whole number stays one. Hexadecimal (0x41) is taken for the words. Raises InvalidCommand."""
+    text = text.strip()
+    try:
+        return int(text, 16) if text.lower().startswith("0x") else int(text)
+    except ValueError:
+        pass
+    try:
+        return float(text)
+    except ValueError:
+        raise InvalidCommand(f"{text!r} is no number") from None
+
+
+def is_decimal(text: str) -> bool:
+    return text.isascii() and text.isdigit()
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """A PORT and how to speak on it, as the options say. Nothing is opened."""
+
+    port: str
+    protocol: str
+    baud: int | None = None
+    echo: bool = False
+    timeout: float | None = None
+    retries: int | None = None
+    address_step: int | None = None
+
+    @property
+    def handle(self) -> type[Handle]:
+        return HANDLES[self.protocol]
+
+    @property
+    def profile(self) -> Profile:
+        return self.handle.profile
+
+    @property
+    def line(self) -> LineSettings:
+        return line_settings(self.profile, self.baud)
+
+    @property
+    def timings(self) -> Timings | None:
+        return None if self.timeout is None else self.profile.timings.with_window(self.timeout)
+
+    def endpoint(self) -> SerialPort | TcpPort:
+        """Raises InvalidCommand for a PORT that is none."""
+        found = endpoint(self.port, defaults=self.line)
+        return replace(found, echo=True) if self.echo else found
+
+    def open_bus(self) -> Bus:
+        """The bus on it, which `async with` opens. Raises InvalidCommand for a PORT that is none."""
+        return Bus(self.endpoint())
+
+    def open_handle(self, bus: Bus, address: int) -> Handle:
+        """A handle on the bus, which need not be open. Raises InvalidCommand."""
+        options: dict[str, Any] = {"timings": self.timings, "retries": self.retries}
+        if self.address_step is not None:
+            options["address_step"] = self.address_step
+        return self.handle(bus, address, **options)
+
+    def one_address(self, node: int | None) -> int:
+        """Of `--node N`. Raises UsageError if it is missing, or given where there are no addresses."""
+        return only_address(self.profile) if node is None else checked(self.profile, (node,))[0]
+
+    def addresses(self, nodes: Sequence[int] | None) -> tuple[int, ...]:
+        """Of `--nodes N-M,K`, likewise."""
+        return (only_address(self.profile),) if nodes is None else checked(self.profile, nodes)
+
+
+def line_settings(profile: Profile, baud: int | None) -> LineSettings:
+    """The protocol's line, at another baud rate if one is given."""
+    return profile.line if baud is None else replace(profile.line, baudrate=baud)
+
+
+def only_address(profile: Profile) -> int:
+    if profile.addressed:
+        raise click.UsageError(f"{profile.name} needs a node: one of {span(profile)}")
+    return profile.addresses.start
+
+
+def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
+    if not profile.addressed:
+        raise click.UsageError(f"{profile.name} has no addresses: one drive a line, named without a node")
+    for node in nodes:
+        profile.check_address(node)
+    return tuple(nodes)
+
+
+def span(profile: Profile) -> str:
+    return f"{profile.addresses.start}-{profile.addresses.stop - 1}"
+
+
+def protocol_option(command: F) -> F:
+    return click.option(
+        "--protocol", required=True, type=click.Choice(list(HANDLES)), metavar="P", help=f"One of {', '.join(HANDLES)}."
+    )(command)
+
+
+def connected(command: F) -> F:
+    """Give a command PORT, --protocol and the options of a port, as one `Connection` named `connection`."""
+
+    @functools.wraps(command)
+    def gathered(
+        port: str,
+        protocol: str,
+        baud: int | None,
+        echo: bool,
+        timeout: float | None,
+        retries: int | None,
+        address_step: int | None,
+        **options: Any,
+    ) -> Any:
+        if address_step is not None and protocol != "msc":
+            raise click.UsageError("--address-step is msc's alone")
+        connection = Connection(port, protocol, baud, echo, timeout, retries, address_step)
+        return command(connection=connection, **options)
+
+    options = (
+        click.argument("port"),
+        protocol_option,
+        click.option("--baud", type=click.IntRange(min=1), metavar="N", help="Baud rate; the protocol's by default."),
+        click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire)."),
+        click.option(
+            "--timeout", type=option_type(parse_milliseconds), metavar="MS", help="The reply window, in milliseconds."
+        ),
+        click.option("--retries", type=click.IntRange(min=0), metavar="N", help="How often a read is tried again."),
+        click.option(
+            "--address-step", type=click.IntRange(min=1), metavar="N", help="msc: addresses from one value to the next."
+        ),
+    )
+    for option in reversed(options):
+        gathered = option(gathered)
+    return gathered  # type: ignore[return-value]  # the decorated function takes more than the one it wraps
+
+
+node_option = click.option("--node", type=click.IntRange(0, HIGHEST_ADDRESS), metavar="N", help="The node's address.")
+nodes_option = click.option(
+    "--nodes", type=option_type(parse_nodes), metavar="N-M,K", help="Node addresses, like 1-8,255."
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+plain_option = click.option("--plain", is_flag=True, help="Plain lines on a terminal too.")
+seconds_option = click.option(
+    "--seconds", type=option_type(parse_seconds), metavar="S", help="End by itself after so many seconds."
+)

@@ -1,0 +1,264 @@
+"""The screen: a process of its own that draws frames and sends back keys, so that drawing never disturbs the line.
+
+Started by `watch` as `python -m busmaster.cli.live DESCRIPTOR`, a connected socket. It ends when the socket does.
+Only the terminal's own colours are used: those that a light background swallows (yellow, white) are not.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import sys
+from collections import defaultdict, deque
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from rich.text import Text
+from textual.app import App, ComposeResult
+from textual.binding import Binding, BindingType
+from textual.widgets import DataTable, Footer, Static
+
+from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row, decode_frame, encode
+
+FRAME_LIMIT = 1 << 22
+"""Bytes of the longest frame: some ten thousand points."""
+BARS = "▁▂▃▄▅▆▇█"
+GAUGE = 20
+EVENTS = 3
+HEALTH_STYLES = {"up": "green", "unknown": "dim", "suspect": "bold magenta", "down": "reverse red"}
+COLUMNS = {"NODE": 8, "ITEM": 16, "VALUE": 10, "UNIT": 5, "TREND": 8, "AGE": 4, "P50 ms": 6, "HEALTH": 7}
+"""With a space on each side of a column these are the 80 columns of the smallest terminal."""
+GROWTH = {"ITEM": 8, "VALUE": 10, "TREND": 16}
+"""How much wider a column gets, in this order, where the terminal is wider."""
+LONGEST_TREND = COLUMNS["TREND"] + GROWTH["TREND"]
+NUMBERS = ("VALUE", "AGE", "P50 ms")
+OLD_AFTER = 3
+"""Periods after which a value's age is worth a look."""
+
+
+def sparkline(numbers: Sequence[float | None]) -> str:
+    """The last values between their own lowest and highest; a gap where there was none."""
+    known = [number for number in numbers if number is not None]
+    if not known:
+        return ""
+    low, span = min(known), max(known) - min(known)
+    top = len(BARS) - 1
+    bars = (" " if x is None else BARS[round((x - low) / span * top)] if span else BARS[0] for x in numbers)
+    return "".join(bars)
+
+
+def age_text(seconds: float | None) -> str:
+    if seconds is None:
+        return "-"
+    if seconds < 10:
+        return f"{seconds:.1f}s"
+    return f"{seconds:.0f}s" if seconds < 600 else f"{seconds / 60:.0f}m"
+
+
+def clock_text(seconds: float) -> str:
+    minutes, seconds = divmod(int(seconds), 60)
+    return f"{minutes // 60:d}:{minutes % 60:02d}:{seconds:02d}"
+
+
+def fit(text: str, width: int) -> str:
+    return text if len(text) <= width else text[: width - 1] + "…"
+
+
+def title_line(frame: Frame, width: int) -> Text:
+    left = Text.assemble((f" {frame.title}", "bold"), f"  {frame.port}")
+    clock = clock_text(frame.now)
+    left.truncate(width - len(clock) - 2, overflow="ellipsis", pad=True)
+    return left + Text(f" {clock} ")
+
+
+def gauge_line(frame: Frame) -> Text:
+    filled = min(GAUGE, round(frame.utilisation * GAUGE))
+    style = "red" if frame.utilisation > 0.9 else "green"
+    return Text.assemble(
+        " line ",
+        ("━" * filled, style),
+        ("─" * (GAUGE - filled), "dim"),
+        f" {frame.utilisation:4.0%} busy  ",
+        (frame.line, "" if frame.line == "ready" else "bold red"),
+        f"  {frame.backlog} waiting",
+    )
+
+
+def group_line(group: GroupRow) -> Text:
+    line = Text.assemble(" ", (group.name, "bold"), f" every {group.period * 1000:g} ms")
+    if group.achieved is not None:
+        line.append(f", achieved {group.achieved * 1000:.1f}")
+        if group.p99 is not None:
+            line.append(f" (p99 {group.p99 * 1000:.1f})")
+    line.append(f"  cycle {group.cycles}  ")
+    line.append(f"missed {group.missed}", style="bold red" if group.missed else "")
+    if group.paused:
+        line.append("  paused", style="bold magenta")
+    return line
+
+
+def column_widths(width: int) -> dict[str, int]:
+    """The columns of a terminal that is so wide."""
+    widths = dict(COLUMNS)
+    spare = width - sum(widths.values()) - 2 * len(widths)
+    for name, growth in GROWTH.items():
+        more = max(0, min(growth, spare))
+        widths[name] += more
+        spare -= more
+    return widths
+
+
+def right(text: str, width: int, style: str = "") -> Text:
+    return Text(fit(text, width).rjust(width), style=style)
+
+
+class Screen(App[None]):
+    """Draws what `take_frame` is given. `send` carries the person's actions."""
+
+    ENABLE_COMMAND_PALETTE = False
+    CSS = """
+    Screen { background: ansi_default; color: ansi_default; }
+    #head { height: auto; }
+    #points { height: 1fr; background: ansi_default; color: ansi_default; scrollbar-size-horizontal: 0; }
+    #points > .datatable--header { background: ansi_default; color: ansi_default; text-style: bold underline; }
+    #points > .datatable--cursor { background: ansi_default; color: ansi_default; text-style: bold; }
+    #points > .datatable--hover { background: ansi_default; }
+    #events { height: auto; max-height: 4; text-style: dim; }
+    Footer { background: ansi_default; color: ansi_default; }
+    FooterKey { background: ansi_default; color: ansi_default; }
+    FooterKey .footer-key--key { background: ansi_default; color: ansi_blue; text-style: bold; }
+    FooterKey .footer-key--description { background: ansi_default; color: ansi_default; }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("q", "leave('quit')", "quit"),
+        Binding("ctrl+c", "leave('interrupt')", show=False, priority=True),
+        Binding("p", "all_groups('pause')", "pause polling"),
+        Binding("d", "all_groups('demand')", "poll now"),
+        Binding("up,down,pageup,pagedown", "scroll", "scroll", key_display="↑↓", show=True),
+    ]
+
+    def __init__(self, connection: socket.socket | None) -> None:
+        super().__init__()
+        self.connection = connection
+        self.writer: asyncio.StreamWriter | None = None
+        self.frame: Frame | None = None
+        self.trends: defaultdict[tuple[str, str], deque[float | None]] = defaultdict(
+            lambda: deque(maxlen=LONGEST_TREND)
+        )
+        self.shown: list[tuple[str, str]] = []
+        self.widths = dict(COLUMNS)
+
+    def compose(self) -> ComposeResult:
+        yield Static(id="head")
+        yield DataTable(id="points", cursor_type="row", cursor_foreground_priority="renderable")
+        yield Static(id="events")
+        yield Footer(show_command_palette=False)
+
+    def on_mount(self) -> None:
+        self.theme = "ansi-dark"
+        self.table.focus()
+        if self.connection is not None:
+            self.run_worker(self.listen(self.connection), exit_on_error=True)
+
+    def on_resize(self) -> None:
+        self.widths = column_widths(self.size.width)
+        self.shown = []
+        self.table.clear(columns=True)
+        for name, width in self.widths.items():
+            self.table.add_column(right(name, width) if name in NUMBERS else Text(name), width=width, key=name)
+        if self.frame:
+            self.take_frame(self.frame)
+
+    @property
+    def table(self) -> DataTable[Text]:
+        table: DataTable[Text] = self.query_one("#points", DataTable)
+        return table
+
+    async def listen(self, connection: socket.socket) -> None:
+        reader, self.writer = await asyncio.open_connection(sock=connection, limit=FRAME_LIMIT)
+        while line := await reader.readline():
+            self.take_frame(decode_frame(line))
+        self.exit()
+
+    def send(self, action: Action) -> None:
+        if self.writer is not None and not self.writer.is_closing():
+            self.writer.write(encode(action))
+
+    def action_leave(self, kind: Any) -> None:
+        self.send(Action(kind))
+        self.exit()
+
+    def action_all_groups(self, kind: Any) -> None:
+        for group in self.frame.groups if self.frame else ():
+            self.send(Action(kind, group.name))
+
+    def action_scroll(self) -> None:
+        """Stands in the footer for the table's own keys."""
+
+    def take_frame(self, frame: Frame) -> None:
+        self.frame = frame
+        width = self.size.width
+        head = [title_line(frame, width), gauge_line(frame), *map(group_line, frame.groups)]
+        self.query_one("#head", Static).update(Text("\n").join(head))
+        events = frame.events[-EVENTS:]
+        self.query_one("#events", Static).update(Text("\n".join(fit(f" {event}", width) for event in events)))
+        self.draw_rows(frame)
+
+    def draw_rows(self, frame: Frame) -> None:
+        table, nodes = self.table, {node.label: node for node in frame.nodes}
+        keys = [(row.node, row.item) for row in frame.rows]
+        if keys != self.shown:
+            table.clear()
+            self.shown = keys
+            for row in frame.rows:
+                table.add_row(*(Text() for _ in COLUMNS), key=self.row_key(row))
+        old = OLD_AFTER * max((group.period for group in frame.groups), default=1.0)
+        before = ""
+        for row in frame.rows:
+            trend = self.trends[row.node, row.item]
+            trend.append(row.number)
+            cells = point_cells(row, list(trend)[-self.widths["TREND"] :], old, self.widths)
+            if row.node != before and row.node in nodes:
+                cells |= node_cells(nodes[row.node], self.widths)
+            for name, cell in cells.items():
+                if table.get_cell(self.row_key(row), name) != cell:
+                    table.update_cell(self.row_key(row), name, cell)
+            before = row.node
+
+    @staticmethod
+    def row_key(row: Row) -> str:
+        return f"{row.node}/{row.item}"
+
+
+def point_cells(row: Row, trend: list[float | None], old: float, widths: dict[str, int]) -> dict[str, Text]:
+    """The cells of one point. An age beyond `old` seconds stands out."""
+    style = "red" if row.error else "magenta" if row.late else "bold"
+    return {
+        "ITEM": Text(fit(row.item, widths["ITEM"])),
+        "VALUE": right(row.value, widths["VALUE"], style),
+        "UNIT": Text(fit(row.unit, widths["UNIT"])),
+        "TREND": Text(sparkline(trend), style="blue"),
+        "AGE": right(age_text(row.age), widths["AGE"], "red" if row.age is not None and row.age > old else ""),
+    }
+
+
+def node_cells(node: NodeRow, widths: dict[str, int]) -> dict[str, Text]:
+    """What is the node's: it stands beside the node's first point."""
+    return {
+        "NODE": Text(fit(node.label, widths["NODE"]), style="bold"),
+        "P50 ms": right(f"{node.p50 * 1000:.1f}" if node.requests else "", widths["P50 ms"]),
+        "HEALTH": Text(fit(node.health, widths["HEALTH"]), style=HEALTH_STYLES.get(node.health, "")),
+    }
+
+
+def main() -> int:
+    """Draw until the socket ends. The one argument is its descriptor."""
+    connection = socket.socket(fileno=int(sys.argv[1]))
+    connection.setblocking(False)
+    screen = Screen(connection)
+    screen.run()
+    return screen.return_code or 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,78 @@
+"""What the process that owns the line and the process that draws the screen say to each other.
+
+One JSON array a line. A frame is the whole picture, so that one that was skipped because the screen is slow is never
+missed; an action is a key that the person pressed.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+
+class Row(msgspec.Struct, array_like=True, frozen=True):
+    """One point. `value` is as it is printed; `number` draws the trend, where there is one; `age` in seconds."""
+
+    node: str
+    item: str
+    value: str
+    unit: str = ""
+    number: float | None = None
+    age: float | None = None
+    late: bool = False
+    error: str = ""
+
+
+class NodeRow(msgspec.Struct, array_like=True, frozen=True):
+    """One node: its health, exchanges that were tried and transactions that failed, latencies in seconds."""
+
+    label: str
+    health: str
+    requests: int = 0
+    failed: int = 0
+    p50: float = 0.0
+    p99: float = 0.0
+
+
+class GroupRow(msgspec.Struct, array_like=True, frozen=True):
+    """One poll group. Periods in seconds; `achieved` is the mean of late, None before the second cycle."""
+
+    name: str
+    period: float
+    achieved: float | None = None
+    p99: float | None = None
+    cycles: int = 0
+    missed: int = 0
+    paused: bool = False
+
+
+class Frame(msgspec.Struct, array_like=True, frozen=True):
+    """The whole picture. `now` in seconds since the start, `utilisation` from 0 to 1 over the last second or so."""
+
+    title: str
+    port: str
+    now: float
+    line: str
+    utilisation: float
+    backlog: int
+    rows: tuple[Row, ...] = ()
+    nodes: tuple[NodeRow, ...] = ()
+    groups: tuple[GroupRow, ...] = ()
+    events: tuple[str, ...] = ()
+
+
+class Action(msgspec.Struct, array_like=True, frozen=True):
+    """What the person asks: `quit`, or `interrupt` (Ctrl-C); `pause` (or go on with) and `demand` a group; `suspend` a node; `write` a point."""
+
+    kind: Literal["quit", "interrupt", "pause", "demand", "suspend", "write"]
+    target: str = ""
+    value: str = ""
+
+
+def encode(message: Frame | Action) -> bytes:
+    return msgspec.json.encode(message) + b"\n"
+
+
+decode_frame = msgspec.json.Decoder(Frame).decode
+decode_action = msgspec.json.Decoder(Action).decode

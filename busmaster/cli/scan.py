@@ -1,0 +1,57 @@
+"""`busmaster scan`: which nodes answer."""
+
+from __future__ import annotations
+
+import sys
+
+import anyio
+import click
+
+from busmaster.cli.arguments import Connection, connected, json_option, nodes_option
+from busmaster.cli.output import emit, json_line, json_value, value_text
+from busmaster.errors import GarbledReply, NodeDown, NoReply, Refused
+from busmaster.node import Node
+
+
+@click.command(short_help="Find the nodes that answer.")
+@connected
+@nodes_option
+@json_option
+def command(connection: Connection, nodes: tuple[int, ...] | None, as_json: bool) -> None:
+    """Ask every node of PORT once and print a line for each that answers: `NODE` and what it answered.
+
+    All addresses of the protocol are asked unless --nodes names some.
+    """
+    if nodes is None and connection.profile.addressed:
+        nodes = tuple(connection.profile.addresses)
+    anyio.run(scan, connection, connection.addresses(nodes), as_json)
+
+
+async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool) -> None:
+    bus = connection.open_bus()
+    handles = [connection.open_handle(bus, address) for address in addresses]
+    async with bus:
+        with click.progressbar(handles, label="scanning", file=sys.stderr, hidden=not sys.stderr.isatty()) as asked:
+            for handle in asked:
+                answer = await ask(handle.node)
+                if answer is not None:
+                    value, outcome = answer
+                    emit(found_json(handle.node, value, outcome) if as_json else f"{handle.node.address} {outcome}")
+
+
+async def ask(node: Node) -> tuple[object, str] | None:
+    """The value and what happened in words; None if nothing was heard of it."""
+    probe = node.profile.probe
+    try:
+        value = await node.request(probe, retries=0)
+    except (NoReply, NodeDown):
+        return None
+    except Refused:
+        return None, f"{probe}: refused"
+    except GarbledReply as error:
+        return None, f"{probe}: {error.what}"
+    return value, f"{probe}: {value_text(value)}"
+
+
+def found_json(node: Node, value: object, outcome: str) -> str:
+    return json_line(node=node.address if node.profile.addressed else None, value=json_value(value), answer=outcome)

@@ -1,0 +1,252 @@
+"""Watching poll groups: as plain lines, as JSON, or on the screen; and the summary at the end."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections import deque
+from collections.abc import Iterable, Iterator
+from enum import Flag
+from importlib.util import find_spec
+from statistics import fmean
+from typing import Any
+
+import anyio
+
+from busmaster.arbiter.events import Event, LatenessRaised, LineChanged, LineState, NodeChanged
+from busmaster.bus import Bus
+from busmaster.cli.app import OK
+from busmaster.cli.drawing import draw
+from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row
+from busmaster.cli.output import emit_all, json_line, json_value, note, value_text
+from busmaster.errors import BusError
+from busmaster.points import Point
+from busmaster.polling import PollGroup, Sample, Snapshot
+
+KEPT_PERIODS = 10_000
+KEPT_EVENTS = 8
+UTILISATION_WINDOW = 1.0
+STATES = {LineState.OFFLINE: "offline", LineState.SETTLING: "settling"}
+"""What is worth a word: a line in use is ready."""
+
+
+class Watch:
+    """What a person sees of a bus while its groups are polled. Times are in seconds since it was made."""
+
+    def __init__(self, bus: Bus, title: str) -> None:
+        self.bus = bus
+        self.title = title
+        self.start = bus.now()
+        self.groups: list[PollGroup] = []
+        self.events: deque[str] = deque(maxlen=KEPT_EVENTS)
+        self._periods: dict[str, deque[float]] = {}
+        self._started: dict[str, float] = {}
+        self._loads: deque[tuple[float, float]] = deque()
+
+    def since(self, time: float | None) -> float | None:
+        return None if time is None else round(time - self.start, 6)
+
+    def add(self, group: PollGroup) -> None:
+        self.groups.append(group)
+        self._periods[group.name] = deque(maxlen=KEPT_PERIODS)
+
+    def saw(self, snapshot: Snapshot) -> None:
+        """Count one cycle."""
+        if snapshot.started is None:
+            return
+        before = self._started.get(snapshot.group)
+        if before is not None:
+            self._periods[snapshot.group].append(snapshot.started - before)
+        self._started[snapshot.group] = snapshot.started
+
+    async def listen(self) -> None:
+        """Keep the last events, as text, until cancelled."""
+        async for event in self.bus.events():
+            text = event_text(event)
+            if text:
+                self.events.append(f"{self.bus.now() - self.start:7.1f} s  {text}")
+
+    def picture(self) -> Frame:
+        now = self.bus.now()
+        statistics = self.bus.statistics()
+        return Frame(
+            title=self.title,
+            port=self.port,
+            now=now - self.start,
+            line=STATES.get(self.bus.state, "ready"),
+            utilisation=self._utilisation(now, statistics.busy + statistics.settling),
+            backlog=statistics.backlog,
+            rows=tuple(row for group in self.groups for row in group_rows(group, now)),
+            nodes=tuple(self._nodes()),
+            groups=tuple(self._group(group) for group in self.groups),
+            events=tuple(self.events),
+        )
+
+    @property
+    def port(self) -> str:
+        settings = self.bus.endpoint.settings
+        name = self.bus.endpoint.name
+        return f"{name}  {settings.baudrate} {settings.framing}" if settings else name
+
+    def act(self, action: Action) -> None:
+        """Do what the person asked for."""
+        for group in self.groups:
+            if group.name == action.target:
+                if action.kind == "demand":
+                    group.demand()
+                elif action.kind == "pause":
+                    group.resume() if group.paused else group.pause()
+
+    def _utilisation(self, now: float, busy: float) -> float:
+        self._loads.append((now, busy))
+        while len(self._loads) > 2 and self._loads[1][0] <= now - UTILISATION_WINDOW:
+            self._loads.popleft()
+        since, busy_then = self._loads[0]
+        return max(0.0, min(1.0, (busy - busy_then) / (now - since))) if now > since else 0.0
+
+    def _nodes(self) -> Iterator[NodeRow]:
+        for node in self.bus.nodes:
+            counts = node.statistics()
+            latency = counts.latency
+            health = "suspended" if node.suspended else node.health.value
+            yield NodeRow(node.label, health, counts.attempts, counts.failed, latency.p50, latency.p99)
+
+    def _group(self, group: PollGroup) -> GroupRow:
+        periods = self._periods[group.name]
+        counts = group.statistics()
+        mean = fmean(periods) if periods else None
+        return GroupRow(group.name, group.period, mean, p99_of(periods), counts.cycles, counts.missed, group.paused)
+
+    def summarise(self) -> None:
+        """On standard error: cycles, missed, achieved period, utilisation; a line for each node."""
+        for group in map(self._group, self.groups):
+            text = f"{group.name}: {group.cycles} cycles, {group.missed} missed"
+            if group.achieved is not None and group.p99 is not None:
+                text += f", period {group.achieved * 1000:.2f} ms mean, {group.p99 * 1000:.2f} ms p99"
+            note(f"{text}, line {self.bus.statistics().utilisation:.1%} busy")
+        for node in self._nodes():
+            note(
+                f"{node.label}: {node.requests} requests, {node.failed} failed, "
+                f"p50 {node.p50 * 1000:.2f} ms, p99 {node.p99 * 1000:.2f} ms"
+            )
+
+
+def p99_of(periods: Iterable[float]) -> float | None:
+    ordered = sorted(periods)
+    return ordered[math.ceil(0.99 * len(ordered)) - 1] if ordered else None
+
+
+def group_rows(group: PollGroup, now: float) -> Iterator[Row]:
+    """A row for each point; what was not polled yet has no value and no age."""
+    latest = group.latest
+    for point in group.points:
+        sample = latest.samples.get(point) if latest else None
+        yield Row(point.node.label, point.item, "-", point.unit) if sample is None else sample_row(point, sample, now)
+
+
+def sample_row(point: Point[Any], sample: Sample, now: float) -> Row:
+    value = sample.value
+    number = float(value) if isinstance(value, int | float) and not isinstance(value, Flag) else None
+    return Row(
+        node=point.node.label,
+        item=point.item,
+        value=value_text(value),
+        unit=point.unit,
+        number=number if number is not None and math.isfinite(number) else None,
+        age=sample.age(now),
+        late=sample.quality.value == "late",
+        error="" if sample.error is None else sample.error.what,
+    )
+
+
+def event_text(event: Event) -> str:
+    match event:
+        case NodeChanged():
+            return f"{event.node.label} is {event.after.value}, was {event.before.value}"
+        case LatenessRaised():
+            return (
+                f"{event.node.label} answered after {event.age * 1000:.0f} ms: "
+                f"its lateness is now {event.lateness * 1000:.0f} ms"
+            )
+        case LineChanged():
+            return f"the line is {event.change.value}" + (f": {event.cause}" if event.cause else "")
+        case _:
+            return ""
+
+
+def json_cycle(watch: Watch, snapshot: Snapshot) -> str:
+    samples = {
+        point.key: {
+            "value": json_value(sample.value),
+            "error": None if sample.error is None else sample.error.what,
+            "late": sample.quality.value == "late",
+        }
+        for point, sample in snapshot.samples.items()
+    }
+    return json_line(
+        group=snapshot.group,
+        cycle=snapshot.cycle,
+        due=watch.since(snapshot.due),
+        started=watch.since(snapshot.started),
+        finished=watch.since(snapshot.finished),
+        missed=snapshot.missed,
+        samples=samples,
+    )
+
+
+def plain_cycle(watch: Watch, snapshot: Snapshot) -> Iterator[str]:
+    """A line a sample: seconds since the start, node and item, the value, or what went wrong."""
+    for point, sample in snapshot.samples.items():
+        value = error_text(sample.error) if sample.error else value_text(sample.value)
+        yield f"{snapshot.finished - watch.start:.3f} {point.key} {value}"
+
+
+def error_text(error: BusError) -> str:
+    return f"- {error.what}"
+
+
+def print_cycle(watch: Watch, snapshot: Snapshot, as_json: bool) -> None:
+    emit_all([json_cycle(watch, snapshot)] if as_json else plain_cycle(watch, snapshot))
+
+
+async def print_cycles(watch: Watch, group: PollGroup, as_json: bool) -> None:
+    """Print every cycle, in a thread: a reader that is slow costs snapshots, never line time."""
+    async for snapshot in group:
+        watch.saw(snapshot)
+        await anyio.to_thread.run_sync(print_cycle, watch, snapshot, as_json, abandon_on_cancel=True)
+
+
+async def count_cycles(watch: Watch, group: PollGroup) -> None:
+    async for snapshot in group:
+        watch.saw(snapshot)
+
+
+async def follow(watch: Watch, *, seconds: float | None, plain: bool, as_json: bool) -> int:
+    """Show the watch's groups for so many seconds, or until the person quits: the exit status."""
+    on_screen = not plain and not as_json and screen_available()
+    status = OK
+    try:
+        with anyio.move_on_after(seconds):
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(watch.listen)
+                for group in watch.groups:
+                    if on_screen:
+                        tasks.start_soon(count_cycles, watch, group)
+                    else:
+                        tasks.start_soon(print_cycles, watch, group, as_json)
+                if on_screen:
+                    status = await draw(watch.picture, watch.act)
+                    tasks.cancel_scope.cancel()
+    finally:
+        watch.summarise()
+    return status
+
+
+def screen_available() -> bool:
+    """A terminal on both sides, and the library that draws."""
+    if not sys.stdout.isatty() or not sys.stdin.isatty():
+        return False
+    if find_spec("textual") is None:
+        note("the live view needs the extra named tui (pip install 'busmaster[tui]'); plain lines instead")
+        return False
+    return True
