@@ -1,0 +1,104 @@
+"""What a command must be, whatever it asks: a value that stays what it is, and sends the same bytes every time."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Any
+
+from busmaster.errors import InvalidCommand
+from busmaster.exchange import Command, Exchange, ReplyTiming, Timings
+from busmaster.profile import Profile
+
+OTHER_TIMINGS = Timings(
+    read=ReplyTiming(0.011, 0.022, 0.033, 0.004),
+    write=ReplyTiming(0.055, 0.066, 0.077, 0.008),
+    packet=ReplyTiming(0.099, 0.1, 0.11, 0.012),
+)
+
+
+def check_command(command: Command[Any], address: int, timings: Timings) -> Iterator[str]:
+    """What does not hold, one sentence each."""
+    if not str(command) or str(command) == object.__repr__(command):
+        yield f"{command!r} has no text: write __str__, as in 'read element 100'"
+    twin = copy.deepcopy(command)
+    if twin != command:
+        yield f"{command!r} does not equal its copy"
+    else:
+        yield from _check_hash(command, twin)
+    yield from _check_immutable(twin)
+    flags: tuple[Any, Any] = (command.writes, command.idempotent)
+    if {type(flag) for flag in flags} != {bool}:
+        yield f"{command!r}: writes and idempotent are True or False"
+    elif not command.writes and not command.idempotent:
+        yield f"{command!r} is a read and not idempotent: then it could not be retried"
+    first, second = command.open(address, timings), command.open(address, timings)
+    if first is second:
+        yield f"{command!r} opens the same exchange twice: each attempt needs a fresh one"
+    if not first.request or first.request != second.request:
+        yield f"{command!r} sends {first.request.hex(' ')!r}, and then {second.request.hex(' ')!r}"
+    own = command.open(address, OTHER_TIMINGS)
+    if own.timing not in (OTHER_TIMINGS.read, OTHER_TIMINGS.write):
+        yield f"{command!r} does not take the read or write timing that its node has"
+    yield from _check_announcements(command, first)
+
+
+def _check_hash(command: Command[Any], twin: Command[Any]) -> Iterator[str]:
+    try:
+        same = hash(command) == hash(twin)
+    except TypeError:
+        yield f"{command!r} is not hashable"
+    else:
+        if not same:
+            yield f"{command!r} has another hash than its copy"
+
+
+def _check_immutable(command: Command[Any]) -> Iterator[str]:
+    slots = (name for kind in type(command).__mro__ for name in getattr(kind, "__slots__", ()))
+    for name in (*slots, *vars(type(command)).get("__annotations__", ()), "something_new"):
+        try:
+            setattr(command, name, None)
+        except (AttributeError, TypeError):
+            continue
+        yield f"{type(command).__name__}.{name} can be changed: make it a frozen dataclass with slots"
+
+
+def _check_announcements(command: Command[Any], exchange: Exchange[Any]) -> Iterator[str]:
+    for sizes in (exchange.sizes, *(leg.sizes for leg in exchange.later)):
+        if not 0 <= sizes.typical <= sizes.longest:
+            yield f"{command!r} announces a reply of typically {sizes.typical} and at most {sizes.longest} bytes"
+    if not exchange.answered and not command.writes:
+        yield f"{command!r} is a read that is not answered"
+
+
+def check_invalid(builders: Iterable[Callable[[], object]]) -> Iterator[str]:
+    """Each of `builders` must raise InvalidCommand."""
+    for number, build in enumerate(builders):
+        try:
+            built = build()
+        except InvalidCommand:
+            continue
+        except Exception as error:
+            yield f"invalid[{number}] raises {error!r} in place of InvalidCommand"
+        else:
+            yield f"invalid[{number}] builds {built!r} in place of raising InvalidCommand"
+
+
+def check_addresses(profile: Profile) -> Iterator[str]:
+    """Every address has its own request; the probe is a read."""
+    probe = profile.probe
+    if probe.writes:
+        yield f"the probe {probe!r} writes"
+    if profile.addressed:
+        asked: dict[bytes, int] = {}
+        for address in profile.addresses:
+            request = probe.open(address, profile.timings).request
+            if request in asked:
+                yield f"addresses {asked[request]} and {address} are sent the same {request.hex(' ')}"
+            asked[request] = address
+    yield from check_invalid(
+        partial(profile.check_address, address)
+        for address in (profile.addresses.start - 1, profile.addresses.stop)
+        if address != profile.broadcast
+    )

@@ -1,0 +1,296 @@
+"""The conformance kit for a protocol: it runs over the five that are here, and over a sixth that you add.
+
+    def test_modbus_keeps_the_contract():
+        check_protocol(
+            PROFILE,
+            [
+                Case(ReadRegister(7), 17, [bytes.fromhex("11 03 02 02 2b 38 e8")], 555),
+                Case(WriteRegister(7, 3), 17, [bytes.fromhex("11 06 00 07 00 03 7a 9a")]),
+                Case(ReadRegister(9), 17, [bytes.fromhex("11 83 02 c1 34")], raises=Refused),
+            ],
+            names=lambda command, address: (address, type(command)),
+            invalid=[lambda: ReadRegister(70000)],
+        )
+
+A few cases say what the document says: a command, the node, what that node answers, and the value. From them the kit
+derives what the arbiter relies on (`busmaster.exchange`), and raises `NotConformant` with all that does not hold:
+
+- every split of every reply gives what one chunk gives; what is cut short is MORE, and an error when time runs out;
+- no single-bit flip of a reply is accepted, but for those that `unseen` lists with a reason;
+- no reply to another case is accepted, unless `names` says that replies cannot tell the two apart; no `foreign` one;
+- any bytes at all end in a value, FrameError or Refused, and every exchange has an end;
+- what follows a reply is handed back; sizes, legs, starts and closing bytes are as announced;
+- commands are immutable, hashable values with a text; bad arguments raise InvalidCommand (`invalid`);
+- every attempt sends the same bytes, and no two addresses do;
+- what is written to an emulated `device` is read back (`round_trips`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from itertools import islice
+from random import Random
+from typing import Any
+
+from busmaster.errors import Refused
+from busmaster.exchange import Command
+from busmaster.profile import Profile
+from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen
+from busmaster.testing.commands import check_addresses, check_command, check_invalid
+from busmaster.testing.damage import bytewise, flips, garbage_chunks, splits
+from busmaster.testing.listening import Ending, Listening
+
+LONG_REPLY = 64
+"""Bytes above which a reply with a flipped bit is not fed byte by byte too."""
+FINDINGS_EACH = 3
+"""How many findings of one kind a case may add: the rest would only repeat them."""
+STRAYS = b"\x00\xff"
+
+
+def check_protocol(
+    profile: Profile,
+    cases: Iterable[Case],
+    *,
+    names: Callable[[Command[Any], int], Hashable] = lambda command, address: (command, address),
+    foreign: Iterable[Foreign] = (),
+    unseen: Iterable[Unseen] = (),
+    invalid: Iterable[Callable[[], object]] = (),
+    round_trips: Iterable[RoundTrip] = (),
+    device: Callable[[bytes], bytes] | None = None,
+    garbage: int = 100,
+    seed: int = 0,
+) -> Tally:
+    """Raises NotConformant unless the protocol keeps the contract for all of `cases`, see the module's text.
+
+    `names(command, address)` is what a reply to it names: where it is equal for two cases, the reply to one may be
+    taken for the other's. `device` is told what the host says, and returns what the device says at once. `garbage`
+    is the number of random replies for each case, drawn from `seed`. Returns how much was tried.
+    """
+    kit = _Kit(profile, list(cases), names, list(unseen), Random(seed))
+    if not kit.cases:
+        raise NotConformant(profile.name, ["there is no case"])
+    findings = [*check_addresses(profile), *check_invalid(invalid)]
+    for case in kit.cases:
+        findings += check_command(case.command, case.address, profile.timings)
+        trouble = list(kit.check_reply(case))
+        if not trouble:
+            for check in (kit.check_splits, kit.check_truncations, kit.check_flips, kit.check_starts):
+                trouble += islice(check(case), FINDINGS_EACH)
+            trouble += islice(kit.check_garbage(case, garbage), FINDINGS_EACH)
+        findings += trouble
+    findings += kit.check_replies_to_others()
+    findings += kit.check_foreign(foreign)
+    findings += kit.check_exemptions()
+    for trip in round_trips:
+        findings += islice(kit.check_round_trip(trip, device), FINDINGS_EACH)
+    if findings:
+        raise NotConformant(profile.name, findings)
+    return kit.tally
+
+
+class _Kit:
+    def __init__(
+        self,
+        profile: Profile,
+        cases: list[Case],
+        names: Callable[[Command[Any], int], Hashable],
+        unseen: list[Unseen],
+        random: Random,
+    ) -> None:
+        self.profile = profile
+        self.cases = cases
+        self.tally: Tally = Counter(cases=len(cases))
+        self._names = names
+        self._unseen = unseen
+        self._needed: set[Unseen] = set()
+        self._random = random
+
+    def listen(self, command: Command[Any], address: int) -> Listening:
+        return Listening(command.open(address, self.profile.timings))
+
+    def hear(self, case: Case, *chunks: bytes) -> Listening:
+        return self.listen(case.command, case.address).feed(*chunks)
+
+    def turns(self, case: Case) -> list[list[bytes]]:
+        """The legs, those in one list that come without a word of the host between: they may come in one chunk."""
+        listening = self.listen(case.command, case.address)
+        turns: list[list[bytes]] = [[]]
+        for leg in case.legs:
+            said = len(listening.said)
+            listening.feed(leg)
+            turns[-1].append(leg)
+            if len(listening.said) > said:
+                turns.append([])
+        return turns
+
+    def runs(self, case: Case) -> Iterator[tuple[list[bytes], bytes]]:
+        """Each turn of the node as one chunk, and what it said in the turns before."""
+        runs = [b"".join(turn) for turn in self.turns(case) if turn]
+        for number, run in enumerate(runs):
+            yield runs[:number], run
+
+    # what a case says
+
+    def check_reply(self, case: Case) -> Iterator[str]:
+        """The reply as it stands, and silence in its place."""
+        listening = self.listen(case.command, case.address)
+        exchange = listening.exchange
+        if case.request is not None and exchange.request != case.request:
+            yield f"{case}: sends {exchange.request.hex(' ')} in place of {case.request.hex(' ')}"
+        silence = self.listen(case.command, case.address).expire()
+        if silence.delivered is exchange.answered or silence.is_bug or silence.is_whole:
+            yield f"{case}: with no reply at all it ends with {silence}"
+        ending = listening.feed(*case.legs).ending if exchange.answered else listening.expire()
+        if ending is None:
+            yield f"{case}: the reply {_hex(case.legs)} does not end it"
+        elif case.raises is not None:
+            if type(ending.error) is not case.raises:
+                yield f"{case}: the reply {_hex(case.legs)} gives {ending} in place of {case.raises.__name__}"
+        elif not ending.delivered or ending.value != case.value or ending.rest:
+            yield f"{case}: the reply {_hex(case.legs)} gives {ending} in place of {case.value!r}"
+        elif not listening.said:
+            yield from self._check_announced(case, ending)
+
+    def _check_announced(self, case: Case, ending: Ending) -> Iterator[str]:
+        exchange = self.listen(case.command, case.address).exchange
+        if not exchange.answered:
+            return
+        sizes = [exchange.sizes, *(leg.sizes for leg in exchange.later)]
+        if len(case.legs) != len(sizes):
+            yield f"{case}: {len(case.legs)} legs in place of the {len(sizes)} announced"
+        for leg, size in zip(case.legs, sizes, strict=False):
+            if len(leg) > size.longest:
+                yield f"{case}: a leg of {len(leg)} bytes is longer than the {size.longest} announced"
+        if len(ending.send) != exchange.closing:
+            yield f"{case}: closes with {len(ending.send)} bytes, not with the {exchange.closing} announced"
+
+    # what the line makes of a reply
+
+    def check_splits(self, case: Case) -> Iterator[str]:
+        for before, run in self.runs(case):
+            whole = self.hear(case, *before, run)
+            for chunks in splits(run):
+                self.tally["splits"] += 1
+                parts = self.hear(case, *before, *chunks)
+                if parts.said != whole.said or not _alike(parts.ending, whole.ending):
+                    yield f"{case}: {run.hex(' ')} gives {whole.ending}, and {parts.ending} as {_hex(chunks)}"
+            if whole.ending is not None and whole.ending.delivered:
+                more = self.hear(case, *before, run + STRAYS).ending
+                if more is None or more.rest != STRAYS:
+                    yield f"{case}: what follows the reply in the same chunk is not handed back: {more}"
+
+    def check_truncations(self, case: Case) -> Iterator[str]:
+        for before, run in self.runs(case):
+            for length in range(1, len(run)):
+                self.tally["truncations"] += 1
+                listening = self.hear(case, *before)
+                said = len(listening.said)
+                listening.feed(run[:length])
+                early = listening.ending is not None or len(listening.said) > said
+                ending = listening.expire()
+                if early or ending.delivered or ending.is_whole or ending.is_bug:
+                    when = "at once" if early else "when time runs out"
+                    yield f"{case}: {length} of the {len(run)} bytes {run.hex(' ')} end {when} with {ending}"
+
+    def check_flips(self, case: Case) -> Iterator[str]:
+        for before, run in self.runs(case):
+            for heard in flips(run, self.profile.line.bytesize):
+                self.tally["flips"] += 1
+                ways = [[heard], bytewise(heard)] if len(heard) <= LONG_REPLY else [[heard]]
+                for chunks in ways:
+                    ending = self.hear(case, *before, *chunks).expire()
+                    if (ending.delivered and not self._is_exempt(run, heard)) or ending.is_bug:
+                        yield f"{case}: {heard.hex(' ')} in place of {run.hex(' ')} gives {ending}"
+
+    def _is_exempt(self, reply: bytes, heard: bytes) -> bool:
+        exemptions = {unseen for unseen in self._unseen if (unseen.reply, unseen.heard) == (reply, heard)}
+        self._needed |= exemptions
+        return bool(exemptions)
+
+    def check_exemptions(self) -> Iterator[str]:
+        for unseen in self._unseen:
+            if unseen not in self._needed:
+                yield f"{unseen} is seen after all, or no case has that reply: take it off the list"
+
+    def check_starts(self, case: Case) -> Iterator[str]:
+        """A byte that begins no reply gives none, whatever follows it."""
+        if not case.legs:
+            return
+        starts = self.listen(case.command, case.address).exchange.starts
+        if case.legs[0][0] not in starts:
+            yield f"{case}: its reply begins with {case.legs[0][0]:02x}, which is not in starts"
+        for byte in range(1 << self.profile.line.bytesize):
+            if byte not in starts:
+                ending = self.hear(case, bytes((byte,)), *case.legs).expire()
+                if ending.delivered or isinstance(ending.error, Refused) or ending.is_bug:
+                    yield f"{case}: {byte:02x} and then the reply gives {ending}"
+
+    def check_garbage(self, case: Case, count: int) -> Iterator[str]:
+        for _ in range(count):
+            self.tally["garbage"] += 1
+            chunks = list(garbage_chunks(self._random, b"".join(case.legs)))
+            ending = self.hear(case, *chunks).expire()
+            if ending.is_bug:
+                yield f"{case}: {_hex(chunks)} gives {ending}"
+
+    # the replies of others
+
+    def check_replies_to_others(self) -> Iterator[str]:
+        for mine in self.cases:
+            names = self._names(mine.command, mine.address)
+            alike = [case for case in self.cases if self._names(case.command, case.address) == names]
+            good = {b"".join(case.legs) for case in alike}
+            others = [case for case in self.cases if case not in alike and case.raises is None and case.legs]
+            for other in others:
+                heard = b"".join(other.legs)
+                yield from self._check_not_accepted(mine.command, mine.address, heard, good, f"the reply to {other}")
+
+    def check_foreign(self, foreign: Iterable[Foreign]) -> Iterator[str]:
+        for other in foreign:
+            yield from self._check_not_accepted(other.command, other.address, other.heard, set(), other.why)
+
+    def _check_not_accepted(
+        self, command: Command[Any], address: int, heard: bytes, good: set[bytes], why: str
+    ) -> Iterator[str]:
+        """`good` replies may stand at the front of `heard`: what follows them is left over and settles the line."""
+        self.tally["foreign"] += 1
+        ending = self.listen(command, address).feed(heard).expire()
+        taken = heard.removesuffix(ending.rest)
+        if (ending.delivered and taken not in good) or ending.is_whole or ending.is_bug:
+            yield f"{command} of {address}: {why}, {heard.hex(' ')}, gives {ending}"
+
+    # a device
+
+    def check_round_trip(self, trip: RoundTrip, device: Callable[[bytes], bytes] | None) -> Iterator[str]:
+        if device is None:
+            yield "round trips need a device"
+            return
+        for value in trip.values:
+            self.tally["round trips"] += 1
+            command = trip.write(value)
+            written = self._converse(command, trip.address, device)
+            if not written.delivered:
+                yield f"{command}: the device's answer gives {written}"
+                continue
+            read = self._converse(trip.read, trip.address, device)
+            if not read.delivered or read.value != trip.read_back(value):
+                yield f"{command}, then {trip.read} gives {read}"
+
+    def _converse(self, command: Command[Any], address: int, device: Callable[[bytes], bytes]) -> Ending:
+        listening = self.listen(command, address)
+        listening.feed(device(listening.exchange.request))
+        for said in listening.said:
+            listening.feed(device(said))
+        ending = listening.expire()
+        if ending.send:
+            device(ending.send)
+        return ending
+
+
+def _alike(one: Ending | None, other: Ending | None) -> bool:
+    return one is other if one is None or other is None else one.same_as(other)
+
+
+def _hex(parts: Iterable[bytes]) -> str:
+    return " | ".join(part.hex(" ") for part in parts)
