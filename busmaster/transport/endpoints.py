@@ -6,7 +6,7 @@ import asyncio
 import difflib
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Protocol
-from urllib.parse import SplitResult, parse_qsl, urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 from busmaster.errors import InvalidCommand
 from busmaster.profile import LineSettings
@@ -64,21 +64,21 @@ def is_paced(endpoint: Endpoint, transport: asyncio.BaseTransport) -> bool:
 def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | TcpPort:
     """The endpoint that `url` names: "/dev/ttyUSB0", "/dev/ttyUSB0?baudrate=9600&parity=E", "socket://host:port".
 
-    `defaults` fills the line settings that the URL leaves open (a TCP port takes the baud rate alone).
+    `defaults` fills the line settings that a serial port's URL leaves open; behind a TCP port they are the server's.
     Raises InvalidCommand, naming the nearest option, for anything that it does not understand.
     """
     if "://" not in url:
         path, _, query = url.partition("?")
         return _serial_port(path, _options(query, SERIAL_OPTIONS), defaults)
-    parts = urlsplit(url)
-    if parts.scheme == "rfc2217":
+    scheme, _, rest = url.partition("://")
+    if scheme == "rfc2217":
         raise InvalidCommand(
             "rfc2217:// does not work with any asyncio serial library: let the server pass raw TCP with the line "
-            f"settings fixed there, and use socket://{parts.netloc}"
+            f"settings fixed there, and use socket://{rest}"
         )
-    if parts.scheme != "socket":
-        raise InvalidCommand(f"no such kind of port: {parts.scheme}://; use a device path or socket://HOST:PORT")
-    return _tcp_port(parts, defaults)
+    if scheme != "socket":
+        raise InvalidCommand(f"no such kind of port: {scheme}://; use a device path or socket://HOST:PORT")
+    return _tcp_port(url)
 
 
 def _serial_port(path: str, options: dict[str, Any], defaults: LineSettings | None) -> SerialPort:
@@ -90,16 +90,15 @@ def _serial_port(path: str, options: dict[str, Any], defaults: LineSettings | No
     return SerialPort(path, **options)
 
 
-def _tcp_port(parts: SplitResult, defaults: LineSettings | None) -> TcpPort:
-    options = _options(parts.query, TCP_OPTIONS)
+def _tcp_port(url: str) -> TcpPort:
     try:
+        parts = urlsplit(url)
         host, port = parts.hostname, parts.port
     except ValueError:
         host, port = None, None
     if not host or port is None or parts.path not in ("", "/"):
-        raise InvalidCommand(f"{parts.geturl()!r} is not of the form socket://HOST:PORT")
-    if defaults is not None:
-        options.setdefault("baudrate", defaults.baudrate)
+        raise InvalidCommand(f"{url!r} is not of the form socket://HOST:PORT")
+    options = _options(parts.query, TCP_OPTIONS)
     return TcpPort(host, port, **options)
 
 

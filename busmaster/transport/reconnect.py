@@ -43,20 +43,20 @@ class Connection:
         self._first_delay = first_delay
         self._longest_delay = longest_delay
         self._jitter = jitter or random.Random()
-        self._tap: _Tap | None = None
+        self._link: _Link | None = None
         self._seen: Hashable | None = None
         self._closing = asyncio.Event()
 
     @property
     def connected(self) -> bool:
-        return self._tap is not None and not self._tap.lost.is_set()
+        return self._link is not None and not self._link.lost.is_set()
 
     async def open(self) -> None:
         """Open it once, now. Raises LineDown."""
         self._seen = self.endpoint.identity()
-        tap = _Tap(self.endpoint.name, self._protocol, self._closing)
-        await self.endpoint.open(lambda: tap)
-        self._tap = tap
+        link = _Link(self.endpoint.name, self._protocol, self._closing)
+        await self.endpoint.open(lambda: link)
+        self._link = link
         if self._closing.is_set():
             await self.close()
 
@@ -75,34 +75,34 @@ class Connection:
     async def close(self) -> None:
         """Close it and return when that is done, within CLOSE_DEADLINE whatever the driver or the network does."""
         self._closing.set()
-        tap = self._tap
-        if tap is None or tap.transport is None or tap.lost.is_set():
+        link = self._link
+        if link is None or link.transport is None or link.lost.is_set():
             return
-        tap.transport.close()
+        link.transport.close()
         try:
             async with asyncio.timeout(CLOSE_DEADLINE):
-                await tap.lost.wait()
+                await link.lost.wait()
         except TimeoutError:
             pass
         finally:
-            if not tap.lost.is_set():
-                tap.transport.abort()
+            if not link.lost.is_set():
+                link.transport.abort()
         await asyncio.sleep(0)  # an aborted transport says so at the next turn of the loop
 
     async def _stay(self) -> float:
         """Open it unless it is, and wait for the loss. Returns for how many seconds it was open."""
         loop = asyncio.get_running_loop()
         since = loop.time()
-        if self._tap is None:
+        if self._link is None:
             try:
                 await self.open()
             except LineDown as cause:
                 if self._on_failed is not None:
                     self._on_failed(cause)
-        if self._tap is None:
+        if self._link is None:
             return 0.0
-        await self._tap.lost.wait()
-        self._tap = None
+        await self._link.lost.wait()
+        self._link = None
         return loop.time() - since
 
     async def _wait(self, delay: float) -> bool:
@@ -123,7 +123,7 @@ class Connection:
         return False
 
 
-class _Tap(asyncio.Protocol):
+class _Link(asyncio.Protocol):
     """Stands between a transport and the protocol, to learn of the loss and to put it into words."""
 
     def __init__(self, name: str, protocol: asyncio.Protocol, closing: asyncio.Event) -> None:

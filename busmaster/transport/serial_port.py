@@ -298,7 +298,7 @@ def _equip(port: SerialPort, device: serial.Serial) -> None:
 
 def _refusal(port: SerialPort, error: Exception) -> LineDown:
     """Why it did not open, in words, and what to try."""
-    path, code = port.path, getattr(error, "errno", None)
+    path, code = port.path, _code(error)
     if code in (errno.EBUSY, errno.EAGAIN):
         owner = adapters.lock_owner(path) or next(iter(adapters.holders(path)), "another program")
         return LineDown(
@@ -314,9 +314,19 @@ def _refusal(port: SerialPort, error: Exception) -> LineDown:
         return LineDown(f"{path} does not take {port.baudrate} baud, {port.settings.framing}", hint="use another rate")
     if code in (errno.EIO, errno.ENXIO, errno.ENODEV):
         return LineDown(f"there is no hardware behind {path}", hint="see `python -m serial.tools.list_ports`")
-    if code is None or code == errno.ENOTTY:
+    if code in (errno.ENOTTY, errno.EISDIR):
         return LineDown(f"{path} is no serial port", hint="see `python -m serial.tools.list_ports`")
-    return LineDown(f"cannot open {path}: {os.strerror(code)}")
+    return LineDown(f"cannot open {path}: {error if code is None else os.strerror(code)}")
+
+
+def _code(error: Exception) -> int | None:
+    """The errno behind an error of pyserial, which hides some in its text."""
+    for raised in (error, error.__context__):
+        if isinstance(raised, termios.error):
+            return int(raised.args[0])
+        if isinstance(raised, OSError) and raised.errno is not None:
+            return raised.errno
+    return None
 
 
 def _release(device: serial.Serial, exclusive: bool) -> None:

@@ -1,0 +1,105 @@
+"""What the transport tests stand on: a protocol that notes what it hears, and the far end of a pty."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import select
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+PATIENCE = 2.0
+"""Seconds after which something that should happen has not."""
+
+
+class Recorder(asyncio.Protocol):
+    """Notes every callback, and can be waited for."""
+
+    def __init__(self) -> None:
+        self.transport: asyncio.Transport | None = None
+        self.connections = 0
+        self.received = b""
+        self.losses: list[Exception | None] = []
+        self.flow: list[str] = []
+        self._changed = asyncio.Event()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self.transport = transport
+        self.connections += 1
+        self._changed.set()
+
+    def data_received(self, data: bytes) -> None:
+        self.received += data
+        self._changed.set()
+
+    def pause_writing(self) -> None:
+        self.flow.append("pause")
+
+    def resume_writing(self) -> None:
+        self.flow.append("resume")
+        self._changed.set()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.losses.append(exc)
+        self._changed.set()
+
+    async def connected(self, times: int = 1) -> None:
+        """Return when it has been connected that often in all."""
+        await self.until(lambda _: self.connections >= times)
+
+    async def lost(self, times: int = 1) -> None:
+        """Return when `connection_lost` has been called that often in all."""
+        await self.until(lambda _: len(self.losses) >= times)
+
+    async def heard(self, end: bytes) -> None:
+        """Return when what was received ends with this."""
+        await self.until(lambda _: self.received.endswith(end))
+
+    async def until(self, condition: Callable[[Recorder], bool], patience: float = PATIENCE) -> None:
+        """Return when `condition` holds. Raises TimeoutError if it does not come to hold."""
+        async with asyncio.timeout(patience):
+            while not condition(self):
+                self._changed.clear()
+                await self._changed.wait()
+
+
+class FarEnd:
+    """The master side of a pty; `path` is where its port is opened."""
+
+    def __init__(self) -> None:
+        self.fd, slave = os.openpty()
+        self.path = os.ttyname(slave)
+        os.close(slave)
+        os.set_blocking(self.fd, False)
+
+    def read(self, patience: float = PATIENCE) -> bytes:
+        """What has arrived, after waiting for the first of it without turning the event loop."""
+        poller = select.poll()
+        poller.register(self.fd, select.POLLIN)
+        if not poller.poll(patience * 1000):
+            return b""
+        return os.read(self.fd, 65536)
+
+    def write(self, data: bytes) -> None:
+        os.write(self.fd, data)
+
+    def unplug(self) -> None:
+        if self.fd >= 0:
+            os.close(self.fd)
+            self.fd = -1
+
+
+@contextlib.contextmanager
+def plugged(link: Path | None = None) -> Iterator[FarEnd]:
+    """A fresh pty, with a symlink to it if one is wanted; unplugged at the end."""
+    far_end = FarEnd()
+    if link is not None:
+        link.symlink_to(far_end.path)
+    try:
+        yield far_end
+    finally:
+        far_end.unplug()
+        if link is not None:
+            link.unlink()

@@ -1,0 +1,86 @@
+"""The URLs that name an endpoint."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.errors import InvalidCommand
+from busmaster.profile import LineSettings
+from busmaster.transport.endpoints import Endpoint, endpoint
+from busmaster.transport.serial_port import SerialPort
+from busmaster.transport.tcp import TcpPort
+
+MENTOR = LineSettings(9600, 7, "E", 1)
+
+
+@pytest.mark.parametrize(
+    ("url", "port"),
+    [
+        ("/dev/ttyUSB0?baudrate=57600", SerialPort("/dev/ttyUSB0", baudrate=57600)),
+        (
+            "/dev/ttyUSB0?baudrate=4800&parity=even&bytesize=7&stopbits=2",
+            SerialPort("/dev/ttyUSB0", baudrate=4800, bytesize=7, parity="E", stopbits=2),
+        ),
+        (
+            "/dev/ttyS0?baudrate=9600&rs485=1&echo=true&low_latency=no&receive_latency=0.016&exclusive=off&paced=on",
+            SerialPort(
+                "/dev/ttyS0",
+                baudrate=9600,
+                rs485=True,
+                echo=True,
+                low_latency=False,
+                receive_latency=0.016,
+                exclusive=False,
+                paced=True,
+            ),
+        ),
+        ("line?baudrate=9600&rtscts=1&parity=n", SerialPort("line", baudrate=9600, rtscts=True)),
+        ("socket://server:4001", TcpPort("server", 4001)),
+        ("socket://[::1]:4001/", TcpPort("::1", 4001)),
+        (
+            "socket://server:4001?baudrate=9600&receive_latency=0.0033&echo=1&paced=1",
+            TcpPort("server", 4001, baudrate=9600, receive_latency=0.0033, echo=True, paced=True),
+        ),
+    ],
+)
+def test_a_url_says_what_the_constructor_says(url: str, port: Endpoint) -> None:
+    assert endpoint(url) == port
+
+
+def test_the_protocol_fills_in_what_the_url_leaves_open() -> None:
+    assert endpoint("/dev/ttyUSB0", defaults=MENTOR) == SerialPort(
+        "/dev/ttyUSB0", baudrate=9600, bytesize=7, parity="E"
+    )
+    assert endpoint("/dev/ttyUSB0?parity=O&baudrate=4800", defaults=MENTOR) == SerialPort(
+        "/dev/ttyUSB0", baudrate=4800, bytesize=7, parity="O"
+    )
+    assert endpoint("socket://server:4001", defaults=MENTOR) == TcpPort("server", 4001)
+
+
+@pytest.mark.parametrize(
+    ("url", "says"),
+    [
+        ("/dev/ttyUSB0", r"no baud rate given; write for example /dev/ttyUSB0\?baudrate=57600"),
+        ("/dev/ttyUSB0?baud=9600", "no such port option 'baud': did you mean 'baudrate'"),
+        ("/dev/ttyUSB0?pairity=E", "did you mean 'parity'"),
+        ("/dev/ttyUSB0?zzz=1", "no such port option 'zzz': use one of baudrate, bytesize, parity"),
+        ("/dev/ttyUSB0?baudrate=fast", "port option baudrate='fast': use a whole number"),
+        ("/dev/ttyUSB0?baudrate=9600&parity=", "port option parity='': use N, E, O, M or S"),
+        ("/dev/ttyUSB0?baudrate=9600&echo=maybe", "echo='maybe': use 1 or 0, true or false"),
+        ("/dev/ttyUSB0?baudrate=9600&stopbits=3", "stopbits='3': use 1, 1.5 or 2"),
+        ("/dev/ttyUSB0?baudrate=9600&receive_latency=16ms", "use a number of seconds, such as 0.016"),
+        ("?baudrate=9600", "a serial port needs a path"),
+        ("socket://server:4001?parity=E", "no such port option 'parity': use one of baudrate, echo"),
+        ("socket://server", "'socket://server' is not of the form socket://HOST:PORT"),
+        ("socket://:4001", "is not of the form"),
+        ("socket://server:port", "is not of the form"),
+        ("socket://server:70000", "is not of the form"),
+        ("socket://server:4001/dev/ttyS0", "is not of the form"),
+        ("socket://[::1:4001", "is not of the form"),
+        ("tcp://server:4001", "no such kind of port: tcp://; use a device path or socket://HOST:PORT"),
+        ("rfc2217://server:4001", "does not work with any asyncio serial library: .* use socket://server:4001"),
+    ],
+)
+def test_what_is_not_understood_is_named_with_what_would_do(url: str, says: str) -> None:
+    with pytest.raises(InvalidCommand, match=says):
+        endpoint(url)

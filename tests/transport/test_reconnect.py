@@ -1,0 +1,267 @@
+"""Connection: one endpoint kept connected, with back-off, on ptys, TCP ports and a port that is told to fail."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import AsyncIterator, Callable, Hashable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from busmaster.errors import LineDown
+from busmaster.profile import LineSettings
+from busmaster.transport import reconnect
+from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.reconnect import Connection
+from busmaster.transport.serial_port import SerialPort
+from busmaster.transport.tcp import TcpPort
+from tests.transport.fakes import FarEnd, Recorder, plugged
+
+
+@asynccontextmanager
+async def kept(endpoint: Endpoint, recorder: Recorder, **options: Any) -> AsyncIterator[Connection]:
+    """A connection that runs in the background."""
+    connection = Connection(endpoint, recorder, **options)
+    running = asyncio.ensure_future(connection.run())
+    try:
+        yield connection
+    finally:
+        await connection.close()
+        async with asyncio.timeout(1):
+            await running
+
+
+class Wire(asyncio.Transport):
+    """A transport without anything behind it. `stuck`: closing it takes for ever."""
+
+    def __init__(self, protocol: asyncio.Protocol, stuck: bool) -> None:
+        super().__init__()
+        self.protocol = protocol
+        self.stuck = stuck
+        self.aborted = False
+
+    def close(self) -> None:
+        if not self.stuck:
+            self.lose(None)
+
+    def abort(self) -> None:
+        self.aborted = True
+        self.lose(None)
+
+    def lose(self, cause: Exception | None) -> None:
+        asyncio.get_running_loop().call_soon(self.protocol.connection_lost, cause)
+
+
+class Told:
+    """An endpoint that fails as often as it is told to."""
+
+    name = "told"
+    settings: LineSettings | None = None
+    echo = False
+    receive_latency = 0.0
+    paced: bool | None = False
+
+    def __init__(self, failures: float = 0, stuck: bool = False) -> None:
+        self.failures = failures
+        self.stuck = stuck
+        self.attempts: list[float] = []
+        self.wires: list[Wire] = []
+        self.device: Hashable | None = None
+        self.attempted = asyncio.Event()
+
+    def identity(self) -> Hashable | None:
+        return self.device
+
+    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> asyncio.Transport:
+        self.attempts.append(asyncio.get_running_loop().time())
+        self.attempted.set()
+        if len(self.attempts) <= self.failures:
+            raise LineDown("told does not exist")
+        wire = Wire(protocol_factory(), self.stuck)
+        self.wires.append(wire)
+        wire.protocol.connection_made(wire)
+        return wire
+
+    @property
+    def pauses(self) -> list[float]:
+        return [after - before for before, after in zip(self.attempts, self.attempts[1:], strict=False)]
+
+
+# -- opening ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.asyncio
+async def test_the_first_opening_says_why_it_failed() -> None:
+    recorder = Recorder()
+    connection = Connection(Told(failures=1), recorder)
+    with pytest.raises(LineDown, match="told does not exist"):
+        await connection.open()
+    assert recorder.connections == 0
+    await connection.open()
+    assert connection.connected
+    await connection.close()
+    assert recorder.losses == [None]
+
+
+@pytest.mark.asyncio
+async def test_attempts_back_off_by_doubling_up_to_the_longest_delay_and_are_reported() -> None:
+    told, recorder, causes = Told(failures=5), Recorder(), list[LineDown]()
+    async with kept(told, recorder, first_delay=0.004, longest_delay=0.016, on_failed=causes.append):
+        await recorder.connected()
+    least = [0.75 * delay for delay in (0.004, 0.008, 0.016, 0.016, 0.016)]
+    assert all(pause >= delay for pause, delay in zip(told.pauses, least, strict=True))
+    assert [str(cause) for cause in causes] == [str(LineDown("told does not exist"))] * 5
+
+
+@pytest.mark.asyncio
+async def test_delays_are_spread_by_a_seeded_source() -> None:
+    asked = []
+
+    class Chance(random.Random):
+        def uniform(self, a: float, b: float) -> float:
+            asked.append((a, b))
+            return 0.0
+
+    told, recorder = Told(failures=20), Recorder()
+    async with kept(told, recorder, jitter=Chance()):
+        await recorder.connected()
+    assert asked == [(0.75, 1.25)] * 20
+
+
+@pytest.mark.asyncio
+async def test_a_port_that_opens_and_is_lost_at_once_is_not_hammered() -> None:
+    told, recorder = Told(), Recorder()
+    async with kept(told, recorder, first_delay=0.002):
+        for n in range(1, 5):
+            await recorder.connected(n)
+            told.wires[-1].lose(None)
+        await recorder.connected(5)
+    assert all(pause >= 0.75 * 0.002 * 2**n for n, pause in enumerate(told.pauses))
+
+
+@pytest.mark.asyncio
+async def test_a_device_that_is_seen_to_return_is_not_kept_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reconnect, "LOOK_EVERY", 0.001)
+    told, recorder = Told(failures=1), Recorder()
+    async with kept(told, recorder, first_delay=60.0):
+        await told.attempted.wait()
+        told.device = "back"
+        await recorder.connected()
+
+
+# -- losing it -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cause", "says"),
+    [
+        (None, "told was closed by the other end; "),
+        (ConnectionResetError(104, "Connection reset by peer"), "told was lost: Connection reset by peer; "),
+        (RuntimeError("odd"), "told was lost: odd; "),
+        (LineDown("gone"), "gone; "),
+    ],
+)
+@pytest.mark.asyncio
+async def test_every_loss_has_a_cause_in_words(cause: Exception | None, says: str) -> None:
+    told, recorder = Told(), Recorder()
+    async with kept(told, recorder):
+        await recorder.connected()
+        told.wires[0].lose(cause)
+        await recorder.lost()
+        assert isinstance(recorder.losses[0], LineDown)
+        assert str(recorder.losses[0]).startswith(says)
+
+
+@pytest.mark.asyncio
+async def test_a_pty_that_is_unplugged_and_comes_back_at_its_link_is_picked_up(tmp_path: Path) -> None:
+    link, recorder = tmp_path / "line", Recorder()
+    async with kept(SerialPort(str(link), baudrate=57600), recorder):
+        for n in range(3):
+            with plugged(link) as far_end:
+                await recorder.connected(n + 1)
+                far_end.write(b"%d" % n)
+                await recorder.heard(b"%d" % n)
+                assert recorder.transport is not None
+                recorder.transport.write(b"hello")
+                assert far_end.read() == b"hello"
+            await recorder.lost(n + 1)
+    assert all(isinstance(loss, LineDown) for loss in recorder.losses)
+
+
+@pytest.mark.asyncio
+async def test_a_server_that_is_restarted_is_connected_to_again() -> None:
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(await reader.read(100))
+        writer.close()
+
+    server = await asyncio.start_server(answer, "127.0.0.1", 0)
+    address = server.sockets[0].getsockname()
+    recorder = Recorder()
+    async with kept(TcpPort(*address), recorder, first_delay=0.001):
+        await recorder.connected()
+        server.close()
+        assert recorder.transport is not None
+        recorder.transport.write(b"one")
+        await recorder.lost()
+        assert recorder.received == b"one"
+        assert "closed by the other end" in str(recorder.losses[0])
+        server = await asyncio.start_server(answer, *address)
+        await recorder.connected(2)
+    assert recorder.losses[1:] == [None]
+    server.close()
+
+
+# -- closing ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.asyncio
+async def test_closing_ends_a_run_that_waits_for_its_next_attempt() -> None:
+    told = Told(failures=float("inf"))
+    async with kept(told, Recorder(), first_delay=60.0):
+        await told.attempted.wait()
+
+
+@pytest.mark.asyncio
+async def test_closing_while_an_opening_is_under_way_closes_what_it_opens(tmp_path: Path) -> None:
+    with plugged() as far_end:
+        recorder = Recorder()
+        connection = Connection(SerialPort(far_end.path, baudrate=57600), recorder)
+        opening = asyncio.ensure_future(connection.open())
+        await asyncio.sleep(0)
+        await connection.close()
+        await opening
+        assert recorder.connections == 1
+        assert recorder.losses == [None]
+
+
+@pytest.mark.asyncio
+async def test_a_transport_that_never_closes_is_aborted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reconnect, "CLOSE_DEADLINE", 0.01)
+    told, recorder = Told(stuck=True), Recorder()
+    connection = Connection(told, recorder)
+    await connection.open()
+    await connection.close()
+    assert told.wires[0].aborted
+    assert recorder.losses == [None]
+    await connection.close()
+
+
+@pytest.mark.asyncio
+async def test_flow_control_reaches_the_protocol() -> None:
+    with plugged() as far_end:
+        await _flood(far_end)
+
+
+async def _flood(far_end: FarEnd) -> None:
+    recorder = Recorder()
+    async with kept(SerialPort(far_end.path, baudrate=57600), recorder):
+        await recorder.connected()
+        assert recorder.transport is not None
+        recorder.transport.write(bytes(200_000))
+        while "resume" not in recorder.flow:
+            far_end.read(patience=0.001)
+            await asyncio.sleep(0)
+    assert recorder.flow == ["pause", "resume"]

@@ -1,0 +1,459 @@
+"""SerialPort on real ptys: every trap of pyserial-asyncio that it mends."""
+
+from __future__ import annotations
+
+import array
+import asyncio
+import errno
+import fcntl
+import os
+import resource
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+from serial.rs485 import RS485Settings
+
+from busmaster.errors import InvalidCommand, LineDown
+from busmaster.transport import serial_port
+from busmaster.transport.endpoints import is_paced
+from busmaster.transport.serial_port import PortTransport, SerialPort
+from tests.transport.fakes import FarEnd, Recorder, plugged
+
+TIOCGEXCL = 0x80045440
+
+
+@pytest.fixture
+def far_end() -> Iterator[FarEnd]:
+    with plugged() as end:
+        yield end
+
+
+async def opened(path: str, **options: Any) -> tuple[PortTransport, Recorder]:
+    recorder = Recorder()
+    transport = await SerialPort(path, baudrate=57600, **options).open(lambda: recorder)
+    return transport, recorder
+
+
+async def closed(transport: PortTransport, recorder: Recorder) -> None:
+    transport.close()
+    await recorder.lost()
+
+
+# -- what it is ------------------------------------------------------------------------------------------------------
+
+
+def test_a_port_is_a_value() -> None:
+    assert SerialPort("/dev/ttyUSB0", baudrate=9600) == SerialPort("/dev/ttyUSB0", baudrate=9600)
+    assert SerialPort("/dev/ttyUSB0", baudrate=9600, parity="E", bytesize=7).settings.framing == "7E1"
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"baudrate": 0}, "baudrate"),
+        ({"bytesize": 9}, "framing"),
+        ({"parity": "X"}, "framing"),
+        ({"stopbits": 3}, "framing"),
+        ({"receive_latency": -0.1}, "receive_latency"),
+        ({"receive_latency": float("nan")}, "receive_latency"),
+        ({"rtscts": True, "rs485": True}, "exclude each other"),
+        ({"path": ""}, "path"),
+    ],
+)
+def test_values_that_no_port_can_have_are_refused_when_it_is_built(options: dict[str, Any], says: str) -> None:
+    values: dict[str, Any] = {"path": "/dev/ttyUSB0", "baudrate": 9600} | options
+    with pytest.raises(InvalidCommand, match=says):
+        SerialPort(**values)
+
+
+@pytest.mark.asyncio
+async def test_bytes_go_both_ways_unchanged(far_end: FarEnd) -> None:
+    transport, recorder = await opened(far_end.path)
+    assert recorder.connections == 1
+    every_byte = bytes(range(256))
+    transport.write(every_byte)
+    assert far_end.read() == every_byte
+    far_end.write(every_byte)
+    await recorder.until(lambda r: len(r.received) == 256)
+    assert recorder.received == every_byte
+    await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_a_pty_is_unpaced_unless_told(far_end: FarEnd) -> None:
+    for told, expected in ((None, False), (True, True), (False, False)):
+        transport, recorder = await opened(far_end.path, paced=told)
+        assert transport.get_extra_info("paced") is expected
+        assert is_paced(SerialPort(far_end.path, baudrate=57600, paced=told), transport) is expected
+        await closed(transport, recorder)
+
+
+# -- writing ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.asyncio
+async def test_a_write_on_an_empty_buffer_leaves_in_the_same_call(far_end: FarEnd) -> None:
+    transport, recorder = await opened(far_end.path)
+    transport.write(bytes.fromhex("07 30 35"))
+    assert far_end.read() == bytes.fromhex("07 30 35")  # the loop has not turned since
+    await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_what_the_driver_does_not_take_follows_in_order_and_pauses_the_protocol_meanwhile(
+    far_end: FarEnd,
+) -> None:
+    transport, recorder = await opened(far_end.path)
+    flood = b"".join(b"%07d\n" % n for n in range(40_000))
+    transport.write(flood[:300_000])
+    transport.write(flood[300_000:])
+    assert recorder.flow == ["pause"]
+    arrived = b""
+    while len(arrived) < len(flood):
+        arrived += far_end.read(patience=0.001)
+        await asyncio.sleep(0)
+    assert arrived == flood
+    await recorder.until(lambda r: r.flow == ["pause", "resume"])
+    assert transport.get_write_buffer_size() == 0
+    transport.write(b"next")
+    assert far_end.read() == b"next"
+    await closed(transport, recorder)
+
+
+# -- losing it -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.asyncio
+async def test_a_hang_up_is_reported_at_once_and_once(far_end: FarEnd) -> None:
+    transport, recorder = await opened(far_end.path)
+    far_end.unplug()
+    await recorder.lost()
+    assert isinstance(recorder.losses[0], LineDown)
+    assert str(recorder.losses[0]).startswith(f"{far_end.path} was lost: it hung up; ")
+    transport.write(b"x")
+    transport.close()
+    transport.abort()
+    await asyncio.sleep(0.01)
+    assert len(recorder.losses) == 1
+
+
+@pytest.mark.asyncio
+async def test_a_write_to_a_lost_port_reports_the_loss_and_not_from_within_the_write(far_end: FarEnd) -> None:
+    transport, recorder = await opened(far_end.path)
+    far_end.unplug()
+    transport.write(b"x")
+    assert recorder.losses == []
+    assert transport.is_closing()
+    transport.write(b"y")
+    await recorder.lost()
+    await asyncio.sleep(0.01)
+    assert len(recorder.losses) == 1
+    assert isinstance(recorder.losses[0], LineDown)
+
+
+@pytest.mark.asyncio
+async def test_a_port_lost_with_output_waiting_reports_the_loss(far_end: FarEnd) -> None:
+    transport, recorder = await opened(far_end.path)
+    transport.write(bytes(300_000))
+    far_end.unplug()
+    await recorder.lost()
+    assert isinstance(recorder.losses[0], LineDown)
+
+
+@pytest.mark.asyncio
+async def test_being_woken_with_nothing_to_read_is_no_loss(far_end: FarEnd) -> None:
+    transport, recorder = await opened(far_end.path)
+    transport._read_ready()  # as when another program reads the port too, and was quicker
+    await asyncio.sleep(0)
+    assert recorder.losses == []
+    await closed(transport, recorder)
+
+
+# -- closing ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.asyncio
+async def test_closing_a_stopped_line_does_not_wait_for_its_output(far_end: FarEnd) -> None:
+    transport, recorder = await opened(far_end.path)
+    transport.write(bytes(300_000))
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    transport.close()
+    assert loop.time() - began < 0.1
+    await recorder.lost()
+    assert loop.time() - began < serial_port.CLOSE_DEADLINE
+    assert recorder.losses == [None]
+
+
+@pytest.mark.asyncio
+async def test_a_driver_that_never_lets_go_delays_a_close_by_its_deadline_alone(
+    far_end: FarEnd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    transport, recorder = await opened(far_end.path)
+    letting_go = threading.Event()
+    monkeypatch.setattr(termios, "tcflush", lambda *_: letting_go.wait())
+    monkeypatch.setattr(serial_port, "CLOSE_DEADLINE", 0.02)
+    transport.close()
+    assert recorder.losses == []
+    await recorder.lost()
+    letting_go.set()
+    await asyncio.sleep(0.02)
+    assert recorder.losses == [None]
+
+
+@pytest.mark.asyncio
+async def test_an_abort_does_not_wait_for_the_driver(far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
+    transport, recorder = await opened(far_end.path)
+    letting_go = threading.Event()
+    monkeypatch.setattr(termios, "tcflush", lambda *_: letting_go.wait())
+    transport.close()
+    transport.abort()
+    await asyncio.sleep(0)
+    assert recorder.losses == [None]
+    letting_go.set()
+
+
+# -- opening ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def slow_driver(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+    """Opening any port waits for this event."""
+    ready = threading.Event()
+    really_open = serial.Serial.open
+
+    def open_slowly(device: serial.Serial) -> None:
+        ready.wait()
+        really_open(device)
+
+    monkeypatch.setattr(serial.Serial, "open", open_slowly)
+    yield ready
+    ready.set()
+
+
+@pytest.mark.asyncio
+async def test_a_slow_opening_leaves_the_loop_free(far_end: FarEnd, slow_driver: threading.Event) -> None:
+    opening = asyncio.ensure_future(opened(far_end.path))
+    await asyncio.sleep(0.02)
+    assert not opening.done()
+    slow_driver.set()
+    await closed(*await opening)
+
+
+@pytest.mark.asyncio
+async def test_an_opening_that_does_not_come_back_is_given_up_and_its_port_released(
+    far_end: FarEnd, slow_driver: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serial_port, "OPEN_DEADLINE", 0.02)
+    with pytest.raises(LineDown, match="did not open within"):
+        await opened(far_end.path)
+    monkeypatch.setattr(serial_port, "OPEN_DEADLINE", 10.0)
+    slow_driver.set()
+    await closed(*await _opened_in_the_end(far_end.path))
+
+
+@pytest.mark.asyncio
+async def test_a_cancelled_opening_releases_its_port(far_end: FarEnd, slow_driver: threading.Event) -> None:
+    opening = asyncio.ensure_future(opened(far_end.path))
+    await asyncio.sleep(0)
+    opening.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    slow_driver.set()
+    await closed(*await _opened_in_the_end(far_end.path))
+
+
+async def _opened_in_the_end(path: str) -> tuple[PortTransport, Recorder]:
+    async with asyncio.timeout(2):
+        while True:
+            try:
+                return await opened(path)
+            except LineDown:
+                await asyncio.sleep(0.001)
+
+
+@pytest.mark.asyncio
+async def test_the_port_is_configured_in_a_thread_alone(far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
+    threads = set()
+    really_ask = termios.tcgetattr
+
+    def ask(descriptor: int) -> list[Any]:
+        threads.add(threading.current_thread())
+        return really_ask(descriptor)
+
+    monkeypatch.setattr(termios, "tcgetattr", ask)  # each configuration begins with it
+    transport, recorder = await opened(far_end.path)
+    assert len(threads) == 1
+    assert threading.main_thread() not in threads
+    await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_descriptors_above_1023_work() -> None:
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if limit[1] != resource.RLIM_INFINITY and limit[1] < 1200:
+        pytest.skip("the system allows this process no such descriptors")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(limit[0], 1200), limit[1]))
+    taken: list[int] = []
+    try:
+        while not taken or taken[-1] < 1030:
+            taken.append(os.open(os.devnull, os.O_RDONLY))
+        with plugged() as far_end:
+            transport, recorder = await opened(far_end.path)
+            assert transport.get_extra_info("serial").fileno() > 1023
+            transport.write(b"ping")
+            assert far_end.read() == b"ping"
+            far_end.write(b"pong")
+            await recorder.heard(b"pong")
+            await closed(transport, recorder)
+    finally:
+        for descriptor in taken:
+            os.close(descriptor)
+        resource.setrlimit(resource.RLIMIT_NOFILE, limit)
+
+
+# -- sole use --------------------------------------------------------------------------------------------------------
+
+
+def _taken(path: str) -> tuple[bool, bool]:
+    """Whether it is flocked, and whether TIOCEXCL is set."""
+    descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        flag = array.array("i", [0])
+        fcntl.ioctl(descriptor, TIOCGEXCL, flag)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True, bool(flag[0])
+        return False, bool(flag[0])
+    finally:
+        os.close(descriptor)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may look into a port that is exclusive")
+@pytest.mark.asyncio
+async def test_both_locks_are_taken_and_given_back(far_end: FarEnd) -> None:
+    bystander = os.open(far_end.path, os.O_RDWR | os.O_NOCTTY)  # keeps the pty, and with it a forgotten flag, alive
+    transport, recorder = await opened(far_end.path)
+    assert _taken(far_end.path) == (True, True)
+    await closed(transport, recorder)
+    assert _taken(far_end.path) == (False, False)
+    transport, recorder = await opened(far_end.path, exclusive=False)
+    assert _taken(far_end.path) == (False, False)
+    await closed(transport, recorder)
+    os.close(bystander)
+
+
+@pytest.mark.asyncio
+async def test_a_second_opening_says_that_this_program_has_it(far_end: FarEnd) -> None:
+    transport, recorder = await opened(far_end.path)
+    with pytest.raises(LineDown, match=f"{far_end.path} is in use by this program; "):
+        await opened(far_end.path)
+    await closed(transport, recorder)
+    await closed(*await opened(far_end.path))
+
+
+@pytest.fixture
+def locked_elsewhere(far_end: FarEnd) -> Iterator[int]:
+    """The id of another process that has locked the port."""
+    lock = f"import fcntl; f = open({far_end.path!r}); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
+    with subprocess.Popen([sys.executable, "-ISc", lock], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdin is not None
+        assert other.stdout is not None
+        other.stdout.readline()
+        yield other.pid
+        other.communicate(b"\n")
+
+
+@pytest.mark.asyncio
+async def test_a_second_opening_says_which_other_program_has_it(far_end: FarEnd, locked_elsewhere: int) -> None:
+    with pytest.raises(LineDown, match=rf"is in use by python\S* \(process {locked_elsewhere}\)"):
+        await opened(far_end.path)
+
+
+# -- what only some drivers have -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("option", "says"), [("rs485", "no RS-485 mode; leave rs485 out"), ("low_latency", "no low-latency flag; leave")]
+)
+@pytest.mark.asyncio
+async def test_a_driver_without_it_is_named_and_the_port_released(far_end: FarEnd, option: str, says: str) -> None:
+    with pytest.raises(LineDown, match=f"the driver of {far_end.path} has {says}"):
+        await opened(far_end.path, **{option: True})
+    await closed(*await opened(far_end.path))
+
+
+@pytest.mark.asyncio
+async def test_driver_extras_are_touched_only_when_asked_for(far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(serial.Serial, "_set_rs485_mode", lambda _, settings: asked.append(settings))
+    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda _, flag: asked.append(flag))
+    await closed(*await opened(far_end.path))
+    assert asked == []
+    settings = RS485Settings(rts_level_for_tx=False, rts_level_for_rx=True)
+    recorder = Recorder()
+    port = SerialPort(far_end.path, baudrate=57600, rs485=settings, low_latency=False)
+    await closed(await port.open(lambda: recorder), recorder)
+    assert asked == [settings, False]
+    asked.clear()
+    await closed(*await opened(far_end.path, rs485=True, low_latency=True))
+    assert asked[0].rts_level_for_tx is True
+    assert asked[1] is True
+
+
+# -- refusals --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.asyncio
+async def test_a_missing_port_is_said_to_be_missing(tmp_path: Path) -> None:
+    with pytest.raises(LineDown, match=r"/no-port does not exist; plug it in"):
+        await opened(str(tmp_path / "no-port"))
+
+
+@pytest.mark.asyncio
+async def test_a_dangling_link_says_where_it_points(tmp_path: Path) -> None:
+    link = tmp_path / "port"
+    link.symlink_to("/dev/pts/99999")
+    with pytest.raises(LineDown, match=r"/port does not exist: it points to /dev/pts/99999, which is gone"):
+        await opened(str(link))
+
+
+@pytest.mark.asyncio
+async def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file", tmp_path, Path(os.devnull)):
+        with pytest.raises(LineDown, match="is no serial port; see"):
+            await opened(str(path))
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (serial.SerialException(errno.EACCES, "denied"), r"no permission to open .*; join its group"),
+        (serial.SerialException(errno.EBUSY, "busy"), "is in use by another program"),
+        (serial.SerialException(errno.ENXIO, "nothing"), "there is no hardware behind"),
+        (termios.error(errno.EIO, "Input/output error"), "there is no hardware behind"),
+        (ValueError("Failed to set custom baud rate"), "does not take 57600 baud, 8N1"),
+        (OSError(errno.EMFILE, "too many"), "Too many open files"),
+    ],
+)
+@pytest.mark.asyncio
+async def test_every_refusal_is_one_sentence_about_the_port(
+    far_end: FarEnd, monkeypatch: pytest.MonkeyPatch, error: Exception, says: str
+) -> None:
+    def refuse(_: serial.Serial) -> None:
+        raise error
+
+    monkeypatch.setattr(serial.Serial, "open", refuse)
+    with pytest.raises(LineDown, match=says) as caught:
+        await opened(far_end.path)
+    assert far_end.path in str(caught.value)
+    assert caught.value.__cause__ is None
