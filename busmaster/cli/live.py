@@ -176,9 +176,12 @@ class Screen(App[None]):
 
     async def listen(self, connection: socket.socket) -> None:
         reader, self.writer = await asyncio.open_connection(sock=connection, limit=FRAME_LIMIT)
-        while line := await reader.readline():
-            self.take_frame(decode_frame(line))
-        self.exit()
+        try:
+            while line := await reader.readline():
+                self.take_frame(decode_frame(line))
+            self.exit()
+        finally:
+            self.writer.close()
 
     def send(self, action: Action) -> None:
         if self.writer is not None and not self.writer.is_closing():

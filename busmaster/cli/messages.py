@@ -63,7 +63,10 @@ class Frame(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Action(msgspec.Struct, array_like=True, frozen=True):
-    """What the person asks: `quit`, or `interrupt` (Ctrl-C); `pause` (or go on with) and `demand` a group; `suspend` a node; `write` a point."""
+    """What the person asks.
+
+    `quit`, or `interrupt` (Ctrl-C); `pause` (or go on with) and `demand` a group; `suspend` a node; `write` a point.
+    """
 
     kind: Literal["quit", "interrupt", "pause", "demand", "suspend", "write"]
     target: str = ""

@@ -1,0 +1,68 @@
+"""Values as they are printed: shortest exact, words with their names, sets by their numbers."""
+
+from __future__ import annotations
+
+import enum
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from busmaster.cli.output import json_value, number_text, value_text
+
+
+class Status(enum.IntFlag):
+    PROGRAM_RUNNING = 1
+    ERROR = 2
+    AUTO_START_ENABLED = 64
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (12.5, "12.5"),
+        (-0.0001, "-0.0001"),
+        (1234.0, "1234"),
+        (1234, "1234"),
+        (-0.0, "0"),
+        (0.1 + 0.2, "0.30000000000000004"),
+        (1e22, "10000000000000000000000"),
+        (1e-7, "0.0000001"),
+        (True, "1"),
+        (Status(65), "65 PROGRAM_RUNNING|AUTO_START_ENABLED"),
+        (Status(0), "0"),
+        (Status(1 | 128), "129 PROGRAM_RUNNING|0x80"),
+        (frozenset({31, 0, 5}), "0,5,31"),
+        (frozenset(), "none"),
+        ((1.5, 2.0), "1.5,2"),
+        (None, "-"),
+    ],
+)
+def test_a_value_is_printed_shortest_and_exact(value: Any, text: str) -> None:
+    assert value_text(value) == text
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_a_printed_number_reads_back_as_itself_and_has_no_exponent(number: float) -> None:
+    text = number_text(number)
+    assert float(text) == number
+    assert "e" not in text
+    assert "." not in text or not text.endswith(("0", "."))
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (12.5, "12.5"),
+        (3.0, "3"),
+        (float("nan"), "null"),
+        (None, "null"),
+        (Status(65), "65"),
+        (frozenset({31, 0, 5}), "[0, 5, 31]"),
+        ((1.0, -2.5), "[1, -2.5]"),
+    ],
+)
+def test_json_has_words_as_numbers_and_sets_and_runs_as_lists(value: Any, text: str) -> None:
+    assert json.dumps(json_value(value)) == text

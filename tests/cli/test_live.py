@@ -1,0 +1,119 @@
+"""The screen, drawn in a terminal of given size: what stands on it, and what its keys send."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+from rich.cells import cell_len
+
+from busmaster.cli.live import COLUMNS, Screen, age_text, clock_text, column_widths, sparkline
+from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row, decode_action, decode_frame, encode
+
+
+def frame(rows: int = 3, *, now: float = 61.0, paused: bool = False) -> Frame:
+    points = [Row(f"node {n}", "axis0.position", f"{n}.5", "mm", n + 0.5, 0.1) for n in range(1, rows)]
+    return Frame(
+        title="busmaster poll",
+        port="/dev/ttyUSB0  57600 8N1",
+        now=now,
+        line="ready",
+        utilisation=0.53,
+        backlog=2,
+        rows=(*points, Row("node 9", "axis0.position", "-", "mm", None, 12.3, False, "no reply within 100 ms")),
+        nodes=(*(NodeRow(f"node {n}", "up", 10, 0, 0.0031, 0.004) for n in range(1, rows)), NodeRow("node 9", "down")),
+        groups=(GroupRow("axes", 0.2, 0.2, 0.2011, 61, 1, paused),),
+        events=("   3.1 s  node 9 is down, was suspect",),
+    )
+
+
+def picture(screen: Screen) -> list[str]:
+    return ["".join(segment.text for segment in strip) for strip in screen.screen._compositor.render_strips()]
+
+
+@pytest.mark.asyncio
+async def test_the_picture_fits_80_by_24_and_says_what_the_frame_says() -> None:
+    screen = Screen(None)
+    async with screen.run_test(size=(80, 24)) as pilot:
+        screen.take_frame(frame())
+        await pilot.pause()
+        lines = picture(screen)
+    assert len(lines) == 24
+    assert {cell_len(line) for line in lines} == {80}
+    text = "\n".join(lines)
+    assert "busmaster poll  /dev/ttyUSB0  57600 8N1" in lines[0]
+    assert "0:01:01" in lines[0]
+    assert "53% busy  ready  2 waiting" in lines[1]
+    assert "axes every 200 ms, achieved 200.0 (p99 201.1)  cycle 61  missed 1" in lines[2]
+    assert "node 1    axis0.position" in text
+    assert "node 9 is down, was suspect" in text
+    assert "quit" in lines[-1]
+    dead = next(line for line in lines if line.strip().startswith("node 9") and "axis0" in line)
+    assert dead.split()[2:] == ["-", "mm", "12s", "down"]
+
+
+@pytest.mark.asyncio
+async def test_columns_stay_aligned_when_values_change_and_the_terminal_grows() -> None:
+    screen = Screen(None)
+    async with screen.run_test(size=(80, 24)) as pilot:
+        screen.take_frame(frame())
+        await pilot.resize_terminal(120, 40)
+        for now in range(5):
+            screen.take_frame(frame(now=now))
+        await pilot.pause()
+        lines = picture(screen)
+    header = next(line for line in lines if "VALUE" in line)
+    row = next(line for line in lines if "1.5" in line)
+    assert header.index("VALUE") + len("VALUE") == row.index("1.5") + len("1.5")
+    assert header.index("HEALTH") == row.index("up")
+    assert {cell_len(line) for line in lines} == {120}
+
+
+@pytest.mark.asyncio
+async def test_keys_send_actions_and_ctrl_c_is_told_from_quit() -> None:
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)
+    screen = Screen(theirs)
+    with ours:
+        async with screen.run_test(size=(80, 24)) as pilot:
+            ours.sendall(encode(frame()))
+            while screen.frame is None:
+                await pilot.pause()
+            await pilot.press("p", "d", "ctrl+c")
+            await pilot.pause()
+        received = ours.recv(4096).splitlines()
+    assert list(map(decode_action, received)) == [
+        Action("pause", "axes"),
+        Action("demand", "axes"),
+        Action("interrupt"),
+    ]
+
+
+def test_messages_come_back_as_they_were_sent() -> None:
+    assert decode_frame(encode(frame())) == frame()
+    assert decode_action(encode(Action("write", "5/1", "2.5"))) == Action("write", "5/1", "2.5")
+    assert encode(frame()).count(b"\n") == 1
+
+
+def test_the_narrowest_terminal_is_80_columns_and_wider_ones_are_used() -> None:
+    assert sum(COLUMNS.values()) + 2 * len(COLUMNS) == 80
+    for width in range(80, 114):
+        assert sum(column_widths(width).values()) + 2 * len(COLUMNS) == width
+
+
+def test_a_trend_spans_its_own_lowest_and_highest_and_shows_gaps() -> None:
+    assert sparkline([0.0, None, 1.0]) == "▁ █"
+    assert sparkline([5.0, 5.0]) == "▁▁"
+    assert sparkline([None, None]) == ""
+
+
+def test_ages_and_clocks_fit_their_columns() -> None:
+    assert [age_text(age) for age in (None, 0.04, 9.94, 12.3, 599, 6000)] == [
+        "-",
+        "0.0s",
+        "9.9s",
+        "12s",
+        "599s",
+        "100m",
+    ]
+    assert clock_text(3661.9) == "1:01:01"
