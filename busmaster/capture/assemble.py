@@ -1,0 +1,183 @@
+"""From what was sent and heard to the packets of a capture: one a frame, each exchange with its outcome.
+
+The outcome is the master's where it came in time, else the listener's own reading of the frames. The master tells it
+only after it has sent the next request, so an exchange is held back until then: at most two are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from busmaster.capture.decode import Decoder
+from busmaster.capture.dialects import dialect, protocol_of
+from busmaster.capture.frames import UNASKED, Frame, Kind
+from busmaster.capture.pcapng import Direction, Outcome, Packet
+
+SAME_CALLBACK = 0.005
+"""Seconds: a verdict that comes later than this after a request is not of the exchange before it."""
+_BROADCAST = ("mentor", 0)
+
+
+class Verdict(NamedTuple):
+    """What the master made of an exchange. `outcome` None: the frames say it better (an unconfirmed write)."""
+
+    request: bytes
+    outcome: Outcome | None
+    comment: str
+
+
+class _Held:
+    """One exchange whose packets wait for its verdict."""
+
+    def __init__(self, request: Frame | None, protocol: str = "") -> None:
+        self.request = request
+        self.broadcast = request is not None and (protocol, request.node) == _BROADCAST
+        self.last: Frame | None = None
+        self.packets: list[Packet] = []
+        self.answer: Packet | None = None
+        self.verdict: Verdict | None = None
+        self.released = False
+
+    def is_of(self, verdict: Verdict) -> bool:
+        return not self.released and self.request is not None and self.request.raw == verdict.request
+
+    def judge(self) -> tuple[Outcome, str]:
+        """By the frames alone."""
+        asked, last = self.request, self.last
+        if asked is None:
+            return Outcome.NONE, ""
+        if last is None:
+            return (Outcome.OK, "") if self.broadcast else (Outcome.NO_REPLY, "no reply")
+        if last.fault:
+            return Outcome.GARBLED, last.fault
+        if last.kind in (Kind.NAK, Kind.EOT):
+            return Outcome.REFUSED, ""
+        if last.kind is Kind.ACK and asked.kind is Kind.READ:
+            return Outcome.NO_REPLY, "nothing came after the ACK"
+        return Outcome.OK, ""
+
+
+class Assembler:
+    """Makes packets and hands them to `write`, in order. `now` is in seconds, and `offset` what makes it 1970's.
+
+    `protocol` is only needed for what cannot be told from requests: "microflex", or a line that is listened to.
+    """
+
+    def __init__(self, write: Callable[[Packet], object], *, protocol: str = "", offset: float = 0.0) -> None:
+        self._write = write
+        self._declared = protocol
+        self._offset = offset
+        self._decoders: dict[str, Decoder] = {}
+        self._protocol = ""
+        self._previous: _Held | None = None
+        self._current = _Held(None)
+        self._now = 0.0
+        if protocol:
+            self._speak(protocol)
+
+    def transmitted(self, now: float, data: bytes) -> None:
+        """The host sent `data`, whole frames."""
+        self._now = now
+        self._rest()
+        protocol = protocol_of(data)
+        if protocol == "hcp2" and self._declared == "microflex":
+            protocol = self._declared
+        if protocol:
+            self._speak(protocol)
+        self._decode(now, data, Direction.HOST)
+
+    def received(self, now: float, data: bytes) -> None:
+        """Bytes came from the line."""
+        self._now = now
+        self._decode(now, data, Direction.NODE)
+
+    def completed(self, now: float, verdict: Verdict) -> None:
+        """The master is done with an exchange."""
+        self._now = now
+        current, previous = self._current, self._previous
+        if previous and current.request and now - current.request.time > SAME_CALLBACK:
+            self._release_previous()
+        if (previous := self._previous) and previous.is_of(verdict):
+            previous.verdict = verdict
+            self._release_previous()
+        elif current.is_of(verdict):
+            current.verdict = verdict
+            self._rest()
+            self._release_previous()
+            self._release(current)
+
+    def take(self, frame: Frame) -> None:
+        """One frame, whoever decoded it."""
+        packet = Packet(self._micros(frame.time), self._protocol, frame.sender, frame.raw, frame.node)
+        self._release_previous()
+        if frame.sender is Direction.HOST and frame.kind in (Kind.READ, Kind.WRITE):
+            self._previous, self._current = self._current, _Held(frame, self._protocol)
+        held = self._current
+        if frame.fault == UNASKED:
+            packet.outcome = Outcome.STRAY
+        elif frame.sender is Direction.NODE:
+            held.last, held.answer = frame, packet
+        elif frame.fault:
+            packet.comment = frame.fault
+        if held.released:
+            self._write(packet)
+        else:
+            held.packets.append(packet)
+
+    def idle(self, now: float) -> None:
+        """Nothing has happened for long: nothing is held back any longer."""
+        self._now = now
+        self._rest()
+        self._release_previous()
+        self._release(self._current)
+
+    def _speak(self, protocol: str) -> None:
+        self._protocol = protocol
+        if protocol not in self._decoders:
+            self._decoders[protocol] = Decoder(dialect(protocol))
+
+    def _decode(self, now: float, data: bytes, sender: Direction) -> None:
+        decoder = self._decoders.get(self._protocol)
+        if decoder is None:
+            self.take(Frame(Kind.NOISE, sender, data, time=now))
+            return
+        for frame in decoder.feed(data, now, sender):
+            self.take(frame)
+
+    def _rest(self) -> None:
+        """What the node left unfinished stays so."""
+        decoder = self._decoders.get(self._protocol)
+        for frame in decoder.quiet() if decoder else ():
+            self.take(frame)
+
+    def _release_previous(self) -> None:
+        if self._previous is not None:
+            self._release(self._previous)
+            self._previous = None
+
+    def _release(self, held: _Held) -> None:
+        if held.released:
+            return
+        held.released = True
+        outcome, comment = held.judge()
+        if held.verdict is not None:
+            outcome, comment = held.verdict.outcome or outcome, held.verdict.comment
+        asked, answer = held.request, held.answer
+        if asked is not None:
+            if answer is None and not held.broadcast:
+                answer = Packet(self._end_of(held), held.packets[0].protocol, Direction.NODE, b"", asked.node)
+                held.packets.append(answer)
+            target = answer or held.packets[0]
+            target.outcome, target.comment = outcome, comment
+        for packet in held.packets:
+            self._write(packet)
+        held.packets.clear()
+
+    def _end_of(self, held: _Held) -> int:
+        """When an unanswered exchange was over: at the latest when the next began."""
+        after = self._current.packets
+        return after[0].micros if held is not self._current and after else self._micros(self._now)
+
+    def _micros(self, now: float) -> int:
+        return round((now + self._offset) * 1e6)

@@ -1,0 +1,64 @@
+"""What a frame on the line says: the one form in which recording, monitoring and replaying speak of it."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+from busmaster.capture.pcapng import Direction
+
+UNASKED = "unasked"
+"""The fault of a frame from a node that nobody had asked."""
+
+
+class Kind(enum.StrEnum):
+    """What sort of frame it is."""
+
+    READ = "read"
+    WRITE = "write"
+    VALUE = "value"
+    ACK = "ack"
+    NAK = "nak"
+    EOT = "eot"
+    NOISE = "noise"
+    """No frame at all, or one that was cut short: `fault` says which."""
+
+
+@dataclass(slots=True)
+class Frame:
+    """One frame as it was heard.
+
+    `item` names the quantity as the command line does ("100", "01.17", "2008:32", "flag:5"); `value` is the data as
+    text, several joined by commas; `fault` says what is wrong with the frame and is empty if nothing is. `node` of a
+    reply is that of the request it answers, since no reply but MSC's carries one.
+    """
+
+    kind: Kind
+    sender: Direction
+    raw: bytes
+    node: int | None = None
+    command: str = ""
+    item: str = ""
+    value: str = ""
+    fault: str = ""
+    answers: bool = False
+    """It ends what the last request asked for, or one leg of it."""
+    time: float = 0.0
+    """Seconds, when its first byte was heard, on the clock of whoever heard it."""
+    delay: float | None = None
+    """Of an answer: seconds since the last byte of what it answers was heard."""
+
+    @property
+    def text(self) -> str:
+        """What it says, without the node: "read 100", "100 = 12.5", "NAK"."""
+        match self.kind:
+            case Kind.READ:
+                return f"{self.command} {self.item}".rstrip()
+            case Kind.WRITE:
+                return f"{self.command} {self.item} = {self.value}"
+            case Kind.VALUE:
+                return f"{self.item} = {self.value}"
+            case Kind.NOISE:
+                return f"{len(self.raw)} byte{'' if len(self.raw) == 1 else 's'}"
+            case _:
+                return self.kind.upper()

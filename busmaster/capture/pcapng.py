@@ -1,0 +1,187 @@
+"""Capture files: the few pcapng blocks that a serial line needs, written and read.
+
+Every packet is one frame on the line. Its bytes follow a header of our own, six bytes, so that a dissector knows
+what no byte of an anonymous reply tells:
+
+    0      version of this header, 1
+    1      protocol, see `PROTOCOLS`
+    2      direction: 0 unknown, 1 from a node, 2 from the host (the codes of the packet's own flags option)
+    3      outcome of the exchange, see `Outcome`; on the last packet from the node, 0 on the others
+    4, 5   node, big-endian; FFFF where unknown or the protocol has none
+
+An exchange that nobody answered ends in a packet of the header alone. Times are whole microseconds since 1970.
+The link type is `LINK_TYPE`, one of those set aside for private use.
+"""
+
+from __future__ import annotations
+
+import enum
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import BinaryIO
+
+LINK_TYPE = 157
+"""LINKTYPE_USER10: private, and not the first of them, which other people's dissectors take."""
+PROTOCOLS = ("", "hcp", "hcp2", "microflex", "msc", "mentor", "dc104")
+HEADER_VERSION = 1
+NO_NODE = 0xFFFF
+
+_HEADER = struct.Struct(">BBBBH")
+_SECTION, _INTERFACE, _PACKET, _STATISTICS = 0x0A0D0D0A, 1, 6, 5
+_BYTE_ORDER = 0x1A2B3C4D
+_COMMENT, _FLAGS, _DROPPED = 1, 2, 4
+_APPLICATION, _NAME, _RESOLUTION, _IF_DROPPED = 4, 2, 9, 5
+_MICROSECONDS = 6
+_LONGEST_BLOCK = 1 << 20
+
+
+class CaptureError(ValueError):
+    """The file is no capture, or not one of ours."""
+
+
+class Direction(enum.IntEnum):
+    """Who spoke."""
+
+    UNKNOWN = 0
+    NODE = 1
+    HOST = 2
+
+
+class Outcome(enum.IntEnum):
+    """How an exchange ended."""
+
+    NONE = 0
+    OK = 1
+    NO_REPLY = 2
+    GARBLED = 3
+    REFUSED = 4
+    STRAY = 5
+
+
+@dataclass(slots=True)
+class Packet:
+    """One frame on the line, as a capture holds it. `micros`: microseconds since 1970."""
+
+    micros: int
+    protocol: str
+    direction: Direction
+    frame: bytes
+    node: int | None = None
+    outcome: Outcome = Outcome.NONE
+    comment: str = ""
+    dropped: int = 0
+    """Events that the recorder had to drop between the packet before and this one."""
+
+
+class PcapngWriter:
+    """Writes packets to a binary file, which it does not own. The head of the file is written at once."""
+
+    def __init__(self, file: BinaryIO, *, port: str = "") -> None:
+        self._file = file
+        self._write(_SECTION, struct.pack("<IHHq", _BYTE_ORDER, 1, 0, -1) + _options((_APPLICATION, b"busmaster")))
+        options = _options((_NAME, port.encode()), (_RESOLUTION, bytes([_MICROSECONDS])))
+        self._write(_INTERFACE, struct.pack("<HHI", LINK_TYPE, 0, 0) + options)
+
+    def write(self, packet: Packet) -> None:
+        node = NO_NODE if packet.node is None else packet.node
+        head = (HEADER_VERSION, PROTOCOLS.index(packet.protocol), packet.direction, packet.outcome, node)
+        data = _HEADER.pack(*head) + packet.frame
+        options = _options(
+            (_COMMENT, packet.comment.encode()),
+            (_FLAGS, struct.pack("<I", packet.direction) if packet.direction else b""),
+            (_DROPPED, struct.pack("<Q", packet.dropped) if packet.dropped else b""),
+        )
+        fixed = struct.pack("<IIIII", 0, packet.micros >> 32, packet.micros & 0xFFFFFFFF, len(data), len(data))
+        self._write(_PACKET, fixed + _padded(data) + options)
+
+    def finish(self, micros: int, dropped: int) -> None:
+        """The closing statistics: how many events were dropped in all."""
+        fixed = struct.pack("<III", 0, micros >> 32, micros & 0xFFFFFFFF)
+        self._write(_STATISTICS, fixed + _options((_IF_DROPPED, struct.pack("<Q", dropped))))
+
+    def _write(self, kind: int, body: bytes) -> None:
+        length = len(body) + 12
+        self._file.write(struct.pack("<II", kind, length) + body + struct.pack("<I", length))
+
+
+def read_packets(file: BinaryIO) -> Iterator[Packet]:
+    """The packets of a capture of ours, in order. Raises CaptureError for any other file, or one cut in mid-block."""
+    ticks: list[int] = []
+    link_types: list[int] = []
+    for kind, body, order in _blocks(file):
+        if kind == _SECTION:
+            ticks.clear()
+            link_types.clear()
+        elif kind == _INTERFACE:
+            link_types.append(struct.unpack_from(f"{order}H", body)[0])
+            resolution = dict(_read_options(body[8:], order)).get(_RESOLUTION, bytes([_MICROSECONDS]))[0]
+            ticks.append(2 ** (resolution & 0x7F) if resolution & 0x80 else 10**resolution)
+        elif kind == _PACKET:
+            interface, high, low, size, _ = struct.unpack_from(f"{order}IIIII", body)
+            if interface >= len(ticks) or link_types[interface] != LINK_TYPE:
+                raise CaptureError(f"not a capture of a serial line: no link type {LINK_TYPE}")
+            micros = ((high << 32) | low) * 1_000_000 // ticks[interface]
+            yield _packet(
+                micros, body[20 : 20 + size], dict(_read_options(body[20 + size + -size % 4 :], order)), order
+            )
+
+
+def _packet(micros: int, data: bytes, options: dict[int, bytes], order: str) -> Packet:
+    if len(data) < _HEADER.size or data[0] != HEADER_VERSION:
+        raise CaptureError("a packet without our header, or of a later version")
+    _, protocol, direction, outcome, node = _HEADER.unpack_from(data)
+    try:
+        return Packet(
+            micros,
+            PROTOCOLS[protocol],
+            Direction(direction),
+            data[_HEADER.size :],
+            None if node == NO_NODE else node,
+            Outcome(outcome),
+            options.get(_COMMENT, b"").decode(errors="replace"),
+            struct.unpack(f"{order}Q", options[_DROPPED])[0] if _DROPPED in options else 0,
+        )
+    except (IndexError, ValueError) as error:
+        raise CaptureError(f"a packet with a header that means nothing: {data[: _HEADER.size].hex(' ')}") from error
+
+
+def _blocks(file: BinaryIO) -> Iterator[tuple[int, bytes, str]]:
+    """Kind, body and byte order ("<" or ">") of each block."""
+    order = "<"
+    first = True
+    while head := file.read(8):
+        if len(head) < 8 or (first and head[:4] != struct.pack("<I", _SECTION)):
+            raise CaptureError("not a pcapng file" if first else "the file is cut in mid-block")
+        mark = b""
+        if head[:4] == struct.pack("<I", _SECTION):
+            mark = file.read(4)
+            order = "<" if mark == struct.pack("<I", _BYTE_ORDER) else ">"
+        kind, length = struct.unpack(f"{order}II", head)
+        if length < 12 + len(mark) or length % 4 or length > _LONGEST_BLOCK:
+            raise CaptureError(f"a block of {length} bytes: the file is damaged")
+        rest = mark + file.read(length - 8 - len(mark))
+        if len(rest) != length - 8:
+            raise CaptureError("the file is cut in mid-block")
+        first = False
+        yield kind, rest[:-4], order
+
+
+def _padded(data: bytes) -> bytes:
+    return data + bytes(-len(data) % 4)
+
+
+def _options(*options: tuple[int, bytes]) -> bytes:
+    """The options that are not empty, and their end; nothing at all if every one is."""
+    coded = b"".join(struct.pack("<HH", code, len(value)) + _padded(value) for code, value in options if value)
+    return coded + bytes(4) if coded else b""
+
+
+def _read_options(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    at = 0
+    while at + 4 <= len(data):
+        code, length = struct.unpack_from(f"{order}HH", data, at)
+        if code == 0:
+            return
+        yield code, data[at + 4 : at + 4 + length]
+        at += 4 + length + -length % 4

@@ -1,0 +1,186 @@
+"""Recording a line while it runs, at no cost to it: the owner of the line only notes what passed, a thread writes.
+
+A tap has three methods, called on the loop that owns the line: `transmitted` and `received`, as soon as bytes have
+left or come (an echo stripped off), and `completed`, when a transaction has ended.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from types import TracebackType
+from typing import Any, BinaryIO, TypeAlias
+
+from busmaster.arbiter.transaction import Transaction
+from busmaster.capture.assemble import Assembler, Verdict
+from busmaster.capture.pcapng import Outcome, Packet, PcapngWriter
+from busmaster.errors import BusError, GarbledReply, NoReply, Refused
+from busmaster.exchange import Command, Timings
+
+CAPACITY = 50_000
+"""Events that may wait for the disk: minutes of a line at 57600 baud."""
+TICK = 0.05
+"""Seconds between two looks of the writing thread, which is never woken by the line."""
+SLICE = 10
+"""Events handled before the thread lets go of the interpreter."""
+PAUSE = 0.0002
+IDLE = 3.0
+"""Seconds without an event after which nothing is held back: longer than any exchange."""
+
+
+class _Sent:
+    """Of the next three: what is noted of one event. Which of them it is, is its type."""
+
+    __slots__ = ("data", "now")
+
+    def __init__(self, now: float, data: bytes) -> None:
+        self.now = now
+        self.data = data
+
+
+class _Heard(_Sent):
+    __slots__ = ()
+
+
+class _Ended:
+    """A copy: a poll's transaction lives on and is run again."""
+
+    __slots__ = ("address", "command", "error", "late", "now", "timings", "value")
+
+    def __init__(self, transaction: Transaction) -> None:
+        self.now = time.monotonic()
+        self.command: Command[Any] = transaction.command
+        self.address = transaction.node.address
+        self.timings: Timings = transaction.node.timings
+        self.value: Any = transaction.value
+        self.error = transaction.error
+        self.late = transaction.late
+
+    def verdict(self) -> Verdict:
+        request = self.command.open(self.address, self.timings).request
+        if self.error is not None:
+            return Verdict(request, outcome_of(self.error), f"{self.command}: {self.error}")
+        value = "ok" if self.value is None else repr(self.value)
+        return Verdict(request, Outcome.OK, f"{self.command}: {value}" + (" (late)" if self.late else ""))
+
+
+_Event: TypeAlias = _Sent | _Heard | _Ended
+
+
+def outcome_of(error: BusError) -> Outcome | None:
+    """None where the error does not say what was on the wire."""
+    match error:
+        case NoReply():
+            return Outcome.NO_REPLY
+        case GarbledReply():
+            return Outcome.GARBLED
+        case Refused():
+            return Outcome.REFUSED
+        case _:
+            return None
+
+
+class Recorder:
+    """A tap that writes a capture. Raises OSError if `path` cannot be written; later errors are kept in `error`.
+
+    `port` names the line in the file; `protocol` "microflex" says that its HCP2 nodes are such drives. Close it off
+    the loop: closing waits for the disk.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], *, port: str = "", protocol: str = "", capacity: int = CAPACITY
+    ) -> None:
+        self.dropped = 0
+        """Events that came while `capacity` of them waited for the disk, or after it had failed."""
+        self.error: OSError | None = None
+        self._capacity = capacity
+        self._events: deque[_Event] = deque()
+        self._stop = threading.Event()
+        self._file: BinaryIO = open(path, "wb")  # noqa: SIM115  # held open until close()
+        self._writer = PcapngWriter(self._file, port=port)
+        self._reported = 0
+        self._offset = time.time() - time.monotonic()
+        self._assembler = Assembler(self._write, protocol=protocol, offset=self._offset)
+        self._thread = threading.Thread(target=self._run, name="busmaster capture", daemon=True)
+        self._thread.start()
+
+    # on the loop that owns the line
+
+    def transmitted(self, now: float, data: bytes) -> None:
+        """`data` was handed to the port at `now`, in seconds of `time.monotonic()`."""
+        self._note(_Sent(now, data))
+
+    def received(self, now: float, data: bytes) -> None:
+        self._note(_Heard(now, data))
+
+    def completed(self, transaction: Transaction) -> None:
+        self._note(_Ended(transaction))
+
+    def _note(self, event: _Event) -> None:
+        if len(self._events) < self._capacity and self.error is None:
+            self._events.append(event)
+        else:
+            self.dropped += 1
+
+    # elsewhere
+
+    def close(self) -> None:
+        """Write what waits and close the file. Never raises; may be called twice."""
+        self._stop.set()
+        self._thread.join()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # on the thread
+
+    def _run(self) -> None:
+        try:
+            with self._file:
+                busy = time.monotonic()
+                while not self._stop.wait(TICK):
+                    if self._events:
+                        busy = time.monotonic()
+                        self._drain()
+                        self._file.flush()
+                    elif time.monotonic() - busy > IDLE:
+                        busy = time.monotonic()
+                        self._assembler.idle(busy)
+                        self._file.flush()
+                self._drain()
+                self._assembler.idle(time.monotonic())
+                self._writer.finish(round(time.time() * 1e6), self.dropped)
+        except OSError as error:
+            self.error = error
+            self.dropped += len(self._events)
+            self._events.clear()
+
+    def _drain(self) -> None:
+        """In small helpings, so that the loop never waits long for the interpreter."""
+        handled = 0
+        while self._events:
+            self._handle(self._events.popleft())
+            handled += 1
+            if handled % SLICE == 0 and not self._stop.is_set():
+                time.sleep(PAUSE)
+
+    def _handle(self, event: _Event) -> None:
+        if type(event) is _Sent:
+            self._assembler.transmitted(event.now, event.data)
+        elif type(event) is _Heard:
+            self._assembler.received(event.now, event.data)
+        elif type(event) is _Ended:
+            self._assembler.completed(event.now, event.verdict())
+
+    def _write(self, packet: Packet) -> None:
+        dropped = self.dropped
+        packet.dropped = dropped - self._reported
+        self._reported = dropped
+        self._writer.write(packet)

@@ -1,0 +1,275 @@
+"""A listener that hears both directions, mixed, and is told nothing else."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from busmaster.capture.decode import Decoder
+from busmaster.capture.dialects import DIALECTS, dialect, protocol_of
+from busmaster.capture.frames import Frame, Kind
+from busmaster.errors import InvalidCommand
+from tests.capture.hearing import NODE, hear, said, sender_of, vectors
+
+
+@pytest.mark.parametrize(("protocol", "name", "raw"), vectors())
+def test_every_frame_of_the_documents_is_one_frame_with_nothing_wrong(protocol: str, name: str, raw: bytes) -> None:
+    (frame,) = Decoder(dialect(protocol)).feed(raw, 0.0, sender_of(name))
+    assert frame.raw == raw
+    assert frame.fault == ("unasked" if frame.sender is NODE else "")
+
+
+@pytest.mark.parametrize(("protocol", "name", "raw"), vectors())
+def test_a_request_tells_its_protocol(protocol: str, name: str, raw: bytes) -> None:
+    if sender_of(name) is NODE:
+        assert protocol_of(raw[:1]) == ""
+    else:
+        assert protocol_of(raw) == protocol
+
+
+def test_hcp_in_both_directions() -> None:
+    frames = hear(
+        "hcp",
+        "04 32 32 02 30 31 05",  # AN00110: read node 2 Comms(1)
+        "02 30 31 31 32 33 2E 34 35 36 03 2B",
+        "04 31 31 02 39 39 31 2C 32 03 2C 15",  # 99 takes the first value, there is no 100: NAK
+        "04 32 32 02 30 31 31 32 33 2E 34 35 36 03 2B 06",
+    )
+    assert said(frames) == [
+        "host 2 read 1",
+        "node 2 1 = 123.456",
+        "host 1 write 99 = 1,2",
+        "node 1 NAK",
+        "host 2 write 1 = 123.456",
+        "node 2 ACK",
+    ]
+
+
+def test_a_checksum_that_is_a_control_character_ends_its_frame_and_starts_none() -> None:
+    frames = hear(
+        "hcp2",
+        "07 30 32 02 30 31 05 04",  # AN00129: read node 2 Comms(1), the checksum is EOT
+        "02 30 31 31 32 33 2E 34 35 36 03 2B",
+        "07 46 46 02 36 39 05 08",
+        "02 36 39 34 30 39 36 03 07",  # the checksum is BEL, the next byte a true one
+        "07 30 30 02 30 31 05 06",
+        "15",
+    )
+    assert said(frames) == [
+        "host 2 read 1",
+        "node 2 1 = 123.456",
+        "host 255 read 105",
+        "node 255 105 = 4096",
+        "host 0 read 1",
+        "node 0 NAK",
+    ]
+
+
+def test_mentor_short_commands_are_the_hosts_only_after_an_answered_read() -> None:
+    frames = hear(
+        "mentor",
+        "04 31 31 32 32 30 31 31 37 05",  # a transcript of an independent CT-ANSI node
+        "02 30 31 31 37 2D 30 30 34 37 36 03 3C",
+        "06",
+        "02 30 31 31 38 2B 30 30 30 30 30 03 30",
+        "08",
+        "02 30 31 31 37 2D 30 30 34 37 36 03 3C",
+        "15",
+        "02 30 31 31 37 2D 30 30 34 37 36 03 3C",
+        "04 31 31 32 32 02 30 31 31 37 2D 30 34 37 36 03 2C",
+        "06",
+        "04 31 31 32 32 02 30 31 31 37 2D 30 34 37 36 03 2D",
+        "15",
+    )
+    assert said(frames) == [
+        "host 12 read 01.17",
+        "node 12 01.17 = -00476",
+        "host 12 next 01.18",
+        "node 12 01.18 = +00000",
+        "host 12 previous 01.17",
+        "node 12 01.17 = -00476",
+        "host 12 again 01.17",
+        "node 12 01.17 = -00476",
+        "host 12 write 01.17 = -0476",
+        "node 12 ACK",
+        "host 12 write 01.17 = -0476 [bad checksum 2D, not 2C]",
+        "node 12 NAK",
+    ]
+
+
+def test_a_lone_eot_says_no_such_parameter_and_one_before_digits_is_a_new_request() -> None:
+    request = "04 31 31 32 32 31 37 32 33 05"
+    answered = hear("mentor", request, "04", "04 31 31 32 32 30 31 31 37 05")
+    assert said(answered) == ["host 12 read 17.23", "node 12 EOT", "host 12 read 01.17"]
+    at_rest = hear("mentor", request, "04", "|")
+    assert said(at_rest) == ["host 12 read 17.23", "node 12 EOT"]
+    asked_again = hear("mentor", request, request)
+    assert said(asked_again) == ["host 12 read 17.23", "host 12 read 17.23"]
+
+
+def test_nobody_answers_a_mentor_broadcast() -> None:
+    frames = hear("mentor", "04 30 30 30 30 02 30 31 31 37 2B 30 30 30 30 03 2F", "06")
+    assert said(frames) == ["host 0 write 01.17 = +0000", "node ACK [unasked]"]
+
+
+def test_parity_in_bit_7_is_not_looked_at() -> None:
+    plain = bytes.fromhex("04 31 31 32 32 30 31 31 37 05")
+    with_parity = bytes(byte | (byte.bit_count() % 2 << 7) for byte in plain)
+    assert with_parity != plain
+    assert said(hear("mentor", with_parity.hex())) == ["host 12 read 01.17"]
+
+
+def test_the_legs_of_an_msc_read_and_of_a_write() -> None:
+    frames = hear(
+        "msc",
+        "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74",
+        "06 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D",  # ACK and packet in one chunk
+        "06",
+        "02 01 00 0D 00 00 44 57 52 49 54 45 2C 07 D8 00 00 04 D2 03 BE",
+        "06",
+    )
+    assert said(frames) == [
+        "host 1 DREAD 2008",
+        "node 1 ACK",
+        "node 1 2008 = 1234",
+        "host 1 ACK",
+        "host 1 DWRITE 2008 = 1234",
+        "node 1 ACK",
+    ]
+    assert [frame.answers for frame in frames] == [False, True, True, False, False, True]
+
+
+def test_an_msc_flag_reply_is_told_from_its_request_by_where_it_comes() -> None:
+    """Both have bodies of eight bytes: RFLAG,[FF] and RFLAG,[NN]."""
+    request, reply = (
+        "02 0F 00 08 00 00 52 46 4C 41 47 2C 00 FF 02 AE",
+        "02 0F 00 08 00 00 52 46 4C 41 47 2C 00 01 01 B0",
+    )
+    frames = hear("msc", request, request, "06", reply, "15", reply, reply, "06", request)
+    assert said(frames) == [
+        "host 15 RFLAG flag:255",
+        "host 15 RFLAG flag:255",  # no ACK came: sent again
+        "node 15 ACK",
+        "node 15 flag:255 = 1",
+        "host 15 NAK",
+        "node 15 flag:255 = 1",
+        "node 15 flag:255 = 1",  # the host's ACK was lost
+        "host 15 ACK",
+        "host 15 RFLAG flag:255",
+    ]
+
+
+def test_msc_packets_may_hold_any_byte_and_lists_of_flags_and_values_are_read() -> None:
+    flags = bytearray(32)
+    for flag in (0, 9, 31, 255):
+        flags[flag // 8] |= 1 << flag % 8
+    body = b"\x03\x00\x27\x00\x00RFLAGS," + bytes(flags)
+    reply = b"\x02" + body + sum(body).to_bytes(2, "big")
+    frames = hear("msc", "02 03 00 07 00 00 52 46 4C 41 47 53 2C 01 F5", "06", reply.hex(), "06")
+    assert said(frames)[2] == "node 3 flags = 0,9,31,255"
+    frames = hear("msc", "02 02 00 08 00 00 53 46 4C 41 47 2C 00 05 01 A8 06")
+    assert said(frames) == ["host 2 SFLAG flag:5 = 1", "node 2 ACK"]
+
+
+def test_an_msc_packet_before_the_ack_answers_something_older() -> None:
+    frames = hear(
+        "msc",
+        "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74",
+        "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D",
+    )
+    assert said(frames)[1] == "node 1 2008 = 1234 [before the ACK]"
+
+
+def test_dc104_and_its_parameter_whose_reply_looks_like_a_request() -> None:
+    frames = hear("dc104", "02 AA 01 AB", "02 01 04 D2 D7", "02 55 01 04 D2 2C", "06", "02 AA 6B 15", "15")
+    assert said(frames) == [
+        "host read 1",
+        "node 1 = 1234",
+        "host write 1 = 1234",
+        "node ACK",
+        "host read 107",
+        "node NAK",
+    ]
+    frames = hear("dc104", "02 AA AA 54", "02 AA 00 05 AF", "02 AA AA 54", "|", "02 AA AA 54", "|")
+    assert said(frames) == ["host read 170", "node 170 = 5", "host read 170", "host read 170"]
+
+
+def test_what_is_wrong_with_a_reply_is_said() -> None:
+    frames = hear(
+        "hcp2",
+        "07 30 32 02 30 31 05 04 02 30 31 31 32 33 2E 34 35 36 03 2C",
+        "07 30 32 02 30 31 05 04 02 30 32 35 03 34",
+        "07 30 32 02 30 31 05 04 06",
+        "06",
+    )
+    assert said(frames)[1::2] == [
+        "node 2 1 = 123.456 [bad checksum 2C, not 2B]",
+        "node 2 2 = 5 [wrong element: 1 was asked]",
+        "node 2 ACK [an ACK answers no read]",
+    ]
+    assert said(frames)[-1] == "node ACK [unasked]"
+
+
+def test_a_cut_reply_ends_at_the_next_request_or_in_silence() -> None:
+    request = "07 30 32 02 30 31 05 04"
+    cut = said(hear("hcp2", request, "02 30 31 31 32", request))
+    assert cut == ["host 2 read 1", "unknown 5 bytes [cut short after 5 bytes]", "host 2 read 1"]
+    silent = said(hear("hcp2", request, "02 30 31 31 32", "|"))
+    assert silent == cut[:2]
+
+
+def test_noise_is_one_line_and_the_frame_after_it_is_whole() -> None:
+    frames = hear("hcp2", "00 FF 81 41", "07 30 32 02 30 31 05 04")
+    assert said(frames) == ["unknown 4 bytes [no frame]", "host 2 read 1"]
+
+
+def test_delays_are_from_the_last_byte_of_the_request_to_the_first_of_the_reply() -> None:
+    decoder = Decoder(dialect("hcp2"))
+    decoder.feed(bytes.fromhex("07 30 32 02"), 1.000)
+    (asked,) = decoder.feed(bytes.fromhex("30 31 05 04"), 1.010)
+    assert decoder.feed(bytes.fromhex("02 30 31"), 1.030) == []
+    (reply,) = decoder.feed(bytes.fromhex("35 03 37"), 1.040)
+    assert (asked.time, asked.delay) == (1.0, None)
+    assert reply.time == 1.03
+    assert reply.delay == pytest.approx(0.02)
+
+
+def test_a_sender_that_is_known_is_believed() -> None:
+    decoder = Decoder(dialect("hcp2"))
+    assert decoder.feed(bytes.fromhex("02 30 31"), 0.0, NODE) == []
+    frames = decoder.feed(bytes.fromhex("07 30 32 02 30 31 05 04"), 0.001, sender_of("read"))
+    assert said(frames) == ["node 3 bytes [cut short after 3 bytes]", "host 2 read 1"]
+
+
+def test_a_protocol_that_does_not_exist_is_refused_by_name() -> None:
+    with pytest.raises(InvalidCommand, match=r"'hcp3'.*hcp, hcp2"):
+        dialect("hcp3")
+
+
+CHUNKS = st.lists(
+    st.one_of(
+        st.sampled_from([raw for _, _, raw in vectors() if len(raw) < 60]),
+        st.sampled_from([b"\x02", b"\x03", b"\x04", b"\x05", b"\x06", b"\x07", b"\x08", b"\x15", b"0"]),
+        st.binary(max_size=6),
+    ),
+    max_size=8,
+)
+
+
+@given(protocol=st.sampled_from(sorted(DIALECTS)), chunks=CHUNKS, cut=st.integers(0, 60))
+def test_every_byte_is_accounted_for_and_chunks_change_nothing(protocol: str, chunks: list[bytes], cut: int) -> None:
+    data = b"".join(chunks)[:240]
+    at_once, in_two, bytewise = (
+        decode_all(protocol, *parts)
+        for parts in ([data], [data[:cut], data[cut:]], [data[at : at + 1] for at in range(len(data))])
+    )
+    assert b"".join(frame.raw for frame in at_once) == data
+    assert said(at_once) == said(in_two) == said(bytewise)
+    assert all(frame.fault for frame in at_once if frame.kind is Kind.NOISE)
+
+
+def decode_all(protocol: str, *chunks: bytes) -> list[Frame]:
+    decoder = Decoder(dialect(protocol))
+    frames = [frame for chunk in chunks for frame in decoder.feed(chunk, 0.0)]
+    return frames + decoder.quiet()

@@ -1,0 +1,116 @@
+"""Captures byte by byte, and there and back."""
+
+from __future__ import annotations
+
+import io
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from busmaster.capture.pcapng import (
+    PROTOCOLS,
+    CaptureError,
+    Direction,
+    Outcome,
+    Packet,
+    PcapngWriter,
+    read_packets,
+)
+
+HEAD = bytes.fromhex(
+    "0a0d0d0a 30000000 4d3c2b1a 0100 0000 ffffffffffffffff 0400 0900 6275736d61737465 72 000000 00000000 30000000"
+    "01000000 28000000 9d00 0000 00000000 0200 0300 434f4d00 0900 0100 06000000 00000000 28000000"
+)
+"""Section header and interface description of the pcapng format: little-endian, link type 157, microseconds."""
+EMPTY = Packet(0, "", Direction.HOST, b"")
+
+
+def written(*packets: Packet, port: str = "") -> bytes:
+    file = io.BytesIO()
+    writer = PcapngWriter(file, port=port)
+    for packet in packets:
+        writer.write(packet)
+    return file.getvalue()
+
+
+def test_the_head_of_a_file() -> None:
+    assert written(port="COM") == HEAD
+
+
+def test_a_packet_byte_by_byte() -> None:
+    ack = Packet(0x0006_2345_6789_ABCD, "hcp2", Direction.NODE, b"\x06", 5, Outcome.OK, "done", 3)
+    assert written(ack, port="COM")[len(HEAD) :] == bytes.fromhex(
+        "06000000 48000000 00000000"  # enhanced packet block, interface 0
+        "45230600 cdab8967 07000000 07000000"  # time, captured and original length
+        "01 02 01 01 0005 06 00"  # our header (HCP2, from a node, ok, node 5), ACK, padding
+        "0100 0400 646f6e65  0200 0400 01000000  0400 0800 0300000000000000  00000000"  # comment, inbound, dropped, end
+        "48000000"
+    )
+
+
+packets = st.builds(
+    Packet,
+    micros=st.integers(0, 2**63),
+    protocol=st.sampled_from(PROTOCOLS),
+    direction=st.sampled_from(Direction),
+    frame=st.binary(max_size=250),
+    node=st.none() | st.integers(0, 255),
+    outcome=st.sampled_from(Outcome),
+    comment=st.text(max_size=30),
+    dropped=st.integers(0, 2**40),
+)
+
+
+@given(st.lists(packets, max_size=4), st.text(max_size=20))
+def test_what_is_written_is_read_back(sequence: list[Packet], port: str) -> None:
+    assert list(read_packets(io.BytesIO(written(*sequence, port=port)))) == sequence
+
+
+def test_closing_statistics_are_skipped_over() -> None:
+    file = io.BytesIO()
+    writer = PcapngWriter(file)
+    writer.finish(1_000_000, 7)
+    file.seek(0)
+    assert list(read_packets(file)) == []
+    assert file.getvalue()[-32:] == bytes.fromhex(
+        "00000000 00000000 40420f00 0500 0800 0700000000000000 00000000 28000000"
+    )
+
+
+def test_a_big_endian_file_in_nanoseconds_is_read_too() -> None:
+    section = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)
+    interface = struct.pack(">IIHHIHHB3xII", 1, 32, 157, 0, 0, 9, 1, 9, 0, 32)
+    ticks = 1_700_000_000_123_456_789
+    packet = struct.pack(">IIIIIII7sxI", 6, 40, 0, ticks >> 32, ticks & 0xFFFFFFFF, 7, 7, b"\1\6\2\0\xff\xff\x06", 40)
+    (read,) = read_packets(io.BytesIO(section + interface + packet))
+    assert read == Packet(1_700_000_000_123_456, "dc104", Direction.HOST, b"\x06")
+
+
+@pytest.mark.parametrize(
+    ("data", "complaint"),
+    [
+        (b"what is this", "not a pcapng file"),
+        (b"\x0a", "not a pcapng file"),
+        (HEAD[:-10], "cut in mid-block"),
+        (HEAD[:51], "cut in mid-block"),
+        (HEAD + bytes.fromhex("06000000 ffffff7f"), "damaged"),
+        (HEAD.replace(b"\x9d\0", b"\x01\0") + written(EMPTY, port="COM")[len(HEAD) :], "no link type 157"),
+    ],
+)
+def test_a_file_that_is_no_capture_of_ours_is_refused(data: bytes, complaint: str) -> None:
+    with pytest.raises(CaptureError, match=complaint):
+        list(read_packets(io.BytesIO(data)))
+
+
+@pytest.mark.parametrize(
+    "header", ["02 01 01 00 ffff", "01 09 01 00 ffff", "01 01 09 00 ffff", "01 01 01 63 ffff", "01"]
+)
+def test_a_packet_whose_header_means_nothing_is_refused(header: str) -> None:
+    packet = bytes.fromhex(header)
+    padded = packet + bytes(-len(packet) % 4)
+    length = 32 + len(padded)
+    block = struct.pack("<IIIIIII", 6, length, 0, 0, 0, len(packet), len(packet)) + padded + struct.pack("<I", length)
+    with pytest.raises(CaptureError, match="header"):
+        list(read_packets(io.BytesIO(HEAD + block)))
