@@ -25,6 +25,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol, final
 
+from busmaster.emulator.faults import Faults
 from busmaster.errors import InvalidCommand
 
 NEVER = math.inf
@@ -118,8 +119,13 @@ class Device(ABC):
         """When its own last byte will have left."""
         self.outbox: list[tuple[float, bytes]] = []
         """What it is going to say, and when the first byte begins. The line empties it."""
+        self.faults = Faults()
+        self.turnaround = 0.0
+        """Seconds for which its driver still holds the line after its last byte."""
         self.lag = 0.0
-        """Added to every delay drawn: how a fault makes one reply late."""
+        """Added to every delay: how a fault makes one reply late."""
+        self.away_until = 0.0
+        """A fault took it off the line until then."""
 
     # What the line calls
 

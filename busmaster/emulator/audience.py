@@ -1,0 +1,139 @@
+"""Who hears what passes on the line, and what they say to it.
+
+Every byte is every device's to hear. A frame of the host's that nobody disturbed goes to the device whose route it
+begins with, in one piece; the others hear it only if they are attentive. What is cut, garbled or glued, everybody
+hears byte by byte, unless it holds no byte that any route begins with: then it can move no device out of its ground
+state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from busmaster.emulator.device import NEVER, Chance, Device
+from busmaster.emulator.faults import misses
+from busmaster.emulator.wave import Wave
+
+Say = Callable[[Device, float, bytes], None]
+"""A device is going to say something: from when on, and what."""
+
+
+class Audience:
+    """The devices of a line. `say` is called with what they say in answer."""
+
+    def __init__(self, say: Say, chance: Chance, tau: float) -> None:
+        self.devices: list[Device] = []
+        self.wakeup = NEVER
+        """When a device wants to be woken, at the earliest."""
+        self.cut_off: frozenset[Device] = frozenset()
+        self._say = say
+        self._chance = chance
+        self._tau = tau
+        self._routes: dict[bytes, tuple[Device, ...]] = {}
+        self._route_sizes: tuple[int, ...] = ()
+        self._openers: frozenset[int] = frozenset()
+        self._attentive: dict[Device, None] = {}
+
+    def add(self, device: Device) -> None:
+        device.tau = self._tau
+        device.chance = self._chance
+        self.devices.append(device)
+        self._learn_routes()
+        self._note(device, 0.0)
+
+    def remove(self, device: Device) -> None:
+        self.devices.remove(device)
+        self._attentive.pop(device, None)
+        self._learn_routes()
+
+    def request(self, frame: bytes, start: float, end: float) -> None:
+        """A frame of the host's passed undisturbed."""
+        for size in self._route_sizes:
+            routed = self._routes.get(frame[:size])
+            if routed is not None:
+                break
+        else:
+            self.overhear(frame, start, end, None, whole=False)
+            return
+        left: list[Device] = []
+        for device in routed:
+            if device in self.cut_off or (self._faulty(device) and misses(device, start, end, True, self._chance)):
+                self._note(device, end)
+            elif device.attentive or not device.take(frame, end):
+                left.append(device)
+            else:
+                self._note(device, end)
+        if left:
+            left += [device for device in self.devices if device not in routed]
+            self.hear(left, frame, start, end)
+        elif self._attentive:
+            self.hear([device for device in self._attentive if device not in routed], frame, start, end)
+
+    def overhear(self, data: bytes, start: float, end: float, talker: Device | None, whole: bool) -> None:
+        """Bytes passed that are no request in one piece; `whole`: a reply in one piece, which begins with no route."""
+        if whole or self._openers.isdisjoint(data):
+            if not self._attentive:
+                return
+            listeners: Iterable[Device] = tuple(self._attentive)
+        else:
+            listeners = self.devices
+        self.hear([device for device in listeners if device is not talker], data, start, end)
+
+    def scatter(self, wave: Wave, end: float) -> None:
+        """What several talkers made of each other's bytes passed; each heard what did not fall in its own talking."""
+        for device in self.devices:
+            for start, byte in wave.heard(device):
+                self.hear((device,), bytes((byte,)), start, end)
+
+    def wake(self) -> None:
+        """`wakeup` has come."""
+        now = self.wakeup
+        self.wakeup = NEVER
+        for device in self.devices:
+            if device.wakeup <= now:
+                device.wake(now)
+                self._note(device, now)
+            elif device.wakeup < self.wakeup:
+                self.wakeup = device.wakeup
+
+    def restart(self, device: Device, now: float) -> None:
+        device.restart(now)
+        self._note(device, now)
+
+    def hear(self, listeners: Iterable[Device], data: bytes, start: float, now: float) -> None:
+        """`listeners` hear `data` byte by byte; its last byte ended at `now`."""
+        for device in listeners:
+            if device in self.cut_off:
+                continue
+            if not self._faulty(device) or not misses(device, start, now, False, self._chance):
+                device.hear(data, start)
+            self._note(device, now)
+
+    @staticmethod
+    def _faulty(device: Device) -> bool:
+        return bool(device.faults.hearing) or device.away_until > 0.0
+
+    def _note(self, device: Device, now: float) -> None:
+        """What it has come to say, whether it must hear everything from now on, and when it wants to be woken."""
+        if device.outbox:
+            said = device.outbox[:]
+            device.outbox.clear()
+            if now >= device.away_until and not device.faults.dead:
+                for start, data in said:
+                    self._say(device, max(start, now), data)
+        device.lag = 0.0
+        if device.attentive:
+            self._attentive[device] = None
+        elif self._attentive:
+            self._attentive.pop(device, None)
+        if device.wakeup < self.wakeup:
+            self.wakeup = device.wakeup
+
+    def _learn_routes(self) -> None:
+        routes: dict[bytes, tuple[Device, ...]] = {}
+        for device in self.devices:
+            for route in device.routes:
+                routes[route] = (*routes.get(route, ()), device)
+        self._routes = routes
+        self._route_sizes = tuple(sorted({len(route) for route in routes}, reverse=True))
+        self._openers = frozenset(route[0] for route in routes)

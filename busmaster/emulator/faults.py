@@ -1,0 +1,226 @@
+"""What can be wrong with a device or a line: zero by default, seeded, changeable while it runs.
+
+Inside and outside the master's assumption (R3: one request causes at most one reply, which begins within its node's
+`lateness`): as long as every fault in use is one of `WITHIN`, and reply delay plus `late_by` stays within that
+lateness, no value that the master delivers may be wrong. `BEYOND` it the replies' anonymity or an 8-bit checksum
+makes a wrong value possible, and the campaigns count how often.
+
+Faults of a line strike every frame on it, the host's too; those of a device what it hears and says.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from busmaster.errors import InvalidCommand
+
+if TYPE_CHECKING:
+    from busmaster.emulator.device import Chance, Device
+
+FORGED = b"\x06\x15\x04"
+"""Bytes that are a whole reply by themselves: ACK, NAK, EOT."""
+
+HEARING = ("dead", "drop", "deaf", "restart", "flapping", "nak", "late")
+SPEAKING = (
+    *("lost", "wrong", "truncated", "flip", "unseen", "doubled", "leading", "trailing"),
+    *("repeated", "duplicate", "forged", "babble", "split"),
+)
+BEYOND = frozenset({"repeated", "duplicate", "forged", "unseen"})
+WITHIN = frozenset({*HEARING, *SPEAKING}) - BEYOND
+SECONDS = ("late_by", "away_for")
+
+
+@dataclass(slots=True)
+class Faults:
+    """Each rate is the probability, from 0 to 1, that a fault strikes one frame. Set them at any time.
+
+    Raises InvalidCommand, on setting too, for a probability that is none.
+    """
+
+    lost: float = 0.0
+    """Never said."""
+    late: float = 0.0
+    """Said up to `late_by` seconds later than usual."""
+    flip: float = 0.0
+    """One bit flipped."""
+    unseen: float = 0.0
+    """The same bit flipped in two bytes: an exclusive-or of all bytes cannot see it."""
+    truncated: float = 0.0
+    """Cut somewhere."""
+    doubled: float = 0.0
+    """Said twice, the second time glued to the first."""
+    repeated: float = 0.0
+    """Said twice, up to 300 ms apart."""
+    wrong: float = 0.0
+    """For another element, parameter or unit than was asked for, with a right checksum."""
+    duplicate: float = 0.0
+    """A second device with the same address answers too, after a delay of its own."""
+    leading: float = 0.0
+    """A few noise bytes before it (a driver switched on): never one of `FORGED`."""
+    trailing: float = 0.0
+    """A few noise bytes glued to its end: never one of `FORGED`."""
+    forged: float = 0.0
+    """A stray ACK, NAK or EOT in front of it."""
+    babble: float = 0.0
+    """A burst of up to 60 noise bytes at some moment of the next 100 ms."""
+    split: float = 0.0
+    """Handed to the host in chunks of 1 to 4 bytes."""
+    deaf: float = 0.0
+    """A request is not heard."""
+    nak: float = 0.0
+    """A request is refused unheeded; 1 is a storm of them."""
+    flapping: float = 0.0
+    """It goes away for up to `away_for` seconds when a request comes."""
+    restart: float = 0.0
+    """Likewise, and what was in its RAM is lost."""
+    dead: float = 0.0
+    """Above 0: it hears and says nothing."""
+    drop: float = 0.0
+    """What comes while it still has something to say is lost on it. At 0 a UART's queue holds it."""
+    late_by: float = 0.1
+    away_for: float = 5.0
+    hearing: tuple[tuple[str, float], ...] = field(default=(), init=False, repr=False)
+    """The faults in use that concern what a device hears. Kept up to date by itself; so is `speaking`."""
+    speaking: tuple[tuple[str, float], ...] = field(default=(), init=False, repr=False)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        rate = name in HEARING or name in SPEAKING
+        if rate and not 0 <= value <= 1:
+            raise InvalidCommand(f"fault {name} is a probability from 0 to 1, not {value:g}")
+        if name in SECONDS and not 0 <= value < math.inf:
+            raise InvalidCommand(f"fault {name} is a number of seconds, 0 or more, not {value:g}")
+        object.__setattr__(self, name, value)
+        if rate:
+            for group, members in (("hearing", HEARING), ("speaking", SPEAKING)):
+                in_use = ((member, getattr(self, member, 0.0)) for member in members)
+                object.__setattr__(self, group, tuple(pair for pair in in_use if pair[1]))
+
+    def __post_init__(self) -> None:
+        self.lost = self.lost
+
+    @classmethod
+    def parse(cls, settings: Iterable[str]) -> Faults:
+        """From texts such as "lost=0.1". Raises InvalidCommand, naming the nearest fault."""
+        faults = cls()
+        for setting in settings:
+            name, _, text = (part.strip() for part in setting.partition("="))
+            if name not in NAMES:
+                near = difflib.get_close_matches(name, NAMES, n=1)
+                guess = f"; did you mean {near[0]}?" if near else ""
+                raise InvalidCommand(f"no such fault {name!r}: use {' '.join(NAMES)}{guess}")
+            try:
+                value = float(text)
+            except ValueError:
+                raise InvalidCommand(f"fault {name}: {text!r} is no number; write for example {name}=0.1") from None
+            setattr(faults, name, value)
+        return faults
+
+    @property
+    def beyond(self) -> frozenset[str]:
+        """The faults in use that are outside R3's assumption: empty means that no wrong value may come of these."""
+        return frozenset(name for name, _ in self.speaking) & BEYOND
+
+    def __str__(self) -> str:
+        return " ".join(
+            f"{name}={getattr(self, name):g}" for name in NAMES if getattr(self, name) != getattr(CALM, name)
+        )
+
+
+NAMES = tuple(sorted({*HEARING, *SPEAKING, *SECONDS}))
+CALM = Faults()
+
+
+def misses(device: Device, start: float, end: float, request: bool, chance: Chance) -> bool:
+    """Whether `device` does not get what passed from `start` to `end`; `request`: a whole frame meant for it."""
+    if start < device.away_until:
+        return True
+    faults = device.faults
+    device.lag = 0.0
+    for name, rate in faults.hearing:
+        if name == "dead":
+            return True
+        if (name != "drop" and not request) or chance.random() >= rate:
+            continue
+        match name:
+            case "drop":
+                if start < device.free_at:
+                    return True
+            case "deaf":
+                return True
+            case "flapping" | "restart":
+                if name == "restart":
+                    device.restart(end)
+                device.away_until = end + chance.uniform(0.0, faults.away_for)
+                return True
+            case "nak":
+                device.reply(device.refusal, end)
+                return True
+            case "late":
+                device.lag = chance.uniform(0.0, faults.late_by)
+    return False
+
+
+Said = tuple[float, bytes, int]
+"""When it starts, the bytes, and the chunks they reach the host in (0: as the line does it)."""
+
+
+def distort(faults: Faults, said: Said, device: Device | None, tau: float, chance: Chance) -> list[Said]:
+    """What becomes of a frame said by `device` (None: the host). Possibly nothing, possibly several."""
+    start, data, chunk = said
+    more: list[Said] = []
+    for name, rate in faults.speaking:
+        if chance.random() >= rate:
+            continue
+        match name:
+            case "lost":
+                return []
+            case "wrong":
+                data = data if device is None else device.disguise(data, chance)
+            case "truncated":
+                data = data[: chance.randrange(0, len(data))]
+            case "flip":
+                data = flipped(data, chance, 1)
+            case "unseen":
+                data = flipped(data, chance, 2)
+            case "doubled":
+                data += data
+            case "leading":
+                data = noise(chance, 3) + data
+            case "trailing":
+                data += noise(chance, 3)
+            case "repeated":
+                more.append((start + len(data) * tau + chance.uniform(0.005, 0.3), data, 0))
+            case "duplicate":
+                again = 0.002 if device is None else device.delay.draw(chance)
+                more.append((start + chance.uniform(0.0, 2 * again), data, 0))
+            case "forged":
+                at = chance.randrange(0, len(FORGED))
+                data = FORGED[at : at + 1] + data
+            case "babble":
+                more.append((start + chance.uniform(0.0, 0.1), noise(chance, 60), 0))
+            case "split":
+                chunk = chance.randrange(1, 5)
+    return [(start, data, chunk), *more] if data else more
+
+
+def noise(chance: Chance, longest: int) -> bytes:
+    """One to `longest` bytes as a disturbed line makes them: all zeros, all ones, or anything but `FORGED`."""
+    kind = chance.randrange(0, 4)
+    count = chance.randrange(1, longest + 1)
+    if kind < 2:
+        return (b"\x00", b"\xff")[kind] * count
+    return bytes(chance.getrandbits(8) for _ in range(count)).translate(None, FORGED) or b"\xff"
+
+
+def flipped(data: bytes, chance: Chance, count: int) -> bytes:
+    """The same bit flipped in `count` bytes; fewer where there are not so many."""
+    mask = 1 << chance.randrange(0, 8)
+    changed = bytearray(data)
+    places = list(range(len(data)))
+    for _ in range(min(count, len(places))):
+        changed[places.pop(chance.randrange(0, len(places)))] ^= mask
+    return bytes(changed)

@@ -1,0 +1,324 @@
+"""The wire: byte-timed, half-duplex, heard by everybody, told the time.
+
+One who plays the host drives it with a few calls, in virtual or in real time:
+
+    line.send(data, now)      the host begins to talk (or goes on, behind what it is still sending)
+    line.next_event()         when to come back, unless something is sent before
+    line.receive(now)         the bytes that have reached the host's port by now
+    line.cut(now)             and line.restore(now)
+
+Time never runs backwards; calls that come early, or twice, do nothing.
+
+Theory of operation. A *talk* is a run of contiguous bytes by one talker. `_active` is the talk on the wire, or the next
+one to be; `_pending` holds those that start later. A talk that nobody disturbs stays one piece: it is heard as a whole
+when its last byte has ended, and given to the host in part before that if the host asks before. Only a talk that
+starts while another is on the wire is taken apart: both go into a `Wave` of bits, which the devices hear when all of it
+has passed. With `paced` False bytes take no time, and nothing ever overlaps.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from heapq import heapify, heappop, heappush
+
+from busmaster.emulator.audience import Audience
+from busmaster.emulator.device import NEVER, Chance, Device, NoChance
+from busmaster.emulator.faults import Faults, Said, distort, flipped
+from busmaster.emulator.wave import Wave
+from busmaster.profile import LineSettings
+
+ROUNDING = 1e-6
+"""Of a byte: times are floats."""
+
+
+@dataclass(frozen=True, slots=True)
+class Echo:
+    """The host hears itself: `delay` seconds late, and each frame with probability `corrupt` with one bit flipped."""
+
+    delay: float = 0.0
+    corrupt: float = 0.0
+
+
+class Talk:
+    """Contiguous bytes by one talker (None: the host). `given` counts those that the host already has."""
+
+    __slots__ = ("chunk", "clean", "data", "end", "given", "start", "talker", "wave")
+
+    def __init__(self, talker: Device | None, start: float, end: float, data: bytes, clean: bool, chunk: int) -> None:
+        self.talker = talker
+        self.start = start
+        self.end = end
+        self.data = data
+        self.clean = clean
+        self.chunk = chunk
+        self.given = 0
+        self.wave: Wave | None = None
+
+
+class Line:
+    """A line with `devices` on it. `faults` strike every frame, the host's too.
+
+    `chance` is a seeded random.Random: needed as soon as a delay or a fault is random, or talkers collide.
+    `chunk` bytes at a time reach the host (0: whole frames, as far as it does not ask before), `latency` seconds after
+    they were on the wire. `turnaround`: for how long the host's driver still holds the line after its last byte.
+    `paced` False: bytes take no time.
+    """
+
+    def __init__(
+        self,
+        settings: LineSettings,
+        devices: Iterable[Device] = (),
+        *,
+        chance: Chance | None = None,
+        faults: Faults | None = None,
+        paced: bool = True,
+        echo: Echo | None = None,
+        chunk: int = 0,
+        latency: float = 0.0,
+        turnaround: float = 0.0,
+    ) -> None:
+        self.settings = settings
+        self.tau = settings.byte_time if paced else 0.0
+        self.chance: Chance = NoChance() if chance is None else chance
+        self.faults = Faults() if faults is None else faults
+        self.echo = echo
+        self.chunk = chunk
+        self.latency = latency
+        self.turnaround = turnaround
+        self.prompt = False
+        """The first byte of a frame is an event of its own: for a host in real time, which cannot ask when it likes."""
+        self.collisions = 0
+        """Talks that started while another was on the wire."""
+        self._active: Talk | None = None
+        self._pending: list[tuple[float, int, Talk]] = []
+        self._order = 0
+        self._sent_by = 0.0
+        self._held_until = 0.0
+        self._holder: Device | None = None
+        self._inbox = b""
+        self._arrivals: deque[tuple[float, bytes]] = deque()
+        self._audience = Audience(self._say, self.chance, self.tau)
+        for device in devices:
+            self.add(device)
+
+    # Who is on it
+
+    @property
+    def devices(self) -> list[Device]:
+        return self._audience.devices
+
+    def add(self, device: Device) -> None:
+        """Two devices may have one address: then both answer, and collide."""
+        self._audience.add(device)
+
+    def remove(self, device: Device) -> None:
+        self._audience.remove(device)
+
+    def device(self, address: int) -> Device:
+        """The first device with that address. Raises KeyError."""
+        for device in self.devices:
+            if device.address == address:
+                return device
+        raise KeyError(address)
+
+    def restart(self, device: Device, now: float) -> None:
+        """Its power fails and is back at once: what was in its RAM is lost."""
+        self._advance(now)
+        self._audience.restart(device, now)
+
+    def cut(self, now: float, *devices: Device) -> None:
+        """The wire to `devices` (to all of them, by default) breaks: what they say or hear ends there and then."""
+        self._advance(now)
+        lost = devices or tuple(self.devices)
+        talk = self._active
+        if talk is not None and talk.start < now:
+            self._give(talk, now)
+            if talk.talker is None and talk.wave is None:
+                self._audience.hear(lost, talk.data[: self._count(talk, now)], talk.start, now)
+        self._audience.cut_off |= frozenset(lost)
+        if talk is not None and (talk.talker in lost or talk.wave is not None):
+            self._active = None
+        self._pending = [entry for entry in self._pending if entry[2].talker not in lost]
+        heapify(self._pending)
+        if self._active is None and self._pending:
+            self._activate(heappop(self._pending)[2])
+
+    def restore(self, now: float) -> None:
+        """The wire is whole again."""
+        self._advance(now)
+        self._audience.cut_off = frozenset()
+
+    # What the host does
+
+    def send(self, data: bytes, now: float) -> None:
+        """The host says `data`, behind what it is still sending."""
+        self._advance(now)
+        start = now if now > self._sent_by else self._sent_by
+        self._sent_by = start + len(data) * self.tau
+        self._say(None, start, data)
+
+    def receive(self, now: float) -> bytes:
+        """What has wholly arrived at the host's port by `now` and was not yet given to it."""
+        self._advance(now)
+        talk = self._active
+        if talk is not None and talk.start < now:
+            self._give(talk, now)
+        arrivals = self._arrivals
+        while arrivals and arrivals[0][0] <= now:
+            self._inbox += arrivals.popleft()[1]
+        data = self._inbox
+        self._inbox = b""
+        return data
+
+    def next_event(self) -> float:
+        """When something happens next, be it within the line; NEVER if nothing will."""
+        when = self._audience.wakeup
+        talk = self._active
+        if talk is not None:
+            end = talk.end
+            chunk = talk.chunk or self.chunk
+            if self.prompt and not talk.given:
+                chunk = 1
+            if chunk and talk.wave is None and self._heard_at_once(talk):
+                end = min(end, talk.start + (talk.given + chunk) * self.tau)
+            if self._pending and self._pending[0][0] < end:
+                end = self._pending[0][0]
+            if end < when:
+                when = end
+        if self._arrivals and self._arrivals[0][0] < when:
+            when = self._arrivals[0][0]
+        return when
+
+    # Talks begin, meet and end
+
+    def _say(self, talker: Device | None, start: float, data: bytes) -> None:
+        if not self.faults.speaking and (talker is None or not talker.faults.speaking):
+            self._join(Talk(talker, start, start + len(data) * self.tau, data, True, 0))
+            return
+        said: list[Said] = [(start, data, 0)]
+        if talker is not None:
+            said = distort(talker.faults, said[0], talker, self.tau, self.chance)
+        for one in said:
+            for begin, some, chunk in distort(self.faults, one, talker, self.tau, self.chance):
+                clean = begin == start and some == data
+                self._join(Talk(talker, begin, begin + len(some) * self.tau, some, clean, chunk))
+
+    def _join(self, talk: Talk) -> None:
+        if talk.talker in self._audience.cut_off:
+            return
+        active = self._active
+        if active is None:
+            self._activate(talk)
+            return
+        if talk.start < active.start:
+            active.wave = None
+            self._activate(talk)
+            talk = active
+        self._order += 1
+        heappush(self._pending, (talk.start, self._order, talk))
+
+    def _activate(self, talk: Talk) -> None:
+        self._active = talk
+        if talk.start < self._held_until and talk.talker is not self._holder:
+            talk.wave = Wave(self.settings, talk.start, self.chance)
+            talk.wave.add(talk.start, b"", self._holder, self._held_until - talk.start)
+            talk.wave.add(talk.start, talk.data, talk.talker, self._hold(talk))
+
+    def _advance(self, now: float) -> None:
+        """Lets happen, in order, all that happens up to `now`."""
+        audience = self._audience
+        while True:
+            talk = self._active
+            due = NEVER if talk is None else talk.end
+            pending = self._pending
+            overlap = bool(pending) and pending[0][0] < due
+            if overlap:
+                due = pending[0][0]
+            if audience.wakeup < due:
+                if audience.wakeup > now:
+                    return
+                audience.wake()
+            elif due > now or talk is None:
+                return
+            elif overlap:
+                self._collide(talk, heappop(pending)[2])
+            else:
+                self._finish(talk)
+
+    def _collide(self, talk: Talk, other: Talk) -> None:
+        self.collisions += 1
+        if talk.wave is None:
+            talk.wave = Wave(self.settings, talk.start, self.chance)
+            talk.wave.add(talk.start, talk.data, talk.talker, self._hold(talk))
+        talk.wave.add(other.start, other.data, other.talker, self._hold(other))
+        talk.end = max(talk.end, other.end)
+
+    def _finish(self, talk: Talk) -> None:
+        talker = talk.talker
+        hold = self._hold(talk)
+        if hold:
+            self._held_until = talk.end + hold
+            self._holder = talker
+        self._active = None
+        if self._pending:
+            self._activate(heappop(self._pending)[2])
+        self._reach_host(talk)
+        if talk.wave is not None:
+            self._audience.scatter(talk.wave, talk.end)
+        elif talker is None and talk.clean:
+            self._audience.request(talk.data, talk.start, talk.end)
+        else:
+            self._audience.overhear(talk.data, talk.start, talk.end, talker, talk.clean)
+
+    def _hold(self, talk: Talk) -> float:
+        return self.turnaround if talk.talker is None else talk.talker.turnaround
+
+    # What the host hears of it
+
+    def _heard_at_once(self, talk: Talk) -> bool:
+        """Whether the host hears it as it comes."""
+        return talk.talker is not None or (self.echo is not None and not self.echo.delay and not self.echo.corrupt)
+
+    def _count(self, talk: Talk, now: float) -> int:
+        """How many of its bytes have ended."""
+        return min(len(talk.data), int((now - talk.start) / self.tau + ROUNDING)) if self.tau else len(talk.data)
+
+    def _give(self, talk: Talk, now: float) -> None:
+        """What has passed of it reaches the host."""
+        if talk.wave is not None:
+            data = self._host_hears(talk.wave, now)[talk.given :]
+        elif self._heard_at_once(talk):
+            data = talk.data[talk.given : self._count(talk, now)]
+        else:
+            return
+        talk.given += len(data)
+        self._arrive(data, now)
+
+    def _reach_host(self, talk: Talk) -> None:
+        """The rest of it reaches the host."""
+        if talk.wave is not None:
+            self._arrive(self._host_hears(talk.wave, NEVER)[talk.given :], talk.end)
+        elif talk.talker is not None:
+            self._arrive(talk.data[talk.given :], talk.end)
+        elif self.echo is not None:
+            data = talk.data[talk.given :]
+            if self.echo.corrupt and self.chance.random() < self.echo.corrupt:
+                data = flipped(data, self.chance, 1)
+            self._arrive(data, talk.end + self.echo.delay)
+
+    def _host_hears(self, wave: Wave, until: float) -> bytes:
+        return bytes(byte for _, byte in wave.heard(None, until, echo=self.echo is not None))
+
+    def _arrive(self, data: bytes, when: float) -> None:
+        arrivals = self._arrivals
+        if not data:
+            return
+        if self.latency or self.echo is not None or arrivals:
+            when += self.latency
+            if arrivals and arrivals[-1][0] > when:
+                when = arrivals[-1][0]
+            arrivals.append((when, data))
+        else:
+            self._inbox += data

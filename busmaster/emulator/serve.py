@@ -1,0 +1,298 @@
+"""A line in real time: on a pseudo-terminal, on a TCP port, or on the running event loop.
+
+The servers run their line in a thread of their own with a clock of their own, since an event loop's timers are rounded
+up to milliseconds, which is half a frame. A thread that has nothing to do sleeps without end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pty
+import queue
+import select
+import socket
+import threading
+import time
+import tty
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from concurrent.futures import Future
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from busmaster.emulator.device import NEVER
+from busmaster.emulator.line import Line
+
+T = TypeVar("T")
+SPIN = 100e-6
+"""Seconds for which the thread waits awake: the kernel wakes a sleeper some 60 microseconds late."""
+CHUNK = 4096
+
+
+class LineServer(ABC):
+    """Runs a line in a thread until it is closed; a context manager. `path` is how a client names it.
+
+    The line and its devices belong to that thread: change them through `call` while it runs (single attributes such
+    as `delay` or a fault's rate may be set from anywhere).
+    """
+
+    path: str
+
+    def __init__(self, line: Line) -> None:
+        self.line = line
+        line.prompt = True
+        self.dropped = 0
+        """Bytes for the host that nobody took in time."""
+        self._actions: queue.SimpleQueue[tuple[Callable[[Line, float], Any], Future[Any]]] = queue.SimpleQueue()
+        self._bell, self._button = os.pipe()
+        os.set_blocking(self._button, False)
+        self._closing = False
+        self._closed = False
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name=f"emulated line {self.path}", daemon=True)
+        self._thread.start()
+
+    def call(self, action: Callable[[Line, float], T]) -> T:
+        """Has the thread call `action(line, now)` and returns, or raises, what came of it.
+
+        Raises RuntimeError if the line is no longer served.
+        """
+        result: Future[T] = Future()
+        self._actions.put((action, result))
+        if self._closing or not self._thread.is_alive():
+            raise RuntimeError(f"{self.path} is no longer served")
+        os.write(self._button, b".")
+        return result.result()
+
+    def close(self) -> None:
+        """Clients find their port gone. Raises what ended the thread before its time, if anything did."""
+        if self._closed:
+            return
+        self._closed = self._closing = True
+        os.write(self._button, b".")
+        self._thread.join()
+        os.close(self._bell)
+        os.close(self._button)
+        if self._error is not None:
+            raise self._error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @abstractmethod
+    def _sources(self) -> list[int]:
+        """The descriptors to read from."""
+
+    @abstractmethod
+    def _read(self, source: int) -> bytes:
+        """What the host says there."""
+
+    @abstractmethod
+    def _deliver(self, data: bytes) -> None:
+        """Hand `data` to the host, without waiting."""
+
+    @abstractmethod
+    def _shut(self) -> None: ...
+
+    def _run(self) -> None:
+        try:
+            while not self._closing:
+                self._step()
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._shut()
+            self._closing = True
+            while not self._actions.empty():
+                self._actions.get()[1].set_exception(RuntimeError(f"{self.path} is no longer served"))
+
+    def _step(self) -> None:
+        now = time.monotonic()
+        data = self.line.receive(now)
+        if data:
+            self._deliver(data)
+        due = self.line.next_event()
+        timeout = None
+        if due != NEVER:
+            timeout = due - time.monotonic() - SPIN
+            if timeout <= 0:
+                while time.monotonic() < due:
+                    pass
+                timeout = 0.0
+        for source in select.select([self._bell, *self._sources()], (), (), timeout)[0]:
+            if source != self._bell:
+                said = self._read(source)
+                if said:
+                    self.line.send(said, time.monotonic())
+                continue
+            os.read(self._bell, CHUNK)
+            while not self._actions.empty():
+                self._act(*self._actions.get())
+
+    def _act(self, action: Callable[[Line, float], Any], result: Future[Any]) -> None:
+        try:
+            result.set_result(action(self.line, time.monotonic()))
+        except Exception as error:
+            result.set_exception(error)
+
+
+class PtyServer(LineServer):
+    """A line on a pseudo-terminal. `path` is `link` if given, else the terminal's own.
+
+    The terminal is raw and is held open, so that clients may come and go. Raises FileExistsError if `link` is there
+    and is no symbolic link.
+    """
+
+    def __init__(self, line: Line, link: str | os.PathLike[str] | None = None) -> None:
+        self._master, self._slave = pty.openpty()
+        self._device = os.ttyname(self._slave)
+        self._link = None if link is None else os.fspath(link)
+        self.path = self._device
+        try:
+            tty.setraw(self._slave)
+            os.set_blocking(self._master, False)
+            if self._link is not None:
+                if os.path.islink(self._link):
+                    os.unlink(self._link)
+                os.symlink(self._device, self._link)
+                self.path = self._link
+        except BaseException:
+            os.close(self._master)
+            os.close(self._slave)
+            raise
+        super().__init__(line)
+
+    def _sources(self) -> list[int]:
+        return [self._master]
+
+    def _read(self, source: int) -> bytes:
+        try:
+            return os.read(source, CHUNK)
+        except BlockingIOError:
+            return b""
+
+    def _deliver(self, data: bytes) -> None:
+        try:
+            taken = os.write(self._master, data)
+        except BlockingIOError:
+            taken = 0
+        self.dropped += len(data) - taken
+
+    def _shut(self) -> None:
+        if self._link is not None and os.path.islink(self._link) and os.readlink(self._link) == self._device:
+            os.unlink(self._link)
+        os.close(self._slave)
+        os.close(self._master)
+
+
+class TcpServer(LineServer):
+    """A line on a TCP port, as a serial device server has it. Clients share it: each hears all that comes back.
+
+    `path` is "socket://HOST:PORT"; port 0 picks a free one. Raises OSError if the port cannot be bound.
+    """
+
+    def __init__(self, line: Line, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._listener = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        self._listener.setblocking(False)
+        self._clients: dict[int, socket.socket] = {}
+        self.host, self.port = self._listener.getsockname()[:2]
+        self.path = f"socket://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
+        super().__init__(line)
+
+    def _sources(self) -> list[int]:
+        return [*self._clients, self._listener.fileno()]
+
+    def _read(self, source: int) -> bytes:
+        if source == self._listener.fileno():
+            self._accept()
+            return b""
+        client = self._clients[source]
+        try:
+            data = client.recv(CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            data = b""
+        if not data:
+            del self._clients[source]
+            client.close()
+        return data
+
+    def _accept(self) -> None:
+        try:
+            client, _ = self._listener.accept()
+        except OSError:
+            return
+        client.setblocking(False)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._clients[client.fileno()] = client
+
+    def _deliver(self, data: bytes) -> None:
+        if not self._clients:
+            self.dropped += len(data)
+        for client in self._clients.values():
+            try:
+                taken = client.send(data)
+            except OSError:
+                taken = 0
+            self.dropped += len(data) - taken
+
+    def _shut(self) -> None:
+        self._listener.close()
+        for client in self._clients.values():
+            client.close()
+
+
+def serve_pty(line: Line, link: str | os.PathLike[str] | None = None) -> PtyServer:
+    """Serves `line` on a pseudo-terminal, and makes `link` (replacing a symbolic link) point to it until closed."""
+    return PtyServer(line, link)
+
+
+def serve_tcp(line: Line, host: str = "127.0.0.1", port: int = 0) -> TcpServer:
+    """Serves `line` on a TCP port until closed."""
+    return TcpServer(line, host, port)
+
+
+class LineDriver:
+    """Runs a line on the running event loop: `on_bytes` is called with what reaches the host.
+
+    Time is the loop's own, so that a loop of virtual time drives it too. On a real loop, timers are rounded up to a
+    millisecond. Call `changed` after acting on the line directly (cut, restart).
+    """
+
+    def __init__(self, line: Line, on_bytes: Callable[[bytes], Any]) -> None:
+        self.line = line
+        line.prompt = True
+        self._on_bytes = on_bytes
+        self._loop = asyncio.get_running_loop()
+        self._timer: asyncio.TimerHandle | None = None
+        self._closed = False
+
+    def send(self, data: bytes) -> None:
+        """The host says `data`, now."""
+        self.line.send(data, self._loop.time())
+        self.changed()
+
+    def changed(self) -> None:
+        """Something happened to the line: look again when to come back."""
+        if self._timer is not None:
+            self._timer.cancel()
+        due = self.line.next_event()
+        self._timer = None if self._closed or due == NEVER else self._loop.call_at(due, self._run)
+
+    def close(self) -> None:
+        """Nothing more reaches the host. The line may be driven anew by another driver."""
+        self._closed = True
+        self.changed()
+
+    def _run(self) -> None:
+        data = self.line.receive(self._loop.time())
+        self.changed()
+        if data:
+            self._on_bytes(data)

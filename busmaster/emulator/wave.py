@@ -1,0 +1,89 @@
+"""What a receiver makes of several talkers at once: bits on the wire, contested where two drivers disagree.
+
+Only collisions come here. A frame that is alone on the line is never taken apart into bits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from busmaster.emulator.device import Chance, Device
+from busmaster.profile import LineSettings
+
+IDLE = 1
+START = 0
+ROUNDING = 1e-6
+"""Of a bit: times are floats."""
+
+
+class Wave:
+    """The line from `start` on, a level a bit time, and who drives it when.
+
+    A talker that starts off the grid of the first is moved up to the next bit: never into the past, so that what was
+    already received stays as it was.
+    """
+
+    def __init__(self, settings: LineSettings, start: float, chance: Chance) -> None:
+        self.start = start
+        self._chance = chance
+        self._bytesize = settings.bytesize
+        self._parity = settings.parity
+        self._stop_bits = math.ceil(settings.stopbits)
+        self._frame_bits = 1 + settings.bytesize + (settings.parity != "N") + self._stop_bits
+        self._bit_time = settings.byte_time / self._frame_bits
+        self._levels: list[int] = []
+        self._driven: list[bool] = []
+        self._talks: list[tuple[int, int, Device | None]] = []
+
+    def add(self, start: float, data: bytes, talker: Device | None, hold: float = 0.0) -> None:
+        """`talker` says `data` from `start` on; its driver then holds the line idle for `hold` seconds.
+
+        Where another already drives a bit and they disagree, chance decides.
+        """
+        at = max(0, math.ceil((start - self.start) / self._bit_time - ROUNDING))
+        bits = [bit for byte in data for bit in self._encode(byte)]
+        self._talks.append((at, at + len(bits), talker))
+        bits += [IDLE] * round(hold / self._bit_time)
+        missing = at + len(bits) - len(self._levels)
+        if missing > 0:
+            self._levels += [IDLE] * missing
+            self._driven += [False] * missing
+        for index, bit in enumerate(bits, at):
+            if self._driven[index] and self._levels[index] != bit:
+                bit = self._chance.getrandbits(1)
+            self._levels[index] = bit
+            self._driven[index] = True
+
+    def heard(
+        self, listener: Device | None, until: float = math.inf, *, echo: bool = False
+    ) -> Iterator[tuple[float, int]]:
+        """When each byte began, and the byte, as far as it ended by `until`.
+
+        `listener` (None: the host) does not hear what comes while it talks, unless it has an `echo`.
+        """
+        deaf = [] if echo else [(first, last) for first, last, talker in self._talks if talker is listener]
+        mask = (1 << self._bytesize) - 1
+        levels = self._levels
+        at = 0
+        while at < len(levels):
+            if levels[at] != START:
+                at += 1
+                continue
+            end = at + self._frame_bits
+            if self.start + end * self._bit_time > until + ROUNDING * self._bit_time:
+                return
+            bits = levels[at + 1 : at + 1 + self._bytesize]
+            value = sum(bit << place for place, bit in enumerate(bits)) | mask & -1 << len(bits)
+            if not any(first < end and at < last for first, last in deaf):
+                yield self.start + at * self._bit_time, value & mask
+            broken = end <= len(levels) and levels[end - self._stop_bits] != IDLE
+            at = end
+            while broken and at < len(levels) and levels[at] == START:
+                at += 1
+
+    def _encode(self, byte: int) -> list[int]:
+        data = [byte >> place & 1 for place in range(self._bytesize)]
+        ones = sum(data) & 1
+        parity = {"N": [], "E": [ones], "O": [1 - ones], "M": [1], "S": [0]}[self._parity]
+        return [START, *data, *parity, *[IDLE] * self._stop_bits]

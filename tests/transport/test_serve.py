@@ -1,0 +1,171 @@
+"""A line served in real time. These tests use the wall clock, and ask of it only what a busy machine can keep."""
+
+import os
+import select
+import socket
+import termios
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from busmaster.emulator.device import Delay
+from busmaster.emulator.devices.mint import MintController
+from busmaster.emulator.line import Line
+from busmaster.emulator.serve import LineServer, TcpServer, serve_pty, serve_tcp
+from busmaster.profile import LineSettings
+
+WRITE = bytes.fromhex("07 30 32 02 30 31 31 32 33 2E 34 35 36 03 2B")  # AN00129: node 2, Comms(1) = 123.456
+READ = bytes.fromhex("07 30 32 02 30 31 05 04")
+REPLY = bytes.fromhex("02 30 31 31 32 33 2E 34 35 36 03 2B")
+
+
+def mint_line(paced: bool = False, delay: float = 0.0) -> Line:
+    return Line(LineSettings(57600), [MintController(2, delay=Delay(delay))], paced=paced)
+
+
+def ask(port: int, request: bytes, length: int, seconds: float = 2.0) -> bytes:
+    """Writes to an open descriptor and waits for `length` bytes."""
+    os.write(port, request)
+    end = time.monotonic() + seconds
+    got = b""
+    while len(got) < length and select.select([port], [], [], max(0.0, end - time.monotonic()))[0]:
+        got += os.read(port, 100)
+    return got
+
+
+def opened(path: str) -> int:
+    return os.open(path, os.O_RDWR | os.O_NOCTTY)
+
+
+def connected(server: TcpServer) -> socket.socket:
+    return socket.create_connection((server.host, server.port))
+
+
+def test_a_pty_answers_as_the_device_does_and_is_raw() -> None:
+    with serve_pty(mint_line()) as server:
+        port = opened(server.path)
+        assert ask(port, WRITE, 1) == b"\x06"
+        assert ask(port, READ, len(REPLY)) == REPLY
+        assert not termios.tcgetattr(port)[3] & (termios.ECHO | termios.ICANON | termios.ISIG)
+        os.close(port)
+
+
+def test_a_client_may_close_the_pty_and_open_it_again() -> None:
+    with serve_pty(mint_line()) as server:
+        for _ in range(3):
+            port = opened(server.path)
+            assert ask(port, WRITE, 1) == b"\x06"
+            os.close(port)
+
+
+def test_a_link_names_the_pty_and_goes_with_it(tmp_path: Path) -> None:
+    link = tmp_path / "line"
+    with serve_pty(mint_line(), link) as server:
+        assert server.path == str(link)
+        port = opened(server.path)
+        assert ask(port, WRITE, 1) == b"\x06"
+        os.close(port)
+    assert not os.path.lexists(link)
+
+
+def test_a_stale_link_is_replaced_but_a_file_is_not(tmp_path: Path) -> None:
+    link = tmp_path / "line"
+    link.symlink_to(tmp_path / "gone")
+    with serve_pty(mint_line(), link):
+        assert os.readlink(link).startswith("/dev/")
+    link.write_text("mine")
+    with pytest.raises(FileExistsError):
+        serve_pty(mint_line(), link)
+    assert link.read_text() == "mine"
+
+
+def test_an_unplugged_pty_is_gone_and_comes_back_at_the_same_path(tmp_path: Path) -> None:
+    link = tmp_path / "line"
+    line = mint_line()
+    first = serve_pty(line, link)
+    port = opened(first.path)
+    assert ask(port, WRITE, 1) == b"\x06"
+    first.close()
+    assert os.read(port, 1) == b""
+    with pytest.raises(OSError, match="Input/output error"):
+        os.write(port, WRITE)
+    os.close(port)
+    with serve_pty(line, link) as again:
+        port = opened(again.path)
+        assert ask(port, READ, len(REPLY)) == REPLY
+        os.close(port)
+
+
+def test_a_tcp_port_answers_several_clients_one_after_another() -> None:
+    with serve_tcp(mint_line()) as server:
+        assert server.path == f"socket://127.0.0.1:{server.port}"
+        with connected(server) as client:
+            assert ask(client.fileno(), WRITE, 1) == b"\x06"
+        with connected(server) as client:
+            assert ask(client.fileno(), READ, len(REPLY)) == REPLY
+
+
+def test_a_closed_tcp_port_can_be_served_again_at_once() -> None:
+    with serve_tcp(mint_line()) as server, connected(server) as client:
+        assert ask(client.fileno(), WRITE, 1) == b"\x06"
+        server.close()
+        assert client.recv(1) == b""
+    with serve_tcp(mint_line(), port=server.port) as again, connected(again) as client:
+        assert ask(client.fileno(), WRITE, 1) == b"\x06"
+
+
+@pytest.mark.parametrize("serve", [serve_pty, serve_tcp])
+def test_a_paced_line_takes_its_time_and_not_much_more(serve: Callable[[Line], LineServer]) -> None:
+    line = mint_line(paced=True, delay=0.002)
+    need = (len(READ) + len(REPLY)) * line.tau + 0.002
+    times = []
+    with serve(line) as server:
+        client = connected(server) if isinstance(server, TcpServer) else None
+        port = opened(server.path) if client is None else client.fileno()
+        ask(port, WRITE, 1)
+        for _ in range(20):
+            start = time.monotonic()
+            assert ask(port, READ, len(REPLY)) == REPLY
+            times.append(time.monotonic() - start)
+        if client is None:
+            os.close(port)
+        else:
+            client.close()
+    assert min(times) >= need
+    assert sorted(times)[len(times) // 2] < need + 0.002
+
+
+def test_an_idle_line_does_not_burn_the_processor() -> None:
+    with serve_pty(mint_line(paced=True)):
+        before = time.process_time()
+        time.sleep(0.2)
+        assert time.process_time() - before < 0.05
+
+
+def test_the_thread_of_the_line_can_be_asked_to_change_it() -> None:
+    with serve_pty(mint_line()) as server:
+        port = opened(server.path)
+        server.call(lambda line, now: line.cut(now))
+        assert ask(port, WRITE, 1, seconds=0.05) == b""
+        server.call(lambda line, now: line.restore(now))
+        assert ask(port, WRITE, 1) == b"\x06"
+        with pytest.raises(KeyError):
+            server.call(lambda line, now: line.device(3))
+        os.close(port)
+    with pytest.raises(RuntimeError):
+        server.call(lambda line, now: None)
+
+
+def test_a_fault_in_a_device_ends_the_server_and_is_told_at_its_close() -> None:
+    class Broken(MintController):
+        def read_element(self, element: int, now: float) -> float:
+            raise ZeroDivisionError
+
+    server = serve_tcp(Line(LineSettings(57600), [Broken(2)]))
+    with connected(server) as client:
+        client.sendall(READ)
+        assert client.recv(1) == b""
+    with pytest.raises(ZeroDivisionError):
+        server.close()
