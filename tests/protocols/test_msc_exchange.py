@@ -1,0 +1,305 @@
+"""MSC on the wire: ACK, packet, the host's ACK; packets sent again; stale ones; ways out."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.exchange import MORE, Done, Expect, FrameError, Refused
+from busmaster.protocols.msc import PROFILE, BlockRead, DataRead, DataWrite, ReadFlag, ReadStatus
+from busmaster.protocols.msc_exchange import PacketExchange, StalePacketListener, packet
+
+ACK, NAK = b"\x06", b"\x15"
+TIMINGS = PROFILE.timings
+REPLY = bytes.fromhex("02 01 00 0a 00 00 44 52 45 41 44 2c 00 00 04 d2 02 6d")
+BAD = REPLY[:-1] + b"\x6e"
+STALE = packet(9, b"RFLAG,\0\1")
+
+
+def reading() -> PacketExchange[int]:
+    return DataRead(2008).open(1, TIMINGS)
+
+
+def acked() -> PacketExchange[int]:
+    exchange = reading()
+    assert exchange.feed(ACK) == Expect(TIMINGS.packet, exchange.later[0].sizes)
+    return exchange
+
+
+def writing() -> PacketExchange[None]:
+    return DataWrite(2008, 1234).open(1, TIMINGS)
+
+
+def says(step: object) -> bytes:
+    assert isinstance(step, Expect)
+    return step.send
+
+
+# as the document has it
+
+
+def test_a_read_is_an_ack_and_a_packet_that_the_host_acks() -> None:
+    exchange = acked()
+    assert exchange.feed(REPLY) == Done(1234, send=ACK)
+
+
+def test_a_write_is_done_with_its_ack() -> None:
+    assert writing().feed(ACK) == Done(None)
+    assert (writing().later, writing().closing) == ((), 0)
+
+
+def test_a_read_announces_its_packet_and_its_closing_ack() -> None:
+    exchange = BlockRead(0).open(1, TIMINGS)
+    (leg,) = exchange.later
+    assert (leg.timing, leg.sizes.typical, leg.sent) == (TIMINGS.packet, 142, 0)
+    assert (exchange.sizes.typical, exchange.closing) == (1, 1)
+
+
+def test_the_block_sequence_number_is_not_used() -> None:
+    body = REPLY[1:-2].replace(b"\x0a\0\0", b"\x0a\x12\x34")
+    numbered = b"\x02" + body + sum(body).to_bytes(2, "big")
+    assert acked().feed(numbered) == Done(1234, send=ACK)
+
+
+def test_what_follows_the_packet_is_handed_back() -> None:
+    assert acked().feed(REPLY + b"\x02\x01") == Done(1234, send=ACK, rest=b"\x02\x01")
+    assert writing().feed(ACK + ACK) == Done(None, rest=ACK)
+
+
+# the device says NAK
+
+
+def test_a_naked_request_is_sent_again_three_times_and_then_refused() -> None:
+    for exchange in (reading(), writing()):
+        for _ in range(3):
+            assert exchange.feed(NAK) == Expect(exchange.timing, exchange.sizes, exchange.request)
+        with pytest.raises(Refused, match="refused 4 times") as refusal:
+            exchange.feed(NAK)
+        assert not refusal.value.confirm
+
+
+def test_an_ack_after_two_naks_is_as_good_as_at_once() -> None:
+    exchange = reading()
+    assert says(exchange.feed(NAK)) == says(exchange.feed(NAK)) == exchange.request
+    exchange.feed(ACK)
+    assert exchange.feed(REPLY) == Done(1234, send=ACK)
+
+
+def test_a_byte_behind_a_nak_is_never_taken_for_the_ack_of_the_packet_sent_again() -> None:
+    exchange = writing()
+    assert exchange.feed(NAK + ACK) is MORE
+    with pytest.raises(FrameError, match="2 bytes that are no packet"):
+        exchange.expired(True)
+
+
+# the packet is damaged
+
+
+def test_a_bad_packet_is_naked_five_times_and_then_acked_away() -> None:
+    exchange = acked()
+    for _ in range(5):
+        assert exchange.feed(BAD) == Expect(TIMINGS.packet, exchange.later[0].sizes, NAK)
+    with pytest.raises(FrameError, match="bad checksum") as error:
+        exchange.feed(BAD)
+    assert (error.value.whole, error.value.send) == (True, ACK)
+
+
+def test_a_packet_that_comes_well_after_five_bad_ones_still_counts() -> None:
+    exchange = acked()
+    for _ in range(5):
+        exchange.feed(BAD)
+    assert exchange.feed(REPLY) == Done(1234, send=ACK)
+
+
+def test_a_cut_packet_is_naked_when_the_line_pauses() -> None:
+    exchange = acked()
+    assert exchange.feed(REPLY[:9]) is MORE
+    assert says(exchange.expired(True)) == NAK
+    assert exchange.feed(REPLY) == Done(1234, send=ACK)
+
+
+@pytest.mark.parametrize(
+    "heard",
+    [
+        pytest.param(b"\x03" + REPLY[1:], id="no STX"),
+        pytest.param(b"\x02\x01\x01" + REPLY[3:], id="a length that no packet has"),
+        pytest.param(b"\x02\x00" + REPLY[2:], id="a unit that does not exist"),
+        pytest.param(REPLY[:3] + b"\x08" + REPLY[4:], id="a length that ends too early"),
+        pytest.param(REPLY[:3] + b"\x8a" + REPLY[4:], id="a length that ends too late"),
+        pytest.param(BAD + b"\x00", id="a byte too many"),
+    ],
+)
+def test_a_reader_that_has_lost_count_says_nak_only_when_the_line_pauses(heard: bytes) -> None:
+    for chunks in ([heard], [bytes((byte,)) for byte in heard[:-1]]):
+        exchange = acked()
+        steps = [exchange.feed(chunk) for chunk in chunks]
+        if steps[-1] is MORE:
+            assert says(exchange.expired(True)) == NAK
+        assert exchange.feed(REPLY) == Done(1234, send=ACK)
+
+
+def test_a_babbling_line_is_not_listened_to_without_end() -> None:
+    exchange = acked()
+    assert all(exchange.feed(b"\xaa") is MORE for _ in range(248))
+    with pytest.raises(FrameError, match="without a pause"):
+        exchange.feed(b"\xaa")
+
+
+def test_no_packet_after_the_ack_fails_with_an_ack_for_one_that_was_lost() -> None:
+    with pytest.raises(FrameError, match="no packet followed the ACK") as error:
+        acked().expired(False)
+    assert (error.value.whole, error.value.send) == (False, ACK)
+
+
+def test_no_ack_is_no_reply() -> None:
+    exchange = reading()
+    assert exchange.feed(b"") is MORE
+    with pytest.raises(FrameError, match="no reply") as error:
+        exchange.expired(False)
+    assert error.value.send == b""
+
+
+# packets that answer something else
+
+
+def test_a_packet_before_the_ack_is_acked_dropped_and_the_ack_awaited() -> None:
+    exchange = reading()
+    assert exchange.feed(REPLY) == Expect(exchange.timing, exchange.sizes, ACK)
+    exchange.feed(ACK)
+    assert exchange.feed(packet(1, b"DREAD,\0\0\0\7")) == Done(7, send=ACK)
+
+
+def test_an_ack_glued_to_a_stale_packet_is_the_requests() -> None:
+    exchange = writing()
+    assert says(exchange.feed(STALE + ACK)) == ACK
+    assert exchange.feed(b"") == Done(None)
+
+
+def test_six_stale_packets_are_dropped_and_the_seventh_ends_the_attempt() -> None:
+    for exchange in (reading(), acked()):
+        for _ in range(6):
+            assert says(exchange.feed(STALE)) == ACK
+        with pytest.raises(FrameError, match="answers something else") as error:
+            exchange.feed(STALE)
+        assert error.value.send == ACK
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        pytest.param(packet(2, b"DREAD,\0\0\0\7"), id="of another unit"),
+        pytest.param(packet(1, b"BREAD," + bytes(128)), id="of another command"),
+        pytest.param(packet(1, b"RREAD,\0\0\0\7"), id="of another command of equal length"),
+        pytest.param(packet(1, b"DREAD,\0\7"), id="of another length"),
+    ],
+)
+def test_a_packet_that_names_something_else_is_never_the_reply(other: bytes) -> None:
+    exchange = acked()
+    assert exchange.feed(other) == Expect(TIMINGS.packet, exchange.later[0].sizes, ACK)
+    assert exchange.feed(REPLY) == Done(1234, send=ACK)
+
+
+def test_a_damaged_packet_before_the_ack_ends_the_attempt_when_the_line_pauses() -> None:
+    """No byte in the middle of it may be taken for the ACK."""
+    exchange = writing()
+    assert exchange.feed(BAD + ACK) is MORE
+    with pytest.raises(FrameError, match="no packet") as error:
+        exchange.expired(True)
+    assert error.value.send == ACK
+
+
+def test_a_packet_before_the_ack_that_is_cut_short_ends_the_attempt() -> None:
+    exchange = writing()
+    assert exchange.feed(STALE[:5]) is MORE
+    with pytest.raises(FrameError, match="cut short after 5 bytes") as error:
+        exchange.expired(True)
+    assert error.value.send == ACK
+
+
+def test_the_requests_own_echo_is_named_as_such() -> None:
+    """Or the echo of the ACK that answers it would be taken for the device's."""
+    exchange = writing()
+    with pytest.raises(FrameError, match="echo=True"):
+        exchange.feed(exchange.request)
+
+
+# ways out
+
+
+def test_a_read_that_must_not_go_on_acks_the_bad_packet_away() -> None:
+    exchange = acked()
+    exchange.feed(BAD)
+    failure = exchange.abandon()
+    assert isinstance(failure, FrameError)
+    assert (failure.whole, failure.send) == (True, ACK)
+
+
+def test_a_cut_or_stale_packet_is_acked_away_and_the_line_settles() -> None:
+    cut, stale = acked(), reading()
+    cut.feed(REPLY[:9])
+    cut.expired(True)
+    stale.feed(STALE)
+    for exchange in (cut, stale):
+        failure = exchange.abandon()
+        assert isinstance(failure, FrameError)
+        assert (failure.whole, failure.send) == (False, ACK)
+
+
+def test_a_naked_request_that_must_not_be_repeated_now_is_refused_until_it_is_confirmed() -> None:
+    exchange = writing()
+    exchange.feed(NAK)
+    failure = exchange.abandon()
+    assert isinstance(failure, Refused)
+    assert failure.confirm
+
+
+# while nothing is asked
+
+
+def test_a_stale_packet_is_acked_and_dropped_in_any_chunks() -> None:
+    listener = StalePacketListener()
+    for _ in range(2):
+        assert listener.feed(b"") is MORE
+        assert all(listener.feed(bytes((byte,))) is MORE for byte in STALE[:-1])
+        assert listener.feed(STALE[-1:] + b"\x02") == Done(None, send=ACK, rest=b"\x02")
+
+
+def test_a_damaged_stale_packet_is_acked_when_the_line_pauses() -> None:
+    listener = StalePacketListener()
+    for heard in (BAD, STALE[:7], b"\x02\xff\xff\xff"):
+        assert listener.feed(heard) is MORE
+        assert listener.expired() == Done(None, send=ACK)
+
+
+@pytest.mark.parametrize("stray", [ACK, NAK, b"\x00" + STALE, b"\x02\xff" + bytes(300)])
+def test_what_is_no_stale_packet_is_not_answered(stray: bytes) -> None:
+    listener = StalePacketListener()
+    with pytest.raises(FrameError, match="stray") as error:
+        listener.feed(stray)
+    assert error.value.send == b""
+    assert listener.feed(STALE) == Done(None, send=ACK)
+
+
+def test_a_bad_unit_byte_with_the_right_length_is_no_exemption_from_settling() -> None:
+    heard = REPLY[:1] + b"\x03" + REPLY[2:]
+    exchange = acked()
+    for _ in range(5):
+        assert says(exchange.feed(heard)) == NAK
+    with pytest.raises(FrameError, match="bad checksum") as error:
+        exchange.feed(heard)
+    assert not error.value.whole
+
+
+def test_a_flags_reply_like_its_request_is_taken_after_the_ack() -> None:
+    """RFLAG of flag 1: the packet "it is on" is the request's own bytes."""
+    exchange = ReadFlag(1).open(4, TIMINGS)
+    exchange.feed(ACK)
+    assert exchange.feed(exchange.request) == Done(True, send=ACK)
+
+
+def test_a_short_open_ended_packet_with_a_bad_checksum_is_naked_after_a_pause() -> None:
+    short = packet(1, b"RQSTAT,\x00\x41")
+    exchange = ReadStatus().open(1, TIMINGS)
+    exchange.feed(ACK)
+    assert exchange.feed(short[:-1] + b"\xff") is MORE
+    assert says(exchange.expired(True)) == NAK
+    assert exchange.feed(short) == Done(65, send=ACK)
