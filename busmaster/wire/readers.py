@@ -115,7 +115,7 @@ class TelegramReader(SingleLeg, Generic[T]):
             return MORE
         return Done(self.parse(buffer[len(header) : etx]), rest=buffer[etx + 2 :])
 
-    def expired(self, started: bool) -> Expect | Done[T]:
+    def expired(self, started: bool) -> NoReturn:
         raise FrameError(f"reply cut short after {len(self._buffer)} bytes") if started else no_reply()
 
 
@@ -134,5 +134,5 @@ class AcknowledgeReader(SingleLeg):
             self.reject(data[0])
         return Done(None, rest=data[1:])
 
-    def expired(self, started: bool) -> Expect | Done[None]:
+    def expired(self, started: bool) -> NoReturn:
         raise no_reply()

@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from hypothesis import strategies as st
+
 from busmaster.errors import Refused
 from busmaster.exchange import MORE, Done, Exchange, Expect, FrameError
 
@@ -53,3 +55,11 @@ def outcome(exchange: Exchange[Any], chunks: Iterable[bytes]) -> object:
 
 def single_bytes(data: bytes) -> list[bytes]:
     return [data[i : i + 1] for i in range(len(data))]
+
+
+def debris(*frames: bytes) -> st.SearchStrategy[list[bytes]]:
+    """Chunks of whole frames, halves of them, control characters and noise: nearer to a reply than noise alone."""
+    controls = [bytes([byte]) for byte in (0x02, 0x03, 0x04, 0x06, 0x15, 0x82)]
+    halves = [half for frame in frames for half in (frame[: len(frame) // 2], frame[len(frame) // 2 :])]
+    piece = st.one_of(st.sampled_from([*frames, *halves, *controls]), st.binary(min_size=1, max_size=4))
+    return st.lists(piece, max_size=6)

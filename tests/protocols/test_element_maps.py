@@ -1,0 +1,104 @@
+"""The extended comms array and the MicroFlex map against the tables of AN00129."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.protocols import comms_array, microflex
+from busmaster.protocols.microflex import CommandWord, StatusWord
+
+
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("axis0.position", 100),
+        ("axis0.encoder", 105),  # the document's own example
+        ("axis0.following_error", 107),
+        ("axis1.position", 115),
+        ("axis7.following_error", 212),
+        ("inputs", 220),
+        ("outputs", 222),  # the document's own example
+        ("adc0", 224),
+        ("adc7", 231),
+        ("error", 232),
+        ("error_line", 233),
+        ("error_axis", 234),
+        ("running", 235),
+        ("line_number", 237),
+        ("firmware", 239),
+    ],
+)
+def test_the_extended_comms_array_is_the_documents(name: str, number: int) -> None:
+    assert comms_array.ELEMENTS[name].number == number
+
+
+def test_only_the_outputs_of_a_controller_are_writable() -> None:
+    assert [e.name for e in comms_array.ELEMENTS.values() if e.writable] == ["outputs"]
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "unit"),
+    [
+        ("position", 100, "counts"),
+        ("axis_error", 103, ""),
+        ("following_error", 107, "counts"),
+        ("command_word", 108, ""),
+        ("status_word", 109, ""),
+        ("drive_error", 110, ""),
+        ("demand_position", 111, "counts"),
+        ("torque_reference", 116, "% of rated current"),
+        ("torque_demand", 117, "% of rated current"),
+        ("speed_reference", 118, "% of max speed"),
+        ("speed_demand", 119, "% of max speed"),
+        ("speed_measured", 120, "% of max speed"),
+        ("speed_error", 121, "% of max speed"),
+        ("drive_overload", 124, "%"),
+        ("motor_overload", 125, "%"),
+        ("bus_voltage", 126, "V"),
+        ("current", 127, "A"),
+        ("current_u", 128, "A"),
+        ("current_v", 129, "A"),
+        ("hall_state", 130, ""),
+        ("absolute_encoder", 131, "counts"),
+        ("phase_search_status", 132, ""),
+        ("inputs", 220, ""),
+        ("outputs", 222, ""),
+        ("analog_input", 224, "%"),
+        ("firmware", 239, ""),
+        ("temperature", 242, "°C"),
+    ],
+)
+def test_the_microflex_map_is_the_documents(name: str, number: int, unit: str) -> None:
+    element = microflex.ELEMENTS[name]
+    assert (element.number, element.unit) == (number, unit)
+
+
+def test_a_microflex_has_27_names_of_which_three_are_writable() -> None:
+    assert len(microflex.ELEMENTS) == 27
+    assert [e.name for e in microflex.ELEMENTS.values() if e.writable] == [
+        "command_word",
+        "torque_reference",
+        "speed_reference",
+    ]
+
+
+@pytest.mark.parametrize("elements", [comms_array.ELEMENTS, microflex.ELEMENTS])
+def test_names_come_in_the_order_of_their_numbers(elements: dict[str, comms_array.Element[object]]) -> None:
+    numbers = [element.number for element in elements.values()]
+    assert numbers == sorted(set(numbers))
+
+
+def test_words_are_flags_and_keep_what_the_document_does_not_define() -> None:
+    assert microflex.STATUS_WORD.decode(192.0) == StatusWord.ENABLED | StatusWord.HARDWARE_ENABLE
+    assert microflex.COMMAND_WORD.decode(129.0) == CommandWord.ENABLE | 1
+
+
+def test_bitmaps_are_non_negative_whole_numbers() -> None:
+    assert comms_array.INPUTS.decode(5.0) == 5
+    assert comms_array.INPUTS.decode(-1.0) == 0xFFFF_FFFF
+    assert isinstance(comms_array.INPUTS.decode(5.0), int)
+
+
+def test_counts_and_codes_are_rounded() -> None:
+    assert comms_array.FIRMWARE.decode(5221.0) == 5221
+    assert comms_array.whole(-1.0001) == -1
