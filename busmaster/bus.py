@@ -171,7 +171,7 @@ class Bus:
         self.pump.turn()
 
     def suspend(self, node: Node, seconds: float) -> None:
-        self._arbiter.suspend(node.record, self.now() + seconds)
+        self._arbiter.dispatcher.suspend(node.record, self.now() + seconds)
         self.pump.turn()
 
     def latest(self, point: Point[Any]) -> Sample | None:
@@ -250,4 +250,4 @@ class Bus:
         except BusError:
             pass
         finally:
-            self._arbiter.release_node(node.record)
+            self._arbiter.dispatcher.release_node(node.record)

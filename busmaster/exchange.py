@@ -231,13 +231,17 @@ class Listener(Protocol):
         ...
 
 
+NO_REPLY = "no reply"
+
+
 def no_reply() -> FrameError:
     """The one failure that every exchange shares: the window ran out before a byte came."""
-    return FrameError("no reply")
+    return FrameError(NO_REPLY)
 
 
 __all__ = [
     "MORE",
+    "NO_REPLY",
     "Command",
     "Done",
     "Exchange",

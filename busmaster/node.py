@@ -115,6 +115,7 @@ class Node:
         start_within: float | None,
         retries: int | None,
         idempotent: bool | None,
+        probe: bool = False,
     ) -> tuple[Transaction, asyncio.Future[Any]]:
         if retries is not None and not 0 <= retries <= 100:
             raise InvalidCommand(f"{self.label}: retries must be 0 to 100, not {retries}")
@@ -129,14 +130,18 @@ class Node:
             start_by=inf if start_within is None else self.bus.now() + start_within,
             retries=retries,
             idempotent=idempotent,
+            probe=probe,
         )
         return transaction, self.bus.pump.transact(transaction)
 
     async def probe(self) -> bool:
         """Ask the node's cheapest read now, once; True if it answered (a refusal is an answer)."""
-        self.record.probe_at = -inf
+        transaction, future = self._start(self.profile.probe, None, None, 0, None, probe=True)
         try:
-            await self.request(self.profile.probe, retries=0)
+            await future
+        except asyncio.CancelledError:
+            self.bus.pump.cancel(transaction)
+            raise
         except BusError:
             return self.health is Health.UP
         return True

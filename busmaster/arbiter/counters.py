@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from busmaster.arbiter.events import LineState
 from busmaster.arbiter.histogram import Histogram
 
 
@@ -113,7 +114,8 @@ class NodeCounters:
 
 class LineCounters:
     __slots__ = (
-        "busy",
+        "_entered",
+        "_spent",
         "cancelled",
         "collisions",
         "completed",
@@ -122,7 +124,6 @@ class LineCounters:
         "noise_bytes",
         "noisy",
         "settles",
-        "settling",
         "since",
         "stray_bytes",
         "tainted",
@@ -136,10 +137,22 @@ class LineCounters:
         self.since = since
         self.exchanges = self.completed = self.cancelled = self.stray_bytes = self.noise_bytes = 0
         self.tainted = self.collisions = self.settles = self.noisy = self.losses = 0
-        self.settling = self.busy = 0.0
+        self._entered = since
+        self._spent = [0.0] * len(LineState)
         self.waits = (Histogram(), Histogram(), Histogram(), Histogram())
 
-    def snapshot(self, now: float, busy: float, settling: float, backlog: int) -> LineStatistics:
+    def spend(self, state: LineState, now: float) -> float:
+        """The time since the last call went by in this state; returns it."""
+        spent = now - self._entered
+        self._spent[state] += spent
+        self._entered = now
+        return spent
+
+    @property
+    def settling(self) -> float:
+        return self._spent[LineState.SETTLING]
+
+    def snapshot(self, now: float, backlog: int) -> LineStatistics:
         first, second, third, fourth = self.waits
         return LineStatistics(
             now - self.since,
@@ -151,8 +164,8 @@ class LineCounters:
             self.tainted,
             self.collisions,
             self.settles,
-            settling,
-            busy,
+            self.settling,
+            self._spent[LineState.EXCHANGE] + self._spent[LineState.HOLDOFF],
             self.noisy,
             self.losses,
             backlog,

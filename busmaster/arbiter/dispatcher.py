@@ -188,6 +188,10 @@ class Dispatcher:
             transaction.refused_until = now + REFUSED_POLL_PAUSE
         self._end(transaction, now, _named(refusal, transaction))
 
+    def unsendable(self, transaction: Transaction, bug: Exception, now: float) -> None:
+        """Its protocol cannot encode it: a bug there, but nobody may wait for ever."""
+        self._end(transaction, now, _error(BusError, f"its protocol could not encode it: {bug!r}", transaction))
+
     def cut_off(self, transaction: Transaction, error: BusError, now: float) -> None:
         """The line was lost under it: a write may have been carried out."""
         if transaction.writes:
@@ -280,11 +284,6 @@ class Dispatcher:
         """Its hook has run: its polls resume with their next cycle."""
         node.held = False
 
-    def probe_soon(self, node: NodeRecord, now: float) -> None:
-        if node.health is Health.DOWN:
-            node.probe_at = now
-            self.plan_probes()
-
     def plan_probes(self) -> None:
         """Set the deadline of the next probe. One probe at a time is out."""
         if self._probe is not None:
@@ -322,7 +321,7 @@ class Dispatcher:
         if now < node.suspended_until:
             self._end(transaction, now, _error(NodeDown, "suspended for maintenance", transaction))
             return False
-        if node.health is not Health.DOWN or transaction.paid:
+        if node.health is not Health.DOWN or transaction.paid or transaction.probe:
             return True
         if transaction.poll is None and self._budget.take(node.lateness, now):
             transaction.paid = node.lateness

@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from busmaster.arbiter.transaction import Transaction
 
 
-class LineState(enum.Enum):
-    """Of the one line. SETTLING and NOISY both discard what comes; NOISY also fails callers."""
+class LineState(enum.IntEnum):
+    """Of the one line; the table on top of arbiter.py says what leads where."""
 
-    OFFLINE = "offline"
-    READY = "ready"
-    HOLDOFF = "holdoff"
-    EXCHANGE = "exchange"
-    SETTLING = "settling"
+    OFFLINE = 0
+    READY = 1
+    HOLDOFF = 2
+    EXCHANGE = 3
+    SETTLING = 4
 
 
 @dataclass(slots=True)

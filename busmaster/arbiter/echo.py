@@ -1,0 +1,34 @@
+"""Local echo: what was sent comes back before anything else does."""
+
+from __future__ import annotations
+
+
+class Echo:
+    """Takes the echo of what was sent off the front of what comes, byte for byte, across exchanges.
+
+    MSC's closing ACK echoes into the next exchange, so what is owed outlives an exchange.
+    """
+
+    __slots__ = ("declared", "owed")
+
+    def __init__(self, declared: bool) -> None:
+        self.declared = declared
+        self.owed = b""
+
+    def sent(self, data: bytes) -> None:
+        if self.declared:
+            self.owed += data
+
+    def strip(self, data: bytes) -> bytes | None:
+        """What came after the echo; None where the echo differs from what was sent: a collision."""
+        owed = self.owed
+        length = min(len(owed), len(data))
+        if data[:length] != owed[:length]:
+            self.owed = b""
+            return None
+        self.owed = owed[length:]
+        return data[length:]
+
+    def forget(self) -> None:
+        """The line settles: what is still owed would be discarded anyway."""
+        self.owed = b""

@@ -1,0 +1,64 @@
+"""The times of one leg of an exchange (R2-R4): when its reply may begin, how long it may last, when it is past."""
+
+from __future__ import annotations
+
+from math import inf
+
+from busmaster.arbiter.strays import QUIET
+from busmaster.exchange import ReplyTiming
+
+TAINT_SHARE = 0.9
+"""A reply cannot begin before this share of its request's own wire time (R4)."""
+
+
+class Leg:
+    """The leg on the wire, or the last one. `latency`: how long received bytes may lie in an adapter, in seconds."""
+
+    __slots__ = ("_latency", "_limit", "_taint_until", "begun", "end", "timing")
+
+    def __init__(self, timing: ReplyTiming, latency: float) -> None:
+        self.timing = timing
+        self.begun = False
+        self.end = -inf
+        """When the last byte sent is on the wire."""
+        self._latency = latency
+        self._limit = inf
+        self._taint_until = -inf
+
+    def begin(self, timing: ReplyTiming, said: float, longest: float, now: float) -> float:
+        """The host says something that takes `said` seconds; the longest reply takes `longest`. When it must begin."""
+        self.timing = timing
+        self.begun = False
+        self.end = end = now + said
+        due = end + timing.window + self._latency
+        self._limit = due + longest + timing.byte_gap
+        return due
+
+    def taint(self, said: float, now: float) -> None:
+        """On a paced line: bytes that come before most of the request is out cannot be its reply."""
+        self._taint_until = now + TAINT_SHARE * said
+
+    def tainted(self, now: float) -> bool:
+        return now < self._taint_until
+
+    def late(self, now: float) -> bool:
+        return now > self.end + self.timing.nominal + self._latency
+
+    def gap_over(self, now: float) -> float:
+        """When the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
+        due = now + self.timing.byte_gap + self._latency
+        return due if due < self._limit else self._limit
+
+    def echoed(self, now: float) -> float:
+        """The last byte of its echo came: its times start here. When its reply must begin."""
+        self._limit += now - self.end
+        self.end = now
+        return now + self.timing.window + self._latency
+
+    def quiet(self) -> float:
+        """The silence, in seconds, after which nothing more of a frame can come."""
+        return max(QUIET, self.timing.byte_gap)
+
+    def past(self) -> float:
+        """From then on, no reply to it can begin (R3)."""
+        return self.end + self.timing.lateness + self._latency

@@ -1,0 +1,92 @@
+"""What came though nobody asked for it: counted, blamed on the node that was slow, answered where that is owed."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import inf
+
+from busmaster.arbiter.counters import LineCounters
+from busmaster.arbiter.events import Event, LatenessRaised, Strayed
+from busmaster.arbiter.health import NodeRecord
+from busmaster.exchange import Done, FrameError, Listener, Need
+
+QUIET = 0.020
+"""The least silence, in seconds, that ends a settle."""
+NOISY_AFTER = 1.0
+"""Seconds without such a silence after which the line is NOISY."""
+STRAGGLER_SHARE = 0.75
+STRAGGLER_MARGIN = 1.6
+LONGEST_LATENESS = 0.5
+STRAGGLER_MEMORY = 1.0
+"""Seconds after which a stray byte is no longer blamed on the last unanswered request."""
+
+
+class Strays:
+    """The bytes between exchanges, of one line."""
+
+    def __init__(self, events: deque[Event], counters: LineCounters) -> None:
+        self.last_byte = -inf
+        self.listener: Listener | None = None
+        self._events = events
+        self._counters = counters
+        self._noise_since = inf
+        self._listening = False
+        self._unanswered: tuple[NodeRecord, float, float] | None = None
+
+    def note(self, data: bytes, now: float, quiet: float) -> None:
+        """Count them; `quiet` is the silence, in seconds, after which a run of noise is over."""
+        self._counters.stray_bytes += len(data)
+        self._events.append(Strayed(data))
+        if now - self.last_byte > quiet or self._noise_since == inf:
+            self._noise_since = now
+        self.last_byte = now
+        self.blame(now)
+
+    def babbling(self, now: float) -> bool:
+        """They have not paused for so long that nothing can be sent."""
+        return now - self._noise_since >= NOISY_AFTER
+
+    def silent(self) -> None:
+        self._noise_since = inf
+
+    # stragglers (R3)
+
+    def unanswered(self, node: NodeRecord, asked: float, lateness: float) -> None:
+        """A request, out since `asked`, got no reply within its window; what comes next may be its straggler."""
+        self._unanswered = (node, asked, lateness)
+
+    def answered(self) -> None:
+        self._unanswered = None
+
+    def blame(self, first_byte: float) -> None:
+        """A reply came long after its request: its node is slower than was believed, so its lateness is raised."""
+        if self._unanswered is None:
+            return
+        node, asked, lateness = self._unanswered
+        self._unanswered = None
+        age = first_byte - asked
+        raised = min(STRAGGLER_MARGIN * age, LONGEST_LATENESS)
+        if STRAGGLER_SHARE * lateness < age <= STRAGGLER_MEMORY and raised > lateness:
+            node.timings = node.timings.with_lateness(raised)
+            self._events.append(LatenessRaised(node, age, raised))
+
+    # what may be owed an answer: MSC sends a packet again until it is ACKed
+
+    def reply_to(self, data: bytes) -> bytes:
+        """What must be said to these bytes, if anything."""
+        if self.listener is None:
+            return b""
+        try:
+            step = self.listener.feed(data)
+        except FrameError as error:
+            self._listening = False
+            return error.send
+        self._listening = step is Need.MORE
+        return step.send if isinstance(step, Done) else b""
+
+    def reply_to_silence(self) -> bytes:
+        """What must be said to a packet that was cut off, if anything."""
+        if self.listener is None or not self._listening:
+            return b""
+        self._listening = False
+        return self.listener.expired().send
