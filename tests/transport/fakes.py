@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import select
+import selectors
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -103,3 +104,27 @@ def plugged(link: Path | None = None) -> Iterator[FarEnd]:
         far_end.unplug()
         if link is not None:
             link.unlink()
+
+
+class VirtualLoop(asyncio.SelectorEventLoop):
+    """Its time stands still while there is something to do, and then jumps to the next timer."""
+
+    def __init__(self) -> None:
+        super().__init__(_Jumping(self))
+        self.now = 0.0
+
+    def time(self) -> float:
+        return self.now
+
+
+class _Jumping(selectors.DefaultSelector):
+    def __init__(self, loop: VirtualLoop) -> None:
+        super().__init__()
+        self._virtual = loop
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        ready = super().select(0)
+        if not ready:
+            assert timeout is not None, "nothing will ever happen again"
+            self._virtual.now += timeout
+        return ready

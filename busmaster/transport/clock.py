@@ -1,0 +1,15 @@
+"""Which clock a loop keeps."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+
+VIRTUAL = 1.0
+"""A loop whose time differs by more seconds than this from the machine's keeps a time of its own."""
+
+
+def clock_of(loop: asyncio.AbstractEventLoop) -> Callable[[], float]:
+    """The loop's own clock if its time is virtual; else the machine's, which is finer than some loops'."""
+    return loop.time if abs(loop.time() - time.monotonic()) > VIRTUAL else time.monotonic
