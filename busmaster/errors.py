@@ -95,6 +95,12 @@ class WriteUnconfirmed(BusError):
     hint = "read the value back before you write again"
 
 
+class VerifyFailed(BusError):
+    """A write was acknowledged, but what was read back is something else."""
+
+    hint = "look for limits, rounding, an interlock, or a program in the node that writes it too"
+
+
 class Superseded(BusError):
     """A queued write was dropped because an urgent write to the same node overtook it."""
 
