@@ -87,8 +87,8 @@ class Line:
         self.chunk = chunk
         self.latency = latency
         self.turnaround = turnaround
-        self.prompt = False
-        """The first byte of a frame is an event of its own: for a host in real time, which cannot ask when it likes."""
+        self.prompt = True
+        """A frame's first byte is an event of its own. Needless if the host asks at each of its deadlines."""
         self.collisions = 0
         """Talks that started while another was on the wire."""
         self._active: Talk | None = None

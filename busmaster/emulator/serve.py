@@ -1,12 +1,11 @@
-"""A line in real time: on a pseudo-terminal, on a TCP port, or on the running event loop.
+"""A line in real time, on a pseudo-terminal or on a TCP port.
 
-The servers run their line in a thread of their own with a clock of their own, since an event loop's timers are rounded
-up to milliseconds, which is half a frame. A thread that has nothing to do sleeps without end.
+A server runs its line in a thread with a clock of its own, since an event loop's timers are rounded up to milliseconds,
+which is half a frame. A thread that has nothing to do sleeps without end.
 """
 
 from __future__ import annotations
 
-import asyncio
 import os
 import pty
 import queue
@@ -41,7 +40,6 @@ class LineServer(ABC):
 
     def __init__(self, line: Line) -> None:
         self.line = line
-        line.prompt = True
         self.dropped = 0
         """Bytes for the host that nobody took in time."""
         self._actions: queue.SimpleQueue[tuple[Callable[[Line, float], Any], Future[Any]]] = queue.SimpleQueue()
@@ -257,42 +255,3 @@ def serve_pty(line: Line, link: str | os.PathLike[str] | None = None) -> PtyServ
 def serve_tcp(line: Line, host: str = "127.0.0.1", port: int = 0) -> TcpServer:
     """Serves `line` on a TCP port until closed."""
     return TcpServer(line, host, port)
-
-
-class LineDriver:
-    """Runs a line on the running event loop: `on_bytes` is called with what reaches the host.
-
-    Time is the loop's own, so that a loop of virtual time drives it too. On a real loop, timers are rounded up to a
-    millisecond. Call `changed` after acting on the line directly (cut, restart).
-    """
-
-    def __init__(self, line: Line, on_bytes: Callable[[bytes], Any]) -> None:
-        self.line = line
-        line.prompt = True
-        self._on_bytes = on_bytes
-        self._loop = asyncio.get_running_loop()
-        self._timer: asyncio.TimerHandle | None = None
-        self._closed = False
-
-    def send(self, data: bytes) -> None:
-        """The host says `data`, now."""
-        self.line.send(data, self._loop.time())
-        self.changed()
-
-    def changed(self) -> None:
-        """Something happened to the line: look again when to come back."""
-        if self._timer is not None:
-            self._timer.cancel()
-        due = self.line.next_event()
-        self._timer = None if self._closed or due == NEVER else self._loop.call_at(due, self._run)
-
-    def close(self) -> None:
-        """Nothing more reaches the host. The line may be driven anew by another driver."""
-        self._closed = True
-        self.changed()
-
-    def _run(self) -> None:
-        data = self.line.receive(self._loop.time())
-        self.changed()
-        if data:
-            self._on_bytes(data)
