@@ -1,14 +1,17 @@
 """What the system knows of a serial port: who holds it, who may open it, what its driver does to the timing.
 
-Nothing here needs the port open. Each finding says what to do about it. Linux only: elsewhere there are no findings.
+Nothing here opens a port. Each finding says what to do about it. Linux only: elsewhere there are no findings.
 """
 
 from __future__ import annotations
 
+import array
 import contextlib
+import fcntl
 import grp
 import os
 import stat
+import termios
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +21,10 @@ SYS = Path("/sys")
 
 SLOW_LATENCY_TIMER = 2
 """Milliseconds; above that, an FTDI adapter's batching shows in every reply."""
+
+FLAGS = 4
+ASYNC_LOW_LATENCY = 1 << 13
+"""Of struct serial_struct (linux/serial.h, linux/tty_flags.h): where its flags are, and the one that we look for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +93,16 @@ def latency_timer(path: str, *, sys: Path = SYS) -> int | None:
         return int((_device(path, sys) / "latency_timer").read_text())
     except (OSError, ValueError):
         return None
+
+
+def low_latency(descriptor: int) -> bool | None:
+    """Whether the driver of an open port has its low-latency flag set; None if it knows no such flag."""
+    settings = array.array("i", [0] * 32)  # struct serial_struct, with room to grow
+    try:
+        fcntl.ioctl(descriptor, termios.TIOCGSERIAL, settings)
+    except OSError:
+        return None
+    return bool(settings[FLAGS] & ASYNC_LOW_LATENCY)
 
 
 def _existence(path: str) -> Finding:
