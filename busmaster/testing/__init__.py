@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen
+from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen, answers_of
 from busmaster.testing.protocol import check_protocol
 
 __all__ = [
@@ -12,5 +12,6 @@ __all__ = [
     "RoundTrip",
     "Tally",
     "Unseen",
+    "answers_of",
     "check_protocol",
 ]

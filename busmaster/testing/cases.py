@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from busmaster.emulator.device import Device
 from busmaster.errors import Refused
 from busmaster.exchange import Command
 
@@ -74,3 +75,15 @@ class NotConformant(AssertionError):
 
 Tally = Counter[str]
 """How much was tried, by kind: "splits", "truncations", "flips", "foreign", "garbage", "round trips"."""
+
+
+def answers_of(device: Device) -> Callable[[bytes], bytes]:
+    """An emulated device, alone on a line on which nothing takes time, as what `round_trips` ask."""
+
+    def answer(heard: bytes) -> bytes:
+        device.hear(heard, 0.0)
+        replies = b"".join(data for _, data in device.outbox)
+        device.outbox.clear()
+        return replies
+
+    return answer

@@ -34,7 +34,7 @@ from random import Random
 from typing import Any
 
 from busmaster.errors import Refused
-from busmaster.exchange import Command
+from busmaster.exchange import Command, Exchange
 from busmaster.profile import Profile
 from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen
 from busmaster.testing.commands import check_addresses, check_command, check_invalid
@@ -45,7 +45,7 @@ LONG_REPLY = 64
 """Bytes above which a reply with a flipped bit is not fed byte by byte too."""
 FINDINGS_EACH = 3
 """How many findings of one kind a case may add: the rest would only repeat them."""
-STRAYS = b"\x00\xff"
+STRAYS = b"\x00\x7f"
 
 
 def check_protocol(
@@ -64,8 +64,9 @@ def check_protocol(
     """Raises NotConformant unless the protocol keeps the contract for all of `cases`, see the module's text.
 
     `names(command, address)` is what a reply to it names: where it is equal for two cases, the reply to one may be
-    taken for the other's. `device` is told what the host says, and returns what the device says at once. `garbage`
-    is the number of random replies for each case, drawn from `seed`. Returns how much was tried.
+    taken for the other's. `device` is told what the host says, and returns what the device says at once (see
+    `answers_of`). `garbage` is the number of random replies for each case, drawn from `seed`. Returns how much was
+    tried.
     """
     kit = _Kit(profile, list(cases), names, list(unseen), Random(seed))
     if not kit.cases:
@@ -149,13 +150,10 @@ class _Kit:
                 yield f"{case}: the reply {_hex(case.legs)} gives {ending} in place of {case.raises.__name__}"
         elif not ending.delivered or ending.value != case.value or ending.rest:
             yield f"{case}: the reply {_hex(case.legs)} gives {ending} in place of {case.value!r}"
-        elif not listening.said:
-            yield from self._check_announced(case, ending)
+        elif exchange.answered and len(b"".join(listening.said)) == sum(leg.sent for leg in exchange.later):
+            yield from self._check_announced(case, exchange, ending)
 
-    def _check_announced(self, case: Case, ending: Ending) -> Iterator[str]:
-        exchange = self.listen(case.command, case.address).exchange
-        if not exchange.answered:
-            return
+    def _check_announced(self, case: Case, exchange: Exchange[Any], ending: Ending) -> Iterator[str]:
         sizes = [exchange.sizes, *(leg.sizes for leg in exchange.later)]
         if len(case.legs) != len(sizes):
             yield f"{case}: {len(case.legs)} legs in place of the {len(sizes)} announced"
@@ -237,14 +235,23 @@ class _Kit:
     # the replies of others
 
     def check_replies_to_others(self) -> Iterator[str]:
+        """Whatever one turn of a node brings, as far as nothing was said again in it."""
+        replies = {id(case): self._first_turn(case) for case in self.cases}
         for mine in self.cases:
             names = self._names(mine.command, mine.address)
-            alike = [case for case in self.cases if self._names(case.command, case.address) == names]
-            good = {b"".join(case.legs) for case in alike}
-            others = [case for case in self.cases if case not in alike and case.raises is None and case.legs]
-            for other in others:
-                heard = b"".join(other.legs)
-                yield from self._check_not_accepted(mine.command, mine.address, heard, good, f"the reply to {other}")
+            alike = {id(case) for case in self.cases if self._names(case.command, case.address) == names}
+            good = {replies[case] for case in alike}
+            for other in self.cases:
+                heard = replies[id(other)]
+                if id(other) not in alike and heard:
+                    why = f"the reply to {other}"
+                    yield from self._check_not_accepted(mine.command, mine.address, heard, good, why)
+
+    def _first_turn(self, case: Case) -> bytes:
+        """Empty for a refusal, and where something had to be repeated: such a case does not show what a reply is."""
+        listening = self.hear(case, *case.legs)
+        repeated = len(b"".join(listening.said)) != sum(leg.sent for leg in listening.exchange.later)
+        return b"" if repeated or case.raises is not None else b"".join(self.turns(case)[0])
 
     def check_foreign(self, foreign: Iterable[Foreign]) -> Iterator[str]:
         for other in foreign:
