@@ -42,6 +42,14 @@ class _Held:
     def is_of(self, verdict: Verdict) -> bool:
         return not self.released and self.request is not None and self.request.raw == verdict.request
 
+    def is_stray(self, frame: Frame) -> bool:
+        """It came from a node after the exchange was over, or before any."""
+        if frame.sender is not Direction.NODE:
+            return False
+        last = self.last
+        over = last is not None and last.kind is not Kind.NOISE and self.judge()[0] is not Outcome.NO_REPLY
+        return frame.fault == UNASKED or self.request is None or (over and frame.kind is Kind.NOISE)
+
     def judge(self) -> tuple[Outcome, str]:
         """By the frames alone."""
         asked, last = self.request, self.last
@@ -114,7 +122,7 @@ class Assembler:
         if frame.sender is Direction.HOST and frame.kind in (Kind.READ, Kind.WRITE):
             self._previous, self._current = self._current, _Held(frame, self._protocol)
         held = self._current
-        if frame.fault == UNASKED:
+        if held.is_stray(frame):
             packet.outcome = Outcome.STRAY
         elif frame.sender is Direction.NODE:
             held.last, held.answer = frame, packet

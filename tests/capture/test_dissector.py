@@ -1,0 +1,277 @@
+"""The shipped dissector, run by the real tshark on captures of every command of every protocol."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from busmaster.capture import DISSECTOR
+from busmaster.capture.pcapng import PROTOCOLS, Direction, Outcome, Packet, PcapngWriter
+from tests.capture.hearing import HOST, NODE, sender_of, vectors
+
+pytestmark = pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
+
+START = 1_700_000_000_000_000
+FIELDS = ("_ws.col.Protocol", "_ws.col.Info", "busmaster.node", "busmaster.checksum.status", "busmaster.value")
+EXPERT = "_ws.expert.message"
+
+
+def dissect(folder: Path, packets: list[Packet], *fields: str) -> list[list[str]]:
+    """The fields of each packet, as tshark prints them."""
+    path = folder / "line.pcapng"
+    with path.open("wb") as file:
+        writer = PcapngWriter(file, port="COM1")
+        for packet in packets:
+            writer.write(packet)
+    names = [argument for field in fields for argument in ("-e", field)]
+    command = ["tshark", "-X", f"lua_script:{DISSECTOR}", "-r", str(path), "-T", "fields", "-E", "separator=\t", *names]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=50)
+    assert "Lua" not in done.stderr, done.stderr
+    rows = [line.split("\t") for line in done.stdout.splitlines()]
+    assert len(rows) == len(packets)
+    return rows
+
+
+def packet(at: int, protocol: str, sender: Direction, frame: str, node: int | None = None) -> Packet:
+    return Packet(START + at * 1000, protocol, sender, bytes.fromhex(frame), node)
+
+
+FLAGS_REPLY = "02 03 00 27 00 00 52 46 4C 41 47 53 2C 01 02 00 80" + " 00" * 27 + " 80 03 18"
+BLOCK = bytes(range(32))
+BREAD_BODY = b"\x01\x00\x86\x00\x00BREAD," + b"".join(bytes((0, 0, 0, n)) for n in BLOCK)
+BREAD_REPLY = b"\x02" + BREAD_BODY + sum(BREAD_BODY).to_bytes(2, "big")
+BWRITE_BODY = b"\x01\x00\x89\x00\x00BWRITE,\x07\xd8" + b"".join(bytes((0, 0, 0, n)) for n in BLOCK)
+BWRITE = b"\x02" + BWRITE_BODY + sum(BWRITE_BODY).to_bytes(2, "big")
+VALUES = ",".join(map(str, range(32)))
+
+CONVERSATIONS: dict[str, list[tuple[Direction, str, str, str, str, str]]] = {
+    # frame, what the dissector says of it, node, checksum, value
+    "hcp": [
+        (HOST, "04 44 44 02 39 39 05", "node 13 read element 99", "13", "", ""),
+        (NODE, "02 39 39 2D 30 2E 30 30 30 31 03 31", "node 13 element 99 = -0.0001", "13", "good", "-0.0001"),
+        (
+            HOST,
+            "04 32 32 02 30 31 31 32 33 2E 34 35 36 03 2B",
+            "node 2 write element 1 = 123.456",
+            "2",
+            "good",
+            "123.456",
+        ),
+        (NODE, "06", "node 2 ACK", "2", "", ""),
+        (
+            HOST,
+            "04 30 30 02 31 30 31 32 33 34 2C 2D 34 35 2E 36 2C 31 31 2E 32 03 2E",
+            "node 0 write element 10 = 1234,-45.6,11.2",
+            "0",
+            "good",
+            "1234,-45.6,11.2",
+        ),
+        (NODE, "15", "node 0 NAK", "0", "", ""),
+    ],
+    "hcp2": [
+        (HOST, "07 46 46 02 36 39 05 08", "node 255 read element 105 (axis0.encoder)", "255", "good", ""),
+        (NODE, "02 36 39 34 30 39 36 03 07", "node 255 element 105 (axis0.encoder) = 4096", "255", "good", "4096"),
+        (HOST, "07 30 31 02 44 45 35 03 34", "node 1 write element 222 (outputs) = 5", "1", "good", "5"),
+        (NODE, "06", "node 1 ACK", "1", "", ""),
+        (
+            HOST,
+            "07 30 37 02 37 36 2D 32 35 2E 35 03 36",
+            "node 7 write element 118 (axis1.axis_error / MicroFlex speed_reference) = -25.5",
+            "7",
+            "good",
+            "-25.5",
+        ),
+        (NODE, "15", "node 7 NAK", "7", "", ""),
+    ],
+    "microflex": [
+        (HOST, "07 30 37 02 36 44 05 72", "node 7 read element 109 (status_word)", "7", "good", ""),
+        (
+            NODE,
+            "02 36 44 31 39 32 03 4B",
+            "node 7 element 109 (status_word) = 192 [hardware_enable|enabled]",
+            "7",
+            "good",
+            "192",
+        ),
+        (
+            HOST,
+            "07 30 37 02 36 43 31 32 38 03 48",
+            "node 7 write element 108 (command_word) = 128 [enable]",
+            "7",
+            "good",
+            "128",
+        ),
+        (NODE, "06", "node 7 ACK", "7", "", ""),
+        (
+            HOST,
+            "07 30 37 02 37 36 2D 32 35 2E 35 03 36",
+            "node 7 write element 118 (speed_reference) = -25.5",
+            "7",
+            "good",
+            "-25.5",
+        ),
+        (NODE, "06", "node 7 ACK", "7", "", ""),
+    ],
+    "mentor": [
+        (HOST, "04 31 31 32 32 30 31 31 37 05", "node 12 read 01.17", "12", "", ""),
+        (NODE, "02 30 31 31 37 2D 30 30 34 37 36 03 3C", "node 12 01.17 = -00476", "12", "good", "-476"),
+        (HOST, "06", "node 12 next", "12", "", ""),
+        (NODE, "02 30 31 31 38 2B 30 30 30 30 30 03 30", "node 12 01.18 = +00000", "12", "good", "0"),
+        (HOST, "08", "node 12 previous", "12", "", ""),
+        (NODE, "02 30 31 31 37 2D 30 30 34 37 36 03 3C", "node 12 01.17 = -00476", "12", "good", "-476"),
+        (HOST, "15", "node 12 again", "12", "", ""),
+        (NODE, "02 30 31 31 37 2D 30 30 34 37 36 03 3C", "node 12 01.17 = -00476", "12", "good", "-476"),
+        (HOST, "04 31 31 32 32 31 37 32 33 05", "node 12 read 17.23", "12", "", ""),
+        (NODE, "04", "node 12 EOT", "12", "", ""),
+        (
+            HOST,
+            "04 31 31 34 34 02 30 31 31 37 2B 30 34 37 36 35 03 3F",
+            "node 14 write 01.17 = +04765",
+            "14",
+            "good",
+            "4765",
+        ),
+        (NODE, "06", "node 14 ACK", "14", "", ""),
+        (
+            HOST,
+            "04 30 30 35 35 02 31 35 36 30 35 34 33 32 31 03 30",
+            "node 5 write 15.60 = 54321",
+            "5",
+            "good",
+            "54321",
+        ),
+        (NODE, "15", "node 5 NAK", "5", "", ""),
+        (HOST, "04 32 32 33 33 02 30 34 32 36 30 31 03 22", "node 23 write 04.26 = 01", "23", "good", "1"),
+        (HOST, "04 30 30 30 30 02 30 31 31 37 2B 30 30 30 30 03 2F", "node 0 write 01.17 = +0000", "0", "good", "0"),
+    ],
+    "msc": [
+        (HOST, "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74", "node 1 DREAD 2008", "1", "good", ""),
+        (NODE, "06", "node 1 ACK", "1", "", ""),
+        (NODE, "02 01 00 0A 00 00 44 52 45 41 44 2C FF FF FF FF 05 93", "node 1 DREAD 2008 = -1", "1", "good", "-1"),
+        (HOST, "15", "node 1 NAK", "1", "", ""),
+        (
+            NODE,
+            "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D",
+            "node 1 DREAD 2008 = 1234",
+            "1",
+            "good",
+            "1234",
+        ),
+        (HOST, "06", "node 1 ACK", "1", "", ""),
+        (
+            HOST,
+            "02 01 00 0D 00 00 44 57 52 49 54 45 2C 07 D8 00 00 04 D2 03 BE",
+            "node 1 DWRITE 2008 = 1234",
+            "1",
+            "good",
+            "1234",
+        ),
+        (NODE, "15", "node 1 NAK", "1", "", ""),
+        (HOST, "02 01 00 08 00 00 42 52 45 41 44 2C 07 D8 02 72", "node 1 BREAD 2008", "1", "good", ""),
+        (NODE, BREAD_REPLY.hex(), "node 1 BREAD 2008 = 0,1,2,3,... (32)", "1", "good", VALUES),
+        (HOST, BWRITE.hex(), "node 1 BWRITE 2008 = 0,1,2,3,... (32)", "1", "good", VALUES),
+        (HOST, "02 02 00 08 00 00 53 46 4C 41 47 2C 00 05 01 A8", "node 2 SFLAG flag 5", "2", "good", ""),
+        (HOST, "02 02 00 08 00 00 43 46 4C 41 47 2C 00 05 01 98", "node 2 CFLAG flag 5", "2", "good", ""),
+        (HOST, "02 0F 00 08 00 00 52 46 4C 41 47 2C 00 FF 02 AE", "node 15 RFLAG flag 255", "15", "good", ""),
+        (NODE, "02 0F 00 08 00 00 52 46 4C 41 47 2C 00 01 01 B0", "node 15 RFLAG flag 255 = 1", "15", "good", "1"),
+        (HOST, "02 03 00 07 00 00 52 46 4C 41 47 53 2C 01 F5", "node 3 RFLAGS", "3", "good", ""),
+        (NODE, FLAGS_REPLY, "node 3 RFLAGS = 0,9,31,255", "3", "good", ""),
+        (HOST, "02 01 00 07 00 00 52 51 53 54 41 54 2C 02 13", "node 1 RQSTAT", "1", "good", ""),
+        (
+            NODE,
+            "02 01 00 0F 00 00 52 51 53 54 41 54 2C 00 41 00 00 00 00 00 00 02 5C",
+            "node 1 RQSTAT = 65 [PROGRAM_RUNNING|AUTO_START_ENABLED]",
+            "1",
+            "good",
+            "65",
+        ),
+    ],
+    "dc104": [
+        (HOST, "02 AA AA 54", "read parameter 170", "", "good", ""),
+        (NODE, "02 AA 00 05 AF", "parameter 170 = 5", "", "good", "5"),
+        (HOST, "02 55 02 FF FF 55", "write parameter 2 = 65535", "", "good", "65535"),
+        (NODE, "06", "ACK", "", "", ""),
+        (HOST, "02 AA 6B 15", "read parameter 107", "", "good", ""),
+        (NODE, "15", "NAK", "", "", ""),
+    ],
+}
+TITLES = {"hcp": "HCP", "hcp2": "HCP2", "microflex": "MicroFlex", "msc": "MSC", "mentor": "Mentor", "dc104": "DC104"}
+
+
+def test_every_command_of_every_protocol_is_put_into_words(tmp_path: Path) -> None:
+    packets: list[Packet] = []
+    expected: list[list[str]] = []
+    for protocol, frames in CONVERSATIONS.items():
+        for sender, frame, *rest in frames:
+            packets.append(packet(len(packets), protocol, sender, frame))
+            expected.append([TITLES[protocol], *rest])
+    assert dissect(tmp_path, packets, *FIELDS) == expected
+
+
+def test_a_bad_checksum_is_flagged_and_a_good_one_is_not(tmp_path: Path) -> None:
+    frames = [(protocol, sender_of(name), raw) for protocol, name, raw in vectors()]
+    frames = [frame for frame in frames if not is_unchecked(*frame)]
+    spoilt = [(protocol, sender, raw[:-1] + bytes((raw[-1] ^ 1,))) for protocol, sender, raw in frames]
+    packets = [Packet(START, protocol, sender, raw) for protocol, sender, raw in frames + spoilt]
+    rows = dissect(tmp_path, packets, "busmaster.checksum.status", EXPERT)
+    good, bad = rows[: len(frames)], rows[len(frames) :]
+    assert {status for status, _ in good} == {"good"}
+    assert {status for status, _ in bad} == {"bad"}
+    assert not any("Bad checksum" in message for _, message in good)
+    assert all("Bad checksum" in message for _, message in bad)
+
+
+def is_unchecked(protocol: str, sender: Direction, raw: bytes) -> bool:
+    """Reads of HCP and Mentor II carry no checksum: the last byte is ENQ."""
+    return sender is HOST and raw[-1] == 5 and (protocol == "mentor" or (protocol == "hcp" and len(raw) == 7))
+
+
+def test_replies_are_tied_to_requests_and_what_is_odd_is_noted(tmp_path: Path) -> None:
+    request = "07 30 32 02 30 31 05 04"
+    packets = [
+        packet(0, "hcp2", HOST, request),
+        packet(3, "hcp2", NODE, "02 30 31 35 03 37"),
+        packet(4, "hcp2", HOST, request),
+        packet(104, "hcp2", NODE, "", 2),
+        packet(105, "hcp2", HOST, request),
+        packet(110, "hcp2", NODE, "02 30 32 35 03 34"),
+        packet(111, "hcp2", NODE, "02 30 31"),
+        packet(200, "hcp2", NODE, "15"),
+        packet(201, "mentor", HOST, "04 31 31 32 32 31 37 32 33 05"),
+        packet(202, "mentor", NODE, "04"),
+    ]
+    packets[3].outcome, packets[7].outcome = Outcome.NO_REPLY, Outcome.STRAY
+    packets[3].comment = "read element 1: node 2: no reply within 100 ms"
+    fields = ("_ws.col.Info", "busmaster.request_in", "busmaster.time", EXPERT, "frame.comment", "frame.p2p_dir")
+    rows = dissect(tmp_path, packets, *fields)
+    assert rows[1] == ["node 2 element 1 = 5", "1", "0.003", "", "", "1"]
+    assert rows[3][0] == "node 2 no reply"
+    assert "No reply" in rows[3][3]
+    assert rows[3][4] == packets[3].comment
+    assert "Not what was asked: element 1" in rows[5][3]
+    assert rows[6][0] == "node 2 no frame (3 bytes)"
+    assert "cut short" in rows[6][3]
+    assert rows[7][:3] == ["NAK", "", ""]
+    assert "Nobody asked" in rows[7][3]
+    assert "No such parameter" in rows[9][3]
+    assert rows[0][5] == "0"
+
+
+def test_no_bytes_however_garbled_upset_it(tmp_path: Path) -> None:
+    draw = random.Random(4)
+    frames = vectors()
+    packets: list[Packet] = []
+    for _ in range(3000):
+        protocol, _, raw = draw.choice(frames)
+        garbled = bytearray(raw[: draw.randrange(len(raw) + 1)] if draw.random() < 0.4 else raw)
+        for _ in range(draw.randrange(4) if garbled else 0):
+            garbled[draw.randrange(len(garbled))] = draw.randrange(256)
+        spoken = protocol if draw.random() < 0.8 else draw.choice(PROTOCOLS)
+        sender, outcome = draw.choice(list(Direction)), draw.choice(list(Outcome))
+        packets.append(Packet(START, spoken, sender, bytes(garbled), draw.choice([None, 1]), outcome))
+    rows = dissect(tmp_path, packets, EXPERT)
+    assert not [message for (message,) in rows if "Lua" in message]
