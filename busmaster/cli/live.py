@@ -119,7 +119,8 @@ class Screen(App[None]):
     CSS = """
     Screen { background: ansi_default; color: ansi_default; }
     #head { height: auto; }
-    #points { height: 1fr; background: ansi_default; color: ansi_default; scrollbar-size-horizontal: 0; }
+    #points { height: 1fr; background: ansi_default; color: ansi_default;
+        scrollbar-size: 0 1; }
     #points > .datatable--header { background: ansi_default; color: ansi_default; text-style: bold underline; }
     #points > .datatable--cursor { background: ansi_default; color: ansi_default; text-style: bold; }
     #points > .datatable--hover { background: ansi_default; }

@@ -25,7 +25,7 @@ class Row(msgspec.Struct, array_like=True, frozen=True):
 
 
 class NodeRow(msgspec.Struct, array_like=True, frozen=True):
-    """One node: its health, exchanges that were tried and transactions that failed, latencies in seconds."""
+    """One node: its health, how many requests were sent and how many of them failed, latencies in seconds."""
 
     label: str
     health: str

@@ -20,6 +20,7 @@ from busmaster.cli.drawing import draw
 from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row
 from busmaster.cli.output import emit_all, json_line, json_value, note, value_text
 from busmaster.errors import BusError
+from busmaster.node import Health
 from busmaster.points import Point
 from busmaster.polling import PollGroup, Sample, Snapshot
 
@@ -95,7 +96,12 @@ class Watch:
                 if action.kind == "demand":
                     group.demand()
                 elif action.kind == "pause":
-                    group.resume() if group.paused else group.pause()
+                    self._pause(group)
+
+    def _pause(self, group: PollGroup) -> None:
+        """Or go on. The time in between is no period."""
+        self._started.pop(group.name, None)
+        group.resume() if group.paused else group.pause()
 
     def _utilisation(self, now: float, busy: float) -> float:
         self._loads.append((now, busy))
@@ -109,7 +115,7 @@ class Watch:
             counts = node.statistics()
             latency = counts.latency
             health = "suspended" if node.suspended else node.health.value
-            yield NodeRow(node.label, health, counts.attempts, counts.failed, latency.p50, latency.p99)
+            yield NodeRow(node.label, health, counts.attempts, counts.attempts - counts.ok, latency.p50, latency.p99)
 
     def _group(self, group: PollGroup) -> GroupRow:
         periods = self._periods[group.name]
@@ -161,7 +167,7 @@ def sample_row(point: Point[Any], sample: Sample, now: float) -> Row:
 
 def event_text(event: Event) -> str:
     match event:
-        case NodeChanged():
+        case NodeChanged() if event.before is not Health.UNKNOWN or event.after is not Health.UP:
             return f"{event.node.label} is {event.after.value}, was {event.before.value}"
         case LatenessRaised():
             return (

@@ -49,7 +49,7 @@ async def test_the_picture_fits_80_by_24_and_says_what_the_frame_says() -> None:
     assert "node 9 is down, was suspect" in text
     assert "quit" in lines[-1]
     dead = next(line for line in lines if line.strip().startswith("node 9") and "axis0" in line)
-    assert dead.split()[2:] == ["-", "mm", "12s", "down"]
+    assert dead.split()[3:] == ["-", "mm", "12s", "down"]
 
 
 @pytest.mark.asyncio

@@ -1,0 +1,94 @@
+"""What `from busmaster import ...` gives: sorted, whole, documented, and cheap to import."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+import typing
+from types import ModuleType
+
+import pytest
+
+import busmaster
+from busmaster import errors
+
+OPTIONAL = ("click", "rich", "msgspec", "textual", "aiomqtt", "prometheus_client", "matplotlib")
+
+
+def order(name: str) -> tuple[bool, bool, str]:
+    """Constants, then classes, then functions, as the linter sorts them."""
+    return not name.isupper(), not name[0].isupper(), name
+
+
+def test_the_public_names_are_sorted_and_each_once() -> None:
+    assert list(busmaster.__all__) == sorted(set(busmaster.__all__), key=order)
+
+
+@pytest.mark.parametrize("name", busmaster.__all__)
+def test_a_public_name_exists_and_has_a_docstring_of_its_own(name: str) -> None:
+    thing = getattr(busmaster, name)
+    if isinstance(thing, type) or inspect.isroutine(thing):
+        documentation = inspect.getdoc(thing) or ""
+        assert documentation.strip(), f"{name} has no docstring"
+        assert not documentation.startswith(f"{name}("), f"{name} has only the one that a dataclass makes"
+
+
+@pytest.mark.parametrize("name", busmaster.__all__)
+def test_a_public_method_says_what_it_does(name: str) -> None:
+    thing = getattr(busmaster, name)
+    if not isinstance(thing, type) or issubclass(thing, BaseException):
+        return
+    for member, value in vars(thing).items():
+        function = value.fget if isinstance(value, property) else getattr(value, "__func__", value)
+        if member.startswith("_") or not inspect.isfunction(function):
+            continue
+        obvious = len(inspect.getsource(function).splitlines()) <= 4
+        assert inspect.getdoc(function) or obvious, f"{name}.{member} has no docstring"
+
+
+def test_every_error_is_public() -> None:
+    defined = {
+        name
+        for name, thing in vars(errors).items()
+        if isinstance(thing, type) and issubclass(thing, Exception) and thing.__module__ == errors.__name__
+    }
+    assert defined <= set(busmaster.__all__)
+
+
+def test_what_the_root_offers_comes_from_the_package() -> None:
+    for name in busmaster.__all__:
+        thing = getattr(busmaster, name)
+        if isinstance(thing, ModuleType):
+            assert thing.__name__.startswith("busmaster.")
+        elif isinstance(thing, type) or inspect.isroutine(thing):
+            assert thing.__module__.split(".")[0] in ("busmaster", "typing"), name
+
+
+def test_public_annotations_resolve() -> None:
+    for name in busmaster.__all__:
+        thing = getattr(busmaster, name)
+        if inspect.isroutine(thing):
+            assert typing.get_type_hints(thing), name
+
+
+def test_importing_it_needs_no_extra() -> None:
+    """With the extras hidden from it, the package imports and its names are there."""
+    hide = f"import sys; sys.modules.update(dict.fromkeys({OPTIONAL!r}))"
+    code = f"{hide}; import busmaster; [getattr(busmaster, name) for name in busmaster.__all__]"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
+
+
+def test_the_command_line_without_its_extra_says_which_one_to_install() -> None:
+    code = (
+        "import importlib.util as u, sys; find = u.find_spec; "
+        "u.find_spec = lambda name, *rest: None if name in ('click', 'rich', 'msgspec') else find(name, *rest); "
+        "from busmaster.cli import main; sys.exit(main(['--help']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False, timeout=30, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == (
+        "busmaster: the command line needs click, rich, msgspec, which the extra named cli brings: "
+        "pip install 'busmaster[cli]'\n"
+    )
