@@ -221,11 +221,6 @@ class Arbiter:
     def poll_timeout(self) -> float:
         return self._deadlines.earliest()
 
-    @property
-    def idle(self) -> bool:
-        """Nothing is on the wire."""
-        return self.state is not LineState.EXCHANGE
-
     def reset_statistics(self, now: float) -> None:
         self._counters.reset(now)
         for node in self.dispatcher.nodes:
@@ -399,6 +394,7 @@ class Arbiter:
     def _end_exchange(self) -> None:
         self._transaction = None
         self._exchange = None
+        self._counters.exchanges += 1
 
     # the line between exchanges
 

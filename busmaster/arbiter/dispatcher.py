@@ -127,7 +127,6 @@ class Dispatcher:
             if poll is not None and poll.started == -inf:
                 poll.started = now
                 poll.jitter.record(now - poll.due)
-        counters.exchanges += 1
         transaction.node.counters.attempts += 1
         transaction.phase = Phase.ON_WIRE
         transaction.attempts += 1

@@ -16,7 +16,7 @@ from typing import Any, Protocol, cast
 import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, Event, Polled
+from busmaster.arbiter.events import Completed, Event, LineState, Polled
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Transaction
 
@@ -90,12 +90,12 @@ class Pump(asyncio.Protocol):
         due = arbiter.poll_timeout()
         if due < self._armed:
             self._arm(due)
-        if self._run_out is not None and arbiter.idle:
+        if self._run_out is not None and arbiter.state is not LineState.EXCHANGE:
             self._run_out.set()
 
     async def run_out(self) -> None:
         """Return when nothing is on the wire: within one exchange."""
-        if not self.arbiter.idle:
+        if self.arbiter.state is LineState.EXCHANGE:
             self._run_out = anyio.Event()
             await self._run_out.wait()
 

@@ -1,0 +1,175 @@
+"""One exchange on the wire, its windows, and what may count as its reply (R1, R2, R4, R5)."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.arbiter.events import LineState
+from busmaster.errors import GarbledReply, NoReply, WriteUnconfirmed
+from busmaster.exchange import Exchange, Timings
+from busmaster.protocols import hcp2
+from tests.arbiter.bench import (
+    ANOTHER_ELEMENT,
+    BAD_CHECKSUM,
+    FIVE,
+    READ_1_OF_NODE_1,
+    SEVEN,
+    TAU,
+    WRITE_5,
+    Bench,
+)
+
+REQUEST = 8 * TAU
+
+
+def test_a_read_is_sent_at_once_and_its_reply_is_the_value() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node())
+    assert bench.sent() == READ_1_OF_NODE_1
+    bench.hear(FIVE, after=0.004)
+    assert (read.value, read.error, bench.ended(read)) == (5.0, None, 1)
+
+
+def test_r1_the_next_request_leaves_only_when_the_reply_is_complete() -> None:
+    bench = Bench()
+    node = bench.node()
+    first, second = bench.ask(node), bench.ask(node)
+    assert bench.sent() == READ_1_OF_NODE_1
+    bench.hear(FIVE[:8], after=0.003)
+    assert bench.sent() == ""
+    bench.hear(FIVE[9:], after=0.001)
+    assert bench.sent() == READ_1_OF_NODE_1
+    bench.hear(SEVEN, after=0.003)
+    assert (first.value, second.value) == (5.0, 7.0)
+
+
+def test_r2_the_window_runs_from_the_end_of_the_request_on_the_wire() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node(), retries=0)
+    bench.wait(REQUEST + 0.0999)
+    assert not bench.ended(read)
+    bench.wait(0.0002)
+    assert isinstance(read.error, NoReply)
+    assert str(read.error).startswith("node 1: no reply within 100 ms, 1 attempt")
+
+
+@pytest.mark.parametrize(("delay", "late"), [(0.049, False), (0.051, True), (0.099, True)])
+def test_r2_a_reply_after_nominal_is_accepted_and_counted_late(delay: float, late: bool) -> None:
+    bench = Bench()
+    node = bench.node()
+    read = bench.ask(node)
+    bench.hear(FIVE, after=REQUEST + delay)
+    assert read.value == 5.0
+    assert node.counters.late == late
+
+
+def test_r2_behind_a_slow_adapter_the_window_is_longer_by_its_latency() -> None:
+    bench = Bench(latency=0.016)
+    read = bench.ask(bench.node(), retries=0)
+    bench.hear(FIVE, after=REQUEST + 0.115)
+    assert read.value == 5.0
+
+
+def test_r2_a_gap_in_a_reply_ends_the_attempt() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node(), retries=0)
+    bench.hear(FIVE[:8], after=0.003)
+    bench.wait(0.0199)
+    assert not bench.ended(read)
+    bench.wait(0.0002)
+    assert isinstance(read.error, GarbledReply)
+
+
+def test_r2_a_trickle_of_bytes_cannot_hold_the_line() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node(), retries=0)
+    bench.hear("02", after=REQUEST + 0.099)
+    bench.hear("30")
+    bench.hear("31")
+    longest = hcp2.Read(1).open(1, hcp2.PROFILE.timings).sizes.longest
+    start = bench.now
+    while read.error is None:
+        bench.hear("31", after=0.001)
+        assert bench.now - start < 1.0
+    assert bench.now <= 1.0 + REQUEST + 0.100 + longest * TAU + 0.020 + 0.001
+
+
+def test_r4_on_a_paced_line_bytes_before_the_request_is_out_taint_the_attempt() -> None:
+    bench = Bench(paced=True)
+    read = bench.ask(bench.node(), retries=0)
+    bench.hear(FIVE, after=REQUEST * 0.8)
+    assert isinstance(read.error, GarbledReply)
+    assert bench.arbiter.state is LineState.SETTLING
+
+
+def test_r4_on_an_unpaced_line_the_reply_may_come_at_once() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node())
+    bench.hear(FIVE)
+    assert read.value == 5.0
+
+
+def test_r5_a_reply_of_another_element_is_never_taken() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node(), retries=0)
+    bench.hear(ANOTHER_ELEMENT, after=0.004)
+    assert isinstance(read.error, GarbledReply)
+
+
+def test_r5_an_ack_is_no_answer_to_a_read() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node(), retries=0)
+    bench.hear("06", after=0.004)
+    assert isinstance(read.error, GarbledReply)
+
+
+def test_r3_a_whole_frame_with_the_right_echo_and_a_bad_checksum_is_asked_again_at_once() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node())
+    bench.sent()
+    bench.hear(BAD_CHECKSUM, after=0.004)
+    assert bench.sent() == READ_1_OF_NODE_1
+    bench.hear(FIVE, after=0.004)
+    assert (read.value, read.attempts) == (5.0, 2)
+
+
+def test_a_value_is_delivered_when_the_loop_slept_through_the_window_but_the_bytes_were_waiting() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node())
+    bench.arbiter.data_received(bytes.fromhex(FIVE), bench.now + 0.4)
+    assert read.value == 5.0
+    assert read.late
+
+
+def test_a_write_is_acknowledged() -> None:
+    bench = Bench()
+    write = bench.ask(bench.node(), hcp2.Write(1, (5,)))
+    assert bench.sent() == WRITE_5
+    bench.hear("06", after=0.004)
+    assert (write.value, write.error) == (None, None)
+
+
+def test_a_write_without_an_answer_is_unconfirmed_and_not_sent_again() -> None:
+    bench = Bench()
+    write = bench.ask(bench.node(), hcp2.Write(1, (5,)))
+    bench.sent()
+    bench.wait(1.0)
+    assert isinstance(write.error, WriteUnconfirmed)
+    assert WRITE_5 not in bench.sent()
+
+
+def test_a_bug_in_a_protocols_reader_fails_its_transaction_and_not_the_line() -> None:
+    class Broken:
+        writes = False
+        idempotent = True
+
+        def open(self, address: int, timings: Timings, /) -> Exchange[float]:
+            raise RuntimeError("boom")
+
+    bench = Bench()
+    node = bench.node()
+    broken, sound = bench.ask(node, Broken()), bench.ask(node)
+    assert "boom" in str(broken.error)
+    assert bench.sent() == READ_1_OF_NODE_1
+    bench.hear(FIVE, after=0.004)
+    assert sound.value == 5.0

@@ -1,0 +1,221 @@
+"""After every uncertain outcome the line is discarded until nothing can come any more (R3, echo, noise)."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, LineState, Strayed
+from busmaster.errors import GarbledReply, LineNoisy, Refused
+from busmaster.protocols import hcp2
+from tests.arbiter.bench import ACK, ANOTHER_ELEMENT, FIVE, NAK, READ_1_OF_NODE_1, SEVEN, TAU, WRITE_5, Bench
+
+REQUEST = 8 * TAU
+
+
+@pytest.mark.parametrize("delay", [0.101, 0.120, 0.149])
+def test_r3_a_late_reply_is_never_taken_for_the_next_one(delay: float) -> None:
+    bench = Bench()
+    node = bench.node()
+    first = bench.ask(node, retries=0)
+    second = bench.ask(node, retries=0)
+    bench.sent()
+    bench.hear(FIVE, after=REQUEST + delay)
+    assert first.error is not None
+    assert bench.sent() == ""
+    bench.until_sent()
+    bench.hear(SEVEN, after=0.004)
+    assert second.value == 7.0
+
+
+def test_r3_nothing_is_sent_before_lateness_has_passed() -> None:
+    bench = Bench()
+    bench.ask(bench.node())
+    bench.sent()
+    assert bench.until_sent() == pytest.approx(REQUEST + 0.150)
+
+
+def test_r3_nothing_is_sent_before_the_line_is_silent() -> None:
+    bench = Bench()
+    bench.ask(bench.node())
+    bench.sent()
+    bench.hear(FIVE, after=REQUEST + 0.145)
+    assert bench.until_sent() == pytest.approx(0.020)
+
+
+def test_r3_a_wrong_echo_settles_for_the_whole_lateness() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node())
+    bench.sent()
+    bench.hear(ANOTHER_ELEMENT, after=REQUEST + 0.002)
+    assert read.attempts == 1
+    assert bench.until_sent() == pytest.approx(0.148)
+
+
+def test_r3_bytes_after_a_reply_settle_but_the_value_stands() -> None:
+    bench = Bench()
+    node = bench.node()
+    read = bench.ask(node)
+    bench.ask(node)
+    bench.sent()
+    bench.hear(FIVE + "15", after=REQUEST + 0.002)
+    assert read.value == 5.0
+    assert bench.arbiter.state is LineState.SETTLING
+    assert bench.until_sent() == pytest.approx(0.148)
+
+
+def test_r3_strays_on_an_idle_line_settle_too() -> None:
+    bench = Bench()
+    node = bench.node()
+    bench.hear("55")
+    bench.ask(node)
+    assert bench.sent() == ""
+    assert bench.until_sent() == pytest.approx(0.020)
+    assert bench.arbiter.statistics(bench.now).stray_bytes == 1
+
+
+def test_r3_a_straggler_raises_its_nodes_lateness() -> None:
+    bench = Bench()
+    node = bench.node()
+    bench.ask(node, retries=0)
+    bench.hear(FIVE, after=REQUEST + 0.140)
+    raised = [event for event in bench.events if isinstance(event, LatenessRaised)]
+    assert [event.node for event in raised] == [node]
+    assert node.lateness == pytest.approx(0.224)
+
+
+def test_r3_a_straggler_in_good_time_raises_nothing() -> None:
+    bench = Bench()
+    node = bench.node()
+    bench.ask(node, retries=0)
+    bench.hear(FIVE, after=REQUEST + 0.111)
+    assert node.lateness == 0.150
+
+
+def test_r3_a_straggler_beyond_lateness_is_known_as_one_and_lateness_is_at_most_500_ms() -> None:
+    bench = Bench()
+    node = bench.node()
+    bench.ask(node, retries=0)
+    bench.hear(FIVE, after=REQUEST + 0.400)
+    assert node.lateness == 0.5
+
+
+def test_r3_after_opening_the_port_an_earlier_masters_reply_is_waited_out() -> None:
+    bench = Bench()
+    bench.arbiter.line_down("unplugged", bench.now)
+    bench.arbiter.line_up(bench.now)
+    node = bench.node()
+    bench.ask(node)
+    assert bench.sent() == ""
+    bench.hear(SEVEN, after=0.1)
+    assert bench.until_sent() == pytest.approx(0.05)
+
+
+def test_r3_a_line_that_does_not_fall_silent_is_noisy_and_recovers_by_itself() -> None:
+    bench = Bench()
+    node = bench.node()
+    waiting = bench.ask(node, retries=0)
+    bench.sent()
+    for _ in range(130):
+        bench.hear("FF", after=0.010)
+    assert waiting.error is not None
+    changes = [e.change for e in bench.events if isinstance(e, LineChanged)]
+    assert changes == [LineChange.NOISY]
+    refused = bench.ask(node)
+    assert isinstance(refused.error, LineNoisy)
+    assert bench.sent() == ""
+    bench.wait(0.021)
+    assert [e.change for e in bench.events if isinstance(e, LineChanged)] == [LineChange.NOISY, LineChange.QUIET]
+    healed = bench.ask(node)
+    assert bench.sent() == READ_1_OF_NODE_1
+    bench.hear(FIVE, after=0.003)
+    assert healed.value == 5.0
+
+
+def test_r3_whoever_waits_when_the_line_turns_noisy_is_told() -> None:
+    bench = Bench()
+    node = bench.node()
+    bench.hear("FF")
+    waiting = bench.ask(node)
+    for _ in range(120):
+        bench.hear("FF", after=0.010)
+    assert isinstance(waiting.error, LineNoisy)
+    assert bench.ended(waiting) == 1
+
+
+def test_r7_a_nak_to_a_read_settles_and_is_confirmed_once() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node())
+    bench.sent()
+    bench.hear(NAK, after=REQUEST + 0.002)
+    assert not bench.ended(read)
+    assert bench.until_sent() == pytest.approx(0.148)
+    bench.sent()
+    bench.hear(NAK, after=REQUEST + 0.002)
+    assert isinstance(read.error, Refused)
+    assert read.attempts == 2
+    assert bench.ended(read) == 1
+
+
+def test_r7_a_nak_that_was_noise_costs_no_value() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node())
+    bench.sent()
+    bench.hear(NAK, after=REQUEST + 0.002)
+    bench.hear(FIVE, after=0.001)
+    bench.until_sent()
+    bench.hear(SEVEN, after=0.004)
+    assert read.value == 7.0
+
+
+def test_r7_a_nak_to_a_write_is_confirmed_at_once() -> None:
+    bench = Bench()
+    write = bench.ask(bench.node(), hcp2.Write(1, (5,)))
+    assert bench.sent() == WRITE_5
+    bench.hear(NAK, after=0.004)
+    assert bench.sent() == WRITE_5
+    bench.hear(ACK, after=0.004)
+    assert write.error is None
+
+
+def test_r7_a_nak_to_several_values_is_final_and_says_that_a_prefix_may_be_stored() -> None:
+    bench = Bench()
+    write = bench.ask(bench.node(), hcp2.Write(99, (7, 8)))
+    bench.sent()
+    bench.hear(NAK, after=0.004)
+    assert isinstance(write.error, Refused)
+    assert "stored" in str(write.error)
+    assert bench.sent() == ""
+
+
+def test_echo_is_stripped_and_the_window_starts_at_its_last_byte() -> None:
+    bench = Bench(echo=True)
+    read = bench.ask(bench.node(), retries=0)
+    bench.hear(READ_1_OF_NODE_1[:11], after=0.010)
+    bench.hear(READ_1_OF_NODE_1[12:], after=0.010)
+    bench.wait(0.099)
+    assert not bench.ended(read)
+    bench.hear(FIVE)
+    assert read.value == 5.0
+
+
+def test_echo_and_reply_may_come_in_one_chunk() -> None:
+    bench = Bench(echo=True)
+    read = bench.ask(bench.node())
+    bench.hear(READ_1_OF_NODE_1 + FIVE, after=0.010)
+    assert read.value == 5.0
+
+
+def test_an_echo_that_differs_is_a_collision() -> None:
+    bench = Bench(echo=True)
+    read = bench.ask(bench.node(), retries=0)
+    bench.hear("07 30 31 02 30 33", after=0.010)
+    assert isinstance(read.error, GarbledReply)
+    assert bench.arbiter.statistics(bench.now).collisions == 1
+    assert any(isinstance(e, Strayed) and e.collision for e in bench.events)
+
+
+def test_an_echo_that_never_comes_is_named_in_the_error() -> None:
+    bench = Bench(echo=True)
+    read = bench.ask(bench.node(), retries=0)
+    bench.wait(0.2)
+    assert "no echo" in str(read.error)
