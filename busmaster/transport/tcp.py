@@ -76,7 +76,7 @@ class TcpPort:
             ) from None
         except OSError as error:
             raise self._refusal(error) from None
-        self._tune(transport.get_extra_info("socket"))
+        _find_out_a_dead_server(transport.get_extra_info("socket"))
         transport.set_write_buffer_limits(high=0)
         return transport
 
@@ -91,10 +91,10 @@ class TcpPort:
         why = os.strerror(error.errno) if error.errno else str(error)
         return LineDown(f"cannot connect to {self.name}: {why}", hint="check its address and the network")
 
-    @staticmethod
-    def _tune(sock: socket.socket) -> None:
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for option, value in KEEP_ALIVE.items():
-            if hasattr(socket, option):  # each system has some of them
-                sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+
+def _find_out_a_dead_server(sock: socket.socket) -> None:
+    """TCP_NODELAY is asyncio's own default."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in KEEP_ALIVE.items():
+        if hasattr(socket, option):  # each system has some of them
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)

@@ -7,10 +7,13 @@ import contextlib
 import os
 import select
 import selectors
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
+from typing import TypeVar
 
+T = TypeVar("T")
 PATIENCE = 2.0
+VIRTUAL_PATIENCE = 1000.0
 """Seconds after which something that should happen has not."""
 
 
@@ -58,9 +61,10 @@ class Recorder(asyncio.Protocol):
         """Return when what was received ends with this."""
         await self.until(lambda _: self.received.endswith(end))
 
-    async def until(self, condition: Callable[[Recorder], bool], patience: float = PATIENCE) -> None:
+    async def until(self, condition: Callable[[Recorder], bool]) -> None:
         """Return when `condition` holds. Raises TimeoutError if it does not come to hold."""
-        async with asyncio.timeout(patience):
+        virtual = isinstance(asyncio.get_running_loop(), VirtualLoop)
+        async with asyncio.timeout(VIRTUAL_PATIENCE if virtual else PATIENCE):
             while not condition(self):
                 self._changed.clear()
                 await self._changed.wait()
@@ -104,6 +108,12 @@ def plugged(link: Path | None = None) -> Iterator[FarEnd]:
         far_end.unplug()
         if link is not None:
             link.unlink()
+
+
+def in_virtual_time(work: Coroutine[None, None, T]) -> T:
+    """Run `work` on a loop whose time jumps."""
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        return runner.run(work)
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
 
 import pytest
 
@@ -12,7 +11,7 @@ from busmaster.emulator.line import Echo, Line
 from busmaster.profile import LineSettings
 from busmaster.transport.endpoints import is_paced
 from busmaster.transport.memory import MemoryPort, MemoryTransport
-from tests.transport.fakes import Recorder, VirtualLoop
+from tests.transport.fakes import Recorder, in_virtual_time
 
 SETTINGS = LineSettings(9600)
 TAU = SETTINGS.byte_time
@@ -39,11 +38,6 @@ def line(paced: bool = True, delay: float = 0.002, echo: Echo | None = None, ans
 async def opened(emulated: Line) -> tuple[MemoryTransport, Recorder]:
     recorder = Recorder()
     return await MemoryPort(emulated).open(lambda: recorder), recorder
-
-
-def in_virtual_time(work: Coroutine[None, None, None]) -> None:
-    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        runner.run(work)
 
 
 def test_it_is_paced_and_echoes_as_its_line_does() -> None:

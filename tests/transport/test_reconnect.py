@@ -18,7 +18,7 @@ from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
-from tests.transport.fakes import FarEnd, Recorder, plugged
+from tests.transport.fakes import FarEnd, Recorder, in_virtual_time, plugged
 
 
 @asynccontextmanager
@@ -70,14 +70,12 @@ class Told:
         self.attempts: list[float] = []
         self.wires: list[Wire] = []
         self.device: Hashable | None = None
-        self.attempted = asyncio.Event()
 
     def identity(self) -> Hashable | None:
         return self.device
 
     async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> asyncio.Transport:
         self.attempts.append(asyncio.get_running_loop().time())
-        self.attempted.set()
         if len(self.attempts) <= self.failures:
             raise LineDown("told does not exist")
         wire = Wire(protocol_factory(), self.stuck)
@@ -106,50 +104,63 @@ async def test_the_first_opening_says_why_it_failed() -> None:
     assert recorder.losses == [None]
 
 
-@pytest.mark.asyncio
-async def test_attempts_back_off_by_doubling_up_to_the_longest_delay_and_are_reported() -> None:
-    told, recorder, causes = Told(failures=5), Recorder(), list[LineDown]()
-    async with kept(told, recorder, first_delay=0.004, longest_delay=0.016, on_failed=causes.append):
-        await recorder.connected()
-    least = [0.75 * delay for delay in (0.004, 0.008, 0.016, 0.016, 0.016)]
-    assert all(pause >= delay for pause, delay in zip(told.pauses, least, strict=True))
-    assert [str(cause) for cause in causes] == [str(LineDown("told does not exist"))] * 5
+class Even(random.Random):
+    """Spreads nothing."""
+
+    def uniform(self, a: float, b: float) -> float:
+        assert (a, b) == (0.75, 1.25)
+        return 1.0
 
 
-@pytest.mark.asyncio
-async def test_delays_are_spread_by_a_seeded_source() -> None:
-    asked = []
+def test_attempts_back_off_by_doubling_up_to_the_longest_delay_and_are_reported() -> None:
+    async def fail() -> None:
+        told, recorder, causes = Told(failures=5), Recorder(), list[LineDown]()
+        async with kept(told, recorder, on_failed=causes.append, first_delay=1.0, longest_delay=4.0, jitter=Even()):
+            await recorder.connected()
+        assert told.pauses == pytest.approx([1, 2, 4, 4, 4])
+        assert [cause.what for cause in causes] == ["told does not exist"] * 5
 
-    class Chance(random.Random):
-        def uniform(self, a: float, b: float) -> float:
-            asked.append((a, b))
-            return 0.0
-
-    told, recorder = Told(failures=20), Recorder()
-    async with kept(told, recorder, jitter=Chance()):
-        await recorder.connected()
-    assert asked == [(0.75, 1.25)] * 20
+    in_virtual_time(fail())
 
 
-@pytest.mark.asyncio
-async def test_a_port_that_opens_and_is_lost_at_once_is_not_hammered() -> None:
-    told, recorder = Told(), Recorder()
-    async with kept(told, recorder, first_delay=0.002):
-        for n in range(1, 5):
-            await recorder.connected(n)
-            told.wires[-1].lose(None)
-        await recorder.connected(5)
-    assert all(pause >= 0.75 * 0.002 * 2**n for n, pause in enumerate(told.pauses))
+def test_delays_are_spread_by_a_quarter_from_a_seeded_source() -> None:
+    async def pauses(seed: int) -> list[float]:
+        told, recorder = Told(failures=20), Recorder()
+        async with kept(told, recorder, first_delay=1.0, longest_delay=1.0, jitter=random.Random(seed)):
+            await recorder.connected()
+        return told.pauses
+
+    once, again, other = (in_virtual_time(pauses(seed)) for seed in (1, 1, 2))
+    assert once == again != other
+    assert all(0.74 < pause < 1.26 for pause in once)
 
 
-@pytest.mark.asyncio
-async def test_a_device_that_is_seen_to_return_is_not_kept_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnect, "LOOK_EVERY", 0.001)
-    told, recorder = Told(failures=1), Recorder()
-    async with kept(told, recorder, first_delay=60.0):
-        await told.attempted.wait()
-        told.device = "back"
-        await recorder.connected()
+def test_a_port_that_opens_and_is_lost_at_once_is_not_hammered_but_one_that_held_is_reopened_soon() -> None:
+    async def lose(after: float) -> list[float]:
+        told, recorder = Told(), Recorder()
+        async with kept(told, recorder, first_delay=1.0, longest_delay=4.0, jitter=Even()):
+            for n in range(1, 5):
+                await recorder.connected(n)
+                await asyncio.sleep(after)
+                told.wires[-1].lose(None)
+            await recorder.connected(5)
+        return told.pauses
+
+    assert in_virtual_time(lose(0.0)) == pytest.approx([1, 2, 4, 4])
+    assert in_virtual_time(lose(10.0)) == pytest.approx([11, 11, 11, 11])
+
+
+def test_a_device_that_is_seen_to_return_is_opened_at_once_and_the_delays_begin_anew() -> None:
+    async def replug() -> None:
+        told, recorder = Told(failures=5), Recorder()
+        async with kept(told, recorder, first_delay=1.0, longest_delay=100.0, jitter=Even()):
+            await asyncio.sleep(9.0)
+            assert len(told.attempts) == 4
+            told.device = "back"
+            await recorder.connected()
+        assert told.attempts == pytest.approx([0, 1, 3, 7, 9, 10], abs=reconnect.LOOK_EVERY)
+
+    in_virtual_time(replug())
 
 
 # -- losing it -------------------------------------------------------------------------------------------------------
@@ -217,11 +228,13 @@ async def test_a_server_that_is_restarted_is_connected_to_again() -> None:
 # -- closing ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.asyncio
-async def test_closing_ends_a_run_that_waits_for_its_next_attempt() -> None:
-    told = Told(failures=float("inf"))
-    async with kept(told, Recorder(), first_delay=60.0):
-        await told.attempted.wait()
+def test_closing_ends_a_run_that_waits_for_its_next_attempt() -> None:
+    async def fail() -> float:
+        async with kept(Told(failures=10), Recorder(), first_delay=60.0, longest_delay=60.0):
+            await asyncio.sleep(30.0)
+        return asyncio.get_running_loop().time()
+
+    assert in_virtual_time(fail()) == pytest.approx(30.0)
 
 
 @pytest.mark.asyncio

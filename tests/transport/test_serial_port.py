@@ -107,19 +107,22 @@ async def test_a_write_on_an_empty_buffer_leaves_in_the_same_call(far_end: FarEn
 
 
 @pytest.mark.asyncio
-async def test_what_the_driver_does_not_take_follows_in_order_and_pauses_the_protocol_meanwhile(
-    far_end: FarEnd,
-) -> None:
+async def test_whatever_the_driver_does_not_take_pauses_the_protocol_and_follows_in_order(far_end: FarEnd) -> None:
     transport, recorder = await opened(far_end.path)
-    flood = b"".join(b"%07d\n" % n for n in range(40_000))
-    transport.write(flood[:300_000])
-    transport.write(flood[300_000:])
+    said = b""
+    while not recorder.flow:
+        said += b"%07d\n" % len(said)
+        transport.write(said[-8:])
+    assert transport.get_write_buffer_size() == 8
+    flood = said[:100_000]
+    transport.write(flood)
+    said += flood
     assert recorder.flow == ["pause"]
     arrived = b""
-    while len(arrived) < len(flood):
+    while len(arrived) < len(said):
         arrived += far_end.read(patience=0.001)
         await asyncio.sleep(0)
-    assert arrived == flood
+    assert arrived == said
     await recorder.until(lambda r: r.flow == ["pause", "resume"])
     assert transport.get_write_buffer_size() == 0
     transport.write(b"next")
@@ -193,6 +196,18 @@ async def test_closing_a_stopped_line_does_not_wait_for_its_output(far_end: FarE
 
 
 @pytest.mark.asyncio
+async def test_closing_discards_what_has_not_left(far_end: FarEnd) -> None:
+    transport, recorder = await opened(far_end.path)
+    transport.write(bytes(300_000))
+    await closed(transport, recorder)
+    arrived = 0
+    with pytest.raises(OSError, match="Input/output error"):  # nobody has the port open any more
+        while True:
+            arrived += len(far_end.read())
+    assert arrived < 5000  # of some 70,000 that the pty had taken, what lay ready to be read
+
+
+@pytest.mark.asyncio
 async def test_a_driver_that_never_lets_go_delays_a_close_by_its_deadline_alone(
     far_end: FarEnd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -254,9 +269,7 @@ async def test_an_opening_that_does_not_come_back_is_given_up_and_its_port_relea
     monkeypatch.setattr(serial_port, "OPEN_DEADLINE", 0.02)
     with pytest.raises(LineDown, match="did not open within"):
         await opened(far_end.path)
-    monkeypatch.setattr(serial_port, "OPEN_DEADLINE", 10.0)
-    slow_driver.set()
-    await closed(*await _opened_in_the_end(far_end.path))
+    await _is_released_in_the_end(far_end.path, slow_driver)
 
 
 @pytest.mark.asyncio
@@ -266,17 +279,21 @@ async def test_a_cancelled_opening_releases_its_port(far_end: FarEnd, slow_drive
     opening.cancel()
     with pytest.raises(asyncio.CancelledError):
         await opening
-    slow_driver.set()
-    await closed(*await _opened_in_the_end(far_end.path))
+    await _is_released_in_the_end(far_end.path, slow_driver)
 
 
-async def _opened_in_the_end(path: str) -> tuple[PortTransport, Recorder]:
-    async with asyncio.timeout(2):
-        while True:
-            try:
-                return await opened(path)
-            except LineDown:
-                await asyncio.sleep(0.001)
+async def _is_released_in_the_end(path: str, slow_driver: threading.Event) -> None:
+    released, really_release = threading.Event(), serial_port._release
+
+    def release(device: serial.Serial, exclusive: bool) -> None:
+        really_release(device, exclusive)
+        released.set()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(serial_port, "_release", release)
+        slow_driver.set()
+        assert await asyncio.to_thread(released.wait, 2)
+    await closed(*await opened(path))
 
 
 @pytest.mark.asyncio
@@ -342,9 +359,11 @@ def _taken(path: str) -> tuple[bool, bool]:
 async def test_both_locks_are_taken_and_given_back(far_end: FarEnd) -> None:
     bystander = os.open(far_end.path, os.O_RDWR | os.O_NOCTTY)  # keeps the pty, and with it a forgotten flag, alive
     transport, recorder = await opened(far_end.path)
+    inherited = os.dup(transport.get_extra_info("serial").fileno())  # as by a process forked meanwhile
     assert _taken(far_end.path) == (True, True)
     await closed(transport, recorder)
     assert _taken(far_end.path) == (False, False)
+    os.close(inherited)
     transport, recorder = await opened(far_end.path, exclusive=False)
     assert _taken(far_end.path) == (False, False)
     await closed(transport, recorder)

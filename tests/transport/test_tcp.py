@@ -88,6 +88,7 @@ async def test_bytes_go_both_ways_without_delay_and_a_dead_server_is_found_out()
         transport = await port.open(lambda: recorder)
         assert recorder.connections == 1
         assert not is_paced(port, transport)
+        assert transport.get_write_buffer_limits() == (0, 0)
         sock = transport.get_extra_info("socket")
         assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
         assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
