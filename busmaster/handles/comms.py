@@ -1,0 +1,148 @@
+"""What the handles of a comms array share (HCP, HCP2, MicroFlex): elements by number or name, written and verified."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, overload
+
+from busmaster.errors import InvalidCommand, VerifyFailed
+from busmaster.exchange import Command
+from busmaster.handles.base import Handle, unknown_item
+from busmaster.points import Point
+from busmaster.protocols import hcp, hcp2
+from busmaster.protocols.comms import is_read_back, telegrams
+from busmaster.protocols.comms_array import Element
+
+if TYPE_CHECKING:
+    from busmaster.node import Priority
+
+T = TypeVar("T")
+
+
+class CommsHandle(Handle):
+    """A handle of a node with a comms array. Each protocol says how an element is read and written, and its names."""
+
+    read_command: ClassVar[type[hcp.Read] | type[hcp2.Read]]
+    write_command: ClassVar[type[hcp.Write] | type[hcp2.Write]]
+    elements: ClassVar[Mapping[str, Element[object]]] = {}
+    form: ClassVar[str]
+    """What an item looks like, for the message to someone who mistyped it."""
+
+    @classmethod
+    def items(cls) -> tuple[str, ...]:
+        return tuple(cls.elements)
+
+    def point(self, item: str) -> Point[Any]:
+        """An element by its number, decimal, or by its name."""
+        if item.isascii() and item.isdigit():
+            return self.element(int(item))
+        return self.named(self._lookup(item))
+
+    def element(self, number: int) -> Point[float]:
+        """An element by its number: read and written as it is, for the node to refuse."""
+        return Point(
+            self.node, str(number), self.read_command(number), encode=lambda value: self.write_command(number, (value,))
+        )
+
+    def named(self, element: Element[T]) -> Point[T]:
+        """An element by what it stands for: decoded, with its unit, and read-only if the map says so."""
+
+        def encode(value: Any) -> Command[None]:
+            return self.write_command(element.number, (value,), idempotent=True)
+
+        return Point(
+            self.node,
+            element.name,
+            self.read_command(element.number),
+            unit=element.unit,
+            decode=element.decode,
+            encode=encode if element.writable else None,
+        )
+
+    async def read(
+        self,
+        element: int | str,
+        *,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+    ) -> float:
+        """The number that an element holds now. Raises Refused for one that the node does not have."""
+        number = element if isinstance(element, int) else self._lookup(element).number
+        return await self.node.request(
+            self.read_command(number), priority=priority, start_within=start_within, retries=retries
+        )
+
+    async def write(
+        self,
+        element: int | str,
+        *values: float,
+        verify: bool = False,
+        idempotent: bool = False,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+    ) -> None:
+        """Write values to an element and those after it, acknowledged.
+
+        A list that does not fit one telegram of 60 characters is sent in several; if one of them fails, those before
+        it are stored. `verify` reads every element back and compares at single precision and 4 decimals: it raises
+        VerifyFailed for the first that differs. `idempotent` allows a retry after an unknown outcome: not for
+        elements whose writing starts a Mint event (Comms 1 to 5). `start_within` is for each telegram.
+
+        Raises InvalidCommand before anything is sent for a value that cannot be sent, or a read-only name.
+        """
+        number = element if isinstance(element, int) else self._writable(element)
+        commands = [self.write_command(number + offset, part, idempotent) for offset, part in telegrams(values)]
+        if not commands:
+            raise InvalidCommand(f"{self.node.label}: there is no value to write")
+        for command in commands:
+            await self.node.request(command, priority=priority, start_within=start_within)
+        if verify:
+            for offset, value in enumerate(values):
+                await self._verify(number + offset, value, priority)
+
+    async def _verify(self, number: int, written: float, priority: Priority | None) -> None:
+        command = self.read_command(number)
+        found = await self.node.request(command, priority=priority)
+        if not is_read_back(written, found):
+            raise VerifyFailed(
+                f"element {number} reads {found!r} after {written!r} was written",
+                node=self.node.label,
+                command=str(command),
+            )
+
+    def _lookup(self, name: str) -> Element[object]:
+        element = self.elements.get(name)
+        if element is None:
+            raise unknown_item(name, self.elements, self.form)
+        return element
+
+    def _writable(self, name: str) -> int:
+        element = self._lookup(name)
+        if not element.writable:
+            raise InvalidCommand(f"{self.node.label}: {name} is read-only")
+        return element.number
+
+
+class HasElements(typing.Protocol):
+    """Whatever makes a point of a named element."""
+
+    @property
+    def named(self) -> Callable[[Element[T]], Point[T]]: ...
+
+
+class Named(Generic[T]):
+    """A class attribute: the point of one named element."""
+
+    def __init__(self, element: Element[T]) -> None:
+        self.element = element
+
+    @overload
+    def __get__(self, holder: None, owner: type) -> Named[T]: ...
+
+    @overload
+    def __get__(self, holder: HasElements, owner: type) -> Point[T]: ...
+
+    def __get__(self, holder: HasElements | None, owner: type) -> Named[T] | Point[T]:
+        return self if holder is None else holder.named(self.element)
