@@ -7,7 +7,7 @@ from collections.abc import Callable
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.devices.hostcomms import HCP, HCP2, Framing
 from busmaster.emulator.devices.microflex import ENABLE, MicroFlexDrive
-from busmaster.emulator.devices.mint import MintController
+from busmaster.emulator.devices.mint import MintController, report_positions
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
 
@@ -37,6 +37,9 @@ def _mint(framing: Framing) -> Maker:
     def make(address: int, delay: Delay, oracle: Oracle | None, lively: bool) -> Device:
         controller = MintController(address, framing, delay=delay, oracle=oracle)
         if lively:
+            controller.program = report_positions
+            controller.statement = 0.05
+            controller.start_program()
             for number, axis in enumerate(controller.axes):
                 axis.swing(100.0, 8.0 + number, address / 7 + number / 3, 0.0)
         return controller

@@ -14,16 +14,21 @@ from busmaster.emulator.device import NEVER
 
 @dataclass(slots=True)
 class Ramp:
-    """A speed that moves to `target` by `rate` per second, and its integral, the `position`."""
+    """A speed that moves to `target` by `rate` per second, and its integral, the `position`.
+
+    Its time begins when it is first advanced.
+    """
 
     rate: float
     speed: float = 0.0
     target: float = 0.0
     position: float = 0.0
-    now: float = 0.0
+    now: float = NEVER
 
     def advance(self, now: float) -> None:
         """To `now`; never back."""
+        if self.now == NEVER:
+            self.now = now
         left = now - self.now
         if left <= 0:
             return

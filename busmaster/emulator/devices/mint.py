@@ -80,7 +80,7 @@ class MintController(HostCommsDevice):
         self.now = NEVER
         """Of the statement that is being executed; NEVER before the first."""
         self.line_number = 0
-        self._program = program
+        self.program = program
         self._run: Generator[int, None, None] | None = None
         self.start_program()
 
@@ -89,7 +89,7 @@ class MintController(HostCommsDevice):
     def start_program(self) -> None:
         """From its first statement, with the comms array as it is. Its time begins when it is next asked."""
         self.now = NEVER
-        self._run = None if self._program is None else self._program(self)
+        self._run = None if self.program is None else self.program(self)
 
     def run(self, now: float) -> None:
         """Executes the statements that are due by `now`."""
@@ -241,6 +241,14 @@ def command_handshake(mint: MintController) -> Generator[int, None, None]:
         yield 9
         comms[1] = 0
         yield 10
+
+
+def report_positions(mint: MintController) -> Generator[int, None, None]:
+    """Not in the documents: keeps Comms(11) to Comms(18) at the positions of the axes, for a host that speaks HCP."""
+    while True:
+        for number, axis in enumerate(mint.axes):
+            mint.comms[11 + number] = axis.position(mint.now)
+        yield 1
 
 
 def jog_on_comms1(mint: MintController, element: int, now: float) -> None:

@@ -1,0 +1,314 @@
+"""The wire's physics: byte times, half-duplex, collisions, echo, turnaround, a cut."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.devices.mint import MintController
+from busmaster.emulator.line import Echo, Line
+from busmaster.emulator.wave import Wave
+from busmaster.errors import InvalidCommand
+from busmaster.profile import LineSettings
+from tests.emulator.lines import SETTINGS, TAU, arrivals, ask, hexed, line_of
+
+READ_2 = bytes.fromhex("07 30 32 02 30 31 05 04")  # AN00129: read node 2 Comms(1)
+READ_3 = bytes.fromhex("07 30 33 02 30 31 05 05")
+REPLY = "02 30 31 30 03 32"  # Comms(1) = 0
+WRITE_2 = bytes.fromhex("07 30 32 02 30 31 31 32 33 2E 34 35 36 03 2B")
+
+
+class Ear(Device):
+    """Hears everything and notes when each byte ended."""
+
+    def __init__(self) -> None:
+        super().__init__(0)
+        self.attentive = True
+        self.heard: list[tuple[float, int]] = []
+
+    def hear_byte(self, byte: int, now: float) -> None:
+        self.heard.append((now, byte))
+
+
+def mint(address: int = 2, delay: float = 0.002) -> MintController:
+    return MintController(address, delay=Delay(delay))
+
+
+# Time
+
+
+def test_a_reply_comes_when_request_delay_and_reply_have_passed() -> None:
+    line = line_of(mint())
+    line.prompt = False
+    line.send(READ_2, 1.0)
+    [(when, data)] = arrivals(line, 2.0)
+    assert data == REPLY
+    assert when == pytest.approx(1.0 + 8 * TAU + 0.002 + 6 * TAU)
+
+
+def test_a_host_that_asks_in_mid_frame_gets_the_bytes_that_have_ended() -> None:
+    line = line_of(mint())
+    line.send(READ_2, 0.0)
+    start = 8 * TAU + 0.002
+    assert line.receive(start + 0.9 * TAU) == b""
+    assert hexed(line.receive(start + 1.1 * TAU)) == "02"
+    assert hexed(line.receive(start + 3.5 * TAU)) == "30 31"
+    assert hexed(line.receive(1.0)) == "30 03 32"
+
+
+def test_the_first_byte_is_an_event_unless_the_host_asks_in_time_by_itself() -> None:
+    line = line_of(mint())
+    line.send(READ_2, 0.0)
+    assert [data for _, data in arrivals(line, 1.0)] == ["02", "30 31 30 03 32"]
+
+
+def test_chunks_split_a_reply_evenly() -> None:
+    line = line_of(mint(), chunk=2)
+    line.prompt = False
+    line.send(READ_2, 0.0)
+    assert [data for _, data in arrivals(line, 1.0)] == ["02 30", "31 30", "03 32"]
+
+
+def test_latency_holds_back_what_the_wire_has_delivered() -> None:
+    line = line_of(mint(), latency=0.016)
+    line.prompt = False
+    line.send(READ_2, 0.0)
+    [(when, _)] = arrivals(line, 1.0)
+    assert when == pytest.approx(14 * TAU + 0.002 + 0.016)
+
+
+def test_without_pace_bytes_take_no_time() -> None:
+    line = line_of(mint(), paced=False)
+    line.send(READ_2, 5.0)
+    assert arrivals(line, 6.0) == [(5.002, REPLY)]
+
+
+def test_seven_bits_with_parity_take_as_long_as_eight_without() -> None:
+    assert Line(LineSettings(9600, 7, "E")).tau == Line(LineSettings(9600)).tau == pytest.approx(10 / 9600)
+
+
+def test_early_and_repeated_calls_do_nothing() -> None:
+    line = line_of(mint())
+    line.prompt = False
+    line.send(READ_2, 1.0)
+    assert line.receive(1.0) == line.receive(1.0) == line.receive(0.5) == b""
+    assert hexed(line.receive(2.0)) == REPLY
+    assert line.receive(2.0) == b""
+    assert line.next_event() == float("inf")
+
+
+def test_the_host_queues_behind_what_it_is_still_sending() -> None:
+    line = line_of(ear := Ear())
+    line.send(b"ab", 0.0)
+    line.send(b"cd", TAU / 2)
+    line.receive(1.0)
+    assert [byte for _, byte in ear.heard] == list(b"abcd")
+    assert [when for when, _ in ear.heard] == pytest.approx([TAU, 2 * TAU, 3 * TAU, 4 * TAU])
+
+
+# Who hears what
+
+
+def test_a_device_that_listens_hears_the_others_too() -> None:
+    line = line_of(mint(), ear := Ear())
+    ask(line, hexed(READ_2))
+    assert bytes(byte for _, byte in ear.heard) == READ_2 + bytes.fromhex(REPLY)
+    assert ear.heard[8][0] == pytest.approx(8 * TAU + 0.002 + TAU)
+
+
+def test_a_request_that_came_glued_to_rubbish_is_heard_all_the_same() -> None:
+    assert ask(line_of(mint()), "00 FF " + hexed(READ_2)) == REPLY
+
+
+def test_the_line_knows_its_devices_by_address() -> None:
+    line = line_of(first := mint(2), mint(3))
+    assert line.device(2) is first
+    line.remove(first)
+    with pytest.raises(KeyError):
+        line.device(2)
+    assert ask(line, hexed(READ_2)) == ""
+    assert ask(line, hexed(READ_3), 1.0) == REPLY
+
+
+# Collisions
+
+
+def test_two_devices_at_one_address_garble_each_other() -> None:
+    one, other = mint(2), mint(2, delay=0.0021)
+    one.comms[1], other.comms[1] = 5, 6
+    line = line_of(one, other)
+    heard = ask(line, hexed(READ_2))
+    assert line.collisions == 1
+    assert heard not in ("02 30 31 35 03 37", "02 30 31 36 03 34")
+
+
+def test_two_equal_replies_at_the_same_moment_look_like_one() -> None:
+    line = line_of(mint(2), mint(2))
+    assert ask(line, hexed(READ_2)) == REPLY
+    assert line.collisions == 1
+
+
+def test_what_had_arrived_before_a_collision_stays_as_it_was() -> None:
+    line = line_of(mint())
+    line.send(READ_2, 0.0)
+    start = 8 * TAU + 0.002
+    assert hexed(line.receive(start + 2.5 * TAU)) == "02 30"
+    line.send(b"\x00", start + 2.5 * TAU)  # the host talks into the reply
+    rest = hexed(line.receive(1.0))
+    assert rest.endswith("03 32")
+    assert len(rest.split()) == 2  # what came while it talked it did not hear
+
+
+def test_a_request_that_collides_with_a_straggler_is_lost_and_not_misheard() -> None:
+    line = line_of(mint(2, delay=0.05), mint(3))
+    line.send(READ_2, 0.0)
+    line.send(READ_3, 0.0505)
+    heard = " ".join(data for _, data in arrivals(line, 1.0))
+    assert line.collisions == 1
+    assert REPLY not in heard
+
+
+@given(st.binary(min_size=1, max_size=8), st.sampled_from("NEOMS"), st.sampled_from([1, 2]))
+@settings(max_examples=50)
+def test_a_lone_talker_is_heard_as_it_spoke_in_any_framing(data: bytes, parity: str, stopbits: int) -> None:
+    wave = Wave(LineSettings(9600, 8, parity, stopbits), 3.0, Random(1))
+    wave.add(3.0, data, None)
+    heard = list(wave.heard(Ear()))
+    assert bytes(byte for _, byte in heard) == data
+    tau = LineSettings(9600, 8, parity, stopbits).byte_time
+    assert [when for when, _ in heard] == pytest.approx([3.0 + n * tau for n in range(len(data))])
+    assert list(wave.heard(None)) == []
+    assert list(wave.heard(None, echo=True)) == heard
+
+
+@given(st.binary(min_size=2, max_size=8), st.binary(min_size=1, max_size=8), st.floats(0, 10), st.integers())
+@settings(max_examples=100)
+def test_a_second_talker_changes_nothing_that_ended_before_it(
+    first: bytes, second: bytes, offset: float, seed: int
+) -> None:
+    alone, both = (Wave(SETTINGS, 0.0, Random(seed)) for _ in range(2))
+    for wave in (alone, both):
+        wave.add(0.0, first, None)
+    both.add(offset * TAU, second, None)
+    ear = Ear()
+    ended = len(list(alone.heard(ear, until=offset * TAU)))
+    assert list(both.heard(ear))[:ended] == list(alone.heard(ear))[:ended]
+
+
+# Echo, turnaround, cut
+
+
+def test_an_echo_gives_the_host_its_own_bytes_first() -> None:
+    line = line_of(mint(), echo=Echo())
+    assert ask(line, hexed(READ_2)) == hexed(READ_2) + " " + REPLY
+
+
+def test_a_late_echo_still_comes_before_the_reply() -> None:
+    line = line_of(mint(delay=0.001), echo=Echo(delay=0.01))
+    line.send(READ_2, 0.0)
+    [(when, data)] = arrivals(line, 1.0)
+    assert when == pytest.approx(8 * TAU + 0.01)
+    assert data == hexed(READ_2) + " " + REPLY
+
+
+def test_a_corrupt_echo_differs_by_one_bit() -> None:
+    echo = bytes.fromhex(ask(line_of(echo=Echo(corrupt=1.0)), hexed(READ_2)))
+    assert sum((a ^ b).bit_count() for a, b in zip(echo, READ_2, strict=True)) == 1
+
+
+def test_a_device_that_holds_the_line_after_its_reply_garbles_the_next_request() -> None:
+    first = mint(2)
+    first.turnaround = 2 * TAU
+    line = line_of(first, mint(3))
+    line.send(READ_2, 0.0)
+    end = 14 * TAU + 0.002
+    line.receive(end)
+    line.send(READ_3, end)
+    assert line.receive(2.0) == b""
+    line.send(READ_2, 2.0)
+    line.receive(2.0 + end)
+    assert ask(line, hexed(READ_3), 2.0 + end + 2.5 * TAU) == REPLY
+
+
+def test_a_host_that_holds_the_line_garbles_a_quick_reply() -> None:
+    line = line_of(mint(delay=0.0), turnaround=3 * TAU)
+    garbled = ask(line, hexed(READ_2))
+    assert garbled != REPLY
+    assert garbled.endswith("03 32")
+    assert ask(line_of(mint(delay=0.002), turnaround=3 * TAU), hexed(READ_2)) == REPLY
+
+
+def test_nothing_passes_a_cut_until_it_is_mended() -> None:
+    line = line_of(mint())
+    line.cut(0.0)
+    assert ask(line, hexed(READ_2), 0.0) == ""
+    line.restore(1.0)
+    assert ask(line, hexed(READ_2), 1.0) == REPLY
+
+
+def test_a_cut_ends_a_reply_in_the_middle() -> None:
+    line = line_of(mint())
+    line.send(READ_2, 0.0)
+    line.cut(8 * TAU + 0.002 + 3.5 * TAU)
+    assert hexed(line.receive(1.0)) == "02 30 31"
+
+
+def test_a_request_that_was_cut_in_the_middle_is_forgotten_at_the_next_reset_byte() -> None:
+    line = line_of(mint())
+    line.send(WRITE_2, 0.0)
+    line.cut(5.5 * TAU)
+    line.restore(0.5)
+    assert ask(line, hexed(READ_2), 1.0) == REPLY
+
+
+def test_a_cut_may_spare_the_devices_before_it() -> None:
+    line = line_of(mint(2), far := mint(3))
+    line.cut(0.0, far)
+    assert ask(line, hexed(READ_2)) == REPLY
+    assert ask(line, hexed(READ_3), 1.0) == ""
+
+
+# Delays
+
+
+def test_a_spread_delay_is_drawn_from_the_chance_that_was_handed_in() -> None:
+    times = []
+    for _ in range(2):
+        line = line_of(MintController(2, delay=Delay(0.05, 0.1)), seed=7)
+        line.prompt = False
+        line.send(READ_2, 0.0)
+        times.append(arrivals(line, 1.0)[0][0] - 14 * TAU)
+    assert times[0] == times[1]
+    assert 0.05 <= times[0] <= 0.1
+
+
+def test_stragglers_are_a_share_of_the_replies() -> None:
+    delay, chance = Delay(0.002, stragglers=0.1, straggle=(0.1, 0.145)), Random(1)
+    drawn = [delay.draw(chance) for _ in range(1000)]
+    assert 50 < sum(d > 0.01 for d in drawn) < 150
+    assert all(d == 0.002 or 0.1 <= d <= 0.145 for d in drawn)
+
+
+def test_chance_that_was_not_handed_in_is_asked_for() -> None:
+    line = Line(SETTINGS, [MintController(2, delay=Delay(0.05, 0.1))])
+    line.send(READ_2, 0.0)
+    with pytest.raises(ValueError, match=r"random\.Random"):
+        line.receive(1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "delay"),
+    [("2", Delay(0.002)), ("50-100", Delay(0.05, 0.1)), ("0", Delay(0.0)), ("1.5-1.5", Delay(0.0015))],
+)
+def test_delays_are_read_as_milliseconds(text: str, delay: Delay) -> None:
+    assert Delay.parse(text) == delay
+
+
+@pytest.mark.parametrize("text", ["", "x", "-5", "100-50", "1-2-3", "nan", "inf"])
+def test_a_delay_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(InvalidCommand, match="reply delay"):
+        Delay.parse(text)

@@ -1,0 +1,322 @@
+"""A Mint controller, as AN00110 (HCP) and AN00129 (HCP2) describe it."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from busmaster.emulator.devices.hostcomms import HCP, HCP2, number_text, numbers
+from busmaster.emulator.devices.mint import MintController, command_handshake, jog_on_comms1, winding
+from busmaster.emulator.motion import Motion
+from busmaster.emulator.oracle import Oracle, oracle_value
+from busmaster.wire.checks import xor
+from tests.emulator.lines import TAU, ask, ask_bytewise, hexed, line_of
+
+ACK, NAK, SILENCE = "06", "15", ""
+
+
+def write(node: int, element: int, data: str) -> str:
+    body = f"{node:02X}\x02{element:02X}{data}\x03".encode()
+    return hexed(b"\x07" + body + bytes([xor(body)]))
+
+
+def read(node: int, element: int) -> str:
+    body = f"{node:02X}\x02{element:02X}\x05".encode()
+    return hexed(b"\x07" + body + bytes([xor(body)]))
+
+
+def value(reply: str) -> str:
+    """The data field of a reply telegram."""
+    return bytes.fromhex(reply)[3:-2].decode()
+
+
+# Frames of the documents
+
+
+@pytest.mark.parametrize(
+    ("request_", "reply"),
+    [
+        ("07 30 32 02 30 31 31 32 33 2E 34 35 36 03 2B", ACK),  # write node 2 Comms(1) = 123.456
+        ("07 30 32 02 30 31 05 04", "02 30 31 31 32 33 2E 34 35 36 03 2B"),  # read it: checksum EOT
+        ("07 30 32 02 46 46 05 05", "02 46 46 30 03 33"),  # read Comms(255): reserved, 0
+    ],
+)
+def test_hcp2_answers_the_documents_own_scenarios(request_: str, reply: str) -> None:
+    mint = MintController(2)
+    mint.comms[1] = 123.456
+    assert ask(line_of(mint), request_) == reply
+
+
+@pytest.mark.parametrize(
+    ("node", "request_", "reply"),
+    [
+        (2, "04 32 32 02 30 31 31 32 33 2E 34 35 36 03 2B", ACK),  # AN00110 "Writing Data"
+        (2, "04 32 32 02 30 31 05", "02 30 31 31 32 33 2E 34 35 36 03 2B"),
+        (13, "04 44 44 02 31 32 35 03 35", ACK),
+        (13, "04 64 64 02 31 32 35 03 35", SILENCE),  # lower case: ignored
+        (13, "04 44 45 02 31 32 35 03 35", SILENCE),  # the two node characters differ
+        (1, "04 31 31 02 39 39 31 2C 32 03 2C", NAK),  # past Comms(99)
+        (1, "04 31 31 02 30 30 05", NAK),  # Comms(00)
+        (1, "04 31 31 02 30 31 31 35 03 06", ACK),  # a checksum that looks like ACK
+        (1, "04 31 31 02 30 31 31 37 03 04", ACK),  # a checksum that looks like EOT
+        (1, "04 31 31 02 30 31 31 37 03 05", NAK),  # a wrong checksum
+    ],
+)
+def test_hcp_answers_as_the_document_says(node: int, request_: str, reply: str) -> None:
+    for asking in (ask, ask_bytewise):
+        mint = MintController(node, HCP)
+        mint.comms[1] = 123.456
+        assert asking(line_of(mint), request_) == reply
+
+
+@pytest.mark.parametrize(
+    ("request_", "reply"),
+    [
+        ("07 30 31 02 30 31 35 03 34", ACK),  # the checksum begins after BEL
+        ("07 30 31 02 30 31 35 03 37", NAK),  # that of HCP
+        ("07 30 31 02 32 36 31 03 35", ACK),  # element "26" is Comms(38)
+        ("07 30 31 02 36 33 37 2C 38 03 26", NAK),  # 99 is stored, 100 is read-only
+        ("07 30 31 02 46 45 31 2C 32 2C 33 03 33", NAK),  # 254, 255, 256
+        ("07 30 31 02 44 45 35 03 34", ACK),  # Comms(222), the outputs
+        ("07 30 31 02 66 65 05 04", NAK),  # a lower-case element
+        ("07 30 31 02 30 30 05 06", NAK),  # element 00
+        ("07 30 31 02 36 34 31 03 32", NAK),  # Comms(100): read-only
+        ("07 30 31 02 30 31 03 01", NAK),  # no data
+        ("07 30 32 02 30 31 35 03 37", SILENCE),  # another node
+        ("00 00 07 30 31 02 30 31 35 03 34", ACK),  # idle bytes in front
+        ("07 30 07 30 31 02 30 31 35 03 34", ACK),  # a reset byte begins anew
+        ("07 30 31 02 30 31 35 02 34", SILENCE),  # a control character in the data: no frame
+        ("07 30 31 02 30 31 35 03", SILENCE),  # cut
+    ],
+)
+def test_hcp2_acknowledges_refuses_and_ignores_as_the_document_says(request_: str, reply: str) -> None:
+    for asking in (ask, ask_bytewise):
+        assert asking(line_of(MintController(1)), request_) == reply
+
+
+def test_every_element_can_be_read_and_names_itself_in_hex() -> None:
+    for node in (0, 1, 13, 255):
+        mint = MintController(node)
+        line = line_of(mint)
+        for element in range(1, 256):
+            reply = bytes.fromhex(ask(line, read(node, element), element))
+            assert reply[1:3] == f"{element:02X}".encode()
+            assert reply[-1] == xor(reply[1:-1])
+
+
+# Values
+
+
+def test_a_multi_value_write_stores_up_to_the_first_bad_one_and_is_then_refused() -> None:
+    mint = MintController(1)
+    assert ask(line_of(mint), write(1, 10, "1,x,3")) == NAK
+    assert mint.comms[10:13] == [1, 0, 0]
+    assert ask(line_of(mint), write(1, 10, "10,20,30")) == ACK
+    assert mint.comms[10:13] == [10, 20, 30]
+
+
+def test_all_or_nothing_stores_nothing_of_a_bad_write() -> None:
+    mint = MintController(1, all_or_nothing=True)
+    assert ask(line_of(mint), write(1, 99, "7,8")) == NAK
+    assert mint.comms[99] == 0
+    assert ask(line_of(mint), write(1, 98, "7,8")) == ACK
+
+
+def test_a_data_field_of_sixty_characters_is_taken_and_one_of_sixty_one_refused() -> None:
+    for asking in (ask, ask_bytewise):
+        mint = MintController(1)
+        assert asking(line_of(mint), write(1, 1, "0" * 59 + "7")) == ACK
+        assert mint.comms[1] == 7
+        assert asking(line_of(mint), write(1, 2, "0" * 60 + "7")) == NAK
+        assert asking(line_of(mint), write(1, 2, "0" * 200 + "7")) == NAK
+        assert mint.comms[2] == 0
+
+
+@pytest.mark.parametrize(
+    ("data", "values"),
+    [
+        (b"1234,-45.6,11.2", (1234, -45.6, 11.2)),
+        (b".5", (0.5,)),
+        (b"+3", (3,)),
+        (b"  7", (7,)),
+        (b"1 2,3", (1, 3)),  # a space ends the conversion
+        (b"5.,3", (5, 3)),
+        (b"1.00005", (1.0001,)),  # half up on the fifth
+        (b"-1.00005", (-1.0001,)),
+        (b"1,,3", (1, None)),
+        (b"1e3", (None,)),
+        (b"", (None,)),
+        (b"9" * 60, (float("9" * 60),)),
+    ],
+)
+def test_numbers_are_read_as_the_document_says(data: bytes, values: tuple[float | None, ...]) -> None:
+    assert numbers(data) == values
+
+
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [(12.5, b"12.5"), (0.0, b"0"), (-0.0, b"0"), (-0.00001, b"0"), (123.45675, b"123.4568"), (4096, b"4096")],
+)
+def test_numbers_are_written_short(number: float, text: bytes) -> None:
+    assert number_text(number) == text
+
+
+@given(st.floats(-1e9, 1e9))
+@settings(max_examples=200)
+def test_a_number_written_and_read_again_is_the_same_to_four_decimals(number: float) -> None:
+    assert list(numbers(number_text(number))) == pytest.approx([number], abs=0.00005001)
+    assert numbers(number_text(number, fixed_decimals=True)) == numbers(number_text(number))
+
+
+def test_a_value_too_long_for_a_reply_is_refused() -> None:
+    mint = MintController(1)
+    mint.comms[1] = 1e30
+    assert ask(line_of(mint), read(1, 1)) == NAK
+
+
+def test_single_precision_keeps_24_bits() -> None:
+    mint = MintController(1, single_precision=True)
+    ask(line_of(mint), write(1, 1, "16777217"))
+    assert value(ask(line_of(mint), read(1, 1))) == "16777216"
+    assert ask(line_of(mint), write(1, 1, "9" * 60)) == ACK
+
+
+@given(st.binary(max_size=40), st.sampled_from([HCP, HCP2]), st.booleans())
+@settings(max_examples=150)
+def test_it_survives_any_bytes_and_then_answers(data: bytes, framing: object, bytewise: bool) -> None:
+    mint = MintController(1, HCP if framing is HCP else HCP2)
+    line = line_of(mint)
+    (ask_bytewise if bytewise else ask)(line, data.hex())
+    assert (ask(line, "04 31 31 02 30 31 05", 10) or ask(line, read(1, 1), 20)).startswith("02 30 31")
+
+
+FRAMES = [read(1, 1), read(1, 4), read(2, 4), write(1, 1, "14"), write(1, 1, "1,2"), write(2, 1, "3"), "07", "02", "30"]
+
+
+@given(st.lists(st.sampled_from(FRAMES), max_size=4), st.integers(0, 30))
+@settings(max_examples=150)
+def test_taking_a_frame_in_one_piece_and_hearing_it_byte_by_byte_do_the_same(frames: list[str], cut: int) -> None:
+    whole, bytewise = MintController(1), MintController(1)
+    for device in (whole, bytewise):
+        for frame in (bytes.fromhex(text)[:cut] for text in frames):
+            taken = device is whole and not device.attentive and frame.startswith(device.routes)
+            if not taken or not device.take(frame, 1.0):
+                device.hear(frame, 1.0)
+    assert whole.outbox == bytewise.outbox
+    assert whole.comms == bytewise.comms
+
+
+# The extended array
+
+
+def test_an_axis_tells_position_velocity_encoder_and_idle() -> None:
+    mint = MintController(1)
+    line = line_of(mint)
+    mint.axes[2].jog(10.0, 0.0)
+    assert float(value(ask(line, read(1, 130), 10.0))) == pytest.approx(100, abs=0.5)
+    assert value(ask(line, read(1, 131), 11.0)) == "10"
+    assert value(ask(line, read(1, 132), 11.5)) == str(int(Motion.JOG))
+    assert float(value(ask(line, read(1, 135), 12.0))) == pytest.approx(120_000, rel=0.01)
+    assert value(ask(line, read(1, 136), 13.0)) == "0"
+    assert value(ask(line, read(1, 106), 14.0)) == "1"  # axis 0 stands
+
+
+def test_inputs_outputs_and_analog_channels_can_be_read() -> None:
+    mint = MintController(1)
+    line = line_of(mint)
+    mint.inputs, mint.adc[3] = 5, 12.25
+    assert ask(line, write(1, 222, "9")) == ACK
+    assert [value(ask(line, read(1, element), element)) for element in (220, 222, 227, 239)] == [
+        "5",
+        "9",
+        "12.25",
+        "5628",
+    ]
+
+
+def test_reserved_elements_read_zero_or_are_refused_if_so_set() -> None:
+    assert value(ask(line_of(MintController(1)), read(1, 221))) == "0"
+    assert ask(line_of(MintController(1, refuse_reserved=True)), read(1, 221)) == NAK
+    assert ask(line_of(MintController(1, axes=1, refuse_reserved=True)), read(1, 115)) == NAK
+    assert ask(line_of(MintController(1)), write(1, 221, "1")) == NAK
+
+
+# Programs and events
+
+
+def test_a_write_to_the_first_five_elements_raises_its_event_even_if_nothing_changed() -> None:
+    heard: list[tuple[int, float]] = []
+    mint = MintController(1, events=[lambda mint, element, now: heard.append((element, mint.comms[element]))])
+    line = line_of(mint)
+    for element in (1, 1, 5, 6):
+        ask(line, write(1, element, "3"))
+    assert heard == [(1, 3), (1, 3), (5, 3)]
+
+
+def test_event_comms1_jogs_the_axis() -> None:
+    mint = MintController(1, events=[jog_on_comms1])
+    line = line_of(mint)
+    ask(line, write(1, 1, "-25"))
+    assert float(value(ask(line, read(1, 101), 2.0))) == -25
+
+
+def test_the_winding_program_traverses_between_its_two_ends() -> None:
+    mint = MintController(1, program=winding)
+    line = line_of(mint)
+    assert value(ask(line, read(1, 3))) == "0"
+    ask(line, write(1, 1, "10,20,4.3"), 1.0)
+    positions = [float(value(ask(line, read(1, 4), 2.0 + step))) for step in range(60)]
+    assert 9.5 < min(positions[5:]) < 11
+    assert 19 < max(positions[5:]) < 20.5
+    assert value(ask(line, read(1, 235), 70.0)) == "1"
+
+
+def test_the_command_handshake_clears_comms1_when_the_move_is_over() -> None:
+    mint = MintController(1, program=command_handshake)
+    line = line_of(mint)
+    ask(line, read(1, 1))
+    ask(line, write(1, 2, "10,5"), 0.1)  # speed 10, target 5
+    mint.run(0.2)
+    while mint.line_number != 10:  # just cleared: the next statement reads Comms(1)
+        mint.run(mint.now + mint.statement)
+    ask(line, write(1, 1, "1"), mint.now - 9 * TAU - TAU / 2)
+    assert value(ask(line, read(1, 1), 0.4)) == "1"
+    assert value(ask(line, read(1, 1), 1.0)) == "0"
+    assert value(ask(line, read(1, 115), 1.1)) == "5"
+
+
+def test_the_command_handshake_loses_a_command_that_comes_between_its_read_and_its_clear() -> None:
+    mint = MintController(1, program=command_handshake)
+    mint.run(0.0)
+    mint.run(1.0)
+    while mint.line_number != 4:  # Comms(1) has been read as 0
+        mint.run(mint.now + mint.statement)
+    assert mint.write_element(1, 1.0, mint.now)
+    mint.comms[2:4] = [10.0, 5.0]
+    mint.run(mint.now + 2.0)
+    assert mint.comms[1] == 0
+    assert mint.axes[1].position(mint.now) == 0
+
+
+def test_a_restart_loses_what_was_in_ram() -> None:
+    mint = MintController(1)
+    line = line_of(mint)
+    ask(line, write(1, 1, "3"))
+    line.restart(mint, 1.0)
+    assert value(ask(line, read(1, 1), 2.0)) == "0"
+
+
+# The oracle
+
+
+def test_with_an_oracle_every_element_tells_node_element_and_writes() -> None:
+    mint = MintController(7, oracle=Oracle(7))
+    line = line_of(mint)
+    assert value(ask(line, read(7, 5))) == str(oracle_value(7, 5, 0))
+    assert ask(line, write(7, 5, str(oracle_value(7, 5, 0)))) == ACK
+    assert value(ask(line, read(7, 5))) == str(oracle_value(7, 5, 1))
+    assert mint.oracle is not None
+    assert mint.oracle.strays == 0
+    ask(line, write(7, 5, str(oracle_value(6, 5, 1))))
+    assert mint.oracle.strays == 1
