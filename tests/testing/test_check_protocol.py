@@ -1,0 +1,503 @@
+"""The conformance kit: a sixth protocol (Modbus RTU) passes it, and each planted bug is found."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from typing import Any, ClassVar
+
+import pytest
+
+from busmaster.emulator.device import Device
+from busmaster.errors import InvalidCommand, Refused
+from busmaster.exchange import (
+    MORE,
+    Command,
+    Done,
+    Expect,
+    FrameError,
+    Leg,
+    Need,
+    ReplyTiming,
+    Sizes,
+    Timings,
+    no_reply,
+)
+from busmaster.profile import LineSettings, Profile
+from busmaster.testing import Case, Foreign, NotConformant, RoundTrip, Unseen, answers_of, check_protocol
+
+READ, WRITE, EXCEPTION = 3, 6, 0x80
+
+
+def crc(data: bytes) -> bytes:
+    check = 0xFFFF
+    for byte in data:
+        check ^= byte
+        for _ in range(8):
+            check = check >> 1 ^ (0xA001 if check & 1 else 0)
+    return check.to_bytes(2, "little")
+
+
+def checked(*data: int) -> bytes:
+    return bytes(data) + crc(bytes(data))
+
+
+class Asking:
+    """One attempt: the unit and function are echoed, an exception is three bytes, everything ends in a CRC."""
+
+    sizes = Sizes(7, 7)
+    later: Sequence[Leg] = ()
+    closing = 0
+    answered = True
+
+    def __init__(self, request: bytes, timing: ReplyTiming) -> None:
+        self.request = request
+        self.timing = timing
+        self.starts = request[:1]
+        self.buffer = b""
+
+    def size(self) -> int:
+        return 7
+
+    def value(self, frame: bytes) -> Any:
+        return int.from_bytes(frame[3:5], "big")
+
+    def echoed(self, frame: bytes) -> bool:
+        return frame[0] == self.request[0] and frame[1] & 0x7F == self.request[1] and frame[2] in (0, 2)
+
+    def sound(self, frame: bytes) -> bool:
+        return crc(frame[:-2]) == frame[-2:]
+
+    def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
+        self.buffer += data
+        if len(self.buffer) < 3:
+            return MORE
+        refused = self.buffer[1] & EXCEPTION
+        size = 5 if refused else self.size()
+        if len(self.buffer) < size:
+            return MORE
+        frame, rest = self.buffer[:size], self.buffer[size:]
+        if not refused and not self.echoed(frame):
+            raise FrameError("wrong echo")
+        if not self.sound(frame):
+            raise FrameError("bad CRC", whole=not refused and not rest)
+        if refused:
+            if frame[:2] != bytes((self.request[0], self.request[1] | EXCEPTION)):
+                raise FrameError("wrong echo")
+            raise Refused(f"exception {frame[2]}")
+        return Done(self.value(frame), rest=rest)
+
+    def expired(self, started: bool, /) -> Expect | Done[Any]:
+        raise FrameError("cut short") if self.buffer else no_reply()
+
+
+class Telling(Asking):
+    """A write: the reply is the request."""
+
+    sizes = Sizes(8, 8)
+
+    def size(self) -> int:
+        return 8
+
+    def value(self, frame: bytes) -> Any:
+        return None
+
+    def echoed(self, frame: bytes) -> bool:
+        return frame[:6] == self.request[:6]
+
+
+def word(value: int) -> tuple[int, int]:
+    if not 0 <= value <= 0xFFFF:
+        raise InvalidCommand(f"{value} is no 16-bit number")
+    return value >> 8, value & 0xFF
+
+
+@dataclass(frozen=True, slots=True)
+class ReadRegister:
+    register: int
+    exchange: type[Asking] = Asking
+    writes: ClassVar[bool] = False
+    idempotent: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        word(self.register)
+
+    def __str__(self) -> str:
+        return f"read register {self.register}"
+
+    def open(self, address: int, timings: Timings, /) -> Asking:
+        return self.exchange(checked(address, READ, *word(self.register), 0, 1), timings.read)
+
+
+@dataclass(frozen=True, slots=True)
+class WriteRegister:
+    register: int
+    value: int
+    exchange: type[Asking] = Telling
+    writes: ClassVar[bool] = True
+    idempotent: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        word(self.register)
+        word(self.value)
+
+    def __str__(self) -> str:
+        return f"write register {self.register} = {self.value}"
+
+    def open(self, address: int, timings: Timings, /) -> Asking:
+        return self.exchange(checked(address, WRITE, *word(self.register), *word(self.value)), timings.write)
+
+
+MODBUS = Profile(
+    name="modbus",
+    title="Modbus RTU",
+    addresses=range(1, 248),
+    line=LineSettings(19200, parity="E"),
+    timings=Timings.uniform(ReplyTiming(0.05, 0.1, 0.2, 0.02)),
+    probe=ReadRegister(0),
+)
+REPLY = bytes.fromhex("11 03 02 02 2b 38 f8")
+OTHER_UNIT = checked(0x12, READ, 2, 2, 0x2B)
+READING = Case(ReadRegister(7), 17, [REPLY], 555)
+CASES = [
+    READING,
+    Case(ReadRegister(7), 18, [OTHER_UNIT], 555),
+    Case(WriteRegister(7, 3), 17, [bytes.fromhex("11 06 00 07 00 03 7a 9a")]),
+    Case(WriteRegister(7, 4), 17, [checked(17, WRITE, 0, 7, 0, 4)], request=checked(17, WRITE, 0, 7, 0, 4)),
+    Case(ReadRegister(9), 17, [bytes.fromhex("11 83 02 c1 34")], raises=Refused),
+]
+
+
+def named(command: Command[Any], address: int) -> Hashable:
+    """A reply to a read names the unit, one to a write everything."""
+    return address, type(command) if isinstance(command, ReadRegister) else command
+
+
+class Registers(Device):
+    """A Modbus slave that takes each chunk for a whole frame."""
+
+    def __init__(self, address: int) -> None:
+        super().__init__(address)
+        self.registers: dict[bytes, bytes] = {}
+
+    def hear(self, data: bytes, start: float) -> None:
+        unit, function, register = data[0], data[1], data[2:4]
+        if unit == self.address and function == WRITE:
+            self.registers[register] = data[4:6]
+            self.reply(data, start)
+        elif unit == self.address:
+            self.reply(checked(unit, READ, 2, *self.registers[register]), start)
+
+    def hear_byte(self, byte: int, now: float) -> None:
+        raise NotImplementedError
+
+
+def round_trip(values: Sequence[int] = (0, 1, 0x0302, 0xFFFF), **options: Any) -> RoundTrip:
+    return RoundTrip(17, lambda value: WriteRegister(7, value), ReadRegister(7), values, **options)
+
+
+def test_a_sixth_protocol_passes() -> None:
+    tally = check_protocol(
+        MODBUS,
+        CASES,
+        names=named,
+        foreign=[Foreign(ReadRegister(7), 17, checked(17, 4, 2, 2, 0x2B), "the reply to another function")],
+        invalid=[lambda: ReadRegister(70000), lambda: WriteRegister(1, -1)],
+        round_trips=[round_trip()],
+        device=answers_of(Registers(17)),
+    )
+    assert tally["round trips"] == 4
+    assert tally["flips"] == 8 * sum(len(case.legs[0]) for case in CASES)
+    assert min(tally[kind] for kind in ("cases", "splits", "truncations", "foreign", "garbage")) >= len(CASES)
+
+
+def test_a_kit_without_cases_has_shown_nothing() -> None:
+    with pytest.raises(NotConformant, match="no case"):
+        check_protocol(MODBUS, [])
+
+
+# planted bugs in a reader
+
+
+def find(*cases: Case, profile: Profile = MODBUS, **options: Any) -> str:
+    """All findings, which there must be."""
+    with pytest.raises(NotConformant) as error:
+        check_protocol(profile, cases or CASES, **{"names": named, **options})
+    assert error.value.findings
+    return str(error.value)
+
+
+def reading_with(exchange: type[Asking], **changes: Any) -> Case:
+    return replace(READING, command=ReadRegister(7, exchange), **changes)
+
+
+class CheckingNoUnit(Asking):
+    def echoed(self, frame: bytes) -> bool:
+        return frame[1:3] == b"\x03\x02"
+
+
+class CheckingNoCrc(Asking):
+    def sound(self, frame: bytes) -> bool:
+        return True
+
+
+class CallingAForeignFrameWhole(Asking):
+    def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
+        try:
+            return super().feed(data)
+        except FrameError as error:
+            raise FrameError(error.what, whole=True) from None
+
+
+class ReadingOnlyWholeChunks(Asking):
+    def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
+        self.buffer = b""
+        return super().feed(data)
+
+
+class TakingTheRest(Asking):
+    def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
+        step = super().feed(data)
+        return Done(step.value) if isinstance(step, Done) else step
+
+
+class ContentWithLess(Asking):
+    def expired(self, started: bool, /) -> Done[Any]:
+        if started:
+            return Done(int.from_bytes(self.buffer[3:5], "big"))
+        raise no_reply()
+
+
+class ContentWithSilence(Asking):
+    def expired(self, started: bool, /) -> Done[Any]:
+        return Done(0)
+
+
+class Crashing(Asking):
+    def size(self) -> int:
+        return {2: 7}[self.buffer[2]]
+
+
+class AskingForEver(Asking):
+    def expired(self, started: bool, /) -> Expect:
+        return Expect(self.timing, self.sizes, b"again")
+
+
+class TurningForEver(Asking):
+    def feed(self, data: bytes, /) -> Expect:
+        return Expect(self.timing, self.sizes)
+
+
+class SearchingForItsUnit(Asking):
+    """And so finding a reply in the middle of noise."""
+
+    def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
+        start = (self.buffer + data).find(17)
+        self.buffer, data = b"", (self.buffer + data)[max(start, 0) :]
+        return super().feed(data)
+
+
+class BeginningElsewhere(Asking):
+    def __init__(self, request: bytes, timing: ReplyTiming) -> None:
+        super().__init__(request, timing)
+        self.starts = b"\x99"
+
+
+class SmallerThanItSays(Asking):
+    sizes = Sizes(3, 5)
+
+
+class SizedBackwards(Asking):
+    sizes = Sizes(9, 8)
+
+
+class ClosingWithMoreThanItSays(Asking):
+    def feed(self, data: bytes, /) -> Need | Expect | Done[Any]:
+        step = super().feed(data)
+        return Done(step.value, send=b"\x06", rest=step.rest) if isinstance(step, Done) else step
+
+
+class WithALegTooMany(Asking):
+    later = (Leg(MODBUS.timings.packet, Sizes(1, 1)),)
+
+
+class Unanswered(Asking):
+    answered = False
+
+
+class WithATimingOfItsOwn(Asking):
+    def __init__(self, request: bytes, timing: ReplyTiming) -> None:
+        super().__init__(request, ReplyTiming(0.1, 0.2, 0.3, 0.4))
+
+
+class NumberingItsRequests(Asking):
+    numbers = count()
+
+    def __init__(self, request: bytes, timing: ReplyTiming) -> None:
+        super().__init__(request + bytes((next(self.numbers) % 256,)), timing)
+
+
+@pytest.mark.parametrize(
+    ("exchange", "finding"),
+    [
+        (CheckingNoUnit, "the reply to read register 7 of 18, .* gives the value 555"),
+        (CheckingNoCrc, "11 03 02 03 2b 38 f8 in place of 11 03 02 02 2b 38 f8 gives the value 811"),
+        (CallingAForeignFrameWhole, r"the reply to read register 7 of 18, .* gives FrameError\('wrong echo'\)"),
+        (ReadingOnlyWholeChunks, r"gives the value 555, and .* as 11 \|"),
+        (TakingTheRest, "what follows the reply in the same chunk is not handed back"),
+        (ContentWithLess, "3 of the 7 bytes .* end when time runs out with the value 0"),
+        (ContentWithSilence, "with no reply at all it ends with the value 0"),
+        (Crashing, "KeyError"),
+        (AskingForEver, "Endless"),
+        (TurningForEver, "Endless"),
+        (SearchingForItsUnit, "00 and then the reply gives the value 555"),
+        (BeginningElsewhere, "its reply begins with 11, which is not in starts"),
+        (SmallerThanItSays, "a leg of 7 bytes is longer than the 5 announced"),
+        (SizedBackwards, "typically 9 and at most 8 bytes"),
+        (ClosingWithMoreThanItSays, "closes with 1 bytes, not with the 0 announced"),
+        (WithALegTooMany, "1 legs in place of the 2 announced"),
+        (Unanswered, "a read that is not answered"),
+        (WithATimingOfItsOwn, "does not take the read or write timing"),
+        (NumberingItsRequests, "sends .*, and then"),
+    ],
+)
+def test_a_bug_in_a_reader_is_found(exchange: type[Asking], finding: str) -> None:
+    assert re.search(finding, find(reading_with(exchange), CASES[1]))
+
+
+def test_a_refusal_of_the_wrong_kind_and_a_wrong_value_are_found() -> None:
+    class Special(Refused):
+        """What a device says that knows more."""
+
+    wrong = [replace(CASES[-1], raises=Special), replace(READING, value=554), replace(READING, legs=[REPLY[:-1]])]
+    findings = find(*wrong, replace(READING, request=b"\x11"))
+    assert re.search(r"gives Refused\(.exception 2.*\) in place of Special", findings)
+    assert "gives the value 555 in place of 554" in findings
+    assert "does not end it" in findings
+    assert "in place of 11\n" in findings + "\n"
+
+
+def test_replies_that_cannot_be_told_apart_are_found_unless_the_tester_says_so() -> None:
+    assert "the reply to read register 9 of 17" in find(
+        READING, replace(READING, command=ReadRegister(9)), names=lambda command, address: (address, command)
+    )
+
+
+def test_a_foreign_reply_that_is_accepted_is_found_with_its_reason() -> None:
+    stale = Foreign(ReadRegister(7), 17, REPLY, "the late reply to register 8")
+    assert "the late reply to register 8, 11 03" in find(foreign=[stale])
+
+
+def test_a_flip_that_is_listed_is_let_pass_and_one_that_is_listed_in_vain_is_not() -> None:
+    flips = [REPLY[:3] + bytes((REPLY[3] ^ 1 << bit,)) + REPLY[4:] for bit in range(8)]
+    heedless = type(
+        "Heedless", (Asking,), {"sound": lambda self, frame: frame[:3] + frame[4:] == REPLY[:3] + REPLY[4:]}
+    )
+    listed = [Unseen(REPLY, heard, "the first data byte is not checked") for heard in flips]
+    check_protocol(MODBUS, [reading_with(heedless)], unseen=listed, names=named)
+    assert "take it off the list" in find(READING, unseen=listed[:1])
+
+
+# planted bugs in a command
+
+
+class Loose:
+    """A command that is no value: mutable, without a text, not hashable, and unequal to its copy."""
+
+    writes = False
+    idempotent = False
+
+    def __init__(self) -> None:
+        self.register = 7
+
+    def open(self, address: int, timings: Timings, /) -> Asking:
+        return ReadRegister(self.register).open(address, timings)
+
+
+class Unhashable(Loose):
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other)
+
+    __hash__ = None  # type: ignore[assignment]  # how Python marks what has no hash
+
+
+class HashedByIdentity(Unhashable):
+    writes = 0  # type: ignore[assignment]  # a bug that a type checker would see
+
+    def __hash__(self) -> int:  # type: ignore[override]  # the base has none
+        return id(self)
+
+
+class Reopened(Loose):
+    def open(self, address: int, timings: Timings, /) -> Asking:
+        return ONE_EXCHANGE
+
+
+ONE_EXCHANGE = ReadRegister(7).open(17, MODBUS.timings)
+
+
+@pytest.mark.parametrize(
+    ("command", "finding"),
+    [
+        (Loose(), "has no text"),
+        (Loose(), "does not equal its copy"),
+        (Loose(), r"Loose\.something_new can be changed"),
+        (Loose(), "is a read and not idempotent"),
+        (Unhashable(), "is not hashable"),
+        (HashedByIdentity(), "has another hash than its copy"),
+        (HashedByIdentity(), "writes and idempotent are True or False"),
+        (Reopened(), "opens the same exchange twice"),
+    ],
+)
+def test_a_bug_in_a_command_is_found(command: Command[Any], finding: str) -> None:
+    assert re.search(finding, find(replace(READING, command=command), names=lambda command, address: None))
+
+
+def refuse_all() -> None:
+    raise ValueError("not an InvalidCommand")
+
+
+def test_bad_arguments_that_are_not_refused_are_found() -> None:
+    builders: list[Callable[[], object]] = [lambda: ReadRegister(7), refuse_all]
+    findings = find(invalid=builders)
+    assert "invalid[0] builds ReadRegister(register=7" in findings
+    assert "invalid[1] raises ValueError('not an InvalidCommand')" in findings
+
+
+def test_bugs_in_a_profile_are_found() -> None:
+    assert "the probe WriteRegister" in find(profile=replace(MODBUS, probe=WriteRegister(0, 0)))
+    deaf = type("Deaf", (Loose,), {"open": lambda self, address, timings: ReadRegister(7).open(1, timings)})
+    assert "addresses 1 and 2 are sent the same 01 03" in find(profile=replace(MODBUS, probe=deaf()))
+
+
+# round trips
+
+
+def test_a_value_that_is_not_read_back_is_found() -> None:
+    class Rounding(Registers):
+        def hear(self, data: bytes, start: float) -> None:
+            super().hear(data, start)
+            if self.registers:
+                self.registers[b"\0\7"] = self.registers[b"\0\7"][:1] + b"\0"
+
+    answers = answers_of(Rounding(17))
+    assert "write register 7 = 258, then read register 7 gives the value 256" in find(
+        round_trips=[round_trip([258])], device=answers
+    )
+    check_protocol(
+        MODBUS,
+        CASES,
+        names=named,
+        round_trips=[round_trip([258], read_back=lambda value: value & 0xFF00)],
+        device=answers,
+    )
+
+
+def test_a_device_that_does_not_answer_is_found() -> None:
+    assert "gives FrameError('no reply')" in find(round_trips=[round_trip()], device=answers_of(Registers(18)))
+
+
+def test_round_trips_need_a_device() -> None:
+    assert "need a device" in find(round_trips=[round_trip()])
