@@ -26,7 +26,7 @@ BARS = "▁▂▃▄▅▆▇█"
 GAUGE = 20
 EVENTS = 3
 HEALTH_STYLES = {"up": "green", "unknown": "dim", "suspect": "bold magenta", "down": "reverse red"}
-COLUMNS = {"NODE": 8, "ITEM": 16, "VALUE": 10, "UNIT": 5, "TREND": 8, "AGE": 4, "P50 ms": 6, "HEALTH": 7}
+COLUMNS = {"NODE": 8, "ITEM": 16, "VALUE": 10, "UNIT": 6, "TREND": 7, "AGE": 4, "P50 ms": 6, "HEALTH": 7}
 """With a space on each side of a column these are the 80 columns of the smallest terminal."""
 GROWTH = {"ITEM": 8, "VALUE": 10, "TREND": 16}
 """How much wider a column gets, in this order, where the terminal is wider."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator
 from enum import Flag
 from importlib.util import find_spec
 from statistics import fmean
@@ -65,7 +65,11 @@ class Watch:
         async for event in self.bus.events():
             text = event_text(event)
             if text:
-                self.events.append(f"{self.bus.now() - self.start:7.1f} s  {text}")
+                self.tell(text)
+
+    def tell(self, text: str) -> None:
+        """Add to the last events."""
+        self.events.append(f"{self.bus.now() - self.start:7.1f} s  {text}")
 
     def picture(self) -> Frame:
         now = self.bus.now()
@@ -147,7 +151,11 @@ def group_rows(group: PollGroup, now: float) -> Iterator[Row]:
     latest = group.latest
     for point in group.points:
         sample = latest.samples.get(point) if latest else None
-        yield Row(point.node.label, point.item, "-", point.unit) if sample is None else sample_row(point, sample, now)
+        yield (
+            Row(point.node.label, point.item, "-", short_unit(point.unit))
+            if sample is None
+            else sample_row(point, sample, now)
+        )
 
 
 def sample_row(point: Point[Any], sample: Sample, now: float) -> Row:
@@ -157,12 +165,17 @@ def sample_row(point: Point[Any], sample: Sample, now: float) -> Row:
         node=point.node.label,
         item=point.item,
         value=value_text(value),
-        unit=point.unit,
+        unit=short_unit(point.unit),
         number=number if number is not None and math.isfinite(number) else None,
         age=sample.age(now),
         late=sample.quality.value == "late",
         error="" if sample.error is None else sample.error.what,
     )
+
+
+def short_unit(unit: str) -> str:
+    """A column has no room for "% of rated current"."""
+    return unit.partition(" of ")[0]
 
 
 def event_text(event: Event) -> str:
@@ -227,14 +240,26 @@ async def count_cycles(watch: Watch, group: PollGroup) -> None:
         watch.saw(snapshot)
 
 
-async def follow(watch: Watch, *, seconds: float | None, plain: bool, as_json: bool) -> int:
-    """Show the watch's groups for so many seconds, or until the person quits: the exit status."""
+async def follow(
+    watch: Watch,
+    *,
+    seconds: float | None = None,
+    plain: bool = False,
+    as_json: bool = False,
+    beside: Callable[[], Coroutine[Any, Any, None]] | None = None,
+) -> int:
+    """Show the watch's groups for so many seconds, or until the person quits: the exit status.
+
+    `beside` runs meanwhile, and is cancelled at the end.
+    """
     on_screen = not plain and not as_json and screen_available()
     status = OK
     try:
         with anyio.move_on_after(seconds):
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(watch.listen)
+                if beside is not None:
+                    tasks.start_soon(beside)
                 for group in watch.groups:
                     if on_screen:
                         tasks.start_soon(count_cycles, watch, group)

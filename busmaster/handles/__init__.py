@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 from busmaster.handles.base import Handle
+from busmaster.handles.hcp import HcpController
+from busmaster.handles.hcp2 import Hcp2Controller
+from busmaster.handles.microflex import MicroFlexDrive
 
-HANDLES: dict[str, type[Handle]] = {}
+HANDLES: dict[str, type[Handle]] = {
+    "hcp": HcpController,
+    "hcp2": Hcp2Controller,
+    "microflex": MicroFlexDrive,
+}
 """`--protocol P` -> the handle that speaks it."""
 
-__all__ = ["HANDLES", "Handle"]
+__all__ = ["HANDLES", "Handle", "Hcp2Controller", "HcpController", "MicroFlexDrive"]

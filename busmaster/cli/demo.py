@@ -1,0 +1,94 @@
+"""`busmaster demo`: an emulated line of eight drives on a real pseudo-terminal, polled live and commanded meanwhile."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import anyio
+import click
+
+from busmaster.bus import Bus
+from busmaster.cli.arguments import plain_option, seconds_option
+from busmaster.cli.demo_line import CONTROLLERS, DRIVES, SETTINGS
+from busmaster.cli.watching import Watch, follow
+from busmaster.errors import BusError
+from busmaster.handles.hcp2 import Hcp2Controller
+from busmaster.handles.microflex import MicroFlexDrive
+from busmaster.transport.serial_port import SerialPort
+
+PERIOD = 0.2
+COMMAND_EVERY = 2.0
+SPEEDS = (25.0, -40.0, 60.0, 0.0, 80.0, -15.0, 40.0)
+"""References in %, one drive after another; more of them than drives, so that each gets another the next time round."""
+
+
+@click.command(short_help="Show an emulated line of drives, polled live.")
+@seconds_option
+@plain_option
+def command(seconds: float | None, plain: bool) -> int:
+    """Emulate a line with eight drives in a process of its own, poll it live and command it meanwhile.
+
+    Controllers (nodes 1 to 3) move their axes, MicroFlex drives (4 to 8) get a new speed reference now and then, and
+    one of them loses its wire for some seconds. Nothing is connected or listened to. Ctrl-C ends it.
+    """
+    with emulated_line() as path:
+        return anyio.run(lambda: demo(path, seconds=seconds, plain=plain))
+
+
+@contextmanager
+def emulated_line() -> Iterator[str]:
+    """The path of the line's pseudo-terminal, served by another process while the context lasts."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "busmaster.cli.demo_line"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+        text=True,
+    )
+    with process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            path = process.stdout.readline().strip()
+            if not path:
+                raise click.ClickException("the emulated line did not start")
+            yield path
+        finally:
+            process.stdin.close()
+
+
+async def demo(path: str, *, seconds: float | None, plain: bool) -> int:
+    bus = Bus(SerialPort(path, baudrate=SETTINGS.baudrate))
+    axes = [Hcp2Controller(bus, address).axis(0) for address in CONTROLLERS]
+    drives = [MicroFlexDrive(bus, address) for address in DRIVES]
+    points = [point for axis in axes for point in (axis.position, axis.velocity)]
+    points += [point for drive in drives for point in (drive.speed_measured, drive.torque_demand)]
+    async with bus:
+        watch = Watch(bus, "busmaster demo")
+        watch.add(bus.poll_group("drives", period=PERIOD, points=points))
+        return await follow(watch, seconds=seconds, plain=plain, beside=lambda: command_drives(watch, drives))
+
+
+async def command_drives(watch: Watch, drives: list[MicroFlexDrive]) -> None:
+    """Enable all drives, then give them new speeds, one after another, until cancelled."""
+    for drive in drives:
+        await attempt(watch, drive, None)
+    for drive, percent in zip(itertools.cycle(drives), itertools.cycle(SPEEDS), strict=False):
+        await attempt(watch, drive, percent)
+        await anyio.sleep(COMMAND_EVERY)
+
+
+async def attempt(watch: Watch, drive: MicroFlexDrive, percent: float | None) -> None:
+    """A new speed, or to be enabled. What goes wrong is an event to show: the demo goes on."""
+    try:
+        if percent is None:
+            await drive.enable()
+        else:
+            await drive.set_speed_reference(percent)
+            watch.tell(f"{drive.node.label}: speed reference {percent:g} %")
+    except BusError as error:
+        watch.tell(f"{drive.node.label}: {error.what}")

@@ -1,0 +1,154 @@
+"""`busmaster monitor`: what passes on a line, without a word of our own."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from datetime import datetime
+from typing import Any
+
+import anyio
+import click
+
+from busmaster.capture.decode import DEFAULT_GAP, Decoder
+from busmaster.capture.dialects import dialect
+from busmaster.capture.frames import Frame, Kind
+from busmaster.capture.pcapng import Direction
+from busmaster.capture.recorder import Recorder
+from busmaster.cli.arguments import Connection, protocol_option
+from busmaster.cli.output import emit
+from busmaster.errors import LineDown
+from busmaster.handles import HANDLES
+
+ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
+
+
+@click.command(short_help="Listen only; decode what passes.")
+@click.argument("port")
+@protocol_option
+@click.option("--baud", type=click.IntRange(min=1), metavar="N", help="Baud rate; the protocol's by default.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+@click.option("--capture", type=click.Path(dir_okay=False), metavar="FILE", help="Record it too, for Wireshark.")
+def command(port: str, protocol: str, baud: int | None, as_json: bool, capture: str | None) -> None:
+    """Decode what passes on PORT, a line a frame, until Ctrl-C. Nothing is ever sent.
+
+    An arrow tells who spoke, the host (->) or a node (<-); the time behind a reply is its delay. Frames are told
+    apart by what they say: a silence only ends one that was cut short.
+    """
+    endpoint = Connection(port, protocol, baud).endpoint()
+    names = element_names(protocol)
+    write = json_text if as_json else plain_text
+    recording: AbstractContextManager[Recorder | None] = nullcontext()
+    if capture is not None:
+        recording = Recorder(capture, port=endpoint.name, protocol=protocol)
+    with recording as recorder:
+        anyio.run(listen, endpoint, Decoder(dialect(protocol)), lambda frame: emit(write(frame, names)), recorder)
+
+
+class Listener(asyncio.Protocol):
+    """Decodes what comes and tells each frame, with the time of day; a frame that is not finished waits for silence."""
+
+    def __init__(self, decoder: Decoder, tell: Callable[[Frame], None], recorder: Recorder | None = None) -> None:
+        self._decoder = decoder
+        self._tell = tell
+        self._recorder = recorder
+        self._loop = asyncio.get_running_loop()
+        self._timer: asyncio.TimerHandle | None = None
+        self._offset = time.time() - time.monotonic()
+        self.lost: asyncio.Future[None] = self._loop.create_future()
+
+    def data_received(self, data: bytes) -> None:
+        now = time.monotonic()
+        if self._recorder is not None:
+            self._recorder.overheard(now, data)
+        if self._timer is not None:
+            self._timer.cancel()
+        self._pass(self._decoder.feed(data, now + self._offset))
+        if self._decoder.unfinished:
+            self._timer = self._loop.call_later(DEFAULT_GAP, self._rest)
+
+    def connection_lost(self, cause: Exception | None) -> None:
+        self._rest()
+        if not self.lost.done():
+            self.lost.set_exception(cause or LineDown("the line was closed", hint="see why at its other end"))
+
+    def _rest(self) -> None:
+        self._pass(self._decoder.quiet())
+
+    def _pass(self, frames: list[Frame]) -> None:
+        """Raises nothing into the transport: whoever waits for the end of the line is told."""
+        try:
+            for frame in frames:
+                self._tell(frame)
+        except OSError as error:
+            if not self.lost.done():
+                self.lost.set_exception(error)
+
+
+async def listen(
+    endpoint: Any, decoder: Decoder, tell: Callable[[Frame], None], recorder: Recorder | None = None
+) -> None:
+    """Until the line is lost. Raises LineDown."""
+    listener = Listener(decoder, tell, recorder)
+    transport = await endpoint.open(lambda: listener)
+    try:
+        await listener.lost
+    finally:
+        transport.close()
+
+
+def element_names(protocol: str) -> dict[str, str]:
+    """What the protocol's map calls its elements, by number."""
+    elements: Mapping[str, Any] = getattr(HANDLES[protocol], "elements", {})
+    return {str(element.number): name for name, element in elements.items()}
+
+
+def plain_text(frame: Frame, names: Mapping[str, str]) -> str:
+    """`14:02:11.485012 <- node 5   100 (axis0.position) = 12.5  2.9 ms`; the bytes too, if something is wrong."""
+    moment = datetime.fromtimestamp(frame.time).astimezone().strftime("%H:%M:%S.%f")
+    node = "" if frame.node is None else f"node {frame.node}"
+    text = frame.text
+    if frame.item in names:
+        text = text.replace(frame.item, f"{frame.item} ({names[frame.item]})", 1)
+    parts = [f"{moment} {ARROWS[frame.sender]} {node:8} {text}"]
+    if frame.delay is not None:
+        parts.append(f"{frame.delay * 1000:.1f} ms")
+    if frame.fault:
+        parts.append(f"! {frame.fault}: {frame.raw.hex(' ')}")
+    return "  ".join(parts)
+
+
+def json_text(frame: Frame, names: Mapping[str, str]) -> str:
+    sender = None if frame.sender is Direction.UNKNOWN else frame.sender.name.lower()
+    fields = {
+        "time": round(frame.time, 6),
+        "from": sender,
+        "node": frame.node,
+        "kind": frame.kind.value,
+        "command": frame.command or None,
+        "item": frame.item or None,
+        "name": names.get(frame.item),
+        "value": json_values(frame) if frame.kind in (Kind.WRITE, Kind.VALUE) else None,
+        "delay": None if frame.delay is None else round(frame.delay, 6),
+        "fault": frame.fault or None,
+        "raw": frame.raw.hex(" "),
+    }
+    return json.dumps(fields)
+
+
+def json_values(frame: Frame) -> Any:
+    """One number, or a list where there are several; text that is no number stays text."""
+    values = [number_of(part) for part in frame.value.split(",")] if frame.value else []
+    return values if frame.item == "flags" or len(values) != 1 else values[0]
+
+
+def number_of(text: str) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
