@@ -58,8 +58,6 @@ from busmaster.profile import Profile
 
 UNKNOWN_LATENESS = 0.150
 """Assumed of an earlier master's nodes while none is known."""
-EARLY = 1e-9
-"""Rounding of a deadline that was computed and is given back as the time."""
 
 
 class Arbiter:
@@ -191,7 +189,6 @@ class Arbiter:
 
     def handle_timeout(self, now: float) -> None:
         deadlines = self._deadlines
-        now += EARLY
         if now >= deadlines.schedule:
             self.dispatcher.release_polls(now)
         if now >= deadlines.expiry:
