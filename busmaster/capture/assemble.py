@@ -43,8 +43,8 @@ class _Held:
         return not self.released and self.request is not None and self.request.raw == verdict.request
 
     def is_stray(self, frame: Frame) -> bool:
-        """It came from a node after the exchange was over, or before any."""
-        if frame.sender is not Direction.NODE:
+        """It came from a node, or from who knows where, after the exchange was over, or before any."""
+        if frame.sender is Direction.HOST:
             return False
         last = self.last
         over = last is not None and last.kind is not Kind.NOISE and self.judge()[0] is not Outcome.NO_REPLY
@@ -69,36 +69,36 @@ class _Held:
 class Assembler:
     """Makes packets and hands them to `write`, in order. `now` is in seconds, and `offset` what makes it 1970's.
 
-    `protocol` is only needed for what cannot be told from requests: "microflex", or a line that is listened to.
+    `protocol` is only needed for what cannot be told from requests: "microflex", or a line that is listened to. With
+    `echo` what the host sends is received too, and left out.
     """
 
-    def __init__(self, write: Callable[[Packet], object], *, protocol: str = "", offset: float = 0.0) -> None:
+    def __init__(
+        self, write: Callable[[Packet], object], *, protocol: str = "", echo: bool = False, offset: float = 0.0
+    ) -> None:
         self._write = write
         self._declared = protocol
+        self._echo = echo
+        self._echo_owed = b""
         self._offset = offset
         self._decoders: dict[str, Decoder] = {}
         self._protocol = ""
         self._previous: _Held | None = None
         self._current = _Held(None)
         self._now = 0.0
-        if protocol:
-            self._speak(protocol)
+        self._speak(protocol)
 
-    def transmitted(self, now: float, data: bytes) -> None:
-        """The host sent `data`, whole frames."""
+    def passed(self, now: float, data: bytes, sender: Direction) -> None:
+        """Bytes were on the line. From the HOST: whole frames. UNKNOWN: a line that is only listened to."""
         self._now = now
-        self._rest()
-        protocol = protocol_of(data)
-        if protocol == "hcp2" and self._declared == "microflex":
-            protocol = self._declared
-        if protocol:
-            self._speak(protocol)
-        self._decode(now, data, Direction.HOST)
-
-    def received(self, now: float, data: bytes) -> None:
-        """Bytes came from the line."""
-        self._now = now
-        self._decode(now, data, Direction.NODE)
+        if sender is Direction.HOST:
+            self._rest()
+            self._speak(self._protocol_of(data))
+            self._echo_owed += data if self._echo else b""
+        elif self._echo_owed:
+            data = self._strip_echo(data)
+        if data:
+            self._decode(now, data, sender)
 
     def completed(self, now: float, verdict: Verdict) -> None:
         """The master is done with an exchange."""
@@ -124,7 +124,7 @@ class Assembler:
         held = self._current
         if held.is_stray(frame):
             packet.outcome = Outcome.STRAY
-        elif frame.sender is Direction.NODE:
+        elif frame.sender is not Direction.HOST:
             held.last, held.answer = frame, packet
         elif frame.fault:
             packet.comment = frame.fault
@@ -140,10 +140,23 @@ class Assembler:
         self._release_previous()
         self._release(self._current)
 
+    def _protocol_of(self, request: bytes) -> str:
+        protocol = protocol_of(request)
+        return self._declared if protocol == "hcp2" and self._declared == "microflex" else protocol
+
     def _speak(self, protocol: str) -> None:
-        self._protocol = protocol
-        if protocol not in self._decoders:
+        """The next bytes are of this protocol; of the same as before if it is "" (an acknowledgement)."""
+        self._protocol = protocol or self._protocol
+        if protocol and protocol not in self._decoders:
             self._decoders[protocol] = Decoder(dialect(protocol))
+
+    def _strip_echo(self, data: bytes) -> bytes:
+        """What is not the echo of what was sent. An echo that differs is left as it came: the line collided."""
+        owed = self._echo_owed
+        length = min(len(owed), len(data))
+        same = data[:length] == owed[:length]
+        self._echo_owed = owed[length:] if same else b""
+        return data[length:] if same else data
 
     def _decode(self, now: float, data: bytes, sender: Direction) -> None:
         decoder = self._decoders.get(self._protocol)

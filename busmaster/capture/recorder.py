@@ -1,7 +1,7 @@
 """Recording a line while it runs, at no cost to it: the owner of the line only notes what passed, a thread writes.
 
 A tap has three methods, called on the loop that owns the line: `transmitted` and `received`, as soon as bytes have
-left or come (an echo stripped off), and `completed`, when a transaction has ended.
+left or come, and `completed`, when a transaction has ended.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, TypeAlias
 
 from busmaster.arbiter.transaction import Transaction
 from busmaster.capture.assemble import Assembler, Verdict
-from busmaster.capture.pcapng import Outcome, Packet, PcapngWriter
+from busmaster.capture.pcapng import Direction, Outcome, Packet, PcapngWriter
 from busmaster.errors import BusError, GarbledReply, NoReply, Refused
 from busmaster.exchange import Command, Timings
 
@@ -30,18 +30,15 @@ IDLE = 3.0
 """Seconds without an event after which nothing is held back: longer than any exchange."""
 
 
-class _Sent:
-    """Of the next three: what is noted of one event. Which of them it is, is its type."""
+class _Passed:
+    """Bytes that were on the line."""
 
-    __slots__ = ("data", "now")
+    __slots__ = ("data", "now", "sender")
 
-    def __init__(self, now: float, data: bytes) -> None:
+    def __init__(self, now: float, data: bytes, sender: Direction) -> None:
         self.now = now
         self.data = data
-
-
-class _Heard(_Sent):
-    __slots__ = ()
+        self.sender = sender
 
 
 class _Ended:
@@ -50,7 +47,7 @@ class _Ended:
     __slots__ = ("address", "command", "error", "late", "now", "timings", "value")
 
     def __init__(self, transaction: Transaction) -> None:
-        self.now = time.monotonic()
+        self.now = transaction.ended_at
         self.command: Command[Any] = transaction.command
         self.address = transaction.node.address
         self.timings: Timings = transaction.node.timings
@@ -66,7 +63,7 @@ class _Ended:
         return Verdict(request, Outcome.OK, f"{self.command}: {value}" + (" (late)" if self.late else ""))
 
 
-_Event: TypeAlias = _Sent | _Heard | _Ended
+_Event: TypeAlias = _Passed | _Ended
 
 
 def outcome_of(error: BusError) -> Outcome | None:
@@ -85,12 +82,18 @@ def outcome_of(error: BusError) -> Outcome | None:
 class Recorder:
     """A tap that writes a capture. Raises OSError if `path` cannot be written; later errors are kept in `error`.
 
-    `port` names the line in the file; `protocol` "microflex" says that its HCP2 nodes are such drives. Close it off
-    the loop: closing waits for the disk.
+    `port` names the line in the file; `protocol` is needed where requests do not tell it (see `Assembler`); `echo`
+    says that what is sent is received too. Close it off the loop: closing waits for the disk.
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], *, port: str = "", protocol: str = "", capacity: int = CAPACITY
+        self,
+        path: str | os.PathLike[str],
+        *,
+        port: str = "",
+        protocol: str = "",
+        echo: bool = False,
+        capacity: int = CAPACITY,
     ) -> None:
         self.dropped = 0
         """Events that came while `capacity` of them waited for the disk, or after it had failed."""
@@ -101,8 +104,8 @@ class Recorder:
         self._file: BinaryIO = open(path, "wb")  # noqa: SIM115  # held open until close()
         self._writer = PcapngWriter(self._file, port=port)
         self._reported = 0
-        self._offset = time.time() - time.monotonic()
-        self._assembler = Assembler(self._write, protocol=protocol, offset=self._offset)
+        offset = time.time() - time.monotonic()
+        self._assembler = Assembler(self._write, protocol=protocol, echo=echo, offset=offset)
         self._thread = threading.Thread(target=self._run, name="busmaster capture", daemon=True)
         self._thread.start()
 
@@ -110,10 +113,14 @@ class Recorder:
 
     def transmitted(self, now: float, data: bytes) -> None:
         """`data` was handed to the port at `now`, in seconds of `time.monotonic()`."""
-        self._note(_Sent(now, data))
+        self._note(_Passed(now, data, Direction.HOST))
 
     def received(self, now: float, data: bytes) -> None:
-        self._note(_Heard(now, data))
+        self._note(_Passed(now, data, Direction.NODE))
+
+    def overheard(self, now: float, data: bytes) -> None:
+        """Bytes of a line that is only listened to: who sent them is worked out from what they say."""
+        self._note(_Passed(now, data, Direction.UNKNOWN))
 
     def completed(self, transaction: Transaction) -> None:
         self._note(_Ended(transaction))
@@ -172,12 +179,10 @@ class Recorder:
                 time.sleep(PAUSE)
 
     def _handle(self, event: _Event) -> None:
-        if type(event) is _Sent:
-            self._assembler.transmitted(event.now, event.data)
-        elif type(event) is _Heard:
-            self._assembler.received(event.now, event.data)
-        elif type(event) is _Ended:
+        if type(event) is _Ended:
             self._assembler.completed(event.now, event.verdict())
+        elif type(event) is _Passed:
+            self._assembler.passed(event.now, event.data, event.sender)
 
     def _write(self, packet: Packet) -> None:
         dropped = self.dropped

@@ -20,7 +20,7 @@ from busmaster.capture.pcapng import Direction
 from busmaster.capture.recorder import Recorder
 from busmaster.cli.arguments import Connection, protocol_option
 from busmaster.cli.output import emit
-from busmaster.errors import LineDown
+from busmaster.errors import BusError, LineDown
 from busmaster.handles import HANDLES
 
 ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
@@ -73,7 +73,8 @@ class Listener(asyncio.Protocol):
     def connection_lost(self, cause: Exception | None) -> None:
         self._rest()
         if not self.lost.done():
-            self.lost.set_exception(cause or LineDown("the line was closed", hint="see why at its other end"))
+            what = cause.what if isinstance(cause, BusError) else str(cause or "the line was closed")
+            self.lost.set_exception(LineDown(what, hint="start again when it is back"))
 
     def _rest(self) -> None:
         self._pass(self._decoder.quiet())

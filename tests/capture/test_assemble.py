@@ -16,11 +16,18 @@ HOST, NODE = Direction.HOST, Direction.NODE
 class Tape:
     """An assembler and what it wrote."""
 
-    def __init__(self, protocol: str = "") -> None:
+    def __init__(self, protocol: str = "", echo: bool = False) -> None:
         self.packets: list[Packet] = []
-        self.assembler = Assembler(self.packets.append, protocol=protocol, offset=100.0)
-        self.sent = self.assembler.transmitted
-        self.heard = self.assembler.received
+        self.assembler = Assembler(self.packets.append, protocol=protocol, echo=echo, offset=100.0)
+
+    def sent(self, now: float, data: bytes) -> None:
+        self.assembler.passed(now, data, HOST)
+
+    def heard(self, now: float, data: bytes) -> None:
+        self.assembler.passed(now, data, NODE)
+
+    def overheard(self, now: float, data: bytes) -> None:
+        self.assembler.passed(now, data, Direction.UNKNOWN)
 
     def said(self, now: float, request: bytes, outcome: Outcome | None, comment: str) -> None:
         self.assembler.completed(now, Verdict(request, outcome, comment))
@@ -173,3 +180,28 @@ def test_hcp2_nodes_may_be_declared_as_drives() -> None:
     tape.sent(1.0, READ)
     tape.lines()
     assert tape.packets[0].protocol == "microflex"
+
+
+def test_an_echo_is_left_out_and_one_that_differs_is_kept() -> None:
+    tape = Tape(echo=True)
+    tape.sent(1.0, READ)
+    tape.heard(1.001, READ[:5])
+    tape.heard(1.002, READ[5:] + VALUE)
+    tape.sent(2.0, READ)
+    tape.heard(2.001, READ[:3] + b"\xff")
+    assert [line[1:3] for line in tape.lines()] == [
+        (READ, NONE),
+        (VALUE, OK),
+        (READ, NONE),
+        (READ[:3] + b"\xff", GARBLED),
+    ]
+
+
+def test_a_line_that_is_only_listened_to_is_recorded_the_same() -> None:
+    told, untold = Tape("hcp2"), Tape("hcp2")
+    for now, request, reply in ((1.0, READ, VALUE), (2.0, OTHER, NAK), (3.0, READ, VALUE[:4]), (4.0, READ, VALUE)):
+        told.sent(now, request)
+        told.heard(now + 0.01, reply)
+        untold.overheard(now, request + reply[:1])
+        untold.overheard(now + 0.01, reply[1:])
+    assert [line[1:3] for line in untold.lines()] == [line[1:3] for line in told.lines()]

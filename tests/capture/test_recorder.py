@@ -23,7 +23,7 @@ REPLY = bytes.fromhex("02 30 31 35 03 37")
 
 def ended(command: Any, value: Any = None, error: BusError | None = None) -> Transaction:
     transaction = Transaction(NodeRecord(hcp2.PROFILE, 2, hcp2.PROFILE.timings, 2), command)
-    transaction.value, transaction.error = value, error
+    transaction.value, transaction.error, transaction.ended_at = value, error, time.monotonic()
     return transaction
 
 
