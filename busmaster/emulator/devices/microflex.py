@@ -245,10 +245,10 @@ class MicroFlexDrive(HostCommsDevice):
     def _update(self, now: float) -> None:
         """Time has passed: the motor has turned, and the drive has warmed up or cooled down."""
         if now > self._updated:
+            self._motor.advance(now)
             final = AMBIENT + HEATING * abs(self._torque) / 100
             self._temperature += (final - self._temperature) * -math.expm1((self._updated - now) / THERMAL_TIME)
             self._updated = now
-            self._motor.advance(now)
 
     def _apply(self, now: float) -> None:
         """Whether the drive runs, and at what speed it aims. After the cancel bit, motion waits until it is cleared."""

@@ -1,0 +1,48 @@
+"""Devices by the name of their protocol."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.emulator.build import MAKERS, make_device
+from busmaster.emulator.device import Delay
+from busmaster.emulator.devices.hostcomms import HCP, HostCommsDevice
+from busmaster.emulator.oracle import Oracle, oracle_value
+from busmaster.errors import InvalidCommand
+from tests.emulator.lines import ask, line_of
+
+
+@pytest.mark.parametrize("protocol", sorted(MAKERS))
+def test_every_protocol_has_a_device(protocol: str) -> None:
+    device = make_device(protocol, 2, delay=Delay(0.01))
+    assert device.address == 2
+    assert device.delay == Delay(0.01)
+    line_of(device)
+
+
+def test_hcp_and_hcp2_controllers_differ_in_framing() -> None:
+    device = make_device("hcp", 2)
+    assert isinstance(device, HostCommsDevice)
+    assert device.framing is HCP
+
+
+def test_something_moves_on_a_lively_device() -> None:
+    for protocol, request in (
+        ("hcp", "04 32 32 02 31 31 05"),  # Comms(11)
+        ("hcp2", "07 30 32 02 36 34 05 07"),  # Comms(100), the position of axis 0
+        ("microflex", "07 30 32 02 36 34 05 07"),
+    ):
+        line = line_of(make_device(protocol, 2, lively=True))
+        assert len({ask(line, request, now) for now in range(1000, 1005)}) > 3
+        still = line_of(make_device(protocol, 2))
+        assert len({ask(still, request, now) for now in range(1000, 1005)}) == 1
+
+
+def test_the_oracle_answers_in_their_place() -> None:
+    line = line_of(make_device("microflex", 2, oracle=Oracle(2)))
+    assert bytes.fromhex(ask(line, "07 30 32 02 36 34 05 07"))[3:-2] == str(oracle_value(2, 100, 0)).encode()
+
+
+def test_a_protocol_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(InvalidCommand, match="no such protocol 'modbus'"):
+        make_device("modbus", 1)

@@ -1,0 +1,259 @@
+"""What can be wrong, one fault at a time, seeded."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+
+from busmaster.emulator.device import Delay
+from busmaster.emulator.devices.mint import MintController
+from busmaster.emulator.faults import BEYOND, FORGED, HEARING, NAMES, SPEAKING, WITHIN, Faults, noise
+from busmaster.emulator.line import Line
+from busmaster.errors import InvalidCommand
+from tests.emulator.lines import TAU, arrivals, ask, hexed, line_of
+
+READ = "07 30 32 02 30 31 05 04"  # AN00129: read node 2 Comms(1)
+WRITE = "07 30 32 02 30 31 31 32 33 2E 34 35 36 03 2B"
+REPLY = bytes.fromhex("02 30 31 31 32 33 2E 34 35 36 03 2B")
+
+
+def line_with(*settings: str, on_line: bool = False, seed: int = 1) -> Line:
+    mint = MintController(2)
+    mint.comms[1] = 123.456
+    line = line_of(mint, seed=seed)
+    line.prompt = False
+    if on_line:
+        line.faults = Faults.parse(settings)
+    else:
+        mint.faults = Faults.parse(settings)
+    return line
+
+
+def heard(*settings: str, request: str = READ, on_line: bool = False, seed: int = 1, seconds: float = 0.5) -> bytes:
+    return bytes.fromhex(ask(line_with(*settings, on_line=on_line, seed=seed), request, seconds=seconds))
+
+
+# Settings
+
+
+def test_there_are_no_faults_by_default() -> None:
+    faults = Faults()
+    assert faults.hearing == faults.speaking == ()
+    assert str(faults) == ""
+    assert heard() == REPLY
+
+
+def test_faults_are_read_from_text() -> None:
+    faults = Faults.parse(["lost=0.1", " late = 0.5", "late_by=0.05"])
+    assert (faults.lost, faults.late, faults.late_by) == (0.1, 0.5, 0.05)
+    assert str(faults) == "late=0.5 late_by=0.05 lost=0.1"
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("lots=0.1", "no such fault 'lots'.*did you mean lost"),
+        ("lost", "fault lost: '' is no number; write for example lost=0.1"),
+        ("lost=often", "'often' is no number"),
+        ("lost=1.5", "fault lost is a probability from 0 to 1, not 1.5"),
+        ("lost=nan", "probability"),
+        ("late_by=-1", "fault late_by is a number of seconds"),
+        ("hearing=1", "no such fault"),
+    ],
+)
+def test_a_setting_that_is_none_is_refused_in_words(setting: str, message: str) -> None:
+    with pytest.raises(InvalidCommand, match=message):
+        Faults.parse([setting])
+
+
+def test_they_can_be_changed_while_it_runs() -> None:
+    line = line_with()
+    faults = line.device(2).faults
+    faults.lost = 1.0
+    assert ask(line, READ) == ""
+    faults.lost = 0.0
+    assert ask(line, READ, 1.0) == hexed(REPLY)
+
+
+def test_every_fault_is_inside_or_outside_the_masters_assumption() -> None:
+    assert WITHIN | BEYOND | {"late_by", "away_for"} == set(NAMES)
+    assert set(HEARING) | set(SPEAKING) == WITHIN | BEYOND
+    assert Faults.parse(["lost=0.1", "flip=0.1"]).beyond == frozenset()
+    assert Faults.parse(["lost=0.1", "forged=0.1"]).beyond == {"forged"}
+
+
+def test_the_same_seed_does_the_same() -> None:
+    every = [f"{name}=0.3" for name in SPEAKING]
+    for seed in range(5):
+        assert heard(*every, seed=seed) == heard(*every, seed=seed)
+    assert len({heard(*every, seed=seed) for seed in range(20)}) > 5
+
+
+def test_a_rate_is_a_share_of_the_frames() -> None:
+    line = line_with("lost=0.2")
+    answered = sum(bool(ask(line, READ, now, 0.1)) for now in range(300))
+    assert 210 < answered < 270
+
+
+# What each does
+
+
+@pytest.mark.parametrize("fault", ["lost", "deaf", "dead"])
+def test_silence(fault: str) -> None:
+    assert heard(f"{fault}=1") == b""
+
+
+def test_a_request_that_is_not_heard_changes_nothing_but_one_whose_answer_is_lost_does() -> None:
+    for fault, stored in (("deaf", 123.456), ("lost", 7.0)):
+        line = line_with(f"{fault}=1")
+        assert ask(line, "07 30 32 02 30 31 37 03 35") == ""  # Comms(1) = 7
+        mint = line.device(2)
+        assert isinstance(mint, MintController)
+        assert mint.comms[1] == stored
+
+
+def test_late() -> None:
+    line = line_with("late=1", "late_by=0.1")
+    line.send(bytes.fromhex(READ), 0.0)
+    [(when, data)] = arrivals(line, 1.0)
+    assert data == hexed(REPLY)
+    usual = 8 * TAU + 0.002 + len(REPLY) * TAU
+    assert usual < when <= usual + 0.1
+    line.device(2).faults.late = 0.0
+    line.send(bytes.fromhex(READ), 1.0)
+    assert arrivals(line, 2.0)[0][0] == pytest.approx(1.0 + usual)
+
+
+def test_a_bit_flipped() -> None:
+    got = heard("flip=1")
+    assert sum((a ^ b).bit_count() for a, b in zip(got, REPLY, strict=True)) == 1
+
+
+def test_two_bits_flipped_that_an_exclusive_or_cannot_see() -> None:
+    got = heard("unseen=1")
+    changed = [a ^ b for a, b in zip(got, REPLY, strict=True) if a != b]
+    assert len(changed) == 2
+    assert changed[0] == changed[1]
+
+
+def test_truncated() -> None:
+    for seed in range(10):
+        got = heard("truncated=1", seed=seed)
+        assert REPLY.startswith(got)
+        assert got != REPLY
+
+
+def test_doubled() -> None:
+    assert heard("doubled=1") == REPLY + REPLY
+
+
+def test_repeated_after_a_while() -> None:
+    line = line_with("repeated=1")
+    line.send(bytes.fromhex(READ), 0.0)
+    (first, data), (second, again) = arrivals(line, 1.0)
+    assert data == again == hexed(REPLY)
+    assert second - first > 0.005
+
+
+def test_a_wrong_element_with_a_right_checksum() -> None:
+    got = heard("wrong=1")
+    assert got[1:3] != REPLY[1:3]
+    assert got[3:-2] == REPLY[3:-2]
+    assert len(got) == len(REPLY)
+    assert heard("wrong=1", request=WRITE) == b"\x06"  # an ACK names nobody
+
+
+def test_a_duplicate_address_collides_or_answers_too() -> None:
+    heard_twice = collided = 0
+    for seed in range(20):
+        line = line_with("duplicate=1", seed=seed)
+        heard_twice += ask(line, READ) == f"{hexed(REPLY)} {hexed(REPLY)}"
+        collided += line.collisions
+    assert heard_twice
+    assert collided
+    assert heard_twice + collided == 20
+
+
+def test_noise_before_and_behind() -> None:
+    before, behind = heard("leading=1"), heard("trailing=1")
+    assert before.endswith(REPLY)
+    assert 1 <= len(before) - len(REPLY) <= 3
+    assert behind.startswith(REPLY)
+    assert 1 <= len(behind) - len(REPLY) <= 3
+
+
+def test_noise_is_never_a_reply_by_itself() -> None:
+    chance = Random(1)
+    for _ in range(500):
+        burst = noise(chance, 8)
+        assert 1 <= len(burst) <= 8
+        assert not set(burst) & set(FORGED)
+
+
+def test_a_forged_reply() -> None:
+    got = heard("forged=1")
+    assert got[:1] in (b"\x06", b"\x15", b"\x04")
+    assert got[1:] == REPLY
+
+
+def test_babble() -> None:
+    got = heard("babble=1", seed=3)
+    assert len(got) > len(REPLY)
+
+
+def test_split_chunks() -> None:
+    line = line_with("split=1")
+    line.send(bytes.fromhex(READ), 0.0)
+    chunks = arrivals(line, 1.0)
+    assert len(chunks) > 2
+    assert bytes.fromhex("".join(data for _, data in chunks)) == REPLY
+
+
+def test_a_storm_of_refusals_changes_nothing() -> None:
+    line = line_with("nak=1")
+    assert ask(line, "07 30 32 02 30 31 37 03 35") == "15"
+    mint = line.device(2)
+    assert isinstance(mint, MintController)
+    assert mint.comms[1] == 123.456
+
+
+def test_a_flapping_device_comes_back_as_it_was() -> None:
+    line = line_with("flapping=1", "away_for=2")
+    assert ask(line, READ) == ""
+    line.device(2).faults.flapping = 0.0
+    assert ask(line, READ, 5.0) == hexed(REPLY)
+
+
+def test_a_restarted_device_comes_back_without_its_ram() -> None:
+    line = line_with("restart=1", "away_for=2")
+    assert ask(line, READ) == ""
+    line.device(2).faults.restart = 0.0
+    assert ask(line, READ, 5.0) == "02 30 31 30 03 32"  # Comms(1) = 0
+
+
+def test_what_comes_while_it_is_busy_is_queued_or_dropped() -> None:
+    """A device that takes 10 ms is asked again after 5."""
+    for settings, replies in (((), 2), (("drop=1",), 1)):
+        line = line_with(*settings)
+        line.device(2).delay = Delay(0.01)
+        line.send(bytes.fromhex(READ), 0.0)
+        line.send(bytes.fromhex(READ), 0.005)
+        assert [data for _, data in arrivals(line, 1.0)] == [hexed(REPLY)] * replies
+
+
+def test_faults_of_the_line_strike_requests_too() -> None:
+    line = line_with("lost=1", on_line=True)
+    assert ask(line, WRITE.replace("31 32 33", "39 32 33")) == ""
+    mint = line.device(2)
+    assert isinstance(mint, MintController)
+    assert mint.comms[1] == 123.456
+    answers = {heard("flip=1", on_line=True, seed=seed) for seed in range(20)}
+    assert b"" in answers  # the node's address was hit
+    assert any(len(answer) == 1 and answer != b"\x15" for answer in answers)  # NAK of a hit checksum, itself hit
+
+
+def test_a_doubled_request_is_answered_twice_or_collides() -> None:
+    line = line_with("doubled=1", on_line=True)
+    got = bytes.fromhex(ask(line, READ))
+    assert got.count(REPLY) >= 2

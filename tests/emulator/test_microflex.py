@@ -1,0 +1,184 @@
+"""A MicroFlex drive, as the last section of AN00129 describes it."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.emulator.devices.microflex import AMBIENT, FULL_SPEED, MicroFlexDrive
+from busmaster.emulator.line import Line
+from busmaster.wire.checks import xor
+from tests.emulator.lines import ask, hexed, line_of
+
+ACK, NAK = "06", "15"
+ENABLED, HARDWARE, STOP, ERROR = 128, 64, 32, 8
+
+
+def write(line: Line, element: int, data: str, now: float) -> str:
+    body = f"07\x02{element:02X}{data}\x03".encode()
+    return ask(line, hexed(b"\x07" + body + bytes([xor(body)])), now)
+
+
+def read(line: Line, element: int, now: float) -> float:
+    body = f"07\x02{element:02X}\x05".encode()
+    return float(bytes.fromhex(ask(line, hexed(b"\x07" + body + bytes([xor(body)])), now))[3:-2])
+
+
+@pytest.fixture
+def drive() -> MicroFlexDrive:
+    return MicroFlexDrive(7)
+
+
+@pytest.fixture
+def line(drive: MicroFlexDrive) -> Line:
+    return line_of(drive)
+
+
+def test_the_documents_frames_enable_it_set_its_speed_and_read_its_status(line: Line) -> None:
+    assert ask(line, "07 30 37 02 36 43 31 32 38 03 48") == ACK  # 108 = 128
+    assert ask(line, "07 30 37 02 37 36 2D 32 35 2E 35 03 36", 1) == ACK  # 118 = -25.5
+    assert ask(line, "07 30 37 02 36 44 05 72", 2) == "02 36 44 31 39 32 03 4B"  # 109 = 192
+
+
+def test_the_measured_speed_follows_the_reference_and_the_position_integrates(line: Line) -> None:
+    write(line, 108, "128", 0)
+    write(line, 118, "50", 1)
+    assert 0 < read(line, 120, 1.5) < 50
+    assert read(line, 121, 1.51) > 0
+    assert read(line, 120, 4) == 50
+    start = read(line, 100, 5)
+    assert read(line, 100, 6) - start == pytest.approx(FULL_SPEED / 2, abs=2)
+    assert read(line, 117, 7) > 0
+    assert read(line, 127, 8) > 0
+    assert read(line, 128, 9) + read(line, 129, 9.0) != 0
+    assert read(line, 111, 10) == pytest.approx(read(line, 100, 10) + read(line, 107, 10), abs=3000)
+
+
+def test_a_disabled_drive_keeps_its_reference_and_stands(line: Line) -> None:
+    write(line, 118, "50", 0)
+    assert read(line, 118, 1) == 50
+    assert read(line, 119, 2) == read(line, 120, 3) == 0
+    write(line, 108, "128", 4)
+    assert read(line, 120, 9) == 50
+    write(line, 108, "0", 10)
+    assert read(line, 120, 19) == 0
+    assert read(line, 109, 20) == HARDWARE
+
+
+def test_it_is_not_enabled_without_the_hardware_enable(drive: MicroFlexDrive, line: Line) -> None:
+    drive.set_hardware_enable(False, 0.0)
+    assert write(line, 108, "128", 1) == ACK
+    assert read(line, 109, 2) == 0
+    drive.set_hardware_enable(True, 3.0)
+    assert read(line, 109, 4) == HARDWARE
+    write(line, 108, "128", 5)
+    assert read(line, 109, 6) == HARDWARE | ENABLED
+
+
+def test_an_error_latches_disables_and_is_cancelled_by_bit_6(drive: MicroFlexDrive, line: Line) -> None:
+    write(line, 108, "128", 0)
+    write(line, 118, "50", 1)
+    drive.trip(4, 5.0)
+    assert read(line, 103, 6) == 4
+    assert read(line, 109, 7) == HARDWARE | ERROR
+    assert read(line, 222, 7.5) == 1
+    write(line, 108, "128", 8)  # cannot be enabled over an error
+    assert read(line, 109, 9) == HARDWARE | ERROR
+    write(line, 108, "192", 10)
+    assert read(line, 103, 11) == 0
+    assert read(line, 109, 12) == HARDWARE | ENABLED
+    assert read(line, 120, 13) == 0  # motion waits for bit 6 to be cleared
+    write(line, 108, "128", 14)
+    assert read(line, 120, 20) == 50
+
+
+def test_an_error_whose_cause_is_still_there_cannot_be_cancelled(drive: MicroFlexDrive, line: Line) -> None:
+    drive.causes = 4
+    drive.trip(5, 0.0, drive_errors=1)
+    assert read(line, 110, 1) == 1
+    write(line, 108, "64", 2)
+    assert read(line, 103, 3) == 4
+    assert read(line, 110, 4) == 0
+
+
+def test_a_cancel_bit_left_high_keeps_errors_from_latching(drive: MicroFlexDrive, line: Line) -> None:
+    write(line, 108, "192", 0)
+    drive.trip(4, 1.0)
+    assert read(line, 103, 2) == 0
+    assert read(line, 108, 3) == 192
+
+
+def test_an_active_stop_input_shows_and_stops(drive: MicroFlexDrive, line: Line) -> None:
+    write(line, 108, "128", 0)
+    write(line, 118, "50", 1)
+    drive.stop_input = True
+    write(line, 118, "50", 5)
+    assert read(line, 109, 9) == HARDWARE | ENABLED | STOP
+    assert read(line, 120, 10) == 0
+
+
+@pytest.mark.parametrize(
+    ("current_control", "host_reference", "torque", "speed"),
+    [(False, True, NAK, ACK), (True, True, ACK, NAK), (False, False, NAK, NAK), (True, False, NAK, NAK)],
+)
+def test_a_reference_is_taken_only_in_its_mode_and_from_the_host(
+    current_control: bool, host_reference: bool, torque: str, speed: str
+) -> None:
+    line = line_of(MicroFlexDrive(7, current_control=current_control, host_reference=host_reference))
+    assert write(line, 116, "10", 0) == torque
+    assert write(line, 118, "10", 1) == speed
+
+
+def test_in_current_control_the_torque_reference_drives_it() -> None:
+    line = line_of(MicroFlexDrive(7, current_control=True))
+    write(line, 108, "128", 0)
+    write(line, 116, "40", 1)
+    assert read(line, 117, 2) == 40
+    assert read(line, 127, 3) == pytest.approx(1.2)
+    assert read(line, 120, 9) > 0
+
+
+@pytest.mark.parametrize("element", [1, 99, 100, 103, 109, 117, 119, 126, 133, 220, 222, 239, 242, 255])
+def test_every_other_element_is_read_only(line: Line, element: int) -> None:
+    assert write(line, element, "1", 0) == NAK
+    read(line, element, 1)
+
+
+@pytest.mark.parametrize("word", ["-1", "256"])
+def test_a_command_word_of_more_than_eight_bits_is_refused(line: Line, word: str) -> None:
+    assert write(line, 108, word, 0) == NAK
+    assert read(line, 108, 1) == 0
+
+
+def test_unmapped_elements_read_zero_or_are_refused_if_so_set(line: Line) -> None:
+    assert read(line, 50, 0) == read(line, 101, 1) == read(line, 236, 2) == 0
+    strict = line_of(MicroFlexDrive(7, refuse_unmapped=True))
+    assert ask(strict, "07 30 37 02 30 31 05 01") == NAK
+
+
+def test_it_reports_firmware_bus_voltage_and_a_temperature_that_rises_under_load(line: Line) -> None:
+    assert read(line, 239, 0) >= 5221
+    assert read(line, 126, 1) == 320
+    assert read(line, 242, 2) == AMBIENT
+    write(line, 108, "128", 3)
+    write(line, 118, "100", 4)
+    warm = read(line, 242, 30)
+    assert AMBIENT < warm < read(line, 242, 100)
+    write(line, 108, "0", 101)
+    assert read(line, 242, 2000) == pytest.approx(AMBIENT, abs=0.01)
+
+
+def test_a_restart_disables_it_and_forgets_its_references(drive: MicroFlexDrive, line: Line) -> None:
+    write(line, 108, "128", 0)
+    write(line, 118, "50", 1)
+    drive.trip(4, 4.0)
+    line.restart(drive, 5.0)
+    assert [read(line, element, element) for element in (103, 108, 109, 118, 120)] == [0, 0, HARDWARE, 0, 0]
+
+
+def test_a_ripple_makes_the_measured_speed_live(drive: MicroFlexDrive, line: Line) -> None:
+    drive.ripple = 0.01
+    write(line, 108, "128", 0)
+    write(line, 118, "50", 1)
+    speeds = {read(line, 120, 10 + n * 0.7) for n in range(10)}
+    assert len(speeds) > 5
+    assert all(49.4 < speed < 50.6 for speed in speeds)
