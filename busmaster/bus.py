@@ -161,16 +161,19 @@ class Bus:
         return group
 
     def remove_group(self, group: PollGroup) -> None:
+        """What `PollGroup.close` does: its polls end, and what they have on the wire goes unheard."""
         if group in self._groups:
             self._groups.remove(group)
             self._arbiter.remove_poll(group.poll, self.now())
             self.pump.turn()
 
     def demand(self, poll: Poll) -> None:
+        """What `PollGroup.demand` does."""
         self._arbiter.demand(poll, self.now())
         self.pump.turn()
 
     def suspend(self, node: Node, seconds: float) -> None:
+        """What `Node.suspend` does."""
         self._arbiter.dispatcher.suspend(node.record, self.now() + seconds)
         self.pump.turn()
 
@@ -186,6 +189,7 @@ class Bus:
         self._touched[node if point is None else point] = self.now()
 
     def touched_at(self, point: Point[Any]) -> float:
+        """When the last write to the point, or to all of its node, ended; -inf if none has."""
         return max(self._touched.get(point, -inf), self._touched.get(point.node, -inf)) if self._touched else -inf
 
     # looking

@@ -112,6 +112,7 @@ class Stream(Generic[T]):
         self._arrived.set()
 
     def put(self, item: T) -> None:
+        """Give the consumer one more; the oldest is dropped where it does not keep up."""
         if len(self._items) == self._items.maxlen:
             self.dropped += 1
         self._items.append(item)

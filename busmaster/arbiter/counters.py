@@ -20,6 +20,7 @@ class Quantiles:
 
     @classmethod
     def of(cls, histogram: Histogram) -> Quantiles:
+        """What a histogram holds now."""
         return cls(
             histogram.count, histogram.mean, histogram.quantile(0.5), histogram.quantile(0.99), histogram.highest
         )

@@ -56,6 +56,8 @@ class LatenessRaised:
 
 
 class LineChange(enum.Enum):
+    """What became of the line: its port UP or DOWN, the line NOISY (nothing is sent) or QUIET again."""
+
     UP = "up"
     DOWN = "down"
     NOISY = "noisy"
@@ -64,6 +66,8 @@ class LineChange(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class LineChanged:
+    """The line changed, and why where that is known."""
+
     change: LineChange
     cause: str = ""
 

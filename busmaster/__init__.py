@@ -1,0 +1,85 @@
+"""busmaster: an asyncio master for drives and motion controllers that share one serial line."""
+
+from __future__ import annotations
+
+from busmaster.arbiter.counters import LineStatistics, NodeStatistics, Quantiles
+from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, LineState, NodeChanged
+from busmaster.arbiter.health import Health
+from busmaster.arbiter.transaction import Priority, Timeline
+from busmaster.bus import Bus
+from busmaster.errors import (
+    BacklogFull,
+    BusClosed,
+    BusError,
+    GarbledReply,
+    InvalidCommand,
+    LineDown,
+    LineNoisy,
+    NodeDown,
+    NoReply,
+    NoSuchParameter,
+    NotStarted,
+    Refused,
+    Superseded,
+    VerifyFailed,
+    WriteUnconfirmed,
+)
+from busmaster.exchange import ReplyTiming, Timings
+from busmaster.handles import Hcp2Controller, HcpController, MicroFlexDrive
+from busmaster.node import Node
+from busmaster.points import Point
+from busmaster.polling import GroupStatistics, PollGroup, Quality, Sample, Snapshot, Stream
+from busmaster.profile import LineSettings, Profile
+from busmaster.transport.endpoints import endpoint
+from busmaster.transport.memory import MemoryPort
+from busmaster.transport.serial_port import SerialPort
+from busmaster.transport.tcp import TcpPort
+
+__all__ = [
+    "BacklogFull",
+    "Bus",
+    "BusClosed",
+    "BusError",
+    "GarbledReply",
+    "GroupStatistics",
+    "Hcp2Controller",
+    "HcpController",
+    "Health",
+    "InvalidCommand",
+    "LatenessRaised",
+    "LineChange",
+    "LineChanged",
+    "LineDown",
+    "LineNoisy",
+    "LineSettings",
+    "LineState",
+    "LineStatistics",
+    "MemoryPort",
+    "MicroFlexDrive",
+    "NoReply",
+    "NoSuchParameter",
+    "Node",
+    "NodeChanged",
+    "NodeDown",
+    "NodeStatistics",
+    "NotStarted",
+    "Point",
+    "PollGroup",
+    "Priority",
+    "Profile",
+    "Quality",
+    "Quantiles",
+    "Refused",
+    "ReplyTiming",
+    "Sample",
+    "SerialPort",
+    "Snapshot",
+    "Stream",
+    "Superseded",
+    "TcpPort",
+    "Timeline",
+    "Timings",
+    "VerifyFailed",
+    "WriteUnconfirmed",
+    "endpoint",
+]
