@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 
 import anyio
@@ -75,20 +75,21 @@ async def demo(path: str, *, seconds: float | None, plain: bool) -> int:
 
 async def command_drives(watch: Watch, drives: list[MicroFlexDrive]) -> None:
     """Enable all drives, then give them new speeds, one after another, until cancelled."""
-    for drive in drives:
-        await attempt(watch, drive, None)
-    for drive, percent in zip(itertools.cycle(drives), itertools.cycle(SPEEDS), strict=False):
-        await attempt(watch, drive, percent)
+    speeds = itertools.cycle(SPEEDS)
+    for drive, percent in zip(drives, speeds, strict=False):
+        await attempt(watch, drive, drive.enable)
+        await attempt(watch, drive, drive.set_speed_reference, percent)
+    for drive, percent in zip(itertools.cycle(drives), speeds, strict=False):
         await anyio.sleep(COMMAND_EVERY)
-
-
-async def attempt(watch: Watch, drive: MicroFlexDrive, percent: float | None) -> None:
-    """A new speed, or to be enabled. What goes wrong is an event to show: the demo goes on."""
-    try:
-        if percent is None:
-            await drive.enable()
-        else:
-            await drive.set_speed_reference(percent)
+        if await attempt(watch, drive, drive.set_speed_reference, percent):
             watch.tell(f"{drive.node.label}: speed reference {percent:g} %")
+
+
+async def attempt(watch: Watch, drive: MicroFlexDrive, order: Callable[..., Awaitable[object]], *values: float) -> bool:
+    """What goes wrong is an event to show: the demo goes on."""
+    try:
+        await order(*values)
     except BusError as error:
         watch.tell(f"{drive.node.label}: {error.what}")
+        return False
+    return True

@@ -23,6 +23,7 @@ from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row, decode
 FRAME_LIMIT = 1 << 22
 """Bytes of the longest frame: some ten thousand points."""
 BARS = "▁▂▃▄▅▆▇█"
+RIPPLE = 0.1
 GAUGE = 20
 EVENTS = 3
 HEALTH_STYLES = {"up": "green", "unknown": "dim", "suspect": "bold magenta", "down": "reverse red"}
@@ -37,14 +38,13 @@ OLD_AFTER = 3
 
 
 def sparkline(numbers: Sequence[float | None]) -> str:
-    """The last values between their own lowest and highest; a gap where there was none."""
+    """The last values between their own lowest and highest; a gap where there was none. A ripple is not a trend."""
     known = [number for number in numbers if number is not None]
     if not known:
         return ""
-    low, span = min(known), max(known) - min(known)
-    top = len(BARS) - 1
-    bars = (" " if x is None else BARS[round((x - low) / span * top)] if span else BARS[0] for x in numbers)
-    return "".join(bars)
+    low, high = min(known), max(known)
+    span = max(high - low, RIPPLE * max(abs(low), abs(high))) or 1.0
+    return "".join(" " if x is None else BARS[round((x - low) / span * (len(BARS) - 1))] for x in numbers)
 
 
 def age_text(seconds: float | None) -> str:
@@ -225,7 +225,8 @@ class Screen(App[None]):
             if row.node != before and row.node in nodes:
                 cells |= node_cells(nodes[row.node], self.widths)
             for name, cell in cells.items():
-                if table.get_cell(self.row_key(row), name) != cell:
+                shown = table.get_cell(self.row_key(row), name)
+                if (shown, shown.style) != (cell, cell.style):
                     table.update_cell(self.row_key(row), name, cell)
             before = row.node
 

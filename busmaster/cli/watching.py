@@ -22,7 +22,7 @@ from busmaster.cli.output import emit_all, json_line, json_value, note, value_te
 from busmaster.errors import BusError
 from busmaster.node import Health
 from busmaster.points import Point
-from busmaster.polling import PollGroup, Sample, Snapshot
+from busmaster.polling import PollGroup, Quality, Sample, Snapshot
 
 KEPT_PERIODS = 10_000
 KEPT_EVENTS = 8
@@ -42,6 +42,7 @@ class Watch:
         self.events: deque[str] = deque(maxlen=KEPT_EVENTS)
         self._periods: dict[str, deque[float]] = {}
         self._started: dict[str, float] = {}
+        self._good: dict[Point[Any], Sample] = {}
         self._loads: deque[tuple[float, float]] = deque()
 
     def since(self, time: float | None) -> float | None:
@@ -52,7 +53,8 @@ class Watch:
         self._periods[group.name] = deque(maxlen=KEPT_PERIODS)
 
     def saw(self, snapshot: Snapshot) -> None:
-        """Count one cycle."""
+        """Count one cycle, and keep the good values: a point that fails shows its last one, growing old."""
+        self._good.update((point, sample) for point, sample in snapshot.samples.items() if sample.error is None)
         if snapshot.started is None:
             return
         before = self._started.get(snapshot.group)
@@ -81,7 +83,7 @@ class Watch:
             line=STATES.get(self.bus.state, "ready"),
             utilisation=self._utilisation(now, statistics.busy + statistics.settling),
             backlog=statistics.backlog,
-            rows=tuple(row for group in self.groups for row in group_rows(group, now)),
+            rows=tuple(self._row(point, group.latest, now) for group in self.groups for point in group.points),
             nodes=tuple(self._nodes()),
             groups=tuple(self._group(group) for group in self.groups),
             events=tuple(self.events),
@@ -121,6 +123,22 @@ class Watch:
             health = "suspended" if node.suspended else node.health.value
             yield NodeRow(node.label, health, counts.attempts, counts.attempts - counts.ok, latency.p50, latency.p99)
 
+    def _row(self, point: Point[Any], latest: Snapshot | None, now: float) -> Row:
+        good, sample = self._good.get(point), latest.samples.get(point) if latest else None
+        value = good.value if good else None
+        number = float(value) if isinstance(value, int | float) and not isinstance(value, Flag) else math.nan
+        failed = sample is not None and sample.error is not None
+        return Row(
+            node=point.node.label,
+            item=point.item,
+            value=value_text(value),
+            unit=short_unit(point.unit),
+            number=number if math.isfinite(number) and not failed else None,
+            age=good.age(now) if good else None,
+            late=good is not None and good.quality is Quality.LATE,
+            error=sample.error.what if sample and sample.error else "",
+        )
+
     def _group(self, group: PollGroup) -> GroupRow:
         periods = self._periods[group.name]
         counts = group.statistics()
@@ -144,33 +162,6 @@ class Watch:
 def p99_of(periods: Iterable[float]) -> float | None:
     ordered = sorted(periods)
     return ordered[math.ceil(0.99 * len(ordered)) - 1] if ordered else None
-
-
-def group_rows(group: PollGroup, now: float) -> Iterator[Row]:
-    """A row for each point; what was not polled yet has no value and no age."""
-    latest = group.latest
-    for point in group.points:
-        sample = latest.samples.get(point) if latest else None
-        yield (
-            Row(point.node.label, point.item, "-", short_unit(point.unit))
-            if sample is None
-            else sample_row(point, sample, now)
-        )
-
-
-def sample_row(point: Point[Any], sample: Sample, now: float) -> Row:
-    value = sample.value
-    number = float(value) if isinstance(value, int | float) and not isinstance(value, Flag) else None
-    return Row(
-        node=point.node.label,
-        item=point.item,
-        value=value_text(value),
-        unit=short_unit(point.unit),
-        number=number if number is not None and math.isfinite(number) else None,
-        age=sample.age(now),
-        late=sample.quality.value == "late",
-        error="" if sample.error is None else sample.error.what,
-    )
 
 
 def short_unit(unit: str) -> str:
@@ -198,7 +189,7 @@ def json_cycle(watch: Watch, snapshot: Snapshot) -> str:
         point.key: {
             "value": json_value(sample.value),
             "error": None if sample.error is None else sample.error.what,
-            "late": sample.quality.value == "late",
+            "late": sample.quality is Quality.LATE,
         }
         for point, sample in snapshot.samples.items()
     }
