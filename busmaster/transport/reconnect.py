@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 from collections.abc import Callable, Hashable
+from typing import cast
 
 from busmaster.errors import LineDown
 from busmaster.transport.endpoints import Endpoint
@@ -134,8 +135,7 @@ class _Link(asyncio.Protocol):
         self._closing = closing
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self.transport = transport
+        self.transport = cast("asyncio.Transport", transport)  # uvloop's are none by inheritance
         self._protocol.connection_made(transport)
 
     def data_received(self, data: bytes) -> None:

@@ -7,7 +7,7 @@ import random
 from collections.abc import AsyncIterator, Callable, Hashable
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -34,11 +34,10 @@ async def kept(endpoint: Endpoint, recorder: Recorder, **options: Any) -> AsyncI
             await running
 
 
-class Wire(asyncio.Transport):
-    """A transport without anything behind it. `stuck`: closing it takes for ever."""
+class Wire:
+    """A transport without anything behind it, nor asyncio's class (as uvloop's). `stuck`: never closes."""
 
     def __init__(self, protocol: asyncio.Protocol, stuck: bool) -> None:
-        super().__init__()
         self.protocol = protocol
         self.stuck = stuck
         self.aborted = False
@@ -80,8 +79,9 @@ class Told:
             raise LineDown("told does not exist")
         wire = Wire(protocol_factory(), self.stuck)
         self.wires.append(wire)
-        wire.protocol.connection_made(wire)
-        return wire
+        transport = cast("asyncio.Transport", wire)
+        wire.protocol.connection_made(transport)
+        return transport
 
     @property
     def pauses(self) -> list[float]:
