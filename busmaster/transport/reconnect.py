@@ -157,5 +157,5 @@ class _Link(asyncio.Protocol):
         if isinstance(exc, LineDown):
             return exc
         if exc is None:
-            return LineDown(f"{self._name} was closed by the other end")
-        return LineDown(f"{self._name} was lost: {getattr(exc, 'strerror', None) or exc}")
+            return LineDown(f"{self._name} was closed by the other end", hint="")
+        return LineDown(f"{self._name} was lost: {getattr(exc, 'strerror', None) or exc}", hint="")

@@ -227,7 +227,7 @@ class PortTransport(_SerialTransport):
         """The port is gone: the protocol is told at the next turn of the loop, never from within its own `write`."""
         self._detach()
         why = "it hung up" if error is None or error.errno == errno.EIO else error.strerror
-        cause = LineDown(f"{self._port.name} was lost: {why}", hint="plug it in again; the bus reconnects by itself")
+        cause = LineDown(f"{self._port.name} was lost: {why}", hint="")
         self._loop.call_soon(self._report, cause)
 
     def _detach(self) -> Future[None]:
