@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import ClassVar
+import asyncio
+from collections.abc import Callable, Coroutine
+from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import anyio
@@ -122,11 +123,11 @@ class MicroFlexDrive(CommsHandle):
             await self._command(enable() | CommandWord.CANCEL)
         except BaseException:
             try:
-                await self._clear_cancel(enable)
+                await _to_the_end(self._clear_cancel(enable))
             except BusError:
                 pass  # what went wrong first says more
             raise
-        await self._clear_cancel(enable)
+        await _to_the_end(self._clear_cancel(enable))
         return await self.status()
 
     async def set_speed_reference(self, percent: float) -> None:
@@ -144,7 +145,7 @@ class MicroFlexDrive(CommsHandle):
 
     async def _clear_cancel(self, enable: Callable[[], CommandWord]) -> None:
         last: BusError | None = None
-        with anyio.move_on_after(CLEAR_WITHIN, shield=True):
+        with anyio.move_on_after(CLEAR_WITHIN):
             while True:
                 try:
                     await self._command(enable())
@@ -175,6 +176,25 @@ class MicroFlexDrive(CommsHandle):
                     command=str(self.status_word.command),
                 )
             await anyio.sleep(LOOK_AGAIN)
+
+
+async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
+    """Run `work` whole, even if the caller is cancelled meanwhile: it gets its CancelledError after that.
+
+    In a task of its own, since a scope's shield holds off anyio's cancellation, but not `Task.cancel()`.
+    """
+    task = asyncio.ensure_future(work)
+    cancelled: asyncio.CancelledError | None = None
+    with anyio.CancelScope(shield=True):
+        while not task.done():
+            try:
+                await asyncio.wait([task])
+            except asyncio.CancelledError as error:
+                cancelled = error
+    if cancelled is not None:
+        await asyncio.gather(task, return_exceptions=True)
+        raise cancelled
+    task.result()
 
 
 def _why_not(status: StatusWord) -> str:

@@ -1,0 +1,78 @@
+"""A bus without a line: nodes answer commands from a table, so that handles can be watched request by request."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any, cast
+
+import anyio.lowlevel
+
+from busmaster.bus import Bus
+from busmaster.exchange import Command, Timings
+from busmaster.node import Priority
+from busmaster.profile import Profile
+
+Answer = Callable[[Command[Any]], Any]
+
+
+class FakeNode:
+    """Every command goes to the bus's `answer`, which returns its value or raises; `log` keeps what was asked."""
+
+    def __init__(self, bus: FakeBus, profile: Profile, address: int) -> None:
+        self.bus = bus
+        self.profile = profile
+        self.address = address
+        self.label = profile.label(address)
+
+    async def request(
+        self,
+        command: Command[Any],
+        *,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+        idempotent: bool | None = None,
+        touches: object = None,
+    ) -> Any:
+        exchange = command.open(self.address, self.profile.timings)
+        assert exchange.request
+        self.bus.log.append((self.address, str(command), priority))
+        self.bus.grown.set()
+        await anyio.lowlevel.checkpoint()
+        return self.bus.answer(command)
+
+
+class FakeBus:
+    def __init__(self, answer: Answer) -> None:
+        self.answer = answer
+        self.log: list[tuple[int, str, Priority | None]] = []
+        self.grown = asyncio.Event()
+        self.time = 0.0
+        self.nodes: dict[tuple[str, int], FakeNode] = {}
+
+    def node(
+        self, profile: Profile, address: int, *, timings: Timings | None = None, retries: int | None = None
+    ) -> FakeNode:
+        profile.check_address(address)
+        return self.nodes.setdefault((profile.name, address), FakeNode(self, profile, address))
+
+    def now(self) -> float:
+        self.time += 0.001
+        return self.time
+
+    async def requests(self, count: int) -> None:
+        """Wait until so many were made."""
+        while len(self.log) < count:
+            self.grown.clear()
+            await self.grown.wait()
+
+    @property
+    def asked(self) -> list[str]:
+        """The commands so far, in words."""
+        return [command for _, command, _ in self.log]
+
+    @property
+    def bus(self) -> Bus:
+        """Itself, as what it stands for."""
+        return cast("Bus", self)

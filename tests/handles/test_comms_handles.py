@@ -1,0 +1,201 @@
+"""HcpController and Hcp2Controller over a node that keeps a comms array."""
+
+from __future__ import annotations
+
+from ctypes import c_float
+from typing import Any
+
+import pytest
+
+from busmaster.errors import InvalidCommand, VerifyFailed
+from busmaster.exchange import Command
+from busmaster.handles.comms import CommsHandle
+from busmaster.handles.hcp import HcpController
+from busmaster.handles.hcp2 import Hcp2Controller
+from busmaster.handles.microflex import MicroFlexDrive
+from busmaster.node import Priority
+from busmaster.protocols import comms_array, hcp2, microflex
+from busmaster.protocols.comms import ReadElement, WriteElements
+from tests.handles.fake_bus import FakeBus
+
+
+class CommsArray(FakeBus):
+    """Elements as a controller keeps them: in single precision, shown with 4 decimals."""
+
+    def __init__(self) -> None:
+        super().__init__(self.obey)
+        self.elements: dict[int, float] = {}
+
+    def obey(self, command: Command[Any]) -> float | None:
+        if isinstance(command, WriteElements):
+            for offset, text in enumerate(command.text.split(",")):
+                self.elements[command.element + offset] = round(c_float(float(text)).value, 4)
+            return None
+        assert isinstance(command, ReadElement)
+        return self.elements.get(command.element, 0.0)
+
+
+@pytest.fixture
+def line() -> CommsArray:
+    return CommsArray()
+
+
+@pytest.fixture(params=[HcpController, Hcp2Controller])
+def controller(request: pytest.FixtureRequest, line: CommsArray) -> CommsHandle:
+    handle: CommsHandle = request.param(line.bus, 5)
+    return handle
+
+
+@pytest.mark.asyncio
+async def test_a_written_element_is_read_back(controller: CommsHandle, line: CommsArray) -> None:
+    await controller.write(1, 123.456)
+    assert await controller.read(1) == pytest.approx(123.456)
+    assert line.asked == ["write element 1 = 123.456", "read element 1"]
+
+
+@pytest.mark.asyncio
+async def test_several_values_go_in_one_telegram(controller: CommsHandle, line: CommsArray) -> None:
+    await controller.write(10, 10, 20, 30)
+    assert line.asked == ["write elements 10-12 = 10,20,30"]
+
+
+@pytest.mark.asyncio
+async def test_a_list_of_more_than_60_characters_goes_in_several(controller: CommsHandle, line: CommsArray) -> None:
+    await controller.write(1, *range(10001, 10025))
+    assert [line.elements[n] for n in range(1, 25)] == [float(10000 + n) for n in range(1, 25)]
+    assert [asked.split(" = ")[0] for asked in line.asked] == [
+        "write elements 1-10",
+        "write elements 11-20",
+        "write elements 21-24",
+    ]
+
+
+@pytest.mark.asyncio
+async def test_nothing_is_sent_of_a_list_that_cannot_be_sent_whole(controller: CommsHandle, line: CommsArray) -> None:
+    for values in ((), (1.0, float("nan")), (*range(10001, 10020), 1e20)):
+        with pytest.raises(InvalidCommand):
+            await controller.write(1, *values)
+    with pytest.raises(InvalidCommand):
+        await controller.write(controller.read_command.last - 10, *range(10001, 10013))
+    assert line.asked == []
+
+
+@pytest.mark.asyncio
+async def test_a_verified_write_reads_every_element_back(controller: CommsHandle, line: CommsArray) -> None:
+    await controller.write(10, 0.12345, 16777217.0, verify=True)
+    assert line.asked[1:] == ["read element 10", "read element 11"]
+
+
+@pytest.mark.asyncio
+async def test_a_write_that_reads_back_otherwise_is_told(controller: CommsHandle, line: CommsArray) -> None:
+    line.answer = lambda command: None if command.writes else 5.0
+    with pytest.raises(VerifyFailed, match=r"node 5: element 11 reads 5\.0 after 6 was written"):
+        await controller.write(10, 5, 6, verify=True)
+
+
+@pytest.mark.asyncio
+async def test_priority_and_idempotence_are_handed_on(controller: CommsHandle, line: CommsArray) -> None:
+    seen: list[Command[Any]] = []
+    line.answer = seen.append
+    await controller.write(1, 5, idempotent=True, priority=Priority.URGENT)
+    await controller.write(1, 5)
+    assert [command.idempotent for command in seen] == [True, False]
+    assert [priority for _, _, priority in line.log] == [Priority.URGENT, None]
+
+
+@pytest.mark.asyncio
+async def test_a_number_is_a_point(controller: CommsHandle, line: CommsArray) -> None:
+    point = controller.point("7")
+    await point.write(2.5)
+    assert await point.read() == 2.5
+    assert point == controller.element(7)
+    assert point.key == "5/7"
+
+
+def test_hcp_knows_no_names(line: CommsArray) -> None:
+    controller = HcpController(line.bus, 5)
+    assert controller.items() == ()
+    for item in ("position", "0", "100", "1.5", "-1", "", "\u0661"):
+        with pytest.raises(InvalidCommand):
+            controller.point(item)
+
+
+def test_a_node_of_hcp_is_at_most_15(line: CommsArray) -> None:
+    with pytest.raises(InvalidCommand):
+        HcpController(line.bus, 16)
+
+
+# names
+
+
+def test_every_name_of_the_extended_comms_array_is_a_point(line: CommsArray) -> None:
+    controller = Hcp2Controller(line.bus, 5)
+    for name in controller.items():
+        point = controller.point(name)
+        assert point.command == hcp2.Read(comms_array.ELEMENTS[name].number)
+        assert point.writable is (name == "outputs")
+
+
+def test_axes_and_io_are_the_same_points_as_their_names(line: CommsArray) -> None:
+    controller = Hcp2Controller(line.bus, 5)
+    for number in range(8):
+        axis = controller.axis(number)
+        for name in ("position", "velocity", "mode", "axis_error", "demand", "encoder", "idle", "following_error"):
+            assert getattr(axis, name) == controller.point(f"axis{number}.{name}")
+        assert controller.io.adc(number) == controller.point(f"adc{number}")
+    for name in ("inputs", "outputs", "error", "error_line", "error_axis", "running", "line_number", "firmware"):
+        assert getattr(controller.io, name) == controller.point(name)
+    assert repr(controller.axis(3)) == "<Axis 3 of node 5>"
+
+
+@pytest.mark.parametrize("number", [-1, 8])
+def test_there_are_8_axes_and_8_analogue_channels(line: CommsArray, number: int) -> None:
+    controller = Hcp2Controller(line.bus, 5)
+    with pytest.raises(InvalidCommand, match="use 0 to 7"):
+        controller.axis(number)
+    with pytest.raises(InvalidCommand, match="use 0 to 7"):
+        controller.io.adc(number)
+
+
+def test_a_mistyped_name_gets_the_nearest_one(line: CommsArray) -> None:
+    with pytest.raises(InvalidCommand, match=r"did you mean 'axis0\.position'"):
+        Hcp2Controller(line.bus, 5).point("axis0.positon")
+
+
+@pytest.mark.asyncio
+async def test_elements_are_read_and_written_by_name(line: CommsArray) -> None:
+    controller = Hcp2Controller(line.bus, 5)
+    line.elements[105] = 4096.0
+    assert await controller.read("axis0.encoder") == 4096.0
+    await controller.write("outputs", 5)
+    assert await controller.io.outputs.read() == 5
+    assert line.asked[1] == "write element 222 = 5"
+
+
+@pytest.mark.asyncio
+async def test_a_name_that_is_read_only_is_refused_and_its_number_is_sent(line: CommsArray) -> None:
+    controller = Hcp2Controller(line.bus, 5)
+    with pytest.raises(InvalidCommand, match="read-only"):
+        await controller.write("inputs", 1)
+    with pytest.raises(InvalidCommand, match="read-only"):
+        await controller.io.inputs.write(1)
+    assert line.asked == []
+    await controller.write(220, 1)
+    assert line.asked == ["write element 220 = 1"]
+
+
+def test_named_levels_may_be_repeated_and_numbers_not(line: CommsArray) -> None:
+    controller = Hcp2Controller(line.bus, 5)
+    assert controller.io.outputs.encode is not None
+    assert controller.io.outputs.encode(5).idempotent
+    number = controller.element(222)
+    assert number.encode is not None
+    assert not number.encode(5).idempotent
+
+
+def test_every_name_of_microflex_is_an_attribute(line: CommsArray) -> None:
+    drive = MicroFlexDrive(line.bus, 7)
+    for name in drive.items():
+        assert getattr(drive, name) == drive.point(name)
+    assert MicroFlexDrive.bus_voltage.element is microflex.BUS_VOLTAGE
+    assert drive.bus_voltage.unit == "V"

@@ -1,0 +1,184 @@
+"""MentorDrive over a node that keeps a table of parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from busmaster.errors import InvalidCommand, VerifyFailed
+from busmaster.exchange import Command
+from busmaster.handles.mentor import MentorDrive, from_line, to_line
+from busmaster.protocols.mentor import CHAINED, PROFILE, Read, ReadRun, Write
+from tests.handles.fake_bus import FakeBus
+
+
+class Parameters(FakeBus):
+    """Parameters as a drive keeps them: whole numbers; high resolution loses its last digit when read."""
+
+    def __init__(self) -> None:
+        super().__init__(self.obey)
+        self.table: dict[tuple[int, int], int] = {}
+
+    def obey(self, command: Command[Any]) -> int | tuple[int, ...] | None:
+        if isinstance(command, Write):
+            number = int(command.text)
+            self.table[command.menu, command.number] = int(number / 10) if command.high_resolution else number
+            return None
+        if isinstance(command, Read):
+            return self.table.get((command.menu, command.number), 0)
+        assert isinstance(command, ReadRun)
+        return tuple(self.table.get((command.menu, command.number + i), 0) for i in range(command.count))
+
+
+@pytest.fixture
+def line() -> Parameters:
+    return Parameters()
+
+
+@pytest.fixture
+def drive(line: Parameters) -> MentorDrive:
+    return MentorDrive(line.bus, 14, decimals={"1.17": 1, "01.18": 0})
+
+
+@pytest.mark.asyncio
+async def test_a_value_is_in_the_parameters_own_unit(drive: MentorDrive, line: Parameters) -> None:
+    await drive.write("1.17", -47.6)
+    assert line.asked == ["write 01.17 = -0476"]  # the guide's example
+    assert await drive.read("01.17") == -47.6
+
+
+@pytest.mark.asyncio
+async def test_high_resolution_adds_a_decimal(drive: MentorDrive, line: Parameters) -> None:
+    await drive.write("1.17", 47.65, high_resolution=True)
+    assert line.asked == ["write 01.17 = +04765"]
+    assert await drive.read("1.17") == 47.6
+    assert await drive.point("1.17:hires").read() == 47.6
+
+
+@pytest.mark.asyncio
+async def test_without_decimals_a_value_is_the_number_on_the_line(drive: MentorDrive, line: Parameters) -> None:
+    await drive.write("4.26", True)
+    await drive.write("2.10", 12)
+    await drive.write("2.11", 13.0)
+    await drive.write("15.60", 54321, wide=True)
+    assert line.asked == ["write 04.26 = 1", "write 02.10 = +0012", "write 02.11 = +0013", "write 15.60 = 54321"]
+    bit = await drive.read("4.26")
+    assert bit == 1
+    assert isinstance(bit, int)
+
+
+@pytest.mark.asyncio
+async def test_a_value_that_does_not_fit_is_refused_before_anything_is_sent(
+    drive: MentorDrive, line: Parameters
+) -> None:
+    for parameter, value in (("2.10", 1.5), ("2.10", 10000), ("1.17", 1000.0), ("1.17", float("nan")), ("1.17", 1e300)):
+        with pytest.raises(InvalidCommand):
+            await drive.write(parameter, value)
+    with pytest.raises(InvalidCommand):
+        await drive.write("117", 1)
+    assert line.asked == []
+
+
+@pytest.mark.asyncio
+async def test_a_verified_write_is_read_back(drive: MentorDrive, line: Parameters) -> None:
+    await drive.write("1.17", -47.6, verify=True)
+    await drive.write("1.17", -47.65, high_resolution=True, verify=True)
+    line.answer = lambda command: None if command.writes else 475
+    with pytest.raises(VerifyFailed, match=r"node 14: 1\.17 reads 475 after \+0476"):
+        await drive.write("1.17", 47.6, verify=True)
+    with pytest.raises(VerifyFailed, match=r"reads 475 after \+04765"):
+        await drive.write("1.17", 47.65, high_resolution=True, verify=True)
+
+
+@pytest.mark.asyncio
+async def test_a_run_is_read_singly_or_in_one_exchange(drive: MentorDrive, line: Parameters) -> None:
+    line.table = {(1, 17): 476, (1, 18): 5, (1, 19): 7}
+    assert await drive.read_run("1.17", 3) == (47.6, 5, 7)
+    assert line.asked == ["read 01.17", "read 01.18", "read 01.19"]
+    line.log.clear()
+    assert await drive.read_run("1.17", 3, chain=True) == (47.6, 5, 7)
+    assert line.asked == ["read 01.17 to 01.19"]
+
+
+@pytest.mark.asyncio
+async def test_all_drives_are_written_at_address_0(drive: MentorDrive, line: Parameters) -> None:
+    await drive.write_all("1.17", 0)
+    await MentorDrive(line.bus, 0).write("1.17", 0)
+    assert [(address, command) for address, command, _ in line.log] == [(0, "write 01.17 = +0000")] * 2
+
+
+@pytest.mark.asyncio
+async def test_all_drives_are_never_read(line: Parameters) -> None:
+    everyone = MentorDrive(line.bus, 0)
+    with pytest.raises(InvalidCommand, match="all drives"):
+        await everyone.read("1.17")
+    with pytest.raises(InvalidCommand, match="all drives"):
+        await everyone.read_run("1.17", 2)
+    with pytest.raises(InvalidCommand, match="all drives"):
+        await everyone.write("1.17", 0, verify=True)
+    assert line.asked == []
+
+
+@pytest.mark.asyncio
+async def test_items_of_the_command_line_are_points(drive: MentorDrive, line: Parameters) -> None:
+    for item in ("1.17", "01.17"):
+        await drive.point(item).write(47.6)
+        assert await drive.point(item).read() == 47.6
+    await drive.point("15.60:wide").write(54321)
+    assert await drive.point("15.60:wide").read() == 54321
+    run = drive.point("1.17:2")
+    assert await run.read() == (47.6, 0)
+    assert not run.writable
+    assert line.asked == [
+        *["write 01.17 = +0476", "read 01.17"] * 2,
+        "write 15.60 = 54321",
+        "read 15.60",
+        "read 01.17 to 01.18",
+    ]
+
+
+@pytest.mark.asyncio
+async def test_a_high_resolution_point_reads_in_the_unit_in_which_it_is_written(
+    drive: MentorDrive, line: Parameters
+) -> None:
+    point = drive.point("2.10:hires")
+    await point.write(4765)
+    assert line.asked == ["write 02.10 = +04765"]
+    assert await point.read() == 4760
+
+
+@pytest.mark.parametrize("item", ["117", "1.17:", "1.17:narrow", "1.17:0", "1.17:84", "1.17:-1", "speed", ""])
+def test_other_items_do_not_exist(drive: MentorDrive, item: str) -> None:
+    with pytest.raises(InvalidCommand):
+        drive.point(item)
+
+
+@pytest.mark.parametrize("address", [1, 9, 10, 90])
+def test_an_address_that_later_products_take_for_a_group_warns(line: Parameters, address: int) -> None:
+    with pytest.warns(UserWarning, match=f"address {address} means a group"):
+        MentorDrive(line.bus, address)
+
+
+@pytest.mark.parametrize("address", [0, 11, 99])
+def test_other_addresses_do_not(line: Parameters, address: int) -> None:
+    MentorDrive(line.bus, address)
+
+
+def test_runs_in_poll_groups_are_opted_into(line: Parameters) -> None:
+    assert MentorDrive(line.bus, 14).node.profile is PROFILE
+    assert MentorDrive(line.bus, 15, chained=True).node.profile is CHAINED
+
+
+@pytest.mark.parametrize(
+    ("value", "decimals", "number"),
+    [(47.65, 1, 477), (-47.65, 1, -477), (47.65, 2, 4765), (5, 0, 5), (0.1 + 0.2, 1, 3), (7, None, 7)],
+)
+def test_a_value_rounds_half_away_from_zero_to_its_decimals(value: float, decimals: int | None, number: int) -> None:
+    assert to_line(value, decimals) == number
+
+
+@pytest.mark.parametrize("number", [-9999, -1, 0, 1, 476, 65535])
+@pytest.mark.parametrize("decimals", [None, 0, 1, 2, 3])
+def test_every_number_on_the_line_comes_back(number: int, decimals: int | None) -> None:
+    assert to_line(from_line(number, decimals), decimals) == number
