@@ -194,6 +194,7 @@ class Arbiter:
         if now >= deadlines.expiry:
             self.dispatcher.expire(now)
         if now >= deadlines.health:
+            self._enter(self.state, now)
             self.dispatcher.probe(now)
         if now >= deadlines.line:
             if self.state is LineState.EXCHANGE:

@@ -39,6 +39,8 @@ REFUSED_POLL_PAUSE = 10.0
 RETRY_PATIENCE = 1.0
 """Seconds after which a request in POLL or BACKGROUND wants to be answered; the period, for a poll."""
 EXPIRY_SLACK = 64
+TELLING = (Refused, Superseded, WriteUnconfirmed)
+"""Errors that say themselves what may have become of a write that was on the wire."""
 
 
 class Dispatcher:
@@ -73,8 +75,8 @@ class Dispatcher:
         if self.fault is not None:
             self._end(transaction, now, _named(self.fault(), transaction))
             return
-        if self.backlog.waiting(transaction.priority) >= self._capacity:
-            waiting = self.backlog.waiting(transaction.priority)
+        waiting = max(self.backlog.waiting(transaction.priority), len(node.writes) if transaction.writes else 0)
+        if waiting >= self._capacity:
             self._end(transaction, now, _error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return
         if not self._may_ask(transaction, now):
@@ -109,7 +111,7 @@ class Dispatcher:
                 self._end(transaction, now, _not_started(transaction, now))
             elif transaction.writes and node.writes[0] is not transaction:
                 self._park(transaction)
-            elif node.health is not Health.DOWN or self._may_ask(transaction, now):
+            elif (node.health is not Health.DOWN and node.suspended_until <= now) or self._may_ask(transaction, now):
                 return transaction
         return None
 
@@ -157,8 +159,7 @@ class Dispatcher:
             node.counters.no_reply += 1
         else:
             node.counters.garbled += 1
-        steady = node.health is Health.UP or node.health is Health.UNKNOWN
-        if steady and transaction.retried < transaction.retries and self._wanted(transaction):
+        if transaction.retried < transaction.retries and self._worth_a_retry(transaction) and self._wanted(transaction):
             transaction.retried += 1
             node.counters.retries += 1
             self._requeue(transaction, now)
@@ -193,8 +194,6 @@ class Dispatcher:
 
     def cut_off(self, transaction: Transaction, error: BusError, now: float) -> None:
         """The line was lost under it: a write may have been carried out."""
-        if transaction.writes:
-            error = _error(WriteUnconfirmed, f"the line was lost before the answer came ({error.what})", transaction)
         self._end(transaction, now, _named(error, transaction))
 
     # everything at once
@@ -215,9 +214,11 @@ class Dispatcher:
         heap = self._expiries
         while heap and (heap[0][0] < now or heap[0][2].phase is Phase.ENDED):
             transaction = heapq.heappop(heap)[2]
+            if transaction.attempts:
+                continue
             if transaction.phase is Phase.QUEUED:
                 self.backlog.discard(transaction, Phase.PARKED)
-            if transaction.phase is Phase.PARKED and not transaction.attempts:
+            if transaction.phase is Phase.PARKED:
                 self._end(transaction, now, _not_started(transaction, now))
         self._deadlines.expiry = heap[0][0] + 1e-9 if heap else inf
 
@@ -242,7 +243,6 @@ class Dispatcher:
         """Run one cycle now, off the grid. The running one serves, if there is one."""
         if poll.active and not poll.running:
             poll.due = now
-            poll.demanded = True
             self._start_cycle(poll, now)
 
     def _start_cycle(self, poll: Poll, now: float) -> None:
@@ -263,7 +263,7 @@ class Dispatcher:
             return _error(NodeDown, "suspended for maintenance", transaction)
         if node.health is Health.DOWN:
             return _error(NodeDown, "down: it is probed, its polls wait", transaction)
-        if node.held:
+        if node.holds:
             return _error(NodeDown, "back, and its on_return hook is still running", transaction)
         if now < transaction.refused_until:
             return _error(Refused, "refused again and again: polled every 10 s", transaction)
@@ -280,8 +280,8 @@ class Dispatcher:
         self.plan_probes()
 
     def release_node(self, node: NodeRecord) -> None:
-        """Its hook has run: its polls resume with their next cycle."""
-        node.held = False
+        """Its hook has run: its polls resume with their next cycle, unless it has died and come back meanwhile."""
+        node.holds -= 1
 
     def plan_probes(self) -> None:
         """Set the deadline of the next probe. One probe at a time is out."""
@@ -331,8 +331,9 @@ class Dispatcher:
 
     def _heard(self, node: NodeRecord, now: float) -> None:
         before = node.health
+        flaps = health.flaps(node, now)
         health.note_success(node, now)
-        if before is Health.DOWN:
+        if before is Health.DOWN and not flaps:
             self._budget.node_returned(now)
             for other in self.nodes:
                 if other.health is Health.DOWN:
@@ -341,10 +342,19 @@ class Dispatcher:
 
     def _report(self, node: NodeRecord, before: Health) -> None:
         if node.health is not before:
-            self.events.append(NodeChanged(node, before, node.health, node.held))
+            returning = before is Health.DOWN and node.has_hook
+            node.holds += returning
+            self.events.append(NodeChanged(node, before, node.health, returning))
         self.plan_probes()
 
     # the ways of one transaction
+
+    def _worth_a_retry(self, transaction: Transaction) -> bool:
+        """Not while its node fails; nor may the polls of nodes that were never heard hold up the start of a line."""
+        node = transaction.node
+        if node.health is Health.UNKNOWN:
+            return transaction.poll is None
+        return not node.failures and node.health is not Health.DOWN
 
     def _wanted(self, transaction: Transaction) -> bool:
         return transaction.heard and not transaction.superseded and self.fault is None
@@ -352,7 +362,7 @@ class Dispatcher:
     def _requeue(self, transaction: Transaction, now: float) -> None:
         """At the back of its class; a poll's key becomes failure time + period (R7)."""
         poll = transaction.poll
-        transaction.deadline = now + (poll.period if poll is not None else RETRY_PATIENCE)
+        transaction.deadline = now + (poll.patience if poll is not None else RETRY_PATIENCE)
         self.backlog.push(transaction)
 
     def _park(self, write: Transaction) -> None:
@@ -381,7 +391,9 @@ class Dispatcher:
         self._deadlines.expiry = heap[0][0] + 1e-9
 
     def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:
-        """Exactly once (R8)."""
+        """Exactly once (R8). A write that was on the wire before something else ended it may have been carried out."""
+        if transaction.writes and transaction.attempts and error is not None and not isinstance(error, TELLING):
+            error = _error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
         transaction.phase = Phase.ENDED
         transaction.ended_at = now
         transaction.error = error

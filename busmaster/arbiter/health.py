@@ -19,6 +19,8 @@ LONGEST_PROBE_DELAY = 30.0
 PROBE_JITTER = 0.2
 STEADY = 30.0
 """Seconds a node must stay up before its next death starts with the first probe delay again: no flapping."""
+UP_AFTER_REPLIES = 3
+"""Replies in a row after which a SUSPECT node is UP: one that flaps is not reported again and again."""
 
 BUDGET_SHARE = 0.02
 BUDGET_IDLE_SHARE = 0.25
@@ -47,12 +49,14 @@ class NodeRecord:
         "failures",
         "has_hook",
         "health",
-        "held",
+        "holds",
         "label",
         "last_reply",
         "probe_at",
         "probe_delay",
         "profile",
+        "replies",
+        "reply_time",
         "retries",
         "suspended_until",
         "timings",
@@ -69,6 +73,11 @@ class NodeRecord:
         self.retries = retries
         self.health = Health.UNKNOWN
         self.failures = 0
+        """Transactions in a row that failed without a valid reply."""
+        self.replies = 0
+        """Replies in a row since it became SUSPECT."""
+        self.reply_time: float | None = None
+        """Seconds from a request to its reply, as poll groups measured them; None until they have."""
         self.last_reply = -inf
         self.up_since = -inf
         self.writes: deque[Transaction] = deque()
@@ -77,7 +86,8 @@ class NodeRecord:
         self.probe_at = inf
         self.suspended_until = -inf
         self.has_hook = False
-        self.held = False
+        self.holds = 0
+        """Returns whose on_return hook has not ended: its polls wait."""
         self.waiter: object = None
 
     @property
@@ -129,35 +139,42 @@ class ProbeBudget:
         self._earned_at = now
 
 
+def flaps(node: NodeRecord, now: float) -> bool:
+    """It has come back a short while ago: its next death or return tells nothing about others."""
+    return now - node.up_since < STEADY
+
+
 def note_success(node: NodeRecord, now: float) -> None:
     """A reply came. The caller reports the change of health."""
-    if node.health is Health.DOWN:
-        node.probe_at = inf
-        node.held = node.has_hook
-    if node.health is not Health.SUSPECT:
-        node.up_since = now
-    node.health = Health.UP
     node.failures = 0
+    if node.health is Health.SUSPECT:
+        node.replies += 1
+        if node.replies < UP_AFTER_REPLIES:
+            return
+    else:
+        node.up_since = now
+        node.probe_at = inf
+    node.health = Health.UP
 
 
 def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> None:
     """A transaction failed without a valid reply. The caller reports the change of health."""
     node.failures += 1
-    node.held = False
+    node.replies = 0
     if node.health is Health.DOWN:
-        node.probe_delay = min(2 * node.probe_delay, LONGEST_PROBE_DELAY)
-        node.probe_at = _jittered(node.probe_delay, now, jitter)
+        if now >= node.probe_at:
+            _probe_later(node, min(2 * node.probe_delay, LONGEST_PROBE_DELAY), now, jitter)
         return
     never_heard = node.health is Health.UNKNOWN
     silent = now - node.last_reply >= DOWN_AFTER_SILENCE
     if never_heard or (node.failures >= DOWN_AFTER_FAILURES and silent):
-        flapped = not never_heard and now - node.up_since < STEADY
-        node.probe_delay = min(2 * node.probe_delay, LONGEST_PROBE_DELAY) if flapped else FIRST_PROBE_DELAY
+        again = min(2 * node.probe_delay, LONGEST_PROBE_DELAY)
         node.health = Health.DOWN
-        node.probe_at = _jittered(node.probe_delay, now, jitter)
+        _probe_later(node, again if flaps(node, now) else FIRST_PROBE_DELAY, now, jitter)
     else:
         node.health = Health.SUSPECT
 
 
-def _jittered(delay: float, now: float, jitter: Callable[[], float]) -> float:
-    return now + delay * (1 + PROBE_JITTER * (2 * jitter() - 1))
+def _probe_later(node: NodeRecord, delay: float, now: float, jitter: Callable[[], float]) -> None:
+    node.probe_delay = delay
+    node.probe_at = now + delay * (1 + PROBE_JITTER * (2 * jitter() - 1))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
-from math import floor, inf
+from math import ceil, floor, inf
 from typing import Any
 
 from busmaster.arbiter.histogram import Histogram
@@ -13,8 +13,15 @@ from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Exchange
 
-HORIZON = 8
-"""Periods of the slowest poll over which phases are chosen."""
+LONGEST_PATIENCE = 10.0
+"""Seconds after which a poll's cycle goes before those that came later, however long its period is."""
+FILL = 0.9
+"""Cycles are spread over this share of the time when phases are chosen: the rest is left for what varies."""
+KINKS = 2000
+"""Bounds the work of choosing one phase: some 2000 of them cost a millisecond."""
+MEETINGS = 8
+"""Two polls whose cycles take longer than so many common divisors of their periods meet anyway."""
+ROUNDING = 1e-7
 
 
 def line_time(exchange: Exchange[Any], byte_time: float, reply_time: float | None = None) -> float:
@@ -39,7 +46,7 @@ class Poll:
     """Transactions that are run once a period, on the grid base + k x period.
 
     `cost` is the line time of one cycle in seconds, for the choice of phases. `results` are its transactions: they
-    hold the outcome of the last cycle until the next one starts.
+    hold the outcome of the last cycle until the next one starts. A poll that was removed is not added again.
     """
 
     __slots__ = (
@@ -47,15 +54,14 @@ class Poll:
         "base",
         "cost",
         "cycles",
-        "demanded",
         "due",
         "finished",
         "fresh",
         "jitter",
-        "late_cycles",
         "missed",
         "name",
         "number",
+        "patience",
         "paused",
         "period",
         "phase",
@@ -72,6 +78,7 @@ class Poll:
             raise InvalidCommand(f"poll group {name!r}: a phase is at least 0 s and below the period, not {phase!r}")
         self.name = name
         self.period = period
+        self.patience = min(period, LONGEST_PATIENCE)
         self.phase = phase
         self.cost = cost
         self.results: Sequence[Transaction] = ()
@@ -83,11 +90,9 @@ class Poll:
         self.active = False
         self.paused = False
         self.remaining = 0
-        self.demanded = False
         self.started = self.finished = -inf
         self.cycles = 0
         self.missed = 0
-        self.late_cycles = 0
         self.jitter = Histogram()
 
     @property
@@ -104,46 +109,50 @@ class Schedule:
     def __init__(self) -> None:
         self._heap: list[tuple[float, int, Poll]] = []
         self._order = count()
-        self._epoch: float | None = None
+        self._epoch = inf
+        self._unplaced: list[Poll] = []
         self.polls: list[Poll] = []
 
     def add(self, poll: Poll, now: float) -> None:
-        """Raises InvalidCommand for a poll that is already on it."""
-        if poll.active:
-            raise InvalidCommand(f"poll group {poll.name!r} is already running")
-        if self._epoch is None:
-            self._epoch = now
-        if poll.phase is None:
-            poll.base = now + quietest_offset(poll, self.polls, now)
-            poll.phase = (poll.base - self._epoch) % poll.period
-        else:
-            past = floor((now - self._epoch - poll.phase) / poll.period)
-            poll.base = self._epoch + poll.phase + (past + 1) * poll.period
-        poll.number = 0
+        """A poll without a phase gets one when it is first due: those added together are placed jointly.
+
+        Raises InvalidCommand for a poll that is, or was, on it.
+        """
+        if poll.active or poll.cycles:
+            raise InvalidCommand(f"poll group {poll.name!r} is or was running: make a new one")
+        self._epoch = min(self._epoch, now)
         poll.active = True
         self.polls.append(poll)
-        heapq.heappush(self._heap, (poll.base, next(self._order), poll))
+        if poll.phase is None:
+            self._unplaced.append(poll)
+        else:
+            self._start(poll, self._epoch + poll.phase, now)
 
     def remove(self, poll: Poll) -> None:
         if poll.active:
             poll.active = False
             self.polls.remove(poll)
+            self._unplaced = [other for other in self._unplaced if other is not poll]
             self._heap = [entry for entry in self._heap if entry[2] is not poll]
             heapq.heapify(self._heap)
 
     def next_due(self) -> float:
+        if self._unplaced:
+            return self._epoch
         return self._heap[0][0] if self._heap else inf
 
     def release(self, now: float) -> list[Poll]:
         """The polls whose cycle starts now, each with `due` set. Cycles that could not start are counted missed."""
+        if self._unplaced:
+            self._place(now)
         starting: list[Poll] = []
         heap = self._heap
         while heap and heap[0][0] <= now:
             poll = heap[0][2]
             behind = floor((now - poll.base) / poll.period) - poll.number
-            if behind > 0 and not poll.paused:
-                poll.missed += behind
-            poll.number += max(behind, 0)
+            if behind > 0:
+                poll.number += behind
+                poll.missed += 0 if poll.paused else behind
             due = poll.next_due()
             poll.number += 1
             heapq.heapreplace(heap, (poll.next_due(), next(self._order), poll))
@@ -153,9 +162,25 @@ class Schedule:
                 poll.missed += 1
                 continue
             poll.due = due
-            poll.demanded = False
             starting.append(poll)
         return starting
+
+    def _place(self, now: float) -> None:
+        """Short periods first: what is left free then repeats, and longer periods find it."""
+        placed = [poll for poll in self.polls if poll not in self._unplaced]
+        load = sum(poll.cost / poll.period for poll in self.polls)
+        for poll in sorted(self._unplaced, key=lambda poll: poll.period):
+            base = now + quietest_offset(poll, placed, now, FILL / load if load else 1.0)
+            poll.phase = (base - self._epoch) % poll.period
+            placed.append(poll)
+            self._start(poll, base, now)
+        self._unplaced.clear()
+
+    def _start(self, poll: Poll, base: float, now: float) -> None:
+        """Its grid begins with the first time from now on."""
+        poll.base = base + ceil((now - base) / poll.period) * poll.period
+        poll.number = 0
+        heapq.heappush(self._heap, (poll.base, next(self._order), poll))
 
 
 def begin_cycle(poll: Poll, now: float) -> list[Transaction]:
@@ -165,7 +190,7 @@ def begin_cycle(poll: Poll, now: float) -> list[Transaction]:
     poll.remaining = len(poll.results)
     poll.started = -inf
     poll.cycles += 1
-    deadline = poll.due + poll.period
+    deadline = poll.due + poll.patience
     for transaction in poll.results:
         transaction.reset()
         transaction.queued = now
@@ -182,38 +207,69 @@ def set_members(poll: Poll, members: Iterable[Transaction], priority: Priority =
     poll.fresh = fresh
 
 
-def quietest_offset(poll: Poll, others: Sequence[Poll], now: float) -> float:
+def quietest_offset(poll: Poll, others: Sequence[Poll], now: float, stretch: float = 1.0) -> float:
     """Seconds from `now`, below the period, at which this poll's cycles meet the others' least.
 
-    Tried are now itself and every moment at which another poll's cycle ends: an optimal packing exists among those.
-    Among equals the earliest wins.
+    All costs are multiplied by `stretch`. The time in which two polls want the line at once is a function of their
+    offset modulo the common divisor of their periods, made of straight pieces; the least sum of all of them lies at
+    one of the kinks. Among equals the earliest wins. The search ends early where there would be too many kinks.
     """
-    busy = [other for other in others if other.cost > 0]
-    if not busy:
+    own = min(poll.cost * stretch, poll.period)
+    pairs = []
+    for other in others:
+        step = common_divisor(poll.period, other.period)
+        length = min(other.cost * stretch, other.period)
+        if own + length < MEETINGS * step:
+            pairs.append(((other.base - now) % step, length, step, step / other.period))
+    if not pairs:
         return 0.0
-    candidates = {0.0}
-    for other in busy:
-        steps = max(1, round(poll.period / other.period))
-        for k in range(steps + 1):
-            candidates.add((other.base + other.cost - now + k * other.period) % poll.period)
-    horizon = now + HORIZON * max(p.period for p in (*busy, poll))
-    return min(sorted(candidates), key=lambda offset: round(_overlap(poll, now + offset, busy, horizon), 6))
+    affordable = KINKS / 4 - sum((own + length) / step + 1 for _, length, step, _ in pairs)
+    reach = affordable / sum(1 / step for _, _, step, _ in pairs)
+    reach = min(poll.period, max(reach, min(step for _, _, step, _ in pairs)))
+    best, least = 0.0, inf
+    overlap = slope = at = 0.0
+    for x, bend in sorted(_kinks(pairs, own, reach)):
+        overlap += slope * (x - at)
+        slope += bend
+        at = x
+        if 0 <= x < reach and overlap < least - ROUNDING:
+            best, least = x, overlap
+    return best
 
 
-def _overlap(poll: Poll, start: float, others: Sequence[Poll], horizon: float) -> float:
-    """Seconds in which this poll's cycles and the others' want the line at once, up to the horizon."""
-    total = 0.0
-    cycles = max(1, min(512, int((horizon - start) / poll.period)))
-    cost = max(poll.cost, 1e-6)
-    for k in range(cycles):
-        begin = start + k * poll.period
-        end = begin + cost
-        for other in others:
-            n = floor((begin - other.base - other.cost) / other.period) + 1
-            while True:
-                at = other.base + n * other.period
-                if at >= end:
-                    break
-                total += max(0.0, min(end, at + other.cost) - max(begin, at))
-                n += 1
-    return total
+def _kinks(
+    pairs: Iterable[tuple[float, float, float, float]], own: float, reach: float
+) -> Iterator[tuple[float, float]]:
+    """Where the sum of overlaps changes its slope, from before 0 up to `reach`, and by how much."""
+    yield 0.0, 0.0
+    for begin, length, step, weight in pairs:
+        shorter = min(own, length)
+        first = begin - own - step * floor((begin + length) / step)
+        for k in range(ceil((reach - first) / step)):
+            start = first + k * step
+            end = start + own + length
+            yield start, weight
+            yield start + shorter, -weight
+            yield end - shorter, -weight
+            yield end, weight
+
+
+def common_divisor(first: float, second: float) -> float:
+    """The greatest time of which both periods are multiples, within a ten-thousandth of the shorter one."""
+    first, second = max(first, second), min(first, second)
+    least = 1e-4 * second
+    while second > least:
+        first, second = second, abs(first - second * round(first / second))
+    return first
+
+
+__all__ = [
+    "Poll",
+    "Priority",
+    "Schedule",
+    "begin_cycle",
+    "common_divisor",
+    "line_time",
+    "quietest_offset",
+    "set_members",
+]
