@@ -35,6 +35,8 @@ OPS = {
     "RFLAGS": Op(7, 39, "flags"),
     "RQSTAT": Op(7, 15, "status"),
 }
+_OPEN_ENDED = {"RQSTAT"}
+"""What follows the status word is "not currently used": replies may have other lengths."""
 
 
 class MscDialect:
@@ -80,7 +82,7 @@ class MscDialect:
         else:
             frame.item = self._asked.item if self._asked else op.item.format("?")
             frame.value = _value(command, payload)
-            if len(raw) - _FRAMING != op.reply:
+            if len(raw) - _FRAMING != op.reply and command not in _OPEN_ENDED:
                 frame.fault = f"a body of {len(raw) - _FRAMING} bytes, not {op.reply}"
         right, found = sum16(raw[1:-2]), int.from_bytes(raw[-2:], "big")
         if found != right:
@@ -97,7 +99,8 @@ class MscDialect:
         if op is None or op.request == op.reply == length:
             in_turn = self._answer == raw or (self._asked is not None and self._acked and not self._answer)
             return Direction.NODE if in_turn else Direction.HOST
-        return Direction.NODE if length == op.reply else Direction.HOST
+        as_long = length != op.request if command in _OPEN_ENDED else length == op.reply
+        return Direction.NODE if as_long else Direction.HOST
 
     def _replied(self, frame: Frame) -> None:
         asked = self._asked

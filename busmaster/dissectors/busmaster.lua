@@ -352,7 +352,7 @@ local OPERATIONS = {
     p.value = tostring(range:uint())
   end },
   RFLAGS = { asks = 0, answers = 32, reply = add_flags },
-  RQSTAT = { asks = 0, answers = 8, reply = function(p, range)
+  RQSTAT = { asks = 0, answers = 8, shortest = 2, reply = function(p, range)
     p.value = tostring(range(0, 2):uint())
     add_bits(p, p.tree:add(f.value, range(0, 2), range(0, 2):uint()), range(0, 2), range(0, 2):uint(), STATUS_BITS)
   end },
@@ -360,7 +360,10 @@ local OPERATIONS = {
 
 local function msc_payload(p, range, operation)
   if p.direction == FROM_NODE then
-    if not operation.reply or not range or range:len() ~= operation.answers then return false end
+    if not operation.reply or not range then return false end
+    if range:len() ~= operation.answers and not (operation.shortest and range:len() >= operation.shortest) then
+      return false
+    end
     operation.reply(p, range)
     return true
   end

@@ -1,0 +1,46 @@
+"""`busmaster replay`: a capture, run through the readers of today."""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import datetime
+
+import click
+
+from busmaster.capture.pcapng import CaptureError, read_packets
+from busmaster.capture.replay import Replayed, replay
+from busmaster.cli.output import emit
+
+CHANGED = 1
+
+
+@click.command(short_help="Run a recorded exchange list against the decoders.")
+@click.argument("capture", type=click.Path(exists=True, dir_okay=False))
+def command(capture: str) -> int:
+    """Read again what a capture has recorded, and say what comes out otherwise than it was recorded.
+
+    A line for each exchange that has changed, then how many there were. The exit status is 1 if any has.
+    """
+    counts: Counter[str] = Counter()
+    try:
+        with open(capture, "rb") as file:
+            for one in replay(read_packets(file)):
+                counts["changed" if one.changed else "same" if one.judged else "unjudged"] += 1
+                if one.changed:
+                    emit(changed_text(one))
+    except CaptureError as error:
+        raise click.UsageError(f"{capture}: {error}") from None
+    emit(summary_text(counts))
+    return CHANGED if counts["changed"] else 0
+
+
+def changed_text(one: Replayed) -> str:
+    moment = datetime.fromtimestamp(one.micros / 1e6).astimezone().strftime("%H:%M:%S.%f")
+    node = "" if one.node is None else f"node {one.node}: "
+    return f"packet {one.packet}, {moment}, {node}{one.command}: was {one.recorded}, is {one.now}"
+
+
+def summary_text(counts: Counter[str]) -> str:
+    total = counts.total()
+    text = f"{total} exchange{'' if total == 1 else 's'}: {counts['same']} the same, {counts['changed']} changed"
+    return text + (f", {counts['unjudged']} without a recorded outcome" if counts["unjudged"] else "")

@@ -1,0 +1,161 @@
+"""A capture through the readers of today: the same, or what has changed."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.capture.assemble import Assembler, Verdict
+from busmaster.capture.pcapng import Direction, Outcome, Packet
+from busmaster.capture.replay import Replayed, replay
+from busmaster.exchange import Command, Timings
+from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from tests.capture.hearing import HOST, NODE
+
+ACK, NAK, EOT = "06", "15", "04"
+FLAGS_REPLY = "02 03 00 27 00 00 52 46 4C 41 47 53 2C 01 02 00 80" + " 00" * 27 + " 80 03 18"
+
+
+def recorded(*turns: tuple[Direction, str]) -> list[Packet]:
+    """What a recorder makes of these turns; nobody tells it the master's verdict."""
+    packets: list[Packet] = []
+    assembler = Assembler(packets.append)
+    for turn, (sender, frame) in enumerate(turns):
+        assembler.passed(float(turn), bytes.fromhex(frame), sender)
+    assembler.idle(100.0)
+    return packets
+
+
+def exchange(command: Command[object], address: int, timings: Timings, *replies: str) -> list[tuple[Direction, str]]:
+    return [(HOST, command.open(address, timings).request.hex()), *((NODE, reply) for reply in replies)]
+
+
+HCP, HCP2, MSC, MENTOR, DC104 = (p.PROFILE.timings for p in (hcp, hcp2, msc, mentor, dc104))
+GOOD = [
+    exchange(hcp.Read(1), 2, HCP, "02 30 31 31 32 33 2E 34 35 36 03 2B"),
+    exchange(hcp.Write(1, (123.456,)), 2, HCP, ACK),
+    exchange(hcp.Write(99, (1.0,)), 1, HCP, NAK),
+    exchange(hcp2.Read(105), 255, HCP2, "02 36 39 34 30 39 36 03 07"),
+    exchange(hcp2.Write(10, (10.0, 20.0, 30.0)), 13, HCP2, ACK),
+    exchange(hcp2.Read(105), 255, HCP2, "02 36 39 34 30", ""),
+    exchange(hcp2.Read(105), 255, HCP2, "02 36 39 34 30 39 36 03 08"),
+    exchange(hcp2.Read(105), 255, HCP2),
+    exchange(dc104.Read(170), 0, DC104, "02 AA 00 05 AF"),
+    exchange(dc104.Write(2, 65535), 0, DC104, ACK),
+    exchange(dc104.Read(107), 0, DC104, NAK),
+    exchange(mentor.Read(1, 17), 12, MENTOR, "02 30 31 31 37 2D 30 34 37 36 03 2C"),
+    exchange(mentor.Read(17, 23), 12, MENTOR, EOT),
+    exchange(mentor.Write(1, 17, -476), 14, MENTOR, ACK),
+    exchange(mentor.Write(1, 17, 4765, high_resolution=True), 14, MENTOR, ACK),
+    exchange(mentor.Write(15, 60, 54321, wide=True), 5, MENTOR, NAK),
+    exchange(mentor.Write(4, 26, True), 23, MENTOR, ACK),
+    exchange(mentor.Write(1, 17, 0), 0, MENTOR),
+    [
+        *exchange(mentor.ReadRun(1, 17, 2), 12, MENTOR, "02 30 31 31 37 2D 30 34 37 36 03 2C"),
+        (HOST, ACK),
+        (NODE, "02 30 31 31 38 2B 30 30 30 30 03 20"),
+    ],
+    [
+        *exchange(msc.DataRead(2008), 1, MSC, ACK, "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"),
+        (HOST, ACK),
+    ],
+    exchange(msc.DataWrite(2008, 1234), 1, MSC, ACK),
+    [*exchange(msc.SetFlag(5), 2, MSC, NAK), *exchange(msc.SetFlag(5), 2, MSC, ACK)],
+    exchange(msc.ClearFlag(5), 2, MSC),
+    [*exchange(msc.ReadFlag(255), 15, MSC, ACK, "02 0F 00 08 00 00 52 46 4C 41 47 2C 00 01 01 B0"), (HOST, ACK)],
+    [*exchange(msc.ReadFlags(), 3, MSC, ACK, FLAGS_REPLY), (HOST, ACK)],
+    [
+        *exchange(
+            msc.ReadStatus(), 1, MSC, ACK, "02 01 00 0F 00 00 52 51 53 54 41 54 2C 00 41 00 00 00 00 00 00 02 5C"
+        ),
+        (HOST, ACK),
+    ],
+    [  # the first packet is hit, the host says NAK, the second is good
+        *exchange(msc.DataRead(2008), 1, MSC, ACK, "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D3 02 6D"),
+        (HOST, NAK),
+        (NODE, "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"),
+        (HOST, ACK),
+    ],
+    exchange(msc.BlockWrite(2008, tuple(range(32))), 1, MSC, ACK),
+    exchange(msc.BlockRead(2008), 1, MSC, ACK),
+]
+
+
+@pytest.mark.parametrize("turns", GOOD, ids=range(len(GOOD)))
+def test_what_todays_readers_make_of_a_recorded_exchange_is_what_was_recorded(
+    turns: list[tuple[Direction, str]],
+) -> None:
+    (one,) = replay(recorded(*turns))
+    assert one.judged
+    assert not one.changed, f"was {one.recorded}, is {one.now}"
+
+
+def test_a_whole_capture_is_cut_into_its_exchanges() -> None:
+    everything = list(replay(recorded(*(turn for turns in GOOD for turn in turns))))
+    assert len(everything) == len(GOOD)
+    assert not any(one.changed for one in everything)
+    assert {one.recorded.outcome for one in everything} == set(Outcome) - {Outcome.NONE, Outcome.STRAY}
+
+
+READ = exchange(hcp2.Read(105), 255, HCP2, "02 36 39 34 30 39 36 03 07")
+
+
+def only(packets: list[Packet]) -> Replayed:
+    (one,) = replay(packets)
+    return one
+
+
+def test_an_outcome_that_differs_is_a_change() -> None:
+    packets = recorded(*READ)
+    packets[1].outcome, packets[1].comment = Outcome.GARBLED, "read element 105: bad checksum"
+    one = only(packets)
+    assert one.changed
+    assert (one.packet, one.node, one.command) == (1, 255, "read element 105")
+    assert str(one.recorded) == "garbled: read element 105: bad checksum"
+    assert str(one.now) == "ok: 4096.0"
+
+
+def test_a_value_that_differs_is_a_change() -> None:
+    packets = recorded(*READ)
+    packets[1].comment = "read element 105: 4097.0 (late)"
+    one = only(packets)
+    assert one.changed
+    assert str(one.recorded) == "ok: 4097.0"
+    packets[1].comment = "read element 105: 4096.0 (late)"
+    assert not only(packets).changed
+
+
+def test_without_a_recorded_value_the_replys_own_numbers_are_compared() -> None:
+    packets = recorded(*READ)
+    packets[1].comment = "read 2 of the 32 values: (1, 2)"
+    assert not only(packets).changed
+    assert str(only(packets).recorded) == "ok: 4096"
+
+
+def test_a_request_that_would_be_written_otherwise_is_a_change() -> None:
+    one = only(recorded((HOST, "07 30 31 02 30 31 2B 35 03 1F"), (NODE, ACK)))
+    assert one.changed
+    assert str(one.now) == "the request would be 07 30 31 02 30 31 35 03 34"
+
+
+def test_a_request_that_no_command_sends_is_a_change_if_it_was_answered() -> None:
+    one = only(recorded((HOST, "07 30 30 02 30 30 05 07"), (NODE, NAK)))
+    assert "1 to 255" in str(one.now)
+    assert one.changed
+
+
+def test_strays_and_what_comes_before_the_first_request_are_left_out() -> None:
+    packets = recorded((NODE, "15"), *READ, (NODE, "02 36 39 34 30 39 36 03 07"))
+    assert [packet.outcome for packet in packets] == [Outcome.STRAY, Outcome.NONE, Outcome.OK, Outcome.STRAY]
+    assert not only(packets).changed
+
+
+def test_the_masters_own_verdict_is_what_counts() -> None:
+    packets: list[Packet] = []
+    assembler = Assembler(packets.append)
+    command = hcp2.Read(105)
+    request = command.open(255, HCP2).request
+    assembler.passed(1.0, request, HOST)
+    assembler.passed(1.01, bytes.fromhex(READ[1][1]), NODE)
+    assembler.completed(1.011, Verdict(request, Outcome.NO_REPLY, "read element 105: node 255: no reply"))
+    assert str(only(packets).now) == "ok: 4096.0"
+    assert only(packets).changed

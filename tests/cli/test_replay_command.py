@@ -1,0 +1,44 @@
+"""`busmaster replay`: what it prints, and how it ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from busmaster.capture.pcapng import Direction, Outcome, Packet, PcapngWriter
+from busmaster.cli import main
+
+REQUEST = bytes.fromhex("07 46 46 02 36 39 05 08")
+REPLY = bytes.fromhex("02 36 39 34 30 39 36 03 07")
+
+
+def capture(folder: Path, *outcomes: Outcome) -> str:
+    path = folder / "line.pcapng"
+    with path.open("wb") as file:
+        writer = PcapngWriter(file)
+        for outcome in outcomes:
+            writer.write(Packet(0, "hcp2", Direction.HOST, REQUEST, 255))
+            writer.write(Packet(0, "hcp2", Direction.NODE, REPLY, 255, outcome))
+    return str(path)
+
+
+def test_nothing_has_changed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", capture(tmp_path, Outcome.OK, Outcome.OK, Outcome.NONE)]) == 0
+    assert capsys.readouterr().out == "3 exchanges: 2 the same, 0 changed, 1 without a recorded outcome\n"
+
+
+def test_what_has_changed_is_a_line_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", capture(tmp_path, Outcome.OK, Outcome.REFUSED)]) == 1
+    first, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("packet 3, ")
+    assert first.endswith("node 255: read element 105: was refused, is ok: 4096.0")
+    assert last == "2 exchanges: 1 the same, 1 changed"
+
+
+def test_a_file_that_is_no_capture_is_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "notes.txt"
+    other.write_text("not a capture at all")
+    assert main(["replay", str(other)]) == 2
+    assert "not a pcapng file" in capsys.readouterr().err
+    assert main(["replay", str(tmp_path / "nowhere")]) == 2
