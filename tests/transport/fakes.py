@@ -86,6 +86,14 @@ class FarEnd:
             return b""
         return os.read(self.fd, 65536)
 
+    def rest(self) -> bytes:
+        """All that still comes, when the port has been closed."""
+        found = b""
+        with contextlib.suppress(OSError):  # EIO: nobody has it open any more
+            while data := self.read():
+                found += data
+        return found
+
     def write(self, data: bytes) -> None:
         os.write(self.fd, data)
 
