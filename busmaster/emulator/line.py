@@ -81,6 +81,7 @@ class Line:
     ) -> None:
         self.settings = settings
         self.tau = settings.byte_time if paced else 0.0
+        self._rounding = self.tau * ROUNDING
         self.chance: Chance = NoChance() if chance is None else chance
         self.faults = Faults() if faults is None else faults
         self.echo = echo
@@ -183,8 +184,8 @@ class Line:
                 chunk = 1
             if chunk and talk.wave is None and self._heard_at_once(talk):
                 end = min(end, talk.start + (talk.given + chunk) * self.tau)
-            if self._pending and self._pending[0][0] < end:
-                end = self._pending[0][0]
+            if self._pending and self._pending[0][0] < talk.end - self._rounding:
+                end = min(end, self._pending[0][0])
             if end < when:
                 when = end
         if self._arrivals and self._arrivals[0][0] < when:
@@ -233,7 +234,7 @@ class Line:
             talk = self._active
             due = NEVER if talk is None else talk.end
             pending = self._pending
-            overlap = bool(pending) and pending[0][0] < due
+            overlap = bool(pending) and pending[0][0] < due - self._rounding
             if overlap:
                 due = pending[0][0]
             if audience.wakeup < due:

@@ -1,0 +1,186 @@
+"""Arbiter, line and devices in virtual time, without an event loop: a day of a line in minutes, the same on every run.
+
+A world is what the pump and the port are in earnest: it hands bytes, time and events between an arbiter and a line.
+Nothing in it waits, reads a clock or draws a random number of its own.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from itertools import count
+from math import inf
+from typing import Any
+
+from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.events import Completed, Event, LineChanged, NodeChanged
+from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.emulator.line import Line
+from busmaster.exchange import Command, Timings
+from busmaster.profile import Profile
+
+FOREVER_STEPS = 100_000
+"""Steps in one moment of time after which a world is thought to turn in circles."""
+
+
+class StuckWorldError(RuntimeError):
+    """Time does not advance any more: the arbiter or the line asks to be called again and again at one moment."""
+
+
+class World:
+    """One arbiter on one emulated line. `now` is its time, in seconds.
+
+    `on_event` is called with each event of the arbiter; it may submit, cancel and so on. `record`, if given, is called
+    with every step as a line of text: the same seeds give the same transcript.
+    The port opens at once; `unplug` and `plug` take it away and give it back.
+    """
+
+    def __init__(
+        self,
+        line: Line,
+        *,
+        on_event: Callable[[Event], None] | None = None,
+        record: Callable[[str], None] | None = None,
+        capacity: int = 1000,
+        now: float = 0.0,
+        jitter: Callable[[], float] = lambda: 0.5,
+    ) -> None:
+        self.line = line
+        line.prompt = False
+        self.now = now
+        self.plugged = False
+        self.arbiter = Arbiter(
+            line.settings.byte_time,
+            now=now,
+            echo=line.echo is not None,
+            receive_latency=line.latency,
+            capacity=capacity,
+            jitter=jitter,
+        )
+        self._on_event = on_event
+        self._record = record
+        self._actions: list[tuple[float, int, Callable[[], object]]] = []
+        self._order = count()
+        self.plug()
+
+    # What is done to it
+
+    def node(
+        self, profile: Profile, address: int, *, timings: Timings | None = None, retries: int | None = None
+    ) -> NodeRecord:
+        """Makes the arbiter know a node. Once each."""
+        return self.arbiter.add_node(profile, address, self.now, timings, retries)
+
+    def request(
+        self, node: NodeRecord, command: Command[Any], priority: Priority = Priority.COMMAND, **options: Any
+    ) -> Transaction:
+        """Submits it now; `options` are those of Transaction. Its end comes as a Completed event, perhaps at once."""
+        transaction = Transaction(node, command, priority=priority, **options)
+        self.arbiter.submit(transaction, self.now)
+        return transaction
+
+    def at(self, when: float, action: Callable[[], object]) -> None:
+        """`action` is called at that time, after what the line and the arbiter have to do then."""
+        heapq.heappush(self._actions, (max(when, self.now), next(self._order), action))
+
+    def plug(self) -> None:
+        """The port is there (again)."""
+        if not self.plugged:
+            self.plugged = True
+            self.line.receive(self.now)
+            self.arbiter.line_up(self.now, paced=self.line.tau > 0)
+
+    def unplug(self, cause: str = "unplugged") -> None:
+        """The port is gone, and what the line has for the host is lost until it is back."""
+        if self.plugged:
+            self.plugged = False
+            self.arbiter.line_down(cause, self.now)
+
+    # How it goes on
+
+    def run(self, until: float) -> None:
+        """To that time."""
+        arbiter, line, actions = self.arbiter, self.line, self._actions
+        steps, moment = 0, -inf
+        self._pump()
+        while True:
+            heard_at = line.next_event()
+            due_at = arbiter.poll_timeout()
+            now = heard_at if heard_at < due_at else due_at
+            if actions and actions[0][0] < now:
+                now = actions[0][0]
+            if now > until:
+                break
+            if now > moment:
+                steps, moment = 0, now
+            else:
+                now = moment
+                steps += 1
+                if steps > FOREVER_STEPS:
+                    raise StuckWorldError(f"at {now:.6f} s: line {heard_at}, arbiter {due_at} in {arbiter.state.name}")
+            self.now = now
+            self._step(now, due_at)
+        self.now = until
+
+    def run_until(self, done: Callable[[], bool], limit: float) -> bool:
+        """Until `done()` holds, at most `limit` seconds on. Returns whether it came to hold."""
+        end = self.now + limit
+        while not done():
+            self._pump()
+            following = min(self.line.next_event(), self.arbiter.poll_timeout())
+            if self._actions:
+                following = min(following, self._actions[0][0])
+            if following > end:
+                self.run(end)
+                return done()
+            self.run(max(following, self.now))
+        return True
+
+    def _step(self, now: float, due_at: float) -> None:
+        data = self.line.receive(now)
+        if data and self.plugged:
+            if self._record is not None:
+                self._record(f"{now:.6f} < {data.hex(' ')}")
+            self.arbiter.data_received(data, now)
+            self._pump()
+        if due_at <= now:
+            self.arbiter.handle_timeout(now)
+            self._pump()
+        actions = self._actions
+        while actions and actions[0][0] <= now:
+            heapq.heappop(actions)[2]()
+            self._pump()
+
+    def _pump(self) -> None:
+        """What the arbiter says goes on the line, and its events to whom they concern."""
+        arbiter = self.arbiter
+        while True:
+            data = arbiter.poll_transmit()
+            if data is not None:
+                if self._record is not None:
+                    self._record(f"{self.now:.6f} > {data.hex(' ')}")
+                if self.plugged:
+                    self.line.send(data, self.now)
+            event = arbiter.poll_event()
+            if event is None:
+                if data is None:
+                    return
+                continue
+            if self._record is not None:
+                self._record(f"{self.now:.6f} {told(event)}")
+            if self._on_event is not None:
+                self._on_event(event)
+
+
+def told(event: Event) -> str:
+    """An event in a line of text, the same on every run."""
+    match event:
+        case Completed(transaction):
+            outcome = transaction.value if transaction.error is None else repr(transaction.error)
+            return f"{transaction.node.label}: {transaction.command} -> {outcome}"
+        case LineChanged(change, cause):
+            return f"line {change.value} {cause}".rstrip()
+        case NodeChanged(node, before, after):
+            return f"{node.label}: {before.value} -> {after.value}"
+    return type(event).__name__

@@ -1,0 +1,75 @@
+"""pytest fixtures for those who test an application of theirs. In a conftest.py:
+
+pytest_plugins = ["busmaster.testing.fixtures"]
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Coroutine, Iterable
+from typing import Any, Protocol
+
+import pytest
+
+from busmaster.emulator.build import make_device
+from busmaster.emulator.device import Delay
+from busmaster.emulator.faults import Faults
+from busmaster.emulator.line import Line
+from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from busmaster.testing.virtual_time import run_in_virtual_time
+
+PROFILES = {
+    "hcp": hcp.PROFILE,
+    "hcp2": hcp2.PROFILE,
+    "microflex": hcp2.PROFILE,
+    "msc": msc.PROFILE,
+    "mentor": mentor.PROFILE,
+    "dc104": dc104.PROFILE,
+}
+
+
+class LineFactory(Protocol):
+    """Makes an emulated line of devices of one protocol; a MemoryPort or `serve_pty` puts it into use.
+
+    `delay` is the devices' reply delay and `faults` what is wrong with each of them ("lost=0.1"). What is random on
+    the line comes from `seed`.
+    """
+
+    def __call__(
+        self,
+        protocol: str,
+        nodes: Iterable[int] = (1,),
+        *,
+        delay: Delay | None = None,
+        faults: Iterable[str] = (),
+        seed: int = 0,
+        **options: Any,
+    ) -> Line: ...
+
+
+@pytest.fixture
+def virtual_time() -> Callable[[Coroutine[Any, Any, Any]], Any]:
+    """Runs a coroutine to its end in virtual time and returns its result: `virtual_time(main())`."""
+    return run_in_virtual_time
+
+
+@pytest.fixture
+def emulated_line() -> LineFactory:
+    """Makes emulated lines: `emulated_line("hcp2", range(1, 9))`. Further options are those of `Line`."""
+
+    def make(
+        protocol: str,
+        nodes: Iterable[int] = (1,),
+        *,
+        delay: Delay | None = None,
+        faults: Iterable[str] = (),
+        seed: int = 0,
+        **options: Any,
+    ) -> Line:
+        devices = [make_device(protocol, node, delay=delay) for node in nodes]
+        settings = tuple(faults)
+        for device in devices:
+            device.faults = Faults.parse(settings)
+        return Line(PROFILES[protocol].line, devices, chance=random.Random(seed), **options)
+
+    return make

@@ -1,0 +1,185 @@
+"""A world: arbiter, line and devices in virtual time."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+
+from busmaster.arbiter.events import Completed, Event, LineChange, LineChanged, Polled
+from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.emulator.device import Delay
+from busmaster.emulator.devices.mint import MintController
+from busmaster.emulator.faults import Faults
+from busmaster.emulator.line import Echo, Line
+from busmaster.emulator.oracle import Oracle, oracle_value
+from busmaster.emulator.world import StuckWorldError, World
+from busmaster.errors import LineDown, NoReply
+from busmaster.protocols import hcp2
+from tests.emulator.lines import SETTINGS, TAU
+
+SETTLED = 0.2
+
+
+def world_of(*devices: MintController, seed: int = 1, **options: object) -> World:
+    line = Line(SETTINGS, devices, chance=Random(seed), **options)  # type: ignore[arg-type]  # options of Line
+    world = World(line)
+    world.run(SETTLED)
+    return world
+
+
+def test_a_read_takes_as_long_as_its_bytes_and_the_devices_delay() -> None:
+    mint = MintController(2, delay=Delay(0.002))
+    mint.comms[1] = 123.456
+    world = world_of(mint)
+    read = world.request(world.node(hcp2.PROFILE, 2), hcp2.Read(1))
+    world.run(1.0)
+    assert read.value == 123.456
+    assert read.ended_at - SETTLED == pytest.approx(8 * TAU + 0.002 + 12 * TAU)
+
+
+def test_a_node_that_is_not_there_fails_after_its_attempts() -> None:
+    world = world_of()
+    read = world.request(world.node(hcp2.PROFILE, 2), hcp2.Read(1))
+    assert world.run_until(lambda: read.ended_at > 0, 5.0)
+    assert isinstance(read.error, NoReply)
+    assert read.attempts == 3
+    assert world.now < SETTLED + 3 * 0.16
+
+
+def test_run_until_gives_up_at_its_limit() -> None:
+    world = world_of()
+    assert not world.run_until(lambda: False, 2.0)
+    assert world.now == pytest.approx(SETTLED + 2.0)
+
+
+def test_an_action_happens_at_its_time_and_events_reach_their_listener() -> None:
+    events: list[tuple[float, Event]] = []
+    line = Line(SETTINGS, [MintController(2)])
+    world = World(line, on_event=lambda event: events.append((world.now, event)))
+    node = world.node(hcp2.PROFILE, 2)
+    world.at(0.5, lambda: world.request(node, hcp2.Write(1, (5.0,))))
+    world.run(1.0)
+    [(when, event)] = [entry for entry in events if isinstance(entry[1], Completed)]
+    assert isinstance(event, Completed)
+    assert event.transaction.error is None
+    assert when == pytest.approx(0.5 + 11 * TAU + 0.002, abs=2 * TAU)
+
+
+def test_a_listener_may_submit_the_next_request() -> None:
+    done: list[Transaction] = []
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, Completed):
+            done.append(event.transaction)
+            if len(done) < 100:
+                world.request(node, hcp2.Read(len(done)))
+
+    world = World(Line(SETTINGS, [MintController(2)]), on_event=on_event)
+    world.run(SETTLED)
+    node = world.node(hcp2.PROFILE, 2)
+    world.request(node, hcp2.Read(100))
+    world.run(2.0)
+    assert len(done) == 100
+    assert world.line.collisions == 0
+
+
+def test_unplugging_fails_what_waits_and_plugging_in_lets_it_go_on() -> None:
+    changes: list[LineChange] = []
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, LineChanged):
+            changes.append(event.change)
+
+    world = World(Line(SETTINGS, [MintController(2, delay=Delay(0.02))]), on_event=on_event)
+    node = world.node(hcp2.PROFILE, 2)
+    world.run(SETTLED)
+    first = world.request(node, hcp2.Read(1))
+    world.at(SETTLED + 0.01, world.unplug)
+    world.run(SETTLED + 0.02)
+    assert isinstance(first.error, LineDown)
+    world.plug()
+    world.run(1.0)
+    assert world.request(node, hcp2.Read(1)).phase.value == "on wire"
+    world.run(2.0)
+    assert changes == [LineChange.UP, LineChange.DOWN, LineChange.UP]
+
+
+def transcript(seed: int) -> list[str]:
+    mint = MintController(2, delay=Delay(0.001, 0.01), oracle=Oracle(2))
+    mint.faults = Faults.parse(["lost=0.1", "flip=0.1", "late=0.2", "trailing=0.1", "split=0.3", "babble=0.05"])
+    lines: list[str] = []
+    world = World(Line(SETTINGS, [mint, MintController(3)], chance=Random(seed)), record=lines.append)
+    for address in (2, 3):
+        poll = Poll(f"node {address}", 0.05)
+        node = world.node(hcp2.PROFILE, address)
+        poll.results = [
+            Transaction(node, hcp2.Read(element), priority=Priority.POLL, poll=poll) for element in (1, 100, 255)
+        ]
+        world.arbiter.add_poll(poll, 0.0)
+        world.at(1.0, lambda node=node: world.request(node, hcp2.Write(1, (5.0,))))  # type: ignore[misc]  # bound now
+    world.run(5.0)
+    return lines
+
+
+def test_the_same_seed_gives_the_same_transcript_and_another_another() -> None:
+    first = transcript(1)
+    assert len(first) > 200
+    assert transcript(1) == first
+    assert transcript(2) != first
+
+
+def element_of(read: Transaction) -> int:
+    assert isinstance(read.command, hcp2.Read)
+    return read.command.element
+
+
+def test_faults_inside_the_assumption_give_no_wrong_value_and_progress_goes_on() -> None:
+    wrong: list[str] = []
+    good = 0
+
+    def on_event(event: Event) -> None:
+        nonlocal good
+        if isinstance(event, Polled):
+            for read in event.poll.results:
+                if read.error is None:
+                    good += 1
+                    if read.value != oracle_value(read.node.address, element_of(read), 0):
+                        wrong.append(f"{world.now}: {read.node.label}, {read.command} = {read.value}")
+
+    devices = [MintController(address, oracle=Oracle(address)) for address in range(1, 5)]
+    faults = ["lost=.05", "late=.05", "late_by=.14", "flip=.05", "truncated=.05", "doubled=.05", "wrong=.05"]
+    faults += ["leading=.05", "trailing=.05", "babble=.02", "split=.05", "nak=.05"]
+    for device in devices:
+        device.faults = Faults.parse(faults)
+    world = World(Line(SETTINGS, devices, chance=Random(3)), on_event=on_event)
+    for device in devices:
+        poll = Poll(repr(device), 0.1)
+        node = world.node(hcp2.PROFILE, device.address)
+        poll.results = [Transaction(node, hcp2.Read(n), priority=Priority.POLL, poll=poll) for n in (1, 2, 100, 200)]
+        world.arbiter.add_poll(poll, 0.0)
+    world.run(60.0)
+    assert wrong == []
+    for device in devices:
+        device.faults = Faults()
+    world.run(120.0)
+    before = good
+    world.run(130.0)
+    assert good - before >= 4 * 4 * 99
+
+
+def test_an_echo_is_stripped() -> None:
+    world = World(Line(SETTINGS, [MintController(2)], echo=Echo()))
+    world.run(SETTLED)
+    read = world.request(world.node(hcp2.PROFILE, 2), hcp2.Read(1))
+    world.run(1.0)
+    assert read.value == 0
+    assert read.attempts == 1
+
+
+def test_a_world_that_turns_in_circles_says_so() -> None:
+    world = world_of()
+    world.arbiter.poll_timeout = lambda: 0.5  # type: ignore[method-assign]  # a bug, planted
+    with pytest.raises(StuckWorldError, match=r"arbiter 0\.5"):
+        world.run(1.0)
