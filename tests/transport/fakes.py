@@ -9,7 +9,9 @@ import select
 import selectors
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
+
+from busmaster.transport.serial_port import PortTransport, SerialPort
 
 T = TypeVar("T")
 PATIENCE = 2.0
@@ -115,6 +117,19 @@ def plugged(link: Path | None = None) -> Iterator[FarEnd]:
         far_end.unplug()
         if link is not None:
             link.unlink()
+
+
+async def opened(path: str, **options: Any) -> tuple[PortTransport, Recorder]:
+    """The serial port at `path`, open, and what hears it."""
+    recorder = Recorder()
+    transport = await SerialPort(path, baudrate=57600, **options).open(lambda: recorder)
+    return transport, recorder
+
+
+async def closed(transport: PortTransport, recorder: Recorder) -> None:
+    """Close it, and wait until it is."""
+    transport.close()
+    await recorder.lost()
 
 
 def in_virtual_time(work: Coroutine[None, None, T]) -> T:

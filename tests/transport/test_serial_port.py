@@ -1,15 +1,8 @@
-"""SerialPort on real ptys: every trap of pyserial-asyncio that it mends."""
+"""SerialPort on real ptys: writing, losing and closing, and every trap of pyserial-asyncio there."""
 
 from __future__ import annotations
 
-import array
 import asyncio
-import errno
-import fcntl
-import os
-import resource
-import subprocess
-import sys
 import termios
 import threading
 from collections.abc import Iterator
@@ -17,33 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import serial
-from serial.rs485 import RS485Settings
 
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.transport import serial_port
 from busmaster.transport.endpoints import is_paced
-from busmaster.transport.serial_port import PortTransport, SerialPort
-from tests.transport.fakes import FarEnd, Recorder, plugged
-
-TIOCGEXCL = 0x80045440
+from busmaster.transport.serial_port import SerialPort
+from tests.transport.fakes import FarEnd, closed, opened, plugged
 
 
 @pytest.fixture
 def far_end() -> Iterator[FarEnd]:
     with plugged() as end:
         yield end
-
-
-async def opened(path: str, **options: Any) -> tuple[PortTransport, Recorder]:
-    recorder = Recorder()
-    transport = await SerialPort(path, baudrate=57600, **options).open(lambda: recorder)
-    return transport, recorder
-
-
-async def closed(transport: PortTransport, recorder: Recorder) -> None:
-    transport.close()
-    await recorder.lost()
 
 
 # -- what it is ------------------------------------------------------------------------------------------------------
@@ -266,257 +244,3 @@ async def test_an_abort_does_not_wait_for_the_driver(far_end: FarEnd, monkeypatc
     await asyncio.sleep(0)
     assert recorder.losses == [None]
     letting_go.set()
-
-
-# -- opening ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def slow_driver(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
-    """Opening any port waits for this event."""
-    ready = threading.Event()
-    really_open = serial.Serial.open
-
-    def open_slowly(device: serial.Serial) -> None:
-        ready.wait()
-        really_open(device)
-
-    monkeypatch.setattr(serial.Serial, "open", open_slowly)
-    yield ready
-    ready.set()
-
-
-@pytest.mark.asyncio
-async def test_a_slow_opening_leaves_the_loop_free(far_end: FarEnd, slow_driver: threading.Event) -> None:
-    opening = asyncio.ensure_future(opened(far_end.path))
-    await asyncio.sleep(0.02)
-    assert not opening.done()
-    slow_driver.set()
-    await closed(*await opening)
-
-
-@pytest.mark.asyncio
-async def test_an_opening_that_does_not_come_back_is_given_up_and_its_port_released(
-    far_end: FarEnd, slow_driver: threading.Event, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(serial_port, "OPEN_DEADLINE", 0.02)
-    with pytest.raises(LineDown, match="did not open within"):
-        await opened(far_end.path)
-    await _is_released_in_the_end(far_end.path, slow_driver)
-
-
-@pytest.mark.asyncio
-async def test_a_cancelled_opening_releases_its_port(far_end: FarEnd, slow_driver: threading.Event) -> None:
-    opening = asyncio.ensure_future(opened(far_end.path))
-    await asyncio.sleep(0)
-    opening.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await opening
-    await _is_released_in_the_end(far_end.path, slow_driver)
-
-
-@pytest.mark.asyncio
-async def test_an_opening_cancelled_when_it_was_all_but_done_is_closed_again(far_end: FarEnd) -> None:
-    class Cancels(Recorder):
-        def connection_made(self, transport: asyncio.BaseTransport) -> None:
-            super().connection_made(transport)
-            opening.cancel()
-
-    recorder = Cancels()
-    opening = asyncio.ensure_future(SerialPort(far_end.path, baudrate=57600).open(lambda: recorder))
-    with pytest.raises(asyncio.CancelledError):
-        await opening
-    await recorder.lost()
-    assert recorder.losses == [None]
-
-
-async def _is_released_in_the_end(path: str, slow_driver: threading.Event) -> None:
-    released, really_release = threading.Event(), serial_port._release
-
-    def release(device: serial.Serial, exclusive: bool) -> None:
-        really_release(device, exclusive)
-        released.set()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(serial_port, "_release", release)
-        slow_driver.set()
-        assert await asyncio.to_thread(released.wait, 2)
-    await closed(*await opened(path))
-
-
-@pytest.mark.asyncio
-async def test_the_port_is_configured_in_a_thread_alone(far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
-    threads = set()
-    really_ask = termios.tcgetattr
-
-    def ask(descriptor: int) -> list[Any]:
-        threads.add(threading.current_thread())
-        return really_ask(descriptor)
-
-    monkeypatch.setattr(termios, "tcgetattr", ask)  # each configuration begins with it
-    transport, recorder = await opened(far_end.path)
-    assert len(threads) == 1
-    assert threading.main_thread() not in threads
-    await closed(transport, recorder)
-
-
-@pytest.mark.asyncio
-async def test_descriptors_above_1023_work() -> None:
-    limit = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if limit[1] != resource.RLIM_INFINITY and limit[1] < 1200:
-        pytest.skip("the system allows this process no such descriptors")
-    resource.setrlimit(resource.RLIMIT_NOFILE, (max(limit[0], 1200), limit[1]))
-    taken: list[int] = []
-    try:
-        while not taken or taken[-1] < 1030:
-            taken.append(os.open(os.devnull, os.O_RDONLY))
-        with plugged() as far_end:
-            transport, recorder = await opened(far_end.path)
-            assert transport.get_extra_info("serial").fileno() > 1023
-            transport.write(b"ping")
-            assert far_end.read() == b"ping"
-            far_end.write(b"pong")
-            await recorder.heard(b"pong")
-            await closed(transport, recorder)
-    finally:
-        for descriptor in taken:
-            os.close(descriptor)
-        resource.setrlimit(resource.RLIMIT_NOFILE, limit)
-
-
-# -- sole use --------------------------------------------------------------------------------------------------------
-
-
-def _taken(bystander: int) -> tuple[bool, bool]:
-    """Whether the port is flocked, and whether TIOCEXCL is set, as seen from a descriptor opened before."""
-    flag = array.array("i", [0])
-    fcntl.ioctl(bystander, TIOCGEXCL, flag)
-    try:
-        fcntl.flock(bystander, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True, bool(flag[0])
-    fcntl.flock(bystander, fcntl.LOCK_UN)
-    return False, bool(flag[0])
-
-
-@pytest.mark.asyncio
-async def test_both_locks_are_taken_and_given_back(far_end: FarEnd) -> None:
-    bystander = os.open(far_end.path, os.O_RDWR | os.O_NOCTTY)  # keeps the pty, and with it a forgotten flag, alive
-    transport, recorder = await opened(far_end.path)
-    inherited = os.dup(transport.get_extra_info("serial").fileno())  # as by a process forked meanwhile
-    assert _taken(bystander) == (True, True)
-    await closed(transport, recorder)
-    assert _taken(bystander) == (False, False)
-    os.close(inherited)
-    transport, recorder = await opened(far_end.path, exclusive=False)
-    assert _taken(bystander) == (False, False)
-    await closed(transport, recorder)
-    os.close(bystander)
-
-
-@pytest.mark.asyncio
-async def test_a_second_opening_says_that_this_program_has_it(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
-    with pytest.raises(LineDown, match=f"{far_end.path} is in use by this program; "):
-        await opened(far_end.path)
-    await closed(transport, recorder)
-    await closed(*await opened(far_end.path))
-
-
-@pytest.fixture
-def locked_elsewhere(far_end: FarEnd) -> Iterator[int]:
-    """The id of another process that has locked the port."""
-    lock = f"import fcntl; f = open({far_end.path!r}); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
-    with subprocess.Popen([sys.executable, "-ISc", lock], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
-        assert other.stdin is not None
-        assert other.stdout is not None
-        other.stdout.readline()
-        yield other.pid
-        other.communicate(b"\n")
-
-
-@pytest.mark.asyncio
-async def test_a_second_opening_says_which_other_program_has_it(far_end: FarEnd, locked_elsewhere: int) -> None:
-    with pytest.raises(LineDown, match=rf"is in use by python\S* \(process {locked_elsewhere}\)"):
-        await opened(far_end.path)
-
-
-# -- what only some drivers have -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("option", "says"), [("rs485", "no RS-485 mode; leave rs485 out"), ("low_latency", "no low-latency flag; leave")]
-)
-@pytest.mark.asyncio
-async def test_a_driver_without_it_is_named_and_the_port_released(far_end: FarEnd, option: str, says: str) -> None:
-    with pytest.raises(LineDown, match=f"the driver of {far_end.path} has {says}"):
-        await opened(far_end.path, **{option: True})
-    await closed(*await opened(far_end.path))
-
-
-@pytest.mark.asyncio
-async def test_driver_extras_are_touched_only_when_asked_for(far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-    monkeypatch.setattr(serial.Serial, "_set_rs485_mode", lambda _, settings: asked.append(settings))
-    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda _, flag: asked.append(flag))
-    await closed(*await opened(far_end.path))
-    assert asked == []
-    settings = RS485Settings(rts_level_for_tx=False, rts_level_for_rx=True)
-    recorder = Recorder()
-    port = SerialPort(far_end.path, baudrate=57600, rs485=settings, low_latency=False)
-    await closed(await port.open(lambda: recorder), recorder)
-    assert asked == [settings, False]
-    asked.clear()
-    await closed(*await opened(far_end.path, rs485=True, low_latency=True))
-    assert asked[0].rts_level_for_tx is True
-    assert asked[1] is True
-
-
-# -- refusals --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.asyncio
-async def test_a_missing_port_is_said_to_be_missing(tmp_path: Path) -> None:
-    with pytest.raises(LineDown, match=r"/no-port does not exist; plug it in"):
-        await opened(str(tmp_path / "no-port"))
-
-
-@pytest.mark.asyncio
-async def test_a_dangling_link_says_where_it_points(tmp_path: Path) -> None:
-    link = tmp_path / "port"
-    link.symlink_to("/dev/pts/99999")
-    with pytest.raises(LineDown, match=r"/port does not exist: it points to /dev/pts/99999, which is gone"):
-        await opened(str(link))
-
-
-@pytest.mark.asyncio
-async def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for path in (tmp_path / "file", tmp_path, Path(os.devnull)):
-        with pytest.raises(LineDown, match="is no serial port; see"):
-            await opened(str(path))
-
-
-@pytest.mark.parametrize(
-    ("error", "says"),
-    [
-        (serial.SerialException(errno.EACCES, "denied"), r"no permission to open .*; join its group"),
-        (serial.SerialException(errno.EBUSY, "busy"), "is in use by another program"),
-        (serial.SerialException(errno.ENXIO, "nothing"), "there is no hardware behind"),
-        (termios.error(errno.EIO, "Input/output error"), "there is no hardware behind"),
-        (ValueError("Failed to set custom baud rate"), "does not take 57600 baud, 8N1"),
-        (OSError(errno.EMFILE, "too many"), "Too many open files"),
-    ],
-)
-@pytest.mark.asyncio
-async def test_every_refusal_is_one_sentence_about_the_port(
-    far_end: FarEnd, monkeypatch: pytest.MonkeyPatch, error: Exception, says: str
-) -> None:
-    def refuse(_: serial.Serial) -> None:
-        raise error
-
-    monkeypatch.setattr(serial.Serial, "open", refuse)
-    with pytest.raises(LineDown, match=says) as caught:
-        await opened(far_end.path)
-    assert far_end.path in str(caught.value)
-    assert caught.value.__cause__ is None
