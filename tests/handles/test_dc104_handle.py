@@ -1,0 +1,88 @@
+"""Dc104Drive over a drive that keeps a table of parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from busmaster.errors import InvalidCommand, VerifyFailed
+from busmaster.exchange import Command
+from busmaster.handles.dc104 import Dc104Drive
+from busmaster.node import Priority
+from busmaster.protocols.dc104 import Read, Write
+from tests.handles.fake_bus import FakeBus
+
+
+class Parameters(FakeBus):
+    """No parameter is above 1000."""
+
+    def __init__(self) -> None:
+        super().__init__(self.obey)
+        self.parameters: dict[int, int] = {}
+
+    def obey(self, command: Command[Any]) -> int | None:
+        if isinstance(command, Write):
+            self.parameters[command.parameter] = min(command.value, 1000)
+            return None
+        assert isinstance(command, Read)
+        return self.parameters.get(command.parameter, 0)
+
+
+@pytest.fixture
+def line() -> Parameters:
+    return Parameters()
+
+
+@pytest.mark.asyncio
+async def test_a_written_parameter_is_read_back(line: Parameters) -> None:
+    drive = Dc104Drive(line.bus)
+    await drive.write(12, 500, verify=True)
+    assert await drive.read(12, priority=Priority.URGENT) == 500
+    assert line.asked == ["write parameter 12 = 500", "read parameter 12", "read parameter 12"]
+    assert repr(drive) == "<Dc104Drive the drive>"
+
+
+@pytest.mark.asyncio
+async def test_a_value_that_the_drive_limits_fails_its_verification(line: Parameters) -> None:
+    with pytest.raises(VerifyFailed, match="parameter 12 reads 1000 after 1500 was written"):
+        await Dc104Drive(line.bus).write(12, 1500, verify=True)
+
+
+@pytest.mark.asyncio
+async def test_a_parameter_is_a_point(line: Parameters) -> None:
+    point = Dc104Drive(line.bus).point("12")
+    await point.write(7)
+    assert await point.read() == 7
+    assert point == Dc104Drive(line.bus).parameter(12)
+    assert point.key == "0/12"
+
+
+@pytest.mark.asyncio
+async def test_what_the_drive_does_not_have_is_never_sent(line: Parameters) -> None:
+    drive = Dc104Drive(line.bus, maximum=120)
+    with pytest.raises(InvalidCommand):
+        await drive.read(121)
+    with pytest.raises(InvalidCommand):
+        await drive.write(0, 1)
+    with pytest.raises(InvalidCommand):
+        await drive.write(1, 65536)
+    for item in ("121", "0", "x", "-1", ""):
+        with pytest.raises(InvalidCommand):
+            drive.point(item)
+    assert line.asked == []
+
+
+@pytest.mark.asyncio
+async def test_parameter_0_is_there_for_those_who_allow_it(line: Parameters) -> None:
+    drive = Dc104Drive(line.bus, allow_zero=True)
+    await drive.write(0, 1)
+    assert await drive.read(0) == 1
+    await drive.point("0").write(1)
+
+
+def test_there_is_one_drive_a_line(line: Parameters) -> None:
+    with pytest.raises(InvalidCommand):
+        Dc104Drive(line.bus, 1)
+    with pytest.raises(InvalidCommand):
+        Dc104Drive(line.bus, maximum=256)
