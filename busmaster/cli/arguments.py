@@ -12,16 +12,18 @@ import click
 from busmaster.bus import Bus
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Timings
-from busmaster.handles import HANDLES, Handle
+from busmaster.handles import HANDLES, Handle, MscController
 from busmaster.profile import LineSettings, Profile
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
 F = TypeVar("F", bound=Callable[..., Any])
+S = TypeVar("S")
 T = TypeVar("T")
 
 HIGHEST_ADDRESS = 255
+HIGHEST_PORT = 65535
 
 
 def option_type(parse: Callable[[str], T]) -> Callable[[str], T]:
@@ -94,6 +96,40 @@ def parse_value(text: str) -> float:
         raise InvalidCommand(f"{text!r} is no number") from None
 
 
+def parse_host_port(text: str) -> tuple[str, int]:
+    """`HOST:PORT`. Raises InvalidCommand."""
+    host, colon, port = text.rpartition(":")
+    if not colon or not host or not is_decimal(port) or int(port) > HIGHEST_PORT:
+        raise InvalidCommand(f"a TCP address is written HOST:PORT, like 127.0.0.1:5020, not {text!r}")
+    return host.strip("[]"), int(port)
+
+
+def parsed(parse: Callable[[S], T], value: S) -> T:
+    """What `parse` makes of an argument; what it refuses is wrong usage. Raises UsageError."""
+    try:
+        return parse(value)
+    except InvalidCommand as error:
+        raise click.UsageError(str(error), click.get_current_context()) from None
+
+
+def is_run(item: str) -> bool:
+    """`2008:32`, `1.17:20`: values from there on."""
+    first, colon, count = item.partition(":")
+    return bool(colon) and first != "flag" and is_decimal(count)
+
+
+def run_names(handle: Handle, item: str, count: int) -> tuple[str, ...]:
+    """What each value of a run, or of several from `item` on, is called: 1.17, 1.18, ..."""
+    if isinstance(handle, MscController):
+        return handle.run_items(item)
+    first, colon, kind = item.partition(":")
+    suffix = f":{kind}" if colon and not is_decimal(kind) else ""
+    menu, dot, number = first.rpartition(".")
+    if not is_decimal(number):
+        raise InvalidCommand(f"several values begin at a number, not at {item!r}")
+    return tuple(f"{menu}{dot}{int(number) + i:0{len(number)}d}{suffix}" for i in range(count))
+
+
 def is_decimal(text: str) -> bool:
     return text.isascii() and text.isdigit()
 
@@ -142,6 +178,10 @@ class Connection:
             options["address_step"] = self.address_step
         return self.handle(bus, address, **options)
 
+    def node_number(self, address: int) -> int | None:
+        """For JSON: null where the protocol has no addresses."""
+        return address if self.profile.addressed else None
+
     def one_address(self, node: int | None) -> int:
         """Of `--node N`. Raises UsageError if it is missing, or given where there are no addresses."""
         return only_address(self.profile) if node is None else checked(self.profile, (node,))[0]
@@ -166,8 +206,17 @@ def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
     if not profile.addressed:
         raise click.UsageError(f"{profile.name} has no addresses: one drive a line, named without a node")
     for node in nodes:
-        profile.check_address(node)
+        parsed(profile.check_address, node)
     return tuple(nodes)
+
+
+def slaves_of(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
+    """The addresses to emulate: those of --nodes, else 1, or the one drive. Raises UsageError."""
+    if nodes is None:
+        return (1,) if profile.addressed else (profile.addresses.start,)
+    if profile.broadcast in nodes:
+        raise click.UsageError(f"{profile.name}: no node has address {profile.broadcast}, which means all of them")
+    return checked(profile, nodes)
 
 
 def span(profile: Profile) -> str:

@@ -8,8 +8,10 @@ from typing import Any
 import anyio
 import click
 
-from busmaster.cli.arguments import Connection, connected, json_option, node_option
-from busmaster.cli.output import emit_all, json_line, json_value, value_text
+from busmaster.cli.arguments import Connection, connected, is_run, json_option, node_option, run_names
+from busmaster.cli.output import emit, emit_all, json_line, json_value, value_text
+from busmaster.errors import Refused
+from busmaster.handles import Handle, MentorDrive, MscController
 from busmaster.points import Point
 
 
@@ -17,28 +19,47 @@ from busmaster.points import Point
 @connected
 @node_option
 @click.argument("items", nargs=-1, required=True, metavar="ITEM...")
+@click.option("--chain", is_flag=True, help="mentor: read a run in one exchange, where no other drive can mistake it.")
 @json_option
-def command(connection: Connection, node: int | None, items: tuple[str, ...], as_json: bool) -> None:
-    """Read each ITEM of one node on PORT and print `ITEM VALUE`, a line each."""
-    anyio.run(read, connection, connection.one_address(node), items, as_json)
+def command(connection: Connection, node: int | None, items: tuple[str, ...], chain: bool, as_json: bool) -> None:
+    """Read each ITEM of one node on PORT and print `ITEM VALUE`, a line each; for a run a line a value."""
+    if chain and connection.protocol != "mentor":
+        raise click.UsageError("--chain is mentor's alone")
+    anyio.run(read, connection, connection.one_address(node), items, chain, as_json)
 
 
-async def read(connection: Connection, address: int, items: tuple[str, ...], as_json: bool) -> None:
+async def read(connection: Connection, address: int, items: tuple[str, ...], chain: bool, as_json: bool) -> None:
     bus = connection.open_bus()
     handle = connection.open_handle(bus, address)
-    points = [handle.point(item) for item in items]
+    points = {item: handle.point(item) for item in items}
     async with bus:
-        for item, point in zip(items, points, strict=True):
-            value = await point.read()
-            emit_all([json_result(point, item, value)] if as_json else plain_result(handle, item, value))
+        for item in items:
+            value = await read_item(handle, points[item], chain)
+            if as_json:
+                emit(json_line(node=connection.node_number(address), item=item, value=json_value(value)))
+            else:
+                emit_all(plain_lines(handle, item, value))
 
 
-def json_result(point: Point[Any], item: str, value: Any) -> str:
-    node = point.node
-    return json_line(node=node.address if node.profile.addressed else None, item=item, value=json_value(value))
+async def read_item(handle: Handle, point: Point[Any], chain: bool) -> Any:
+    """What is best read otherwise than its point is, else the point."""
+    match handle:
+        case MentorDrive() if is_run(point.item) and not chain:
+            parameter, _, count = point.item.partition(":")
+            return await handle.read_run(parameter, int(count))
+        case MscController() if point.item == "flags":
+            try:
+                return await point.read()
+            except Refused:  # a model without RFLAGS: flag by flag
+                return await handle.flags()
+        case _:
+            return await point.read()
 
 
-def plain_result(handle: Any, item: str, value: Any) -> Iterator[str]:
+def plain_lines(handle: Handle, item: str, value: Any) -> Iterator[str]:
     """A line, or for a run a line a value."""
-    for name, one in zip(handle.run_items(item), value, strict=True) if isinstance(value, tuple) else [(item, value)]:
+    if not isinstance(value, tuple):
+        yield f"{item} {value_text(value)}"
+        return
+    for name, one in zip(run_names(handle, item, len(value)), value, strict=True):
         yield f"{name} {value_text(one)}"

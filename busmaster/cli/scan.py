@@ -36,7 +36,9 @@ async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool
                 answer = await ask(handle.node)
                 if answer is not None:
                     value, outcome = answer
-                    emit(found_json(handle.node, value, outcome) if as_json else f"{handle.node.address} {outcome}")
+                    number = connection.node_number(handle.node.address)
+                    found = json_line(node=number, value=json_value(value), answer=outcome)
+                    emit(found if as_json else f"{handle.node.address} {outcome}")
 
 
 async def ask(node: Node) -> tuple[object, str] | None:
@@ -51,7 +53,3 @@ async def ask(node: Node) -> tuple[object, str] | None:
     except GarbledReply as error:
         return None, f"{probe}: {error.what}"
     return value, f"{probe}: {value_text(value)}"
-
-
-def found_json(node: Node, value: object, outcome: str) -> str:
-    return json_line(node=node.address if node.profile.addressed else None, value=json_value(value), answer=outcome)

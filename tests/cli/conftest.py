@@ -1,0 +1,78 @@
+"""Commands run in this process, on lines served by threads of it; and, where it matters, as processes."""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from busmaster.cli import main
+from busmaster.emulator.build import make_device
+from busmaster.emulator.line import Line
+from busmaster.emulator.serve import TcpServer, serve_tcp
+from busmaster.handles import HANDLES
+
+ROOT = Path(__file__).parent.parent.parent
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "error", "PYTHONUNBUFFERED": ""}
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    status: int
+    out: str
+    err: str
+
+    @property
+    def lines(self) -> list[str]:
+        return self.out.splitlines()
+
+
+Command = Callable[..., Outcome]
+
+
+@pytest.fixture
+def busmaster(capfd: pytest.CaptureFixture[str]) -> Iterator[Command]:
+    """Run a command line in this process: what it printed, and its exit status."""
+    handlers, show = list(logging.getLogger().handlers), warnings.showwarning
+
+    def run(*arguments: str) -> Outcome:
+        status = main(arguments)
+        return Outcome(status, *capfd.readouterr())
+
+    yield run
+    logging.getLogger().handlers[:] = handlers
+    warnings.showwarning = show
+
+
+def serve(protocol: str, *addresses: int) -> TcpServer:
+    devices = [make_device(protocol, address) for address in addresses]
+    return serve_tcp(Line(HANDLES[protocol].profile.line, devices, chance=random.Random(1), paced=False))
+
+
+@pytest.fixture(scope="module")
+def controllers() -> Iterator[TcpServer]:
+    """Mint controllers 1 to 8."""
+    with serve("hcp2", *range(1, 9)) as server:
+        yield server
+
+
+def started(*arguments: str) -> subprocess.Popen[str]:
+    """A command as a process of its own, in a session of its own: Ctrl-C reaches it alone."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "busmaster", *arguments],
+        cwd=ROOT,
+        env=ENVIRONMENT,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )

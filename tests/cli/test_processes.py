@@ -1,0 +1,146 @@
+"""Commands as processes of their own: what they print when, how they end, and what a terminal shows."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fcntl import ioctl
+from pathlib import Path
+from struct import pack
+from termios import TIOCSWINSZ, tcgetattr
+
+import pytest
+
+from busmaster.emulator.serve import TcpServer
+from tests.cli.conftest import ENVIRONMENT, ROOT, started
+
+HCP2 = ("--protocol", "hcp2")
+PATIENCE = 20.0
+
+
+@contextmanager
+def emulated(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """`busmaster emulate` as a process, and where it says that it listens."""
+    with started("emulate", *HCP2, *options) as process:
+        assert process.stdout is not None
+        try:
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.kill()
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    process = started(*arguments)
+    out, err = process.communicate(timeout=PATIENCE)
+    return subprocess.CompletedProcess(arguments, process.returncode, out, err)
+
+
+def test_a_value_goes_there_and_back_over_an_emulated_pty_by_its_link(tmp_path: Path) -> None:
+    link = str(tmp_path / "line")
+    with emulated("--nodes", "1-8", "--pty", link, "--paced") as (process, path):
+        assert path == link
+        assert run("write", path, *HCP2, "--node", "5", "1=123.456").stdout == "1 ok\n"
+        assert run("read", path, *HCP2, "--node", "5", "1").stdout == "1 123.456\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+    assert not os.path.lexists(link)
+
+
+def test_emulate_ends_by_itself_after_its_seconds() -> None:
+    done = run("emulate", *HCP2, "--tcp", "127.0.0.1:0", "--seconds", "0.1")
+    assert done.returncode == 0
+    assert done.stdout.startswith("socket://127.0.0.1:")
+    assert done.stderr == ""
+
+
+def test_ctrl_c_ends_a_poll_with_its_summary_and_status_130(controllers: TcpServer) -> None:
+    options = ("--nodes", "1", "--items", "1", "--period", "0.02")
+    with started("poll", controllers.path, *HCP2, *options) as process:
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=PATIENCE)
+    assert first.split()[1:] == ["1/1", "0"]
+    assert process.returncode == 130
+    assert "cycles" in err
+    assert "Traceback" not in err
+
+
+def test_a_reader_that_goes_away_ends_a_poll_quietly(controllers: TcpServer) -> None:
+    options = ("--nodes", "1", "--items", "1", "--period", "0.02", "--json")
+    with started("poll", controllers.path, *HCP2, *options) as process:
+        assert process.stdout is not None
+        assert json.loads(process.stdout.readline())["cycle"] == 1
+        process.stdout.close()
+        assert process.stderr is not None
+        err = process.stderr.read()
+        assert process.wait(PATIENCE) == 0
+    assert all(line.startswith("busmaster: ") for line in err.splitlines())
+    assert "internal" not in err
+
+
+def test_the_demo_without_a_terminal_prints_plain_lines_and_ends_by_itself() -> None:
+    done = run("demo", "--seconds", "1.5")
+    assert done.returncode == 0
+    keys = {line.split()[1] for line in done.stdout.splitlines()}
+    assert {"1/axis0.position", "8/speed_measured"} <= keys
+    assert "Traceback" not in done.stderr
+    assert "node 8: " in done.stderr
+
+
+class Terminal:
+    """A real pseudo-terminal of 80 by 24, and what was drawn on it."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.master, slave = pty.openpty()
+        ioctl(slave, TIOCSWINSZ, pack("HHHH", 24, 80, 0, 0))
+        self.before = tcgetattr(slave)
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "busmaster", *arguments],
+            cwd=ROOT,
+            env=ENVIRONMENT | {"TERM": "xterm-256color", "PYTHONWARNINGS": ""},
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            start_new_session=True,
+        )
+        self.slave = slave
+        self.drawn = b""
+
+    def until(self, seen: Callable[[bytes], bool]) -> None:
+        """Read until `seen` is satisfied with all that was drawn so far."""
+        deadline = time.monotonic() + PATIENCE
+        while not seen(self.drawn):
+            assert time.monotonic() < deadline, self.drawn[-2000:]
+            self.drawn += os.read(self.master, 65536)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self.master)
+        os.close(self.slave)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("key", "status"), [(b"\x03", 130), (b"q", 0)])
+def test_the_demo_on_a_terminal_draws_and_gives_the_terminal_back(key: bytes, status: int) -> None:
+    terminal = Terminal("demo")
+    try:
+        terminal.until(lambda drawn: b"busmaster demo" in drawn and b"axis0.position" in drawn and b"speed" in drawn)
+        os.write(terminal.master, key)
+        assert terminal.process.wait(PATIENCE) == status
+        terminal.until(lambda drawn: b"cycles" in drawn)
+        assert b"Traceback" not in terminal.drawn
+        assert tcgetattr(terminal.slave) == terminal.before
+        assert b"\x1b[?1049l" in terminal.drawn
+    finally:
+        terminal.close()
