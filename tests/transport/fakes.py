@@ -6,14 +6,13 @@ import asyncio
 import contextlib
 import os
 import select
-import selectors
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
+from busmaster.testing.virtual_time import VirtualTimeLoop
 from busmaster.transport.serial_port import PortTransport, SerialPort
 
-T = TypeVar("T")
 PATIENCE = 2.0
 VIRTUAL_PATIENCE = 1000.0
 """Seconds after which something that should happen has not."""
@@ -64,7 +63,7 @@ class Recorder(asyncio.Protocol):
 
     async def until(self, condition: Callable[[Recorder], bool]) -> None:
         """Return when `condition` holds. Raises TimeoutError if it does not come to hold."""
-        virtual = isinstance(asyncio.get_running_loop(), VirtualLoop)
+        virtual = isinstance(asyncio.get_running_loop(), VirtualTimeLoop)
         async with asyncio.timeout(VIRTUAL_PATIENCE if virtual else PATIENCE):
             while not condition(self):
                 self._changed.clear()
@@ -130,33 +129,3 @@ async def closed(transport: PortTransport, recorder: Recorder) -> None:
     """Close it, and wait until it is."""
     transport.close()
     await recorder.lost()
-
-
-def in_virtual_time(work: Coroutine[None, None, T]) -> T:
-    """Run `work` on a loop whose time jumps."""
-    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        return runner.run(work)
-
-
-class VirtualLoop(asyncio.SelectorEventLoop):
-    """Its time stands still while there is something to do, and then jumps to the next timer."""
-
-    def __init__(self) -> None:
-        super().__init__(_Jumping(self))
-        self.now = 0.0
-
-    def time(self) -> float:
-        return self.now
-
-
-class _Jumping(selectors.DefaultSelector):
-    def __init__(self, loop: VirtualLoop) -> None:
-        super().__init__()
-        self._virtual = loop
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        ready = super().select(0)
-        if not ready:
-            assert timeout is not None, "nothing will ever happen again"
-            self._virtual.now += timeout
-        return ready

@@ -9,9 +9,10 @@ import pytest
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Echo, Line
 from busmaster.profile import LineSettings
+from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport.endpoints import is_paced
 from busmaster.transport.memory import MemoryPort, MemoryTransport
-from tests.transport.fakes import Recorder, in_virtual_time
+from tests.transport.fakes import Recorder
 
 SETTINGS = LineSettings(9600)
 TAU = SETTINGS.byte_time
@@ -63,7 +64,7 @@ def test_in_virtual_time_a_reply_comes_exactly_when_its_last_byte_has_left() -> 
         await recorder.lost()
         assert recorder.losses == [None]
 
-    in_virtual_time(ask())
+    run_in_virtual_time(ask())
 
 
 def test_a_long_reply_comes_in_pieces_with_no_gap_that_would_end_it() -> None:
@@ -90,7 +91,7 @@ def test_a_long_reply_comes_in_pieces_with_no_gap_that_would_end_it() -> None:
         transport.close()
         await recorder.lost()
 
-    in_virtual_time(ask())
+    run_in_virtual_time(ask())
 
 
 def test_an_unpaced_line_that_answers_at_once_never_calls_back_from_within_a_write() -> None:
@@ -103,7 +104,7 @@ def test_an_unpaced_line_that_answers_at_once_never_calls_back_from_within_a_wri
         transport.abort()
         await recorder.lost()
 
-    in_virtual_time(ask())
+    run_in_virtual_time(ask())
 
 
 def test_it_can_be_unplugged_once_and_then_says_nothing_more() -> None:
@@ -126,7 +127,7 @@ def test_it_can_be_unplugged_once_and_then_says_nothing_more() -> None:
         transport.close()
         await recorder.lost()
 
-    in_virtual_time(ask())
+    run_in_virtual_time(ask())
 
 
 @pytest.mark.asyncio

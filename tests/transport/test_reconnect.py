@@ -13,12 +13,13 @@ import pytest
 
 from busmaster.errors import LineDown
 from busmaster.profile import LineSettings
+from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport import reconnect
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
-from tests.transport.fakes import FarEnd, Recorder, in_virtual_time, plugged
+from tests.transport.fakes import FarEnd, Recorder, plugged
 
 
 @asynccontextmanager
@@ -120,7 +121,7 @@ def test_attempts_back_off_by_doubling_up_to_the_longest_delay_and_are_reported(
         assert told.pauses == pytest.approx([1, 2, 4, 4, 4])
         assert [cause.what for cause in causes] == ["told does not exist"] * 5
 
-    in_virtual_time(fail())
+    run_in_virtual_time(fail())
 
 
 def test_delays_are_spread_by_a_quarter_from_a_seeded_source() -> None:
@@ -130,7 +131,7 @@ def test_delays_are_spread_by_a_quarter_from_a_seeded_source() -> None:
             await recorder.connected()
         return told.pauses
 
-    once, again, other = (in_virtual_time(pauses(seed)) for seed in (1, 1, 2))
+    once, again, other = (run_in_virtual_time(pauses(seed)) for seed in (1, 1, 2))
     assert once == again != other
     assert all(0.74 < pause < 1.26 for pause in once)
 
@@ -146,8 +147,8 @@ def test_a_port_that_opens_and_is_lost_at_once_is_not_hammered_but_one_that_held
             await recorder.connected(5)
         return told.pauses
 
-    assert in_virtual_time(lose(0.0)) == pytest.approx([1, 2, 4, 4])
-    assert in_virtual_time(lose(10.0)) == pytest.approx([11, 11, 11, 11])
+    assert run_in_virtual_time(lose(0.0)) == pytest.approx([1, 2, 4, 4])
+    assert run_in_virtual_time(lose(10.0)) == pytest.approx([11, 11, 11, 11])
 
 
 def test_a_device_that_is_seen_to_return_is_opened_at_once_and_the_delays_begin_anew() -> None:
@@ -160,7 +161,7 @@ def test_a_device_that_is_seen_to_return_is_opened_at_once_and_the_delays_begin_
             await recorder.connected()
         assert told.attempts == pytest.approx([0, 1, 3, 7, 9, 10], abs=reconnect.LOOK_EVERY)
 
-    in_virtual_time(replug())
+    run_in_virtual_time(replug())
 
 
 # -- losing it -------------------------------------------------------------------------------------------------------
@@ -234,7 +235,7 @@ def test_closing_ends_a_run_that_waits_for_its_next_attempt() -> None:
             await asyncio.sleep(30.0)
         return asyncio.get_running_loop().time()
 
-    assert in_virtual_time(fail()) == pytest.approx(30.0)
+    assert run_in_virtual_time(fail()) == pytest.approx(30.0)
 
 
 @pytest.mark.asyncio
