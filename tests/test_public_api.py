@@ -34,19 +34,6 @@ def test_a_public_name_exists_and_has_a_docstring_of_its_own(name: str) -> None:
         assert not documentation.startswith(f"{name}("), f"{name} has only the one that a dataclass makes"
 
 
-@pytest.mark.parametrize("name", busmaster.__all__)
-def test_a_public_method_says_what_it_does(name: str) -> None:
-    thing = getattr(busmaster, name)
-    if not isinstance(thing, type) or issubclass(thing, BaseException):
-        return
-    for member, value in vars(thing).items():
-        function = value.fget if isinstance(value, property) else getattr(value, "__func__", value)
-        if member.startswith("_") or not inspect.isfunction(function):
-            continue
-        obvious = len(inspect.getsource(function).splitlines()) <= 4
-        assert inspect.getdoc(function) or obvious, f"{name}.{member} has no docstring"
-
-
 def test_every_error_is_public() -> None:
     defined = {
         name
