@@ -121,6 +121,8 @@ class Bus:
         if known is not None:
             if timings not in (None, known.record.timings) or retries not in (None, known.record.retries):
                 raise InvalidCommand(f"{known.label} is in use with other timings or retries")
+            if profile.merge is not None:
+                known.record.profile = profile
             return known
         if retries is not None and not 0 <= retries <= 100:
             raise InvalidCommand(f"retries must be 0 to 100, not {retries}")

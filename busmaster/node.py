@@ -121,6 +121,10 @@ class Node:
             raise InvalidCommand(f"{self.label}: retries must be 0 to 100, not {retries}")
         if start_within is not None and not 0 <= start_within < inf:
             raise InvalidCommand(f"{self.label}: start_within is a time of 0 s or more, not {start_within!r}")
+        if self.address == self.profile.broadcast and not command.writes:
+            raise InvalidCommand(
+                f"{self.profile.name}: address {self.address} is for writes to all; nobody answers a read"
+            )
         if not self.bus.running:
             raise BusClosed("the bus is not open", node=self.label, command=str(command))
         transaction = Transaction(

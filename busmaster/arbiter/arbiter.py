@@ -337,9 +337,8 @@ class Arbiter:
         transaction = self._transaction
         assert transaction is not None
         transaction.last_byte = now
-        free = now
-        if step.send:
-            free = self._say(step.send, now)
+        answered = self._exchange is not None and self._exchange.answered
+        free = self._say(step.send, now) if step.send else now
         self._end_exchange()
         self.dispatcher.succeeded(transaction, step.value, now)
         if step.rest:
@@ -348,7 +347,7 @@ class Arbiter:
             self._settle(now)
             return
         self._strays.answered()
-        self._release_at(free + self._leg.timing.turnaround, now)
+        self._release_at(free + self._leg.timing.turnaround if answered else now, now)
 
     def _attempt_failed(self, error: FrameError, now: float, no_reply: bool = False) -> None:
         transaction = self._transaction
