@@ -11,7 +11,6 @@ from busmaster.points import Point
 from busmaster.profile import Profile
 from busmaster.protocols import dc104
 from busmaster.protocols.dc104 import Read, Write
-from busmaster.wire.integers import whole_number
 
 if TYPE_CHECKING:
     from busmaster.bus import Bus
@@ -41,8 +40,9 @@ class Dc104Drive(Handle):
         retries: int | None = None,
     ) -> None:
         super().__init__(bus, address, timings=timings, retries=retries)
-        self._maximum = whole_number(maximum, 1, dc104.HIGHEST_PARAMETER, "maximum")
+        self._maximum = maximum
         self._minimum = 0 if allow_zero else 1
+        self._read(maximum)
 
     def point(self, item: str) -> Point[int]:
         """A parameter by its number, decimal."""

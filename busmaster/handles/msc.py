@@ -28,7 +28,6 @@ from busmaster.protocols.msc import (
     SetFlag,
     merging,
 )
-from busmaster.wire.integers import whole_number
 
 if TYPE_CHECKING:
     from busmaster.bus import Bus
@@ -65,8 +64,7 @@ class MscController(Handle):
         timings: Timings | None = None,
         retries: int | None = None,
     ) -> None:
-        if address_step is not None:
-            whole_number(address_step, 1, BLOCK, "address_step")
+        merging(address_step=address_step)
         self.address_step = address_step
         self.model = model
         self.symbols = dict(symbols or {})

@@ -10,7 +10,6 @@ from busmaster.errors import InvalidCommand
 from busmaster.exchange import Timings
 from busmaster.points import Point
 from busmaster.protocols.msc import BLOCK, HIGHEST_ADDRESS, BlockRead, BlockWrite, DataRead, DataWrite
-from busmaster.wire.integers import whole_number
 
 if TYPE_CHECKING:
     from busmaster.handles.msc import MscController
@@ -32,7 +31,7 @@ def place(address: int, index: int, step: int | None) -> int:
             f"while the address step is unknown, {BLOCK} values at most can be read, and one or {BLOCK} written: "
             "give address_step or call find_address_step"
         )
-    return whole_number(address + index * step, 0, HIGHEST_ADDRESS, "the last data address")
+    return DataRead(address + index * step).address
 
 
 class Part(NamedTuple):
@@ -45,7 +44,8 @@ class Part(NamedTuple):
 
 def reads(address: int, count: int, step: int | None) -> list[Part]:
     """The exchanges that read `count` values."""
-    whole_number(count, 1, HIGHEST_ADDRESS + 1, "count")
+    if not 1 <= count <= HIGHEST_ADDRESS:
+        raise InvalidCommand(f"there are not {count} values to read")
     if step is not None:
         place(address, count - 1, step)
     starts = ((place(address, i, step), min(BLOCK, count - i)) for i in range(0, count, BLOCK))

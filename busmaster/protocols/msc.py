@@ -239,8 +239,11 @@ def merging(*, address_step: int | None = None, all_flags: bool = False) -> Merg
     """A Profile's `merge`: neighbouring DREADs as one BREAD, RFLAGs as one RFLAGS.
 
     `address_step` is what the address grows by from one value to the next; without it no DREADs are merged.
-    `all_flags` says that the controller knows RFLAGS (MSC-850/32, MSC-250).
+    `all_flags` says that the controller knows RFLAGS (MSC-850/32, MSC-250). Raises InvalidCommand for a step of 0,
+    or one so large that no block has room.
     """
+    if address_step is not None:
+        whole_number(address_step, 1, HIGHEST_ADDRESS // BLOCK, "address_step")
 
     def merge(commands: Sequence[Command[Any]]) -> Sequence[Batch]:
         batches = [] if address_step is None else _data_batches(commands, address_step)

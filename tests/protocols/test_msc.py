@@ -215,6 +215,8 @@ def test_no_block_runs_beyond_the_last_address() -> None:
 
 def test_values_are_not_merged_while_the_address_step_is_unknown() -> None:
     assert merge([DataRead(2000), DataRead(2004)]) == []
+    with pytest.raises(InvalidCommand):
+        merging(address_step=0)
 
 
 def test_flags_are_read_at_once_where_the_controller_can() -> None:
