@@ -95,6 +95,7 @@ class Line:
         self._active: Talk | None = None
         self._pending: list[tuple[float, int, Talk]] = []
         self._order = 0
+        self._mending: Talk | None = None
         self._sent_by = 0.0
         self._held_until = 0.0
         self._holder: Device | None = None
@@ -133,6 +134,7 @@ class Line:
         """The wire to `devices` (to all of them, by default) breaks: what they say or hear ends there and then."""
         self._advance(now)
         lost = devices or tuple(self.devices)
+        self._mending = None
         talk = self._active
         if talk is not None and talk.start < now:
             self._give(talk, now)
@@ -147,9 +149,13 @@ class Line:
             self._activate(heappop(self._pending)[2])
 
     def restore(self, now: float) -> None:
-        """The wire is whole again."""
+        """The wire is whole again. Who was cut off does not hear the frame that the host is in the middle of."""
         self._advance(now)
-        self._audience.cut_off = frozenset()
+        talk = self._active
+        if talk is not None and talk.talker is None and talk.start < now:
+            self._mending = talk
+        else:
+            self._audience.cut_off = frozenset()
 
     # What the host does
 
@@ -272,6 +278,9 @@ class Line:
             self._audience.request(talk.data, talk.start, talk.end)
         else:
             self._audience.overhear(talk.data, talk.start, talk.end, talker, talk.clean)
+        if talk is self._mending:
+            self._mending = None
+            self._audience.cut_off = frozenset()
 
     def _hold(self, talk: Talk) -> float:
         return self.turnaround if talk.talker is None else talk.talker.turnaround

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.devices.mint import MintController
+from busmaster.emulator.faults import HEARING, SPEAKING, Faults
 from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.wave import Wave
 from busmaster.errors import InvalidCommand
@@ -265,11 +266,76 @@ def test_a_request_that_was_cut_in_the_middle_is_forgotten_at_the_next_reset_byt
     assert ask(line, hexed(READ_2), 1.0) == REPLY
 
 
+def test_a_request_across_a_short_cut_is_not_heard() -> None:
+    line = line_of(mint())
+    line.send(WRITE_2, 0.0)
+    line.cut(5.5 * TAU)
+    line.restore(6.5 * TAU)
+    assert arrivals(line, 0.5) == []
+    assert ask(line, hexed(READ_2), 1.0) == REPLY
+
+
 def test_a_cut_may_spare_the_devices_before_it() -> None:
     line = line_of(mint(2), far := mint(3))
     line.cut(0.0, far)
     assert ask(line, hexed(READ_2)) == REPLY
     assert ask(line, hexed(READ_3), 1.0) == ""
+
+
+# Anything, in any order
+
+
+@given(
+    st.integers(),
+    st.lists(st.tuples(st.sampled_from(["send", "wait", "cut", "restore", "restart", "look"]), st.floats(0, 0.01))),
+    st.booleans(),
+    st.sampled_from([None, Echo(), Echo(0.003), Echo(corrupt=0.5)]),
+)
+@settings(max_examples=150)
+def test_whatever_happens_the_line_comes_to_rest_and_then_works(
+    seed: int, happenings: list[tuple[str, float]], paced: bool, echo: Echo | None
+) -> None:
+    chance = Random(seed)
+    devices = [mint(2), mint(2, delay=0.0), mint(3)]
+    for device in devices:
+        device.turnaround = TAU
+        device.faults = Faults.parse([f"{name}=0.1" for name in (*HEARING, *SPEAKING) if name != "dead"])
+    line = Line(
+        SETTINGS,
+        devices,
+        chance=chance,
+        paced=paced,
+        echo=echo,
+        chunk=seed % 3,
+        latency=seed % 2 * 0.001,
+        turnaround=TAU,
+    )
+    now = 0.0
+    for what, seconds in happenings:
+        now += seconds
+        match what:
+            case "send":
+                line.send(chance.choice([READ_2, READ_3, WRITE_2, b"\x07", b"\x00\xff"]), now)
+            case "cut":
+                line.cut(now, *chance.choice([(), devices[:1]]))
+            case "restore":
+                line.restore(now)
+            case "restart":
+                line.restart(devices[0], now)
+            case "look":
+                line.receive(now)
+    steps = 0
+    while (when := line.next_event()) != float("inf"):
+        assert when >= now - 1e-9 or steps == 0
+        now = max(now, when)
+        line.receive(now)
+        steps += 1
+        assert steps < 10_000
+    for device in devices:
+        device.faults = Faults()
+    line.echo = None
+    line.restore(now)
+    assert ask(line, hexed(READ_3), now + 10) == REPLY
 
 
 # Delays
