@@ -1,17 +1,25 @@
-"""For those who test with busmaster, or add to it: shipped, documented, and used by its own tests."""
+"""For those who test with busmaster, or add to it: shipped, documented, and used by its own tests.
+
+`check_protocol` is the conformance kit of a protocol; `run_in_virtual_time` runs an application on a loop whose time
+jumps; `busmaster.testing.fixtures` has pytest fixtures.
+"""
 
 from __future__ import annotations
 
 from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen, answers_of
 from busmaster.testing.protocol import check_protocol
+from busmaster.testing.virtual_time import DeadlockError, VirtualTimeLoop, run_in_virtual_time
 
 __all__ = [
     "Case",
+    "DeadlockError",
     "Foreign",
     "NotConformant",
     "RoundTrip",
     "Tally",
     "Unseen",
+    "VirtualTimeLoop",
     "answers_of",
     "check_protocol",
+    "run_in_virtual_time",
 ]
