@@ -26,6 +26,7 @@ from busmaster.profile import Profile
 from busmaster.transport.endpoints import Endpoint, is_paced
 from busmaster.transport.pump import Pump, Tap
 from busmaster.transport.reconnect import Connection
+from busmaster.transport.serial_port import SerialPort
 
 BYTE_TIME_UNTIL_KNOWN = 10 / 9600
 EVENT_BUFFER = 256
@@ -229,7 +230,9 @@ class Bus:
             if not self._byte_time_known:
                 self._arbiter.byte_time = profile.line.byte_time
                 self._byte_time_known = True
-        elif settings.framing != profile.line.framing and not any(p == profile.name for p, _ in self._nodes):
+        elif not isinstance(self.endpoint, SerialPort) or any(name == profile.name for name, _ in self._nodes):
+            return
+        elif settings.framing != profile.line.framing:
             warnings.warn(
                 f"{profile.name} is meant for {profile.line.framing}, but {self.endpoint.name} is {settings.framing}",
                 stacklevel=4,

@@ -125,7 +125,8 @@ class Arbiter:
         self.dispatcher.cancel(transaction, now)
 
     def add_poll(self, poll: Poll, now: float) -> None:
-        self.dispatcher.add_poll(poll, now)
+        """Its first cycle waits until a line that has just been opened can be used."""
+        self.dispatcher.add_poll(poll, max(now, self._quarantine))
 
     def remove_poll(self, poll: Poll, now: float) -> None:
         self.dispatcher.remove_poll(poll, now)

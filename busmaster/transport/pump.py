@@ -19,9 +19,8 @@ from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import Completed, Event, LineState, Polled
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Transaction
-
-VIRTUAL = 1.0
-"""A loop whose time differs by more seconds than this from the machine's keeps a time of its own."""
+from busmaster.errors import LineDown
+from busmaster.transport.clock import clock_of
 
 
 class Tap(Protocol):
@@ -59,9 +58,9 @@ class Pump(asyncio.Protocol):
         self._run_out: anyio.Event | None = None
 
     def bind(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Keep this loop's time. Virtual time is the loop's own; else it is the machine's, finer than some loops'."""
+        """Keep this loop's time."""
         self._loop = loop
-        self.clock = loop.time if abs(loop.time() - time.monotonic()) > VIRTUAL else time.monotonic
+        self.clock = clock_of(loop)
 
     # what the bus calls
 
@@ -121,7 +120,8 @@ class Pump(asyncio.Protocol):
 
     def connection_lost(self, cause: Exception | None) -> None:
         self._transport = None
-        self.arbiter.line_down(str(cause) if cause is not None else "it was closed", self.clock())
+        what = cause.what if isinstance(cause, LineDown) else str(cause or "it was closed")
+        self.arbiter.line_down(what, self.clock())
         self.turn()
 
     # inside
