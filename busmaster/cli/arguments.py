@@ -10,6 +10,8 @@ from typing import Any, TypeVar
 import click
 
 from busmaster.bus import Bus
+from busmaster.capture.recorder import Recorder
+from busmaster.cli.output import note
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Timings
 from busmaster.handles import HANDLES, Handle, MscController
@@ -145,6 +147,7 @@ class Connection:
     timeout: float | None = None
     retries: int | None = None
     address_step: int | None = None
+    capture: str | None = None
 
     @property
     def handle(self) -> type[Handle]:
@@ -168,8 +171,16 @@ class Connection:
         return replace(found, echo=True) if self.echo else found
 
     def open_bus(self) -> Bus:
-        """The bus on it, which `async with` opens. Raises InvalidCommand for a PORT that is none."""
-        return Bus(self.endpoint())
+        """The bus on it, which `async with` opens. Raises InvalidCommand for a PORT that is none.
+
+        With --capture it is recorded until the command ends.
+        """
+        where = self.endpoint()
+        if self.capture is None:
+            return Bus(where)
+        recorder = Recorder(self.capture, port=where.name, protocol=self.protocol, echo=where.echo)
+        click.get_current_context().call_on_close(lambda: end_capture(recorder))
+        return Bus(where, tap=recorder)
 
     def open_handle(self, bus: Bus, address: int) -> Handle:
         """A handle on the bus, which need not be open. Raises InvalidCommand."""
@@ -189,6 +200,15 @@ class Connection:
     def addresses(self, nodes: Sequence[int] | None) -> tuple[int, ...]:
         """Of `--nodes N-M,K`, likewise."""
         return (only_address(self.profile),) if nodes is None else checked(self.profile, nodes)
+
+
+def end_capture(recorder: Recorder) -> None:
+    """Wait for the disk, and say so if not all is there."""
+    recorder.close()
+    if recorder.error is not None:
+        note(f"the capture is not whole: {recorder.error.strerror or recorder.error}")
+    elif recorder.dropped:
+        note(f"the capture is not whole: {recorder.dropped} events were dropped")
 
 
 def line_settings(profile: Profile, baud: int | None) -> LineSettings:
@@ -241,11 +261,12 @@ def connected(command: F) -> F:
         timeout: float | None,
         retries: int | None,
         address_step: int | None,
+        capture: str | None,
         **options: Any,
     ) -> Any:
         if address_step is not None and protocol != "msc":
             raise click.UsageError("--address-step is msc's alone")
-        connection = Connection(port, protocol, baud, echo, timeout, retries, address_step)
+        connection = Connection(port, protocol, baud, echo, timeout, retries, address_step, capture)
         return command(connection=connection, **options)
 
     options = (
@@ -257,6 +278,9 @@ def connected(command: F) -> F:
             "--timeout", type=option_type(parse_milliseconds), metavar="MS", help="The reply window, in milliseconds."
         ),
         click.option("--retries", type=click.IntRange(min=0), metavar="N", help="How often a read is tried again."),
+        click.option(
+            "--capture", type=click.Path(dir_okay=False), metavar="FILE", help="Record the line for Wireshark (pcapng)."
+        ),
         click.option(
             "--address-step", type=click.IntRange(min=1), metavar="N", help="msc: addresses from one value to the next."
         ),

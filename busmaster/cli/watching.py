@@ -121,7 +121,8 @@ class Watch:
             counts = node.statistics()
             latency = counts.latency
             health = "suspended" if node.suspended else node.health.value
-            yield NodeRow(node.label, health, counts.attempts, counts.attempts - counts.ok, latency.p50, latency.p99)
+            failed = counts.no_reply + counts.garbled + counts.refused
+            yield NodeRow(node.label, health, counts.attempts, failed, latency.p50, latency.p99)
 
     def _row(self, point: Point[Any], latest: Snapshot | None, now: float) -> Row:
         good, sample = self._good.get(point), latest.samples.get(point) if latest else None

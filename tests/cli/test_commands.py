@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from busmaster.capture.pcapng import Direction, read_packets
 from busmaster.emulator.serve import TcpServer
 from tests.cli.conftest import Command, serve
 
@@ -175,6 +176,20 @@ def test_scan_prints_a_line_for_each_node_that_answers(busmaster: Command, contr
     assert (found.status, found.lines) == (0, ["6 read element 1: 0", "7 read element 1: 0"])
     found = busmaster("scan", controllers.path, *HCP2, "--nodes", "7", "--json")
     assert json.loads(found.out) == {"node": 7, "value": 0, "answer": "read element 1: 0"}
+
+
+def test_any_command_can_be_captured(busmaster: Command, controllers: TcpServer, tmp_path: Path) -> None:
+    file = tmp_path / "line.pcapng"
+    read = busmaster("read", controllers.path, *HCP2, "--node", "8", "1", "2", "--capture", str(file))
+    assert (read.status, read.err) == (0, "")
+    with file.open("rb") as capture:
+        packets = list(read_packets(capture))
+    assert [packet.direction for packet in packets] == [Direction.HOST, Direction.NODE] * 2
+    assert packets[0].frame == bytes.fromhex("07 30 38 02 30 31 05 0E")
+
+    outcome = busmaster("read", controllers.path, *HCP2, "--node", "8", "1", "--capture", str(tmp_path / "no" / "dir"))
+    assert (outcome.status, outcome.out) == (1, "")
+    assert outcome.err.endswith("No such file or directory\n")
 
 
 def test_words_are_printed_with_the_names_of_their_bits(busmaster: Command) -> None:
