@@ -100,6 +100,7 @@ class Line:
         self._held_until = 0.0
         self._holder: Device | None = None
         self._inbox = b""
+        self._arrived = 0.0
         self._arrivals: deque[tuple[float, bytes]] = deque()
         self._audience = Audience(self._say, self.chance, self.tau)
         for device in devices:
@@ -180,7 +181,9 @@ class Line:
         return data
 
     def next_event(self) -> float:
-        """When something happens next, be it within the line; NEVER if nothing will."""
+        """When something happens next, be it within the line, or has happened unnoticed; NEVER if nothing will."""
+        if self._inbox:
+            return self._arrived
         when = self._audience.wakeup
         talk = self._active
         if talk is not None:
@@ -332,3 +335,4 @@ class Line:
             arrivals.append((when, data))
         else:
             self._inbox += data
+            self._arrived = when

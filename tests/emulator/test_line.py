@@ -335,7 +335,8 @@ def test_whatever_happens_the_line_comes_to_rest_and_then_works(
         device.faults = Faults()
     line.echo = None
     line.restore(now)
-    assert ask(line, hexed(READ_3), now + 10) == REPLY
+    ask(line, hexed(READ_3), now + 10)  # its first byte may be the checksum of a frame that was cut
+    assert ask(line, hexed(READ_3), now + 20) == REPLY
 
 
 # Delays
