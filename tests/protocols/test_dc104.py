@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,8 +9,9 @@ from hypothesis import strategies as st
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.exchange import MORE, Done, FrameError
 from busmaster.protocols.dc104 import PROFILE, Read, Write
+from tests.protocols.asking import vectors
 
-FRAMES = json.loads((Path(__file__).parents[1] / "vectors" / "frames.json").read_text())["DC104"]
+FRAMES = vectors("DC104")
 ACK, NAK = b"\x06", b"\x15"
 PARAMETERS = st.integers(1, 255)
 VALUES = st.integers(0, 65535)
@@ -21,10 +19,9 @@ VALUES = st.integers(0, 65535)
 
 def frames(prefix: str) -> list[tuple[list[int], bytes]]:
     """The numbers in the name of each frame of that kind, and its bytes."""
-    named = [(frame["name"], bytes.fromhex(frame["hex"])) for frame in FRAMES]
     return [
         ([int(word) for word in name.split() if word.isdigit()], data)
-        for name, data in named
+        for name, data in FRAMES.items()
         if name.startswith(prefix)
     ]
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -31,9 +29,9 @@ from busmaster.protocols.msc import (
     merging,
 )
 from busmaster.protocols.msc_exchange import packet
+from tests.protocols.asking import vectors
 
-VECTORS = json.loads((Path(__file__).parents[1] / "vectors" / "frames.json").read_text())["MSC"]
-FRAMES = {frame["name"]: bytes.fromhex(frame["hex"]) for frame in VECTORS}
+FRAMES = vectors("MSC")
 ACK = b"\x06"
 
 REQUESTS: dict[str, tuple[Command[Any], int]] = {
