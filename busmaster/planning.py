@@ -1,0 +1,418 @@
+"""Does this schedule fit this line? Pure arithmetic over profiles, commands and periods.
+
+`plan` says how busy the line will be, how long each group's cycle takes, which group will miss cycles and what would
+fit, and how long anybody can wait in the worst case. Reply times are measured or declared; where neither is known,
+half of the nominal one is assumed. All times are in seconds.
+
+The worst case is that of R9: every exchange lasts as long as an exchange can, and whatever may go first goes first. It
+holds while each request causes at most one reply (R3), be it one that trickles in byte by byte; on a line that is
+never silent nobody waits longer either, but fails with LineNoisy.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from math import ceil, floor, inf, log10
+from typing import Any, NamedTuple, TypeAlias
+
+from busmaster.arbiter.schedule import Poll, Priority, Schedule, line_time
+from busmaster.exchange import Command, Exchange, Timings
+from busmaster.profile import Batch, LineSettings, Profile
+
+SHARE = 7
+"""Exchanges of higher classes after which a lower class that waits gets a slot (R9)."""
+QUIET = 0.020
+"""The least silence that ends a settle (R3)."""
+NOISY_AFTER = 1.0
+"""Without such a silence for so long, the line is NOISY and whoever waits fails (R3)."""
+COMFORT = 0.9
+"""The share of the line that a schedule may take: the rest is for commands, retries and probes."""
+BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
+HORIZON = 10
+"""Periods of the slowest group over which the timetable is played through, at most TIMETABLE exchanges."""
+TIMETABLE = 20_000
+
+Merge: TypeAlias = Callable[[Sequence[Command[Any]]], Sequence[Batch]]
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedNode:
+    """A node as the planner sees it. `reply_time`: seconds from a request to its reply, if known or measured."""
+
+    profile: Profile
+    address: int
+    timings: Timings | None = None
+    reply_time: float | None = None
+
+    def open(self, command: Command[Any]) -> Exchange[Any]:
+        return command.open(self.address, self.timings or self.profile.timings)
+
+    def line_time(self, command: Command[Any], byte_time: float) -> float:
+        """Seconds of the line that one undisturbed attempt takes."""
+        return line_time(self.open(command), byte_time, self.reply_time)
+
+
+Read: TypeAlias = tuple[PlannedNode, Command[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedGroup:
+    """A poll group to be: what it reads of which node, once a period.
+
+    `merge`: the cheaper exchanges that it opts in to, beside those of the profiles.
+    """
+
+    name: str
+    period: float
+    reads: Sequence[Read]
+    phase: float | None = None
+    priority: Priority = Priority.POLL
+    merge: Sequence[Merge] = ()
+
+
+# cheaper exchanges
+
+
+class Served(NamedTuple):
+    """One exchange, and the indexes of the commands that it stands for.
+
+    A `batch` brings a sequence of their values, and saves so many seconds of the line compared with single commands.
+    """
+
+    command: Command[Any]
+    serves: tuple[int, ...]
+    batch: bool = False
+    saved: float = 0.0
+
+
+def cheapest(
+    node: PlannedNode, commands: Sequence[Command[Any]], merges: Iterable[Merge], byte_time: float
+) -> list[Served]:
+    """The exchanges that serve all these commands of one node in the least line time that the merges offer.
+
+    The greatest saving first; each command is served once, in the order of the first that an exchange serves.
+    """
+    offers = [batch for merge in merges for batch in merge(commands)]
+    if not offers:
+        return [Served(command, (index,)) for index, command in enumerate(commands)]
+    costs = [node.line_time(command, byte_time) for command in commands]
+    weighed = [
+        Served(
+            batch.command,
+            batch.serves,
+            True,
+            sum(costs[index] for index in batch.serves) - node.line_time(batch.command, byte_time),
+        )
+        for batch in offers
+    ]
+    left = set(range(len(commands)))
+    chosen: list[Served] = []
+    for served in sorted(weighed, key=lambda served: -served.saved):
+        if served.saved > 0 and left.issuperset(served.serves):
+            left.difference_update(served.serves)
+            chosen.append(served)
+    chosen += (Served(commands[index], (index,)) for index in left)
+    return sorted(chosen, key=lambda served: min(served.serves))
+
+
+# the worst case
+
+
+def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: float = 0.0) -> float:
+    """Seconds for which one attempt can keep the line from others, its settle included, if nothing is repeated in it.
+
+    The H of R9: each leg's request, its window (or lateness) and its longest reply; then the silence after the last
+    byte, which a reply that trickles in puts off.
+    """
+    before = worst = 0.0
+    legs = [(len(exchange.request), exchange.timing, exchange.sizes)]
+    legs += ((leg.sent, leg.timing, leg.sizes) for leg in exchange.later)
+    for sent, timing, sizes in legs:
+        said = before + sent * byte_time + receive_latency
+        whole = timing.window + timing.byte_gap + sizes.longest * byte_time
+        quiet = max(QUIET, timing.byte_gap)
+        trickle = min(sizes.longest * quiet, NOISY_AFTER + quiet)
+        worst = max(worst, said + max(whole, timing.lateness) + trickle + quiet)
+        before = said + whole
+    return worst + exchange.closing * byte_time + exchange.timing.turnaround
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """How long a request of each class can wait until it is sent (R9), with so many exchanges polled on the line.
+
+    `hold` is the longest hold of one exchange, `urgent_hold` the longest while an urgent request waits: then nothing
+    is repeated within an exchange. Those of COMMAND and below hold as long as URGENT is rare.
+    """
+
+    hold: float
+    urgent_hold: float
+    polls: int = 0
+    background: int = 0
+    patience: float = 1.0
+    """The longest time, in seconds, for which a poll lets later ones with a shorter period pass."""
+
+    def wait(self, priority: Priority, *, ahead: int = 0, patience: float | None = None) -> float:
+        """`ahead`: how many of URGENT or COMMAND wait already."""
+        if priority is Priority.URGENT:
+            return self.urgent_hold * (1 + ahead)
+        if priority is Priority.COMMAND:
+            return self.hold * (1 + ahead + ceil((ahead + 1) / SHARE))
+        turns = SHARE + 1
+        if priority is Priority.BACKGROUND or self.background:
+            turns *= 2
+        rivals = self.background if priority is Priority.BACKGROUND else self.polls
+        return (self.patience if patience is None else patience) + turns * max(1, rivals) * self.hold
+
+
+def bounds(
+    reads: Iterable[Read], byte_time: float, receive_latency: float = 0.0, *, polls: int = 0, background: int = 0
+) -> Bounds:
+    """The bounds for a line on which nothing else is asked than these, and every node's probe."""
+    asked = set(reads)
+    asked |= {(node, node.profile.probe) for node, _ in asked}
+    holds = [(longest_hold(node.open(c), byte_time, receive_latency), node.profile.exchange_limit) for node, c in asked]
+    return Bounds(
+        hold=max((hold + (limit or 0.0) for hold, limit in holds), default=0.0),
+        urgent_hold=max((hold for hold, _ in holds), default=0.0),
+        polls=polls,
+        background=background,
+    )
+
+
+# the plan
+
+
+@dataclass(frozen=True, slots=True)
+class MergedReads:
+    """One merged exchange of a group: how many single commands it stands for, and what that saves in each cycle."""
+
+    node: str
+    command: str
+    serves: int
+    saved: float
+
+
+@dataclass(frozen=True, slots=True)
+class GroupPlan:
+    """One group on the line. `values` are read in `exchanges` that take `line_time` seconds in each cycle.
+
+    `cycle` and `longest_cycle` (mean and longest) run from a cycle's due time to its last value, if nothing goes
+    wrong. `missed` is the share of its cycles that cannot start in time, so that they come every `achieved` seconds.
+    `worst_wait` and `worst_cycle` are the bounds of R9, from due time to start and to end. `fitting_period` is the
+    shortest with which the schedule would fit comfortably, were all else as it is: None where it fits as it is, or
+    where this group alone cannot make it fit. `could_save`: what merges that nobody opted in to would save a cycle.
+    """
+
+    name: str
+    period: float
+    values: int
+    exchanges: int
+    line_time: float
+    cycle: float
+    longest_cycle: float
+    missed: float
+    achieved: float
+    worst_wait: float
+    worst_cycle: float
+    merged: tuple[MergedReads, ...]
+    fitting_period: float | None
+    could_save: float
+
+    @property
+    def utilisation(self) -> float:
+        """The share of the line that it asks for."""
+        return self.line_time / self.period
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What a line will be like. `utilisation` is the share of it that the schedule asks for: above 1 it does not fit.
+
+    `worst_waits` are the bounds of R9 for one more request of each class; on a healthy line a command waits at most
+    for one exchange, `typical_wait`. `fitting_baudrate` is the lowest usual one at which the schedule would fit
+    comfortably; None where it does as it is, or where none is enough.
+    """
+
+    line: LineSettings
+    utilisation: float
+    groups: tuple[GroupPlan, ...]
+    typical_wait: float
+    worst_waits: Mapping[Priority, float]
+    fitting_baudrate: int | None
+
+    @property
+    def fits(self) -> bool:
+        """As long as nothing goes wrong, no cycle is missed."""
+        return self.utilisation <= 1 and not any(group.missed for group in self.groups)
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What does not fit and what would, a sentence each; empty where the schedule fits comfortably."""
+        return tuple(_advice(self))
+
+
+def plan(
+    groups: Iterable[PlannedGroup],
+    *,
+    line: LineSettings,
+    receive_latency: float = 0.0,
+    others: Iterable[Read] = (),
+    could_merge: Sequence[Merge] = (),
+) -> Plan:
+    """What becomes of these poll groups on this line.
+
+    `others` may be asked beside them: the worst case reckons with those, and with every node's probe. `could_merge`
+    are merges to be weighed that no group opts in to. Raises InvalidCommand for a period or phase that cannot be.
+    """
+    drafts = [_Draft(group, line.byte_time) for group in groups]
+    asked = [(node, served.command) for draft in drafts for node, served in draft.exchanges]
+    low = sum(len(draft.costs) for draft in drafts if draft.group.priority is Priority.BACKGROUND)
+    polls = sum(len(draft.costs) for draft in drafts) - low
+    bound = bounds((*asked, *others), line.byte_time, receive_latency, polls=polls, background=low)
+    utilisation = sum(draft.utilisation for draft in drafts)
+    _play(drafts)
+    return Plan(
+        line=line,
+        utilisation=utilisation,
+        groups=tuple(draft.planned(utilisation, bound, could_merge) for draft in drafts),
+        typical_wait=max((cost for draft in drafts for cost in draft.costs), default=0.0),
+        worst_waits={priority: bound.wait(priority) for priority in Priority},
+        fitting_baudrate=_fitting_baudrate(drafts, line) if utilisation > COMFORT else None,
+    )
+
+
+class _Draft:
+    """A group on its way to its GroupPlan."""
+
+    def __init__(self, group: PlannedGroup, byte_time: float) -> None:
+        self.group = group
+        self.byte_time = byte_time
+        self.exchanges = list(_exchanges(group, group.merge, byte_time))
+        self.costs = [node.line_time(served.command, byte_time) for node, served in self.exchanges]
+        self.poll = Poll(group.name, group.period, phase=group.phase, cost=sum(self.costs))
+        self.poll.waiter = self
+        self.finished = 0
+        self.total = self.longest = 0.0
+
+    @property
+    def utilisation(self) -> float:
+        return self.poll.cost / self.group.period
+
+    def note_cycle(self, seconds: float) -> None:
+        self.finished += 1
+        self.total += seconds
+        self.longest = max(self.longest, seconds)
+
+    def planned(self, utilisation: float, bound: Bounds, could_merge: Sequence[Merge]) -> GroupPlan:
+        group, cost = self.group, self.poll.cost
+        missed = self.poll.missed / (self.poll.missed + max(1, self.finished))
+        left = COMFORT - (utilisation - self.utilisation)
+        wait = bound.wait(group.priority, patience=self.poll.patience)
+        further = _exchanges(group, (*group.merge, *could_merge), self.byte_time)
+        return GroupPlan(
+            name=group.name,
+            period=group.period,
+            values=len(group.reads),
+            exchanges=len(self.costs),
+            line_time=cost,
+            cycle=self.total / self.finished if self.finished else inf if self.costs else 0.0,
+            longest_cycle=self.longest if self.finished or not self.costs else inf,
+            missed=missed,
+            achieved=group.period / (1 - missed),
+            worst_wait=wait,
+            worst_cycle=wait + bound.hold,
+            merged=tuple(
+                MergedReads(node.profile.label(node.address), str(s.command), len(s.serves), s.saved)
+                for node, s in self.exchanges
+                if s.batch
+            ),
+            fitting_period=_rounded_up(cost / left) if utilisation > COMFORT and left > 0 else None,
+            could_save=max(0.0, cost - sum(node.line_time(s.command, self.byte_time) for node, s in further)),
+        )
+
+
+def _exchanges(group: PlannedGroup, merges: Sequence[Merge], byte_time: float) -> Iterator[tuple[PlannedNode, Served]]:
+    """Node by node, each command once."""
+    commands: dict[PlannedNode, dict[Command[Any], None]] = {}
+    for node, command in group.reads:
+        commands.setdefault(node, {})[command] = None
+    for node, wanted in commands.items():
+        own = () if node.profile.merge is None else (node.profile.merge,)
+        for served in cheapest(node, tuple(wanted), (*own, *merges), byte_time):
+            yield node, served
+
+
+def _play(drafts: Sequence[_Draft]) -> None:
+    """The timetable, if every exchange takes its line time: earliest deadline first, and BACKGROUND as R9 has it."""
+    schedule, order = Schedule(), count()
+    for draft in drafts:
+        schedule.add(draft.poll, 0.0)
+    waiting: list[tuple[float, int, float, _Draft]] = []
+    background: list[tuple[float, int, float, _Draft]] = []
+    end = HORIZON * max((draft.group.period for draft in drafts), default=0.0)
+    now, streak = 0.0, 0
+    for _ in range(TIMETABLE):
+        if not waiting and not background:
+            now = max(now, schedule.next_due())
+        if now >= end:
+            break
+        for poll in schedule.release(now):
+            queue = background if poll.waiter.group.priority is Priority.BACKGROUND else waiting
+            poll.remaining = len(poll.waiter.costs)
+            for cost in poll.waiter.costs:
+                heapq.heappush(queue, (poll.due + poll.patience, next(order), cost, poll.waiter))
+        if background and (streak >= SHARE or not waiting):
+            streak = 0
+            _, _, cost, draft = heapq.heappop(background)
+        elif waiting:
+            streak = streak + 1 if background else 0
+            _, _, cost, draft = heapq.heappop(waiting)
+        else:
+            continue
+        now += cost
+        draft.poll.remaining -= 1
+        if not draft.poll.remaining:
+            draft.note_cycle(now - draft.poll.due)
+
+
+# what would fit
+
+
+def _fitting_baudrate(drafts: Sequence[_Draft], line: LineSettings) -> int | None:
+    for baudrate in BAUDRATES:
+        if baudrate > line.baudrate:
+            byte_time = replace(line, baudrate=baudrate).byte_time
+            if sum(_Draft(draft.group, byte_time).utilisation for draft in drafts) <= COMFORT:
+                return baudrate
+    return None
+
+
+def _rounded_up(seconds: float) -> float:
+    """To two digits: a period that somebody would write down."""
+    unit = 10.0 ** (floor(log10(seconds)) - 1)
+    return round(ceil(seconds / unit - 1e-9) * unit, 9)
+
+
+def _advice(plan: Plan) -> Iterator[str]:
+    if plan.utilisation <= COMFORT and plan.fits:
+        return
+    yield f"the schedule asks for {plan.utilisation:.0%} of the line; comfortable is up to {COMFORT:.0%}"
+    for group in plan.groups:
+        if group.missed:
+            yield (
+                f"group {group.name!r} will miss {group.missed:.0%} of its cycles: "
+                f"one every {group.achieved:.3g} s in place of {group.period:g} s"
+            )
+        if group.fitting_period is not None:
+            yield f"it would fit with a period of {group.fitting_period:g} s for group {group.name!r}"
+        if group.could_save:
+            share = group.could_save / group.period
+            yield f"merged reads would take {share:.0%} of the line off group {group.name!r}, where they are safe"
+    if plan.utilisation > COMFORT:
+        yield f"it would fit with all periods {plan.utilisation / COMFORT:.2f} times as long"
+    if plan.fitting_baudrate is not None:
+        yield f"it would fit at {plan.fitting_baudrate} baud"
