@@ -267,9 +267,8 @@ class Line:
 
     def _finish(self, talk: Talk) -> None:
         talker = talk.talker
-        hold = self._hold(talk)
-        if hold:
-            self._held_until = talk.end + hold
+        if self.turnaround if talker is None else talker.turnaround:
+            self._held_until = talk.end + self._hold(talk)
             self._holder = talker
         self._active = None
         if self._pending:

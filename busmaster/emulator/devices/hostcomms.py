@@ -29,7 +29,7 @@ KEPT = 80
 NUMBER = re.compile(rb" *([+-]?(?:\d+\.?\d*|\.\d+))(?: .*)?")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Framing:
     """What tells the two protocols apart."""
 
@@ -231,6 +231,7 @@ class HostCommsDevice(Device):
         return telegram(self.framing, other + (other >= element), reply[3:-2])
 
 
+@lru_cache(maxsize=4096)
 def telegram(framing: Framing, element: int, text: bytes) -> bytes:
     """A reply to a read: STX, element, data, ETX, and the exclusive-or of all after STX."""
     covered = framing.element(element) + text + b"\x03"
