@@ -19,6 +19,7 @@ from textual.binding import Binding, BindingType
 from textual.widgets import DataTable, Footer, Static
 
 from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row, decode_frame, encode
+from busmaster.cli.output import value_text
 
 FRAME_LIMIT = 1 << 22
 """Bytes of the longest frame: some ten thousand points."""
@@ -220,7 +221,7 @@ class Screen(App[None]):
         before = ""
         for row in frame.rows:
             trend = self.trends[row.node, row.item]
-            trend.append(row.number)
+            trend.append(row.value if isinstance(row.value, int | float) and not row.error else None)
             cells = point_cells(row, list(trend)[-self.widths["TREND"] :], old, self.widths)
             if row.node != before and row.node in nodes:
                 cells |= node_cells(nodes[row.node], self.widths)
@@ -240,7 +241,7 @@ def point_cells(row: Row, trend: list[float | None], old: float, widths: dict[st
     style = "red" if row.error else "magenta" if row.late else "bold"
     return {
         "ITEM": Text(fit(row.item, widths["ITEM"])),
-        "VALUE": right(row.value, widths["VALUE"], style),
+        "VALUE": right(value_text(row.value), widths["VALUE"], style),
         "UNIT": Text(fit(row.unit, widths["UNIT"])),
         "TREND": Text(sparkline(trend), style="blue"),
         "AGE": right(age_text(row.age), widths["AGE"], "red" if row.age is not None and row.age > old else ""),

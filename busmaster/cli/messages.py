@@ -12,13 +12,15 @@ import msgspec
 
 
 class Row(msgspec.Struct, array_like=True, frozen=True):
-    """One point. `value` is as it is printed; `number` draws the trend, where there is one; `age` in seconds."""
+    """One point. `value` is a number, which the screen formats and draws a trend of, or a text; `age` in seconds.
+
+    With an `error`, the value and its age are those of the last good one.
+    """
 
     node: str
     item: str
-    value: str
+    value: float | str | None
     unit: str = ""
-    number: float | None = None
     age: float | None = None
     late: bool = False
     error: str = ""

@@ -6,7 +6,6 @@ import math
 import sys
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Iterator
-from enum import Flag
 from importlib.util import find_spec
 from statistics import fmean
 from typing import Any
@@ -24,9 +23,11 @@ from busmaster.node import Health
 from busmaster.points import Point
 from busmaster.polling import PollGroup, Quality, Sample, Snapshot
 
-KEPT_PERIODS = 10_000
+KEPT_PERIODS = 1_000
 KEPT_EVENTS = 8
 UTILISATION_WINDOW = 1.0
+COUNTED_EVERY = 0.5
+"""Seconds between two looks at the counts of nodes and groups."""
 STATES = {LineState.OFFLINE: "offline", LineState.SETTLING: "settling"}
 """What is worth a word: a line in use is ready."""
 
@@ -43,6 +44,9 @@ class Watch:
         self._periods: dict[str, deque[float]] = {}
         self._started: dict[str, float] = {}
         self._good: dict[Point[Any], Sample] = {}
+        self._counted = -math.inf
+        self._node_rows: tuple[NodeRow, ...] = ()
+        self._group_rows: tuple[GroupRow, ...] = ()
         self._loads: deque[tuple[float, float]] = deque()
 
     def since(self, time: float | None) -> float | None:
@@ -74,7 +78,12 @@ class Watch:
         self.events.append(f"{self.bus.now() - self.start:7.1f} s  {text}")
 
     def picture(self) -> Frame:
+        """For the screen. Cheap: it is taken on the loop that owns the line."""
         now = self.bus.now()
+        if now >= self._counted + COUNTED_EVERY:
+            self._counted = now
+            self._node_rows = tuple(self._nodes())
+            self._group_rows = tuple(map(self._group, self.groups))
         statistics = self.bus.statistics()
         return Frame(
             title=self.title,
@@ -84,8 +93,8 @@ class Watch:
             utilisation=self._utilisation(now, statistics.busy + statistics.settling),
             backlog=statistics.backlog,
             rows=tuple(self._row(point, group.latest, now) for group in self.groups for point in group.points),
-            nodes=tuple(self._nodes()),
-            groups=tuple(self._group(group) for group in self.groups),
+            nodes=self._node_rows,
+            groups=self._group_rows,
             events=tuple(self.events),
         )
 
@@ -108,6 +117,7 @@ class Watch:
         """Or go on. The time in between is no period."""
         self._started.pop(group.name, None)
         group.resume() if group.paused else group.pause()
+        self._counted = -math.inf
 
     def _utilisation(self, now: float, busy: float) -> float:
         self._loads.append((now, busy))
@@ -127,17 +137,14 @@ class Watch:
     def _row(self, point: Point[Any], latest: Snapshot | None, now: float) -> Row:
         good, sample = self._good.get(point), latest.samples.get(point) if latest else None
         value = good.value if good else None
-        number = float(value) if isinstance(value, int | float) and not isinstance(value, Flag) else math.nan
-        failed = sample is not None and sample.error is not None
         return Row(
-            node=point.node.label,
-            item=point.item,
-            value=value_text(value),
-            unit=short_unit(point.unit),
-            number=number if math.isfinite(number) and not failed else None,
-            age=good.age(now) if good else None,
-            late=good is not None and good.quality is Quality.LATE,
-            error=sample.error.what if sample and sample.error else "",
+            point.node.label,
+            point.item,
+            value if type(value) in (int, float) or value is None else value_text(value),
+            short_unit(point.unit),
+            good.age(now) if good else None,
+            good is not None and good.quality is Quality.LATE,
+            sample.error.what if sample and sample.error else "",
         )
 
     def _group(self, group: PollGroup) -> GroupRow:

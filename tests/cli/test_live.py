@@ -12,7 +12,7 @@ from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row, decode
 
 
 def frame(rows: int = 3, *, now: float = 61.0, paused: bool = False) -> Frame:
-    points = [Row(f"node {n}", "axis0.position", f"{n}.5", "mm", n + 0.5, 0.1) for n in range(1, rows)]
+    points = [Row(f"node {n}", "axis0.position", n + 0.5, "mm", 0.1) for n in range(1, rows)]
     return Frame(
         title="busmaster poll",
         port="/dev/ttyUSB0  57600 8N1",
@@ -20,7 +20,7 @@ def frame(rows: int = 3, *, now: float = 61.0, paused: bool = False) -> Frame:
         line="ready",
         utilisation=0.53,
         backlog=2,
-        rows=(*points, Row("node 9", "axis0.position", "-", "mm", None, 12.3, False, "no reply within 100 ms")),
+        rows=(*points, Row("node 9", "axis0.position", None, "mm", 12.3, False, "no reply within 100 ms")),
         nodes=(*(NodeRow(f"node {n}", "up", 10, 0, 0.0031, 0.004) for n in range(1, rows)), NodeRow("node 9", "down")),
         groups=(GroupRow("axes", 0.2, 0.2, 0.2011, 61, 1, paused),),
         events=("   3.1 s  node 9 is down, was suspect",),
