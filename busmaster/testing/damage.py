@@ -7,6 +7,7 @@ from itertools import combinations, pairwise
 from random import Random
 
 FEW_BYTES = 10
+MANY_BYTES = 64
 
 
 def bytewise(data: bytes) -> list[bytes]:
@@ -15,14 +16,15 @@ def bytewise(data: bytes) -> list[bytes]:
 
 
 def splits(data: bytes) -> Iterator[list[bytes]]:
-    """Ways to cut `data` into chunks: all for a few bytes; else into two or three, and one byte at a time."""
-    places = range(1, len(data))
-    few = len(data) <= FEW_BYTES
-    for count in range(1, len(data) if few else 3):
-        for cuts in combinations(places, count):
-            edges = (0, *cuts, len(data))
+    """Ways to cut `data` into chunks: all for a few bytes; else into two, or three if there are not many, and one byte
+    at a time."""
+    length = len(data)
+    most = length if length <= FEW_BYTES else 3 if length <= MANY_BYTES else 2
+    for count in range(1, most):
+        for cuts in combinations(range(1, length), count):
+            edges = (0, *cuts, length)
             yield [data[a:b] for a, b in pairwise(edges)]
-    if not few:
+    if length > FEW_BYTES:
         yield bytewise(data)
 
 

@@ -38,11 +38,9 @@ from busmaster.exchange import Command, Exchange
 from busmaster.profile import Profile
 from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen
 from busmaster.testing.commands import check_addresses, check_command, check_invalid
-from busmaster.testing.damage import bytewise, flips, garbage_chunks, splits
+from busmaster.testing.damage import MANY_BYTES, bytewise, flips, garbage_chunks, splits
 from busmaster.testing.listening import Ending, Listening
 
-LONG_REPLY = 64
-"""Bytes above which a reply with a flipped bit is not fed byte by byte too."""
 FINDINGS_EACH = 3
 """How many findings of one kind a case may add: the rest would only repeat them."""
 STRAYS = b"\x00\x7f"
@@ -195,7 +193,7 @@ class _Kit:
         for before, run in self.runs(case):
             for heard in flips(run, self.profile.line.bytesize):
                 self.tally["flips"] += 1
-                ways = [[heard], bytewise(heard)] if len(heard) <= LONG_REPLY else [[heard]]
+                ways = [[heard], bytewise(heard)] if len(heard) <= MANY_BYTES else [[heard]]
                 for chunks in ways:
                     ending = self.hear(case, *before, *chunks).expire()
                     if (ending.delivered and not self._is_exempt(run, heard)) or ending.is_bug:

@@ -11,9 +11,11 @@ from busmaster.errors import NoSuchParameter, Refused
 from busmaster.exchange import Command
 from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
 from busmaster.testing import Case, Foreign, RoundTrip, Unseen, answers_of, check_protocol
+from tests.protocols.slaves import MscSlave, dc104_slave, mentor_slave
 
 ACK, NAK, EOT = b"\x06", b"\x15", b"\x04"
 DECIMALS = [0.0, 1.0, -1.0, 0.5, -0.0001, 123.456, 99999.9999, 1234567, -7654321]
+WORDS = tuple(value for bit in range(0, 32, 2) for value in (2**bit - 1, -(2**bit)))
 
 
 def element_named(command: Command[Any], address: int) -> Hashable:
@@ -103,6 +105,14 @@ def test_mentor_keeps_the_contract() -> None:
             lambda: mentor.Write(15, 60, 65536, wide=True),
             lambda: mentor.Read(1, 17).open(0, mentor.PROFILE.timings),
         ],
+        round_trips=[
+            RoundTrip(14, lambda value: mentor.Write(1, 17, value), mentor.Read(1, 17), range(-9999, 10000, 101)),
+            RoundTrip(
+                14, lambda value: mentor.Write(15, 60, value, wide=True), mentor.Read(15, 60), [0, 9999, 10000, 65535]
+            ),
+            RoundTrip(14, lambda value: mentor.Write(4, 26, value), mentor.Read(4, 26), [True, False]),
+        ],
+        device=mentor_slave(),
     )
 
 
@@ -149,6 +159,15 @@ def test_msc_keeps_the_contract() -> None:
             Foreign(msc.DataWrite(2008, 1234), 1, dread, "the same, and it holds no ACK"),
         ],
         invalid=[lambda: msc.DataRead(65536), lambda: msc.BlockWrite(0, (1, 2)), lambda: msc.ReadFlag(256)],
+        round_trips=[
+            RoundTrip(7, lambda value: msc.DataWrite(2008, value), msc.DataRead(2008), WORDS),
+            RoundTrip(7, lambda value: msc.DataWrite(0xFFFF, value), msc.DataRead(0xFFFF), WORDS),
+            RoundTrip(7, lambda values: msc.BlockWrite(100, values), msc.BlockRead(100), [WORDS, WORDS[::-1]]),
+            RoundTrip(7, msc.SetFlag, msc.ReadFlag(9), [9], read_back=lambda flag: True),
+            RoundTrip(7, msc.ClearFlag, msc.ReadFlag(9), [9], read_back=lambda flag: False),
+            RoundTrip(7, msc.SetFlag, msc.ReadFlags(), range(256), read_back=lambda flag: set(range(flag + 1))),
+        ],
+        device=MscSlave(7),
     )
 
 
@@ -170,4 +189,9 @@ def test_dc104_keeps_the_contract() -> None:
         ],
         names=dc104_parameter_named,
         invalid=[lambda: dc104.Read(0), lambda: dc104.Read(256), lambda: dc104.Write(1, 65536)],
+        round_trips=[
+            RoundTrip(0, lambda value: dc104.Write(5, value), dc104.Read(5), range(0, 65536, 257)),
+            RoundTrip(0, lambda value: dc104.Write(255, value), dc104.Read(255), [0, 1, 0x0206, 0xFFFF]),
+        ],
+        device=dc104_slave(),
     )
