@@ -15,10 +15,12 @@
 A few cases say what the document says: a command, the node, what that node answers, and the value. From them the kit
 derives what the arbiter relies on (`busmaster.exchange`), and raises `NotConformant` with all that does not hold:
 
-- every split of every reply gives what one chunk gives; what is cut short is MORE, and an error when time runs out;
+- every split of every reply gives what one chunk gives (of longer replies: into two, into three, and one byte at a
+  time); what is cut short is MORE, and an error when time runs out;
 - no single-bit flip of a reply is accepted, but for those that `unseen` lists with a reason;
 - no reply to another case is accepted, unless `names` says that replies cannot tell the two apart; no `foreign` one;
-- any bytes at all end in a value, FrameError or Refused, and every exchange has an end;
+- any bytes at all end in a value, FrameError or Refused, and every exchange has an end; the profile's listener, if it
+  has one, takes any bytes too;
 - what follows a reply is handed back; sizes, legs, starts and closing bytes are as announced;
 - commands are immutable, hashable values with a text; bad arguments raise InvalidCommand (`invalid`);
 - every attempt sends the same bytes, and no two addresses do;
@@ -34,7 +36,7 @@ from random import Random
 from typing import Any
 
 from busmaster.errors import Refused
-from busmaster.exchange import Command, Exchange
+from busmaster.exchange import Command, Done, Exchange, FrameError, Listener
 from busmaster.profile import Profile
 from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen
 from busmaster.testing.commands import check_addresses, check_command, check_invalid
@@ -230,6 +232,20 @@ class _Kit:
             ending = self.hear(case, *chunks).expire()
             if ending.is_bug:
                 yield f"{case}: {_hex(chunks)} gives {ending}"
+            if self.profile.listen is not None:
+                yield from self._check_listener(self.profile.listen(), chunks)
+
+    def _check_listener(self, listener: Listener, chunks: Iterable[bytes]) -> Iterator[str]:
+        """One listener serves all that comes unasked: it goes on after whatever it was fed."""
+        for chunk in chunks:
+            try:
+                listener.feed(chunk)
+            except FrameError:
+                continue
+            except Exception as error:
+                yield f"the listener raises {error!r} for {chunk.hex(' ')}"
+        if not isinstance(listener.expired(), Done):
+            yield "the listener has no end when time runs out"
 
     # the replies of others
 

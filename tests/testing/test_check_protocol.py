@@ -317,6 +317,25 @@ def test_bugs_in_a_profile_are_found() -> None:
     assert "addresses 1 and 2 are sent the same 01 03" in find(profile=replace(MODBUS, probe=deaf()))
 
 
+class DeafListener:
+    def feed(self, data: bytes, /) -> Done[None]:
+        raise KeyError(data[:1])
+
+    def expired(self) -> Any:
+        return None
+
+
+class EndlessListener(DeafListener):
+    def feed(self, data: bytes, /) -> Done[None]:
+        return Done(None)
+
+
+def test_bugs_in_a_listener_are_found() -> None:
+    findings = find(READING, profile=replace(MODBUS, listen=DeafListener))
+    assert "the listener raises KeyError" in findings
+    assert "the listener has no end" in find(READING, profile=replace(MODBUS, listen=EndlessListener))
+
+
 # round trips
 
 
