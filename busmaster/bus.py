@@ -17,8 +17,9 @@ from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import Event, LineState, NodeChanged, Strayed
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Priority
-from busmaster.errors import BusError, InvalidCommand
+from busmaster.errors import InvalidCommand
 from busmaster.exchange import Timings
+from busmaster.logbook import Logbook
 from busmaster.node import Node
 from busmaster.points import Point
 from busmaster.polling import PollGroup, Sample, Stream
@@ -47,6 +48,7 @@ class Bus:
             raise InvalidCommand(f"a bus needs room for at least one request, not {capacity}")
         self.endpoint = endpoint
         self._random = random.Random(seed)
+        self._logbook = Logbook(endpoint.name)
         settings = endpoint.settings
         self._byte_time_known = settings is not None
         self._arbiter = Arbiter(
@@ -241,6 +243,7 @@ class Bus:
     def _on_event(self, event: Event) -> None:
         if isinstance(event, NodeChanged) and event.returning and isinstance(event.node.waiter, Node):
             self._start(self._run_hook(event.node.waiter))
+        self._logbook.note(event, self.now())
         if not isinstance(event, Strayed):
             for stream in self._streams:
                 stream.put(event)
@@ -256,7 +259,7 @@ class Bus:
         try:
             if node.on_return is not None:
                 await node.on_return(node)
-        except BusError:
-            pass
+        except Exception as error:
+            self._logbook.failed_hook(node.label, error)
         finally:
             self._arbiter.dispatcher.release_node(node.record)

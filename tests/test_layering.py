@@ -13,7 +13,7 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "busmaster"
 BASE = {"errors", "exchange", "profile"}
-HOLDINGS = {"bus", "node", "points", "polling"}
+HOLDINGS = {"bus", "logbook", "node", "points", "polling"}
 ALL = {entry.stem for entry in PACKAGE.iterdir() if entry.suffix in ("", ".py") and entry.name[0] != "_"}
 
 MAY_IMPORT: dict[str, set[str]] = {

@@ -1,0 +1,54 @@
+"""What goes into the log (R14): changes of state, and no more often than a person can read."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Hashable
+
+from busmaster.arbiter.events import Event, LatenessRaised, LineChange, LineChanged, NodeChanged, Strayed
+from busmaster.arbiter.health import Health
+
+logger = logging.getLogger("busmaster")
+
+PAUSE = 10.0
+"""Seconds in which a thing that happens again and again is logged once; the next line says how often it was."""
+
+
+class Logbook:
+    """The log of one line. `name` is the port's."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._written: dict[Hashable, tuple[float, int]] = {}
+
+    def note(self, event: Event, now: float) -> None:
+        """Write a line for a change of a node or of the line, for a collision and for a raised lateness."""
+        if isinstance(event, NodeChanged):
+            level = logging.WARNING if event.after is Health.DOWN else logging.INFO
+            text = f"{event.node.label} is {event.after.value} (was {event.before.value})"
+            self._write((event.node, event.after), level, text, now)
+        elif isinstance(event, LineChanged):
+            level = logging.WARNING if event.change in (LineChange.DOWN, LineChange.NOISY) else logging.INFO
+            because = f": {event.cause}" if event.cause else ""
+            self._write(event.change, level, f"the line is {event.change.value}{because}", now)
+        elif isinstance(event, LatenessRaised):
+            text = (
+                f"{event.node.label} answered {event.age * 1000:.0f} ms after its request: "
+                f"its lateness is now {event.lateness * 1000:.0f} ms"
+            )
+            self._write((event.node, LatenessRaised), logging.WARNING, text, now)
+        elif isinstance(event, Strayed) and event.collision:
+            text = f"the echo differs from what was sent: a collision ({event.data.hex(' ')})"
+            self._write(Strayed, logging.WARNING, text, now)
+
+    def failed_hook(self, label: str, error: Exception) -> None:
+        """A user's on_return hook raised."""
+        logger.error("%s: the on_return hook of %s failed", self._name, label, exc_info=error)
+
+    def _write(self, key: Hashable, level: int, text: str, now: float) -> None:
+        last, more = self._written.get(key, (-PAUSE, 0))
+        if now - last < PAUSE:
+            self._written[key] = (last, more + 1)
+            return
+        self._written[key] = (now, 0)
+        logger.log(level, "%s: %s%s", self._name, text, f" ({more} more since the last such line)" if more else "")
