@@ -135,6 +135,31 @@ def test_the_line_knows_its_devices_by_address() -> None:
     assert ask(line, hexed(READ_3), 1.0) == REPLY
 
 
+class Insister(Device):
+    """Says its name every 10 ms until it has heard anything."""
+
+    def hear_byte(self, byte: int, now: float) -> None:
+        self.wakeup = float("inf")
+
+    def wake(self, now: float) -> None:
+        self.reply(b"here", now, 0.0)
+        self.wakeup = now + 0.01
+
+
+def test_a_device_may_speak_unasked_when_its_own_timer_runs_out() -> None:
+    device = Insister(1)
+    device.wakeup = 0.005
+    device.attentive = True
+    line = line_of(device, mint(3))
+    line.prompt = False
+    assert [round(when - 4 * TAU, 6) for when, _ in arrivals(line, 0.03)] == [0.005, 0.015, 0.025]
+    assert ask(line, hexed(READ_3), 0.03) == REPLY
+    device.wakeup = 1.0
+    device.faults.dead = 1.0
+    line.restart(device, 0.9)
+    assert ask(line, "00", 0.95, 0.2) == ""
+
+
 # Collisions
 
 

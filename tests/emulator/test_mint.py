@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -297,6 +299,31 @@ def test_the_command_handshake_loses_a_command_that_comes_between_its_read_and_i
     mint.run(mint.now + 2.0)
     assert mint.comms[1] == 0
     assert mint.axes[1].position(mint.now) == 0
+
+
+def test_the_command_handshake_moves_relative_and_home() -> None:
+    mint = MintController(1, program=command_handshake)
+    mint.run(0.0)
+    mint.comms[2:4] = [100.0, 5.0]
+    for command, position in ((2, 5), (2, 10), (3, 0)):
+        while mint.line_number != 10:
+            mint.run(mint.now + mint.statement)
+        assert mint.write_element(1, command, mint.now)
+        mint.run(mint.now + 2.0)
+        assert mint.comms[1] == 0
+        assert mint.axes[1].position(mint.now) == position
+
+
+def test_a_program_that_ends_is_no_longer_running() -> None:
+    def short(mint: MintController) -> Generator[int, None, None]:
+        mint.comms[7] = 1
+        yield 1
+
+    mint = MintController(1, program=short)
+    assert [mint.read_element(235, now) for now in (0.0, 1.0)] == [True, False]
+    assert mint.comms[7] == 1
+    mint.start_program()
+    assert mint.read_element(235, 2.0) is True
 
 
 def test_a_restart_loses_what_was_in_ram() -> None:

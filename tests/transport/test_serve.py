@@ -137,6 +137,33 @@ def test_a_paced_line_takes_its_time_and_not_much_more(serve: Callable[[Line], L
     assert sorted(times)[len(times) // 2] < need + 0.002
 
 
+@pytest.mark.parametrize("serve", [serve_pty, serve_tcp])
+def test_a_host_that_never_reads_loses_bytes_and_hurts_nobody(serve: Callable[[Line], LineServer]) -> None:
+    with serve(mint_line()) as server:
+        client = connected(server) if isinstance(server, TcpServer) else None
+        if client is not None:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+        port = opened(server.path) if client is None else client.fileno()
+        os.write(port, READ)
+        flood = REPLY * 100_000
+        assert server.call(lambda line, now: server._deliver(flood)) is None
+        assert server.dropped > 0
+        assert ask(port, b"", 1) != b""
+        if client is None:
+            os.close(port)
+        else:
+            client.close()
+
+
+def test_a_tcp_client_that_vanishes_leaves_the_port_to_others() -> None:
+    with serve_tcp(mint_line()) as server:
+        with connected(server) as client:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\x01\0\0\0\0\0\0\0")  # close by a reset
+            client.sendall(b"\0")
+        with connected(server) as client:
+            assert ask(client.fileno(), WRITE, 1) == b"\x06"
+
+
 def test_an_idle_line_does_not_burn_the_processor() -> None:
     with serve_pty(mint_line(paced=True)):
         before = time.process_time()
