@@ -1,0 +1,170 @@
+"""Lines to measure on: ptys, TCP connections or socket pairs, with the responder at their other end."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+import tty
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from busmaster.profile import LineSettings
+from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.serial_port import SerialPort
+from busmaster.transport.tcp import TcpPort
+
+ROOT = Path(__file__).parent.parent
+FREE_BAUDRATE = 57600
+"""Said of a line that is not paced: windows follow it, the bytes do not."""
+SPIN = 500e-6
+"""Longer than a sleeping core takes to wake up, where one line has the responder to itself."""
+CORES = sorted(os.sched_getaffinity(0))
+
+
+class Kind(Enum):
+    PTY = "pty"
+    TCP = "TCP"
+    SOCKETPAIR = "socketpair"
+
+
+@dataclass(frozen=True)
+class SocketPort:
+    """An endpoint on a socket that is connected already: it can be opened once."""
+
+    sock: socket.socket
+    settings: LineSettings | None = None
+    name: str = "socketpair"
+    echo: bool = False
+    receive_latency: float = 0.0
+    paced: bool | None = None
+
+    def identity(self) -> None:
+        return None
+
+    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> asyncio.Transport:
+        transport, _ = await asyncio.get_running_loop().create_connection(protocol_factory, sock=self.sock)
+        return transport
+
+
+class Lines:
+    """`count` lines of one kind, all served by one responder process. Use it in `with`; `ports` are the near ends.
+
+    `table` maps each request to the parts of its reply. `baudrate` None: the line is not paced. `delay` is the
+    device's reply time in seconds. A `swallow` that a request begins with is taken off (the host's ACK in MSC). For
+    `spin` seconds before a reply is due the responder watches the clock, awake.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        table: Mapping[bytes, Sequence[bytes]],
+        *,
+        kind: Kind = Kind.PTY,
+        settings: LineSettings | None = None,
+        delay: float = 0.0,
+        swallow: bytes = b"",
+        spin: float = SPIN,
+    ) -> None:
+        self.ports: list[Endpoint] = []
+        self._kept: list[int] = []
+        self._table = table
+        self._settings = settings
+        self._far = [self._pair(kind) for _ in range(count)]
+        self._order = {
+            "table": {ask.hex(): [part.hex() for part in say] for ask, say in table.items()},
+            "swallow": swallow.hex(),
+            "spin": spin,
+            "lines": [
+                {
+                    "fd": fd,
+                    "tau": settings.byte_time if settings is not None else 0.0,
+                    "delay": delay,
+                    "listen": kind is Kind.TCP,
+                }
+                for fd in self._far
+            ],
+        }
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def _pair(self, kind: Kind) -> int:
+        settings = self._settings or LineSettings(FREE_BAUDRATE)
+        if kind is Kind.PTY:
+            far, near = os.openpty()
+            tty.setraw(near)
+            self._kept.append(near)  # while somebody holds it, the far end reads no hang-up between two masters
+            self.ports.append(SerialPort(os.ttyname(near), baudrate=settings.baudrate))
+            return far
+        if kind is Kind.TCP:
+            server = socket.create_server(("127.0.0.1", 0))
+            self.ports.append(TcpPort("127.0.0.1", server.getsockname()[1], baudrate=settings.baudrate))
+            return server.detach()
+        ours, theirs = socket.socketpair()
+        ours.setblocking(False)
+        self.ports.append(SocketPort(ours, settings))
+        return theirs.detach()
+
+    def __enter__(self) -> Lines:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.responder"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=self._far,
+            cwd=ROOT,
+        )
+        for fd in self._far:
+            os.close(fd)
+        _part_from(self._process.pid, self._settings is not None)
+        self._tell(json.dumps(self._order))
+        self._hear()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait(10)
+        for fd in self._kept:
+            os.close(fd)
+
+    def dead_times(self) -> list[list[float]]:
+        """Seconds between each reply and the next request, line by line, since this was asked last."""
+        self._tell("report")
+        return [line["dead"] for line in self._hear()]
+
+    def _tell(self, word: str) -> None:
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._process.stdin.write(word.encode() + b"\n")
+        self._process.stdin.flush()
+
+    def _hear(self) -> list[dict[str, Any]]:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        report: list[dict[str, Any]] = json.loads(self._process.stdout.readline())
+        return report
+
+
+def _part_from(responder: int, paced: bool) -> None:
+    """Give the responder a core of its own; where it keeps time, let nobody else interrupt it there, if we may.
+
+    It stands for the wire and the devices, which take no time of the master's and wait for no other program. One that
+    answers at once is a process like any other: waking each other up is part of what a ping-pong costs.
+    """
+    if len(CORES) == 1:
+        return
+    os.sched_setaffinity(responder, CORES[-1:])
+    os.sched_setaffinity(0, CORES[:-1])
+    if paced:
+        with contextlib.suppress(PermissionError):
+            os.sched_setscheduler(responder, os.SCHED_FIFO, os.sched_param(1))

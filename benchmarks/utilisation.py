@@ -1,0 +1,74 @@
+"""How much of what the wire can carry is carried, at real baud rates and device reply times.
+
+The limit of the wire is bits and reply time and nothing else: requests, replies, the host's ACK in MSC, and the
+device's reply time. The responder keeps that time by its own precise clock. Beside ours runs the bare
+asyncio.Protocol loop: what it does not reach, this machine cannot.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from statistics import mean
+
+from benchmarks.asks import hcp2_asks, msc_asks, wire_time
+from benchmarks.harness import Claim, Options, Outcome, Table, alternate
+from benchmarks.lines import Lines
+from benchmarks.masters import Ask, Bare, Ours
+from busmaster.profile import LineSettings, Profile
+from busmaster.protocols import hcp2, msc
+
+BAUDRATES = (9600, 57600, 115200)
+REPLY_TIMES = (0.0, 0.002, 0.02)
+CLAIMED_REPLY_TIME = 0.002
+OF_THE_WIRE = 98.0
+OF_BARE = 97.0
+COLUMNS = ("line", "reply time ms", "wrong", "limit /s", "ours /s", "% of limit", "bare % of limit", "% of bare")
+
+
+def run(options: Options) -> Outcome:
+    outcome = Outcome()
+    table = Table("Transactions a second against the limit of the wire", COLUMNS)
+    for profile, asks in ((hcp2.PROFILE, hcp2_asks()), (msc.PROFILE, msc_asks())):
+        for baudrate in BAUDRATES:
+            for delay in options.pick(REPLY_TIMES, (CLAIMED_REPLY_TIME,)):
+                asyncio.run(_measure(profile, asks, baudrate, delay, options, table, outcome))
+    outcome.tables.append(table)
+    return outcome
+
+
+async def _measure(
+    profile: Profile,
+    asks: Sequence[Ask],
+    baudrate: int,
+    delay: float,
+    options: Options,
+    table: Table,
+    outcome: Outcome,
+) -> None:
+    settings = LineSettings(baudrate)
+    limit = 1 / mean(wire_time(ask, settings, delay) for ask in asks)
+    ours, bare = Ours(profile, asks), Bare(asks)
+    round_length = options.pick(0.5, 0.1)
+    transactions = max(1, round(round_length * limit / len(asks))) * len(asks)
+    replies = {ask.request: ask.reply for ask in asks}
+    with Lines(2, replies, settings=settings, delay=delay, swallow=asks[0].closing) as lines:
+        await ours.open(lines.ports[0])
+        await bare.open(lines.ports[1])
+        await bare.run(1)
+        timings = await alternate({"ours": ours.run, "bare": bare.run}, transactions, options.pick(9, 3))
+        await ours.close()
+        await bare.close()
+    share = 100 / timings["ours"].each / limit
+    bare_share = 100 / timings["bare"].each / limit
+    of_bare = 100 / timings["ours"].ratio(timings["bare"])
+    name = f"{profile.name} {baudrate}"
+    rate = 1 / timings["ours"].each
+    table.row(name, delay * 1000, timings["ours"].wrong, limit, rate, share, bare_share, of_bare)
+    outcome.wrong += timings["ours"].wrong
+    outcome.series[f"{name}, {delay * 1000:g} ms"] = {"ours": share, "bare": bare_share}
+    if delay == CLAIMED_REPLY_TIME and profile is hcp2.PROFILE:
+        if baudrate == min(BAUDRATES):
+            outcome.claims.append(Claim(f"% of the wire's limit, {name}", share, OF_THE_WIRE, at_most=False))
+        else:
+            outcome.claims.append(Claim(f"% of the bare loop's rate, {name}", of_bare, OF_BARE, at_most=False))
