@@ -200,6 +200,18 @@ class Exchange(Protocol[T_co]):
         ...
 
 
+class Abandonable(Protocol):
+    """An exchange that can be ended where it would say something again: needed where a profile has an
+    `exchange_limit` (R9)."""
+
+    def abandon(self) -> FrameError | Refused:
+        """What to fail the attempt with in place of the last Expect's `send`, which is then not sent.
+
+        A FrameError's own `send` leaves the node with nothing unacknowledged.
+        """
+        ...
+
+
 class Command(Protocol[T_co]):
     """What to ask of a node: an immutable, hashable value, checked when it is built (InvalidCommand).
 
@@ -242,6 +254,7 @@ def no_reply() -> FrameError:
 __all__ = [
     "MORE",
     "NO_REPLY",
+    "Abandonable",
     "Command",
     "Done",
     "Exchange",

@@ -57,7 +57,8 @@ class Profile:
 
     `probe` is its cheapest read, asked of a node that may be dead. `merge` proposes cheaper exchanges for commands of
     one node; a poll group and the planner weigh them by line time. `listen` reads what arrives while nothing is
-    asked. `exchange_limit` bounds one exchange as a whole, in seconds (MSC: past it a bad packet is ACKed away).
+    asked. `exchange_limit` bounds one exchange as a whole, in seconds (MSC: past it a bad packet is ACKed away); its
+    exchanges are `Abandonable`.
     """
 
     name: str

@@ -34,7 +34,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import inf
-from typing import Any
+from typing import Any, cast
 
 from busmaster.arbiter.counters import LineCounters, LineStatistics
 from busmaster.arbiter.deadlines import Deadlines
@@ -53,7 +53,7 @@ from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.strays import QUIET, Strays
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import BusClosed, BusError, LineDown, LineNoisy, Refused
-from busmaster.exchange import NO_REPLY, Done, Exchange, Expect, FrameError, ReplyTiming, Timings
+from busmaster.exchange import NO_REPLY, Abandonable, Done, Exchange, Expect, FrameError, ReplyTiming, Timings
 from busmaster.profile import Profile
 
 UNKNOWN_LATENESS = 0.150
@@ -330,7 +330,7 @@ class Arbiter:
         assert transaction is not None
         limit = transaction.node.profile.exchange_limit
         if step.send and limit is not None and (now - transaction.started > limit or self.dispatcher.urgent_waits()):
-            raise self._exchange.abandon()  # type: ignore[union-attr]  # profiles with a limit have it
+            raise cast("Abandonable", self._exchange).abandon()
         self._begin_leg(step.timing, step.sizes.longest, step.send, now)
 
     def _complete(self, step: Done[Any], now: float) -> None:
