@@ -47,8 +47,9 @@ class _Held:
         if frame.sender is Direction.HOST:
             return False
         last = self.last
-        over = last is not None and last.kind is not Kind.NOISE and self.judge()[0] is not Outcome.NO_REPLY
-        return frame.fault == UNASKED or self.request is None or (over and frame.kind is Kind.NOISE)
+        over = last is not None and self.judge()[0] is not Outcome.NO_REPLY
+        odd = frame.kind is Kind.NOISE or (last is not None and last.kind is Kind.NOISE)
+        return frame.fault == UNASKED or self.request is None or (over and odd)
 
     def judge(self) -> tuple[Outcome, str]:
         """By the frames alone."""
@@ -80,6 +81,7 @@ class Assembler:
         self._declared = protocol
         self._echo = echo
         self._echo_owed = b""
+        self._sent = b""
         self._offset = offset
         self._decoders: dict[str, Decoder] = {}
         self._protocol = ""
@@ -94,10 +96,13 @@ class Assembler:
         if sender is Direction.HOST:
             self._rest()
             self._speak(self._protocol_of(data))
-            self._echo_owed += data if self._echo else b""
+            if self._echo:
+                self._echo_owed += data
+                self._sent = data
         elif self._echo_owed:
             data = self._strip_echo(data)
         if data:
+            self._release_previous()
             self._decode(now, data, sender)
 
     def completed(self, now: float, verdict: Verdict) -> None:
@@ -118,7 +123,6 @@ class Assembler:
     def take(self, frame: Frame) -> None:
         """One frame, whoever decoded it."""
         packet = Packet(self._micros(frame.time), self._protocol, frame.sender, frame.raw, frame.node)
-        self._release_previous()
         if frame.sender is Direction.HOST and frame.kind in (Kind.READ, Kind.WRITE):
             self._previous, self._current = self._current, _Held(frame, self._protocol)
         held = self._current
@@ -126,6 +130,8 @@ class Assembler:
             packet.outcome = Outcome.STRAY
         elif frame.sender is not Direction.HOST:
             held.last, held.answer = frame, packet
+        elif frame.kind is Kind.NAK:
+            held.last = None  # MSC: the packet again
         elif frame.fault:
             packet.comment = frame.fault
         if held.released:
@@ -151,12 +157,17 @@ class Assembler:
             self._decoders[protocol] = Decoder(dialect(protocol))
 
     def _strip_echo(self, data: bytes) -> bytes:
-        """What is not the echo of what was sent. An echo that differs is left as it came: the line collided."""
-        owed = self._echo_owed
-        length = min(len(owed), len(data))
-        same = data[:length] == owed[:length]
-        self._echo_owed = owed[length:] if same else b""
-        return data[length:] if same else data
+        """What is not the echo of what was sent last, or before that (MSC's closing ACK comes with the next request).
+
+        An echo that differs is left as it came: the line collided.
+        """
+        for owed in (self._sent, self._echo_owed):
+            length = min(len(owed), len(data))
+            if length and data[:length] == owed[:length]:
+                self._echo_owed, self._sent = owed[length:], b""
+                return data[length:]
+        self._echo_owed = b""
+        return data
 
     def _decode(self, now: float, data: bytes, sender: Direction) -> None:
         decoder = self._decoders.get(self._protocol)

@@ -44,6 +44,11 @@ def characters(field: bytes) -> str:
     return field.decode("ascii", "backslashreplace")
 
 
+def came_back(raw: bytes) -> Frame:
+    """A whole request that was received by the host: an echo that nobody declared, or that differs."""
+    return Frame(Kind.NOISE, Direction.NODE, raw, fault="a request, received")
+
+
 class CommsDialect:
     """What HCP and HCP2 share: a reset byte, the node as two characters, the element as two characters."""
 
@@ -93,7 +98,9 @@ class CommsDialect:
         return closed_size(data, 6)
 
     def explain(self, raw: bytes, sender: Direction, /) -> Frame:
-        return self._request(raw) if raw[0] == self.reset else self._reply(raw)
+        if raw[0] != self.reset:
+            return self._reply(raw)
+        return came_back(raw) if sender is Direction.NODE else self._request(raw)
 
     def _request(self, raw: bytes) -> Frame:
         kind = Kind.READ if raw[6] == ENQ else Kind.WRITE
@@ -194,8 +201,8 @@ class MentorDialect:
 
     def _after_eot(self, data: bytes, sender: Direction, quiet: bool) -> int:
         """A request; or alone, while something is asked, "no such parameter"."""
-        alone = data[1] < _SPACE if len(data) > 1 else quiet
-        if sender is Direction.NODE or (alone and sender is Direction.UNKNOWN and self._asked):
+        alone = data[1] < _SPACE if len(data) > 1 else quiet or sender is Direction.NODE
+        if alone and (sender is Direction.NODE or (sender is Direction.UNKNOWN and self._asked)):
             return 1
         end = field_end(data, 1)
         if end == 9 < len(data) and data[9] == ENQ:
@@ -210,7 +217,7 @@ class MentorDialect:
     def explain(self, raw: bytes, sender: Direction, /) -> Frame:
         data = _plain(raw)
         if data[0] == EOT and len(data) > 1:
-            frame = self._request(data)
+            frame = came_back(data) if sender is Direction.NODE else self._request(data)
         elif data[0] in (ACK, NAK, BS) and self._is_short(sender):
             frame = self._short(data[0])
         elif data[0] == STX and sender is Direction.HOST:

@@ -486,7 +486,7 @@ local function add_outcome(p, outcome, whole, size)
   if outcome == STRAY then p.tree:add_proto_expert_info(e.stray) end
   if size == 0 then return (p.node and "node " .. p.node .. " " or "") .. (OUTCOMES[outcome] or "") end
   local text = info(p)
-  if not whole then text = text .. " (" .. size .. " bytes)" end
+  if not whole then text = text .. " (" .. size .. (size == 1 and " byte)" or " bytes)") end
   return p.bad and text .. " [bad checksum]" or text
 end
 

@@ -138,6 +138,32 @@ def test_noise_behind_a_reply_leaves_its_outcome_alone() -> None:
     assert tape.lines()[1:3] == [(NODE, VALUE, OK, ""), (NODE, b"\x00\x00", STRAY, "")]
 
 
+def test_a_reply_behind_noise_is_none_for_no_reader_looks_for_its_start() -> None:
+    tape = Tape()
+    tape.sent(1.0, READ)
+    tape.heard(1.002, b"\x05" + NAK)
+    assert [line[1:3] for line in tape.lines()] == [(READ, NONE), (b"\x05", GARBLED), (NAK, STRAY)]
+
+
+def test_a_bad_packet_that_is_sent_again_ends_well() -> None:
+    tape = Tape()
+    request = bytes.fromhex("02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74")
+    reply = bytes.fromhex("02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D")
+    tape.sent(1.0, request)
+    tape.heard(1.02, ACK + reply[:5])
+    tape.sent(1.2, NAK)
+    tape.heard(1.22, reply)
+    tape.sent(1.23, ACK)
+    assert [line[1:3] for line in tape.lines()] == [
+        (request, NONE),
+        (ACK, NONE),
+        (reply[:5], NONE),
+        (NAK, NONE),
+        (reply, OK),
+        (ACK, NONE),
+    ]
+
+
 def test_a_broadcast_is_over_when_it_is_sent() -> None:
     tape = Tape()
     everybody = bytes.fromhex("04 30 30 30 30 02 30 31 31 37 2B 30 30 30 30 03 2F")
@@ -187,11 +213,18 @@ def test_an_echo_is_left_out_and_one_that_differs_is_kept() -> None:
     tape.sent(1.0, READ)
     tape.heard(1.001, READ[:5])
     tape.heard(1.002, READ[5:] + VALUE)
-    tape.sent(2.0, READ)
-    tape.heard(2.001, READ[:3] + b"\xff")
+    tape.sent(2.0, READ)  # its echo never comes
+    tape.sent(3.0, OTHER)
+    tape.heard(3.001, OTHER + NAK)
+    tape.sent(4.0, READ)
+    tape.heard(4.001, READ[:3] + b"\xff")
     assert [line[1:3] for line in tape.lines()] == [
         (READ, NONE),
         (VALUE, OK),
+        (READ, NONE),
+        (b"", NO_REPLY),
+        (OTHER, NONE),
+        (NAK, REFUSED),
         (READ, NONE),
         (READ[:3] + b"\xff", GARBLED),
     ]
@@ -205,3 +238,22 @@ def test_a_line_that_is_only_listened_to_is_recorded_the_same() -> None:
         untold.overheard(now, request + reply[:1])
         untold.overheard(now + 0.01, reply[1:])
     assert [line[1:3] for line in untold.lines()] == [line[1:3] for line in told.lines()]
+
+
+def test_an_echo_that_never_came_does_not_use_up_the_next_one() -> None:
+    tape = Tape(echo=True)
+    write, read = bytes.fromhex("04 31 31 02 31 30 35 03 37"), bytes.fromhex("04 31 31 02 31 30 05")
+    tape.sent(1.0, write)
+    tape.sent(2.0, read)
+    tape.heard(2.001, read[:5])
+    tape.heard(2.002, read[5:] + bytes.fromhex("02 31 30 33 03 31"))
+    assert [line[1:3] for line in tape.lines()][2:] == [(read, NONE), (bytes.fromhex("02 31 30 33 03 31"), OK)]
+
+
+def test_mscs_closing_ack_is_echoed_into_the_next_exchange() -> None:
+    tape = Tape(echo=True)
+    request = bytes.fromhex("02 01 00 0D 00 00 44 57 52 49 54 45 2C 07 D8 00 00 04 D2 03 BE")
+    tape.sent(1.0, ACK)
+    tape.sent(1.0, request)
+    tape.heard(1.02, ACK + request + ACK)
+    assert [line[1:3] for line in tape.lines()][-2:] == [(request, NONE), (ACK, OK)]

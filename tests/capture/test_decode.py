@@ -242,6 +242,22 @@ def test_a_sender_that_is_known_is_believed() -> None:
     assert said(frames) == ["node 3 bytes [cut short after 3 bytes]", "host 2 read 1"]
 
 
+@pytest.mark.parametrize(
+    ("protocol", "request_", "answer"),
+    [
+        ("hcp2", "07 30 30 02 30 31 05 06", "15"),  # its checksum is ACK
+        ("hcp", "04 31 31 02 30 31 31 35 03 06", "06"),
+        ("mentor", "04 31 31 32 32 30 31 31 37 05", "04"),
+    ],
+)
+def test_a_request_that_the_host_receives_is_no_answer_to_it(protocol: str, request_: str, answer: str) -> None:
+    decoder = Decoder(dialect(protocol))
+    decoder.feed(bytes.fromhex(request_), 0.0, sender_of("read"))
+    echo, reply = decoder.feed(bytes.fromhex(request_ + answer), 0.001, NODE)
+    assert (echo.kind, echo.fault, echo.raw) == (Kind.NOISE, "a request, received", bytes.fromhex(request_))
+    assert (reply.sender, reply.answers) == (NODE, True)
+
+
 def test_a_protocol_that_does_not_exist_is_refused_by_name() -> None:
     with pytest.raises(InvalidCommand, match=r"'hcp3'.*hcp, hcp2"):
         dialect("hcp3")

@@ -5,12 +5,17 @@ from __future__ import annotations
 import random
 import shutil
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
 from busmaster.capture import DISSECTOR
 from busmaster.capture.pcapng import PROTOCOLS, Direction, Outcome, Packet, PcapngWriter
+from busmaster.protocols import hcp2
+from busmaster.protocols.comms_array import ELEMENTS as CONTROLLER
+from busmaster.protocols.comms_array import Element
+from busmaster.protocols.microflex import ELEMENTS as DRIVE
 from tests.capture.hearing import HOST, NODE, sender_of, vectors
 
 pytestmark = pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
@@ -210,6 +215,15 @@ def test_every_command_of_every_protocol_is_put_into_words(tmp_path: Path) -> No
             packets.append(packet(len(packets), protocol, sender, frame))
             expected.append([TITLES[protocol], *rest])
     assert dissect(tmp_path, packets, *FIELDS) == expected
+
+
+@pytest.mark.parametrize(("protocol", "elements"), [("hcp2", CONTROLLER), ("microflex", DRIVE)])
+def test_elements_are_called_what_the_package_calls_them(
+    tmp_path: Path, protocol: str, elements: Mapping[str, Element[object]]
+) -> None:
+    reads = [hcp2.Read(element.number).open(1, hcp2.PROFILE.timings).request for element in elements.values()]
+    rows = dissect(tmp_path, [Packet(START, protocol, HOST, read) for read in reads], "busmaster.name")
+    assert [name.partition(" / ")[0] for (name,) in rows] == list(elements)
 
 
 def test_a_bad_checksum_is_flagged_and_a_good_one_is_not(tmp_path: Path) -> None:

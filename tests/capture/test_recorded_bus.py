@@ -1,0 +1,57 @@
+"""A bus with a recorder as its tap: what it did is in the file, and reads back the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from busmaster.bus import Bus
+from busmaster.capture.pcapng import Outcome, Packet, read_packets
+from busmaster.capture.recorder import Recorder
+from busmaster.capture.replay import replay
+from busmaster.emulator.build import make_device
+from busmaster.emulator.line import Echo, Line
+from busmaster.errors import NoReply, Refused
+from busmaster.handles import Hcp2Controller, HcpController, MicroFlexDrive
+from busmaster.profile import LineSettings
+from busmaster.transport.memory import MemoryPort
+
+
+async def record(path: Path, echo: bool) -> list[Packet]:
+    devices = [make_device("hcp", 1), make_device("hcp2", 2), make_device("microflex", 7)]
+    line = Line(LineSettings(57600), devices, echo=Echo() if echo else None)
+    with Recorder(path, echo=echo) as tap:
+        async with Bus(MemoryPort(line), tap=tap) as bus:
+            old, new, drive = HcpController(bus, 1), Hcp2Controller(bus, 2), MicroFlexDrive(bus, 7)
+            await old.write(10, 1.5, -2)
+            assert await old.read(11) == -2
+            await drive.status_word.read()
+            with pytest.raises(Refused):
+                await new.write(100, 3)
+            with pytest.raises(NoReply):
+                await Hcp2Controller(bus, 9).read(1)
+            await new.axis(0).position.read()
+            axes = bus.poll_group("axes", period=0.05, points=[new.axis(0).position, new.axis(1).position])
+            await anext(aiter(axes))
+    with path.open("rb") as file:
+        return list(read_packets(file))
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("echo", [False, True])
+async def test_every_exchange_of_a_bus_is_recorded_with_its_outcome(tmp_path: Path, echo: bool) -> None:
+    packets = await record(tmp_path / "line.pcapng", echo)
+    assert [packet.micros for packet in packets] == sorted(packet.micros for packet in packets)
+    exchanges = list(replay(packets))
+    assert not [f"{one.command}: {one.recorded}, {one.now}" for one in exchanges if one.changed or not one.judged]
+    assert [(one.node, one.command, one.recorded.outcome) for one in exchanges][:4] == [
+        (1, "write elements 10-11 = 1.5,-2", Outcome.OK),
+        (1, "read element 11", Outcome.OK),
+        (7, "read element 109", Outcome.OK),
+        (2, "write element 100 = 3", Outcome.REFUSED),
+    ]
+    silent = [packet.comment for packet in packets if packet.outcome is Outcome.NO_REPLY]
+    assert silent[-1].startswith("read element 1: node 9: no reply within 100 ms")
+    assert "read element 11: -2.0" in [packet.comment for packet in packets]
+    assert exchanges[-1].command in ("read element 100", "read element 115")
