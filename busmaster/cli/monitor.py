@@ -6,7 +6,6 @@ import asyncio
 import json
 import time
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from datetime import datetime
 from typing import Any
 
@@ -19,6 +18,7 @@ from busmaster.capture.frames import Frame, Kind
 from busmaster.capture.pcapng import Direction
 from busmaster.capture.recorder import Recorder
 from busmaster.cli.arguments import Connection, protocol_option
+from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.output import emit
 from busmaster.errors import BusError, LineDown
 from busmaster.handles import HANDLES
@@ -31,7 +31,7 @@ ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 @protocol_option
 @click.option("--baud", type=click.IntRange(min=1), metavar="N", help="Baud rate; the protocol's by default.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
-@click.option("--capture", type=click.Path(dir_okay=False), metavar="FILE", help="Record it too, for Wireshark.")
+@capture_option
 def command(port: str, protocol: str, baud: int | None, as_json: bool, capture: str | None) -> None:
     """Decode what passes on PORT, a line a frame, until Ctrl-C. Nothing is ever sent.
 
@@ -41,10 +41,7 @@ def command(port: str, protocol: str, baud: int | None, as_json: bool, capture: 
     endpoint = Connection(port, protocol, baud).endpoint()
     names = element_names(protocol)
     write = json_text if as_json else plain_text
-    recording: AbstractContextManager[Recorder | None] = nullcontext()
-    if capture is not None:
-        recording = Recorder(capture, port=endpoint.name, protocol=protocol)
-    with recording as recorder:
+    with capturing(capture, port=endpoint.name, protocol=protocol) as recorder:
         anyio.run(listen, endpoint, Decoder(dialect(protocol)), lambda frame: emit(write(frame, names)), recorder)
 
 
