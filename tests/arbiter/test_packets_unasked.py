@@ -1,0 +1,123 @@
+"""MSC's packets: two legs, a closing ACK, stale packets, and a limit on one exchange (PROTOCOLS 5, R9)."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.arbiter.events import LineState
+from busmaster.arbiter.transaction import Priority
+from busmaster.errors import GarbledReply, Refused
+from busmaster.protocols import msc
+from tests.arbiter.bench import Bench
+
+READ_2008 = "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74"
+REPLY_1234 = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"
+BAD_REPLY = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D3 02 6D"
+ACK, NAK = "06", "15"
+
+
+def bench() -> Bench:
+    made = Bench()
+    made.arbiter.byte_time = 10 / 9600
+    return made
+
+
+def test_ack_then_packet_then_the_hosts_ack() -> None:
+    line = bench()
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    read = line.ask(node, msc.DataRead(2008))
+    following = line.ask(node, msc.DataRead(2008))
+    assert line.sent() == READ_2008
+    line.hear(ACK, after=0.03)
+    line.hear(REPLY_1234, after=0.1)
+    assert (read.value, line.sent()) == (1234, ACK)
+    assert line.arbiter.state is LineState.HOLDOFF
+    assert line.until_sent() == pytest.approx(10 / 9600)
+    assert line.sent() == READ_2008
+    line.hear(ACK + REPLY_1234, after=0.05)
+    assert following.value == 1234
+
+
+def test_a_bad_packet_is_naked_and_comes_again() -> None:
+    line = bench()
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    read = line.ask(node, msc.DataRead(2008))
+    line.sent()
+    line.hear(ACK + BAD_REPLY, after=0.05)
+    assert line.sent() == NAK
+    line.hear(REPLY_1234, after=0.05)
+    assert (read.value, read.attempts) == (1234, 1)
+    assert line.sent() == ACK
+
+
+def test_a_device_that_naks_is_asked_three_times_more_and_then_refuses() -> None:
+    line = bench()
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    read = line.ask(node, msc.DataRead(2008))
+    for _ in range(3):
+        assert line.sent() == READ_2008
+        line.hear(NAK, after=0.03)
+    assert line.sent() == READ_2008
+    line.hear(NAK, after=0.03)
+    assert isinstance(read.error, Refused)
+    assert read.attempts == 1
+
+
+def test_r9_with_an_urgent_request_waiting_a_bad_packet_is_acked_away() -> None:
+    line = bench()
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    read = line.ask(node, msc.DataRead(2008), retries=0)
+    urgent = line.ask(node, msc.ReadStatus(), priority=Priority.URGENT)
+    line.sent()
+    line.hear(ACK + BAD_REPLY, after=0.05)
+    assert isinstance(read.error, GarbledReply)
+    assert line.sent() == ACK
+    line.until_sent()
+    line.sent()
+    assert urgent.attempts == 1
+
+
+def test_r9_an_exchange_past_its_limit_does_not_ask_again() -> None:
+    line = bench()
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    read = line.ask(node, msc.DataRead(2008), retries=0)
+    line.sent()
+    line.hear(ACK, after=0.4)
+    line.hear(BAD_REPLY, after=0.9)
+    assert line.sent() == NAK
+    line.hear(BAD_REPLY, after=0.9)
+    assert line.sent() == ACK
+    assert isinstance(read.error, GarbledReply)
+
+
+@pytest.mark.parametrize("stale", [REPLY_1234, BAD_REPLY])
+def test_a_stale_packet_on_an_idle_line_is_acked_and_dropped(stale: str) -> None:
+    line = bench()
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    line.hear(stale)
+    line.wait(0.2)
+    assert line.sent() == ACK
+    read = line.ask(node, msc.DataRead(2008))
+    line.until_sent()
+    line.sent()
+    line.hear(ACK + REPLY_1234.replace("04 D2 02 6D", "04 D3 02 6E"), after=0.05)
+    assert read.value == 1235
+
+
+def test_a_stale_packet_while_the_line_settles_is_acked_too() -> None:
+    line = bench()
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    read = line.ask(node, msc.DataRead(2008), retries=0)
+    line.sent()
+    line.wait(0.55)
+    assert read.error is not None
+    line.sent()
+    line.hear(REPLY_1234, after=0.1)
+    assert line.sent() == ACK
