@@ -288,9 +288,9 @@ class Dispatcher:
         if self._probe is not None:
             self._deadlines.health = inf
             return
-        self._deadlines.health = min(
-            (max(n.probe_at, n.suspended_until) for n in self.nodes if n.health is Health.DOWN), default=inf
-        )
+        down = [node for node in self.nodes if node.health is Health.DOWN]
+        self._budget.probe = max((node.lateness for node in down), default=0.0)
+        self._deadlines.health = min((max(node.probe_at, node.suspended_until) for node in down), default=inf)
 
     def probe(self, now: float) -> None:
         """Ask the dead node whose turn it is, if the budget allows."""

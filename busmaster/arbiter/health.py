@@ -26,7 +26,7 @@ BUDGET_SHARE = 0.02
 BUDGET_IDLE_SHARE = 0.25
 BUDGET_SHARE_AFTER_RETURN = 0.2
 BUDGET_RETURN_PERIOD = 30.0
-BUDGET_CAPACITY = 1.0
+BUDGET_CAPACITY = 0.5
 """Seconds of line time that may be saved up."""
 LONGEST_BUDGET_WAIT = 1.0
 
@@ -98,17 +98,20 @@ class NodeRecord:
 
 
 class ProbeBudget:
-    """A token bucket of line time, in seconds."""
+    """A token bucket of line time, in seconds. `probe`: what a probe costs if it is not answered."""
 
-    __slots__ = ("_earned_at", "_generous_until", "tokens")
+    __slots__ = ("_earned_at", "_generous_until", "probe", "tokens")
 
     def __init__(self, now: float) -> None:
         self.tokens = BUDGET_CAPACITY
+        self.probe = 0.0
         self._earned_at = now
         self._generous_until = -inf
 
     def idle(self, seconds: float) -> None:
-        self.tokens = min(BUDGET_CAPACITY, self.tokens + BUDGET_IDLE_SHARE * seconds)
+        """The line had a pause. One too short for a probe earns nothing: there a probe would delay what comes next."""
+        if seconds > self.probe:
+            self.tokens = min(BUDGET_CAPACITY, self.tokens + BUDGET_IDLE_SHARE * (seconds - self.probe))
 
     def node_returned(self, now: float) -> None:
         self._earn(now)

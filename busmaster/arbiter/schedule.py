@@ -65,6 +65,7 @@ class Poll:
         "paused",
         "period",
         "phase",
+        "priority",
         "remaining",
         "results",
         "started",
@@ -81,6 +82,7 @@ class Poll:
         self.patience = min(period, LONGEST_PATIENCE)
         self.phase = phase
         self.cost = cost
+        self.priority = Priority.POLL
         self.results: Sequence[Transaction] = ()
         self.fresh: Sequence[Transaction] | None = None
         self.waiter: Any = None
@@ -184,7 +186,10 @@ class Schedule:
 
 
 def begin_cycle(poll: Poll, now: float) -> list[Transaction]:
-    """Make the poll's transactions fresh; returns them, ready to be queued."""
+    """Make the poll's transactions fresh; returns them, ready to be queued.
+
+    A node that was never heard is read in BACKGROUND, so that absent nodes hold up nobody when a line starts.
+    """
     if poll.fresh is not None:
         poll.results, poll.fresh = poll.fresh, None
     poll.remaining = len(poll.results)
@@ -195,6 +200,7 @@ def begin_cycle(poll: Poll, now: float) -> list[Transaction]:
         transaction.reset()
         transaction.queued = now
         transaction.deadline = deadline
+        transaction.priority = poll.priority if transaction.node.last_reply > -inf else Priority.BACKGROUND
     return list(poll.results)
 
 
@@ -203,8 +209,8 @@ def set_members(poll: Poll, members: Iterable[Transaction], priority: Priority =
     fresh = tuple(members)
     for transaction in fresh:
         transaction.poll = poll
-        transaction.priority = priority
     poll.fresh = fresh
+    poll.priority = priority
 
 
 def quietest_offset(poll: Poll, others: Sequence[Poll], now: float, stretch: float = 1.0) -> float:
