@@ -10,7 +10,7 @@ from busmaster.capture.decode import Decoder
 from busmaster.capture.dialects import DIALECTS, dialect, protocol_of
 from busmaster.capture.frames import Frame, Kind
 from busmaster.errors import InvalidCommand
-from tests.capture.hearing import NODE, hear, said, sender_of, vectors
+from tests.capture.hearing import HOST, NODE, hear, said, sender_of, vectors
 
 
 @pytest.mark.parametrize(("protocol", "name", "raw"), vectors())
@@ -211,6 +211,66 @@ def test_what_is_wrong_with_a_reply_is_said() -> None:
     assert said(frames)[-1] == "node ACK [unasked]"
 
 
+@pytest.mark.parametrize(
+    ("protocol", "frames", "last"),
+    [
+        ("hcp", "04 31 32 02 30 31 05", "host read 1 [no node address: '12']"),
+        ("hcp", "04 31 31 02 41 31 05", "host 1 read 'A1'"),
+        ("hcp2", "07 30 61 02 30 31 05 54", "host read 1 [no node address: '0a']"),
+        ("hcp2", "07 30 32 02 30 61 05 54", "host 2 read '0a'"),
+        ("hcp2", "07 30 31 02 30 31 35 03 34 02 30 31 35 03 37", "node 1 1 = 5 [a value answers no write]"),
+        ("hcp2", "07 30 31 02 30 31 35 03 34 15 15", "node NAK [unasked]"),
+        ("mentor", "04 31 32 33 34 30 31 31 37 05", "host read 01.17 [no drive address: '1234']"),
+        ("mentor", "04 31 31 32 32 30 31 41 37 05", "host 12 read '01A7'"),
+        ("mentor", "04 31 31 32 32 30 31 31 37 05 06", "node 12 ACK [an ACK answers no read]"),
+        (
+            "mentor",
+            "04 31 31 32 32 30 31 31 37 05 02 30 31 31 38 2B 30 30 30 30 30 03 30",
+            "node 12 01.18 = +00000 [wrong parameter: 01.17 was asked]",
+        ),
+        (
+            "mentor",
+            "04 32 32 33 33 02 30 34 32 36 31 03 32 02 30 34 32 36 31 03 32",
+            "node 23 04.26 = 1 [a value answers no write]",
+        ),
+        ("mentor", "04 31 31 32 32 30 31 31 37 05 15 15", "host 12 again 01.17"),
+        ("msc", "02 01 00 05 00 00 48 45 4C 50 2C 01 5B", "host 1 HELP [no command: 'HELP']"),
+        ("msc", "02 01 00 07 00 00 44 52 45 41 44 2C 07 01 9B", "host 1 DREAD 7 [a body of 7 bytes, not 8]"),
+        ("msc", "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 75", "host 1 DREAD 2008 [bad checksum 0275, not 0274]"),
+        (
+            "msc",
+            "02 02 00 08 00 00 44 52 45 41 44 2C 07 D8 02 75 06 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D",
+            "node 1 2008 = 1234 [wrong answer: DREAD of unit 2 was asked]",
+        ),
+        ("msc", "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D", "node 1 ? = 1234 [unasked]"),
+        ("msc", "06", "node ACK [unasked]"),
+        ("dc104", "02 AA 01 AB 06", "node ACK [an ACK answers no read]"),
+        ("dc104", "02 AA 01 AB 02 02 00 00 02", "node 2 = 0 [wrong parameter: 1 was asked]"),
+        ("dc104", "02 55 01 04 D2 2C 02 01 04 D2 D7", "node 1 = 1234 [a value answers no write]"),
+        ("dc104", "02 AA 01 AC", "host read 1 [bad checksum AC, not AB]"),
+    ],
+)
+def test_what_is_wrong_with_a_frame_is_said(protocol: str, frames: str, last: str) -> None:
+    assert said(hear(protocol, frames))[-1] == last
+
+
+def test_a_status_word_may_be_followed_by_anything() -> None:
+    """RQSTAT's [FF] and [AAAA] "are not currently used"."""
+    reply = "02 01 00 09 00 00 52 51 53 54 41 54 2C 00 41 02 56"
+    frames = hear("msc", "02 01 00 07 00 00 52 51 53 54 41 54 2C 02 13", "06", reply)
+    assert said(frames)[-1] == "node 1 status = 65"
+
+
+def test_a_mentor_write_without_an_address_goes_to_the_drive_read_last() -> None:
+    decoder = Decoder(dialect("mentor"))
+    decoder.feed(bytes.fromhex("04 31 31 32 32 30 31 31 37 05"), 0.0, HOST)
+    decoder.feed(bytes.fromhex("02 30 31 31 37 2D 30 34 37 36 03 2C"), 0.01, NODE)
+    frames = decoder.feed(bytes.fromhex("02 30 31 31 37 2D 30 34 37 36 03 2C"), 0.02, HOST)
+    assert said(frames + decoder.feed(b"\x06", 0.03, NODE)) == ["host 12 write 01.17 = -0476", "node 12 ACK"]
+    fresh = Decoder(dialect("mentor"))
+    assert said(fresh.feed(b"\x06", 0.0, HOST)) == ["host next [unasked]"]
+
+
 def test_a_cut_reply_ends_at_the_next_request_or_in_silence() -> None:
     request = "07 30 32 02 30 31 05 04"
     cut = said(hear("hcp2", request, "02 30 31 31 32", request))
@@ -238,7 +298,7 @@ def test_delays_are_from_the_last_byte_of_the_request_to_the_first_of_the_reply(
 def test_a_sender_that_is_known_is_believed() -> None:
     decoder = Decoder(dialect("hcp2"))
     assert decoder.feed(bytes.fromhex("02 30 31"), 0.0, NODE) == []
-    frames = decoder.feed(bytes.fromhex("07 30 32 02 30 31 05 04"), 0.001, sender_of("read"))
+    frames = decoder.feed(bytes.fromhex("07 30 32 02 30 31 05 04"), 0.001, HOST)
     assert said(frames) == ["node 3 bytes [cut short after 3 bytes]", "host 2 read 1"]
 
 
@@ -252,7 +312,7 @@ def test_a_sender_that_is_known_is_believed() -> None:
 )
 def test_a_request_that_the_host_receives_is_no_answer_to_it(protocol: str, request_: str, answer: str) -> None:
     decoder = Decoder(dialect(protocol))
-    decoder.feed(bytes.fromhex(request_), 0.0, sender_of("read"))
+    decoder.feed(bytes.fromhex(request_), 0.0, HOST)
     echo, reply = decoder.feed(bytes.fromhex(request_ + answer), 0.001, NODE)
     assert (echo.kind, echo.fault, echo.raw) == (Kind.NOISE, "a request, received", bytes.fromhex(request_))
     assert (reply.sender, reply.answers) == (NODE, True)
