@@ -202,6 +202,17 @@ class Connection:
         return (only_address(self.profile),) if nodes is None else checked(self.profile, nodes)
 
 
+@dataclass(frozen=True, slots=True)
+class View:
+    """How what is polled is shown: for so many seconds or until Ctrl-C, as JSON, as plain lines, or on the screen."""
+
+    seconds: float | None = None
+    as_json: bool = False
+    plain: bool = False
+    read_only: bool = False
+    """No key of the screen writes."""
+
+
 def end_capture(recorder: Recorder) -> None:
     """Wait for the disk, and say so if not all is there."""
     recorder.close()
@@ -288,6 +299,19 @@ def connected(command: F) -> F:
     for option in reversed(options):
         gathered = option(gathered)
     return gathered  # type: ignore[return-value]  # the decorated function takes more than the one it wraps
+
+
+def viewed(command: F) -> F:
+    """Give a command the options of a view, as one `View` named `view`."""
+
+    @functools.wraps(command)
+    def gathered(seconds: float | None, as_json: bool, plain: bool, read_only: bool, **options: Any) -> Any:
+        return command(view=View(seconds, as_json, plain, read_only), **options)
+
+    read_only = click.option("--read-only", is_flag=True, help="Live view: no key writes to a node.")
+    for option in (read_only, plain_option, json_option, seconds_option):
+        gathered = option(gathered)
+    return gathered  # type: ignore[return-value]  # likewise
 
 
 node_option = click.option("--node", type=click.IntRange(0, HIGHEST_ADDRESS), metavar="N", help="The node's address.")

@@ -12,7 +12,7 @@ import anyio
 import click
 
 from busmaster.bus import Bus
-from busmaster.cli.arguments import plain_option, seconds_option
+from busmaster.cli.arguments import View, plain_option, seconds_option
 from busmaster.cli.demo_line import CONTROLLERS, DRIVES, SETTINGS
 from busmaster.cli.watching import Watch, follow
 from busmaster.errors import BusError
@@ -36,7 +36,7 @@ def command(seconds: float | None, plain: bool) -> int:
     one of them loses its wire for some seconds. Nothing is connected or listened to. Ctrl-C ends it.
     """
     with emulated_line() as path:
-        return anyio.run(lambda: demo(path, seconds=seconds, plain=plain))
+        return anyio.run(demo, path, View(seconds=seconds, plain=plain))
 
 
 @contextmanager
@@ -61,16 +61,16 @@ def emulated_line() -> Iterator[str]:
             process.stdin.close()
 
 
-async def demo(path: str, *, seconds: float | None, plain: bool) -> int:
+async def demo(path: str, view: View) -> int:
     bus = Bus(SerialPort(path, baudrate=SETTINGS.baudrate))
     axes = [Hcp2Controller(bus, address).axis(0) for address in CONTROLLERS]
     drives = [MicroFlexDrive(bus, address) for address in DRIVES]
     points = [point for axis in axes for point in (axis.position, axis.velocity)]
     points += [point for drive in drives for point in (drive.speed_measured, drive.torque_demand)]
     async with bus:
-        watch = Watch(bus, "busmaster demo")
+        watch = Watch(bus, "busmaster demo", view)
         watch.add(bus.poll_group("drives", period=PERIOD, points=points))
-        return await follow(watch, seconds=seconds, plain=plain, beside=lambda: command_drives(watch, drives))
+        return await follow(watch, lambda: command_drives(watch, drives))
 
 
 async def command_drives(watch: Watch, drives: list[MicroFlexDrive]) -> None:

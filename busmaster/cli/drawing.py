@@ -20,7 +20,7 @@ FAREWELL = 3.0
 """Seconds in which the screen gives the terminal back."""
 
 
-async def draw(picture: Callable[[], Frame], act: Callable[[Action], None]) -> int:
+async def draw(picture: Callable[[], Frame], act: Callable[[Action], object]) -> int:
     """Show `picture()` until the person quits (0), presses Ctrl-C (130), or the screen's process fails (1).
 
     Cancelling it gives the terminal back.
@@ -53,7 +53,7 @@ async def feed(writer: asyncio.StreamWriter, picture: Callable[[], Frame]) -> No
         await anyio.sleep(INTERVAL)
 
 
-async def hear(reader: asyncio.StreamReader, act: Callable[[Action], None]) -> int:
+async def hear(reader: asyncio.StreamReader, act: Callable[[Action], object]) -> int:
     """Pass on what the person asks for, until it is to end: the exit status."""
     try:
         while line := await reader.readline():

@@ -16,8 +16,10 @@ from typing import Any, ClassVar
 from rich.text import Text
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
+from textual.screen import Screen as TextualScreen
 from textual.widgets import DataTable, Footer, Static
 
+from busmaster.cli.dialog import AskValue
 from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row, decode_frame, encode
 from busmaster.cli.output import value_text
 
@@ -134,8 +136,10 @@ class Screen(App[None]):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("q", "leave('quit')", "quit"),
         Binding("ctrl+c", "leave('interrupt')", show=False, priority=True),
-        Binding("p", "all_groups('pause')", "pause polling"),
-        Binding("d", "all_groups('demand')", "poll now"),
+        Binding("p", "ask('pause')", "pause polling"),
+        Binding("d", "ask('demand')", "poll now"),
+        Binding("s", "suspend", "suspend node"),
+        Binding("w", "write", "write value"),
         Binding("up,down,pageup,pagedown", "scroll", "scroll", key_display="↑↓", show=True),
     ]
 
@@ -172,8 +176,18 @@ class Screen(App[None]):
             self.take_frame(self.frame)
 
     @property
+    def base(self) -> TextualScreen[object]:
+        """The picture, under whatever question is open."""
+        return self.screen_stack[0]
+
+    @property
+    def selected(self) -> Row | None:
+        rows, index = self.frame.rows if self.frame else (), self.table.cursor_row
+        return rows[index] if index < len(rows) else None
+
+    @property
     def table(self) -> DataTable[Text]:
-        table: DataTable[Text] = self.query_one("#points", DataTable)
+        table: DataTable[Text] = self.base.query_one("#points", DataTable)
         return table
 
     async def listen(self, connection: socket.socket) -> None:
@@ -193,9 +207,28 @@ class Screen(App[None]):
         self.send(Action(kind))
         self.exit()
 
-    def action_all_groups(self, kind: Any) -> None:
-        for group in self.frame.groups if self.frame else ():
-            self.send(Action(kind, group.name))
+    def action_ask(self, kind: Any) -> None:
+        self.send(Action(kind))
+
+    def action_suspend(self) -> None:
+        row = self.selected
+        if row is not None:
+            self.send(Action("suspend", row.node))
+
+    def action_write(self) -> None:
+        """Ask for a value of the selected point, and again whether to write it."""
+        row = self.selected
+        if row is None or self.frame is None:
+            return
+        if self.frame.read_only or not row.writable:
+            self.notify(f"{row.node} {row.item} is read-only")
+            return
+
+        def send(value: str | None) -> None:
+            if value is not None:
+                self.send(Action("write", row.node, row.item, value))
+
+        self.push_screen(AskValue(f"{row.node} {row.item}", row.unit), send)
 
     def action_scroll(self) -> None:
         """Stands in the footer for the table's own keys."""
@@ -204,9 +237,9 @@ class Screen(App[None]):
         self.frame = frame
         width = self.size.width
         head = [title_line(frame, width), gauge_line(frame), *map(group_line, frame.groups)]
-        self.query_one("#head", Static).update(Text("\n").join(head))
+        self.base.query_one("#head", Static).update(Text("\n").join(head))
         events = frame.events[-EVENTS:]
-        self.query_one("#events", Static).update(Text("\n".join(fit(f" {event}", width) for event in events)))
+        self.base.query_one("#events", Static).update(Text("\n".join(fit(f" {event}", width) for event in events)))
         self.draw_rows(frame)
 
     def draw_rows(self, frame: Frame) -> None:

@@ -24,6 +24,7 @@ class Row(msgspec.Struct, array_like=True, frozen=True):
     age: float | None = None
     late: bool = False
     error: str = ""
+    writable: bool = False
 
 
 class NodeRow(msgspec.Struct, array_like=True, frozen=True):
@@ -62,16 +63,19 @@ class Frame(msgspec.Struct, array_like=True, frozen=True):
     nodes: tuple[NodeRow, ...] = ()
     groups: tuple[GroupRow, ...] = ()
     events: tuple[str, ...] = ()
+    read_only: bool = False
 
 
 class Action(msgspec.Struct, array_like=True, frozen=True):
     """What the person asks.
 
-    `quit`, or `interrupt` (Ctrl-C); `pause` (or go on with) and `demand` a group; `suspend` a node; `write` a point.
+    `quit`, or `interrupt` (Ctrl-C); `pause` (or go on with) and `demand` the groups; `suspend` (or go on with) the node
+    `target`; `write` the text `value` to its point `item`.
     """
 
     kind: Literal["quit", "interrupt", "pause", "demand", "suspend", "write"]
     target: str = ""
+    item: str = ""
     value: str = ""
 
 

@@ -7,14 +7,13 @@ import click
 
 from busmaster.cli.arguments import (
     Connection,
+    View,
     connected,
-    json_option,
     nodes_option,
     option_type,
     parse_items,
     parse_seconds,
-    plain_option,
-    seconds_option,
+    viewed,
 )
 from busmaster.cli.watching import Watch, follow
 
@@ -26,41 +25,25 @@ from busmaster.cli.watching import Watch, follow
 @click.option(
     "--period", required=True, type=option_type(parse_seconds), metavar="S", help="Seconds from cycle to cycle."
 )
-@seconds_option
-@json_option
-@plain_option
+@viewed
 def command(
-    connection: Connection,
-    nodes: tuple[int, ...] | None,
-    items: tuple[str, ...],
-    period: float,
-    seconds: float | None,
-    as_json: bool,
-    plain: bool,
+    connection: Connection, nodes: tuple[int, ...] | None, items: tuple[str, ...], period: float, view: View
 ) -> int:
     """Read the items of every node on PORT once a period, until Ctrl-C.
 
     On a terminal a live table; else, or with --plain, a line a value: seconds since the start, NODE/ITEM and the
     value, or `-` and what went wrong. A summary on standard error ends it.
     """
-    addresses = connection.addresses(nodes)
-    return anyio.run(lambda: poll(connection, addresses, items, period, seconds=seconds, plain=plain, as_json=as_json))
+    return anyio.run(poll, connection, connection.addresses(nodes), items, period, view)
 
 
 async def poll(
-    connection: Connection,
-    addresses: tuple[int, ...],
-    items: tuple[str, ...],
-    period: float,
-    *,
-    seconds: float | None,
-    plain: bool,
-    as_json: bool,
+    connection: Connection, addresses: tuple[int, ...], items: tuple[str, ...], period: float, view: View
 ) -> int:
     bus = connection.open_bus()
     handles = [connection.open_handle(bus, address) for address in addresses]
     points = [handle.point(item) for handle in handles for item in items]
     async with bus:
-        watch = Watch(bus, "busmaster poll")
+        watch = Watch(bus, "busmaster poll", view)
         watch.add(bus.poll_group("poll", period=period, points=points))
-        return await follow(watch, seconds=seconds, plain=plain, as_json=as_json)
+        return await follow(watch)

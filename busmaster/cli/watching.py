@@ -15,16 +15,18 @@ import anyio
 from busmaster.arbiter.events import Event, LatenessRaised, LineChanged, LineState, NodeChanged
 from busmaster.bus import Bus
 from busmaster.cli.app import OK
+from busmaster.cli.arguments import View, parse_value
 from busmaster.cli.drawing import draw
 from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row
 from busmaster.cli.output import emit_all, json_line, json_value, note, value_text
-from busmaster.errors import BusError
+from busmaster.errors import BusError, InvalidCommand
 from busmaster.node import Health
 from busmaster.points import Point
 from busmaster.polling import PollGroup, Quality, Sample, Snapshot
 
 KEPT_PERIODS = 1_000
 KEPT_EVENTS = 8
+SUSPENDED_FOR = 60.0
 UTILISATION_WINDOW = 1.0
 COUNTED_EVERY = 0.5
 """Seconds between two looks at the counts of nodes and groups."""
@@ -33,11 +35,15 @@ STATES = {LineState.OFFLINE: "offline", LineState.SETTLING: "settling"}
 
 
 class Watch:
-    """What a person sees of a bus while its groups are polled. Times are in seconds since it was made."""
+    """What a person sees of a bus while its groups are polled. Times are in seconds since it was made.
 
-    def __init__(self, bus: Bus, title: str) -> None:
+    `view` says how it is shown.
+    """
+
+    def __init__(self, bus: Bus, title: str, view: View) -> None:
         self.bus = bus
         self.title = title
+        self.view = view
         self.start = bus.now()
         self.groups: list[PollGroup] = []
         self.events: deque[str] = deque(maxlen=KEPT_EVENTS)
@@ -96,6 +102,7 @@ class Watch:
             nodes=self._node_rows,
             groups=self._group_rows,
             events=tuple(self.events),
+            read_only=self.view.read_only,
         )
 
     @property
@@ -104,20 +111,46 @@ class Watch:
         name = self.bus.endpoint.name
         return f"{name}  {settings.baudrate} {settings.framing}" if settings else name
 
-    def act(self, action: Action) -> None:
-        """Do what the person asked for."""
-        for group in self.groups:
-            if group.name == action.target:
-                if action.kind == "demand":
+    async def act(self, action: Action) -> None:
+        """Do what the person asked for. What cannot be done is an event."""
+        match action.kind:
+            case "demand":
+                for group in self.groups:
                     group.demand()
-                elif action.kind == "pause":
-                    self._pause(group)
-
-    def _pause(self, group: PollGroup) -> None:
-        """Or go on. The time in between is no period."""
-        self._started.pop(group.name, None)
-        group.resume() if group.paused else group.pause()
+            case "pause":
+                self._pause()
+            case "suspend":
+                self._suspend(action.target)
+            case "write" if not self.view.read_only:
+                await self._write(action)
         self._counted = -math.inf
+
+    def _pause(self) -> None:
+        """Or go on. The time in between is no period."""
+        paused = all(group.paused for group in self.groups)
+        self._started.clear()
+        for group in self.groups:
+            group.resume() if paused else group.pause()
+
+    def _suspend(self, label: str) -> None:
+        """Or go on."""
+        for node in self.bus.nodes:
+            if node.label == label:
+                node.suspend(0.0 if node.suspended else SUSPENDED_FOR)
+                self.tell(f"{label} is suspended for {SUSPENDED_FOR:.0f} s" if node.suspended else f"{label} goes on")
+
+    async def _write(self, action: Action) -> None:
+        points = {(point.node.label, point.item): point for group in self.groups for point in group.points}
+        point = points.get((action.target, action.item))
+        if point is None:
+            return
+        name = f"{action.target} {action.item}"
+        try:
+            await point.write(parse_value(action.value))
+        except (BusError, InvalidCommand) as error:
+            self.tell(f"{name} = {action.value}: {error.what if isinstance(error, BusError) else error}")
+        else:
+            self.tell(f"{name} = {action.value} written")
 
     def _utilisation(self, now: float, busy: float) -> float:
         self._loads.append((now, busy))
@@ -145,6 +178,7 @@ class Watch:
             good.age(now) if good else None,
             good is not None and good.quality is Quality.LATE,
             sample.error.what if sample and sample.error else "",
+            point.writable,
         )
 
     def _group(self, group: PollGroup) -> GroupRow:
@@ -223,15 +257,15 @@ def error_text(error: BusError) -> str:
     return f"- {error.what}"
 
 
-def print_cycle(watch: Watch, snapshot: Snapshot, as_json: bool) -> None:
-    emit_all([json_cycle(watch, snapshot)] if as_json else plain_cycle(watch, snapshot))
+def print_cycle(watch: Watch, snapshot: Snapshot) -> None:
+    emit_all([json_cycle(watch, snapshot)] if watch.view.as_json else plain_cycle(watch, snapshot))
 
 
-async def print_cycles(watch: Watch, group: PollGroup, as_json: bool) -> None:
+async def print_cycles(watch: Watch, group: PollGroup) -> None:
     """Print every cycle, in a thread: a reader that is slow costs snapshots, never line time."""
     async for snapshot in group:
         watch.saw(snapshot)
-        await anyio.to_thread.run_sync(print_cycle, watch, snapshot, as_json, abandon_on_cancel=True)
+        await anyio.to_thread.run_sync(print_cycle, watch, snapshot, abandon_on_cancel=True)
 
 
 async def count_cycles(watch: Watch, group: PollGroup) -> None:
@@ -239,22 +273,16 @@ async def count_cycles(watch: Watch, group: PollGroup) -> None:
         watch.saw(snapshot)
 
 
-async def follow(
-    watch: Watch,
-    *,
-    seconds: float | None = None,
-    plain: bool = False,
-    as_json: bool = False,
-    beside: Callable[[], Coroutine[Any, Any, None]] | None = None,
-) -> int:
-    """Show the watch's groups for so many seconds, or until the person quits: the exit status.
+async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] | None = None) -> int:
+    """Show the watch's groups for its seconds, or until the person quits: the exit status.
 
     `beside` runs meanwhile, and is cancelled at the end.
     """
-    on_screen = not plain and not as_json and screen_available()
+    view = watch.view
+    on_screen = not view.plain and not view.as_json and screen_available()
     status = OK
     try:
-        with anyio.move_on_after(seconds):
+        with anyio.move_on_after(view.seconds):
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(watch.listen)
                 if beside is not None:
@@ -263,9 +291,9 @@ async def follow(
                     if on_screen:
                         tasks.start_soon(count_cycles, watch, group)
                     else:
-                        tasks.start_soon(print_cycles, watch, group, as_json)
+                        tasks.start_soon(print_cycles, watch, group)
                 if on_screen:
-                    status = await draw(watch.picture, watch.act)
+                    status = await draw(watch.picture, lambda action: tasks.start_soon(watch.act, action))
                     tasks.cancel_scope.cancel()
     finally:
         watch.summarise()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 
+import msgspec
 import pytest
 from rich.cells import cell_len
 
@@ -83,15 +84,66 @@ async def test_keys_send_actions_and_ctrl_c_is_told_from_quit() -> None:
             await pilot.pause()
         received = ours.recv(4096).splitlines()
     assert list(map(decode_action, received)) == [
-        Action("pause", "axes"),
-        Action("demand", "axes"),
+        Action("pause"),
+        Action("demand"),
         Action("interrupt"),
     ]
 
 
+class Recording(Screen):
+    """Keeps what would go through the socket."""
+
+    def __init__(self, connection: socket.socket | None) -> None:
+        super().__init__(connection)
+        self.sent: list[Action] = []
+
+    def send(self, action: Action) -> None:
+        self.sent.append(action)
+
+
+async def pressed(*keys: str, row: Row, read_only: bool = False) -> list[Action]:
+    """What the screen sends when these keys are pressed on that row."""
+    screen = Recording(None)
+    async with screen.run_test(size=(80, 24)) as pilot:
+        screen.take_frame(msgspec.structs.replace(frame(), rows=(row,), read_only=read_only))
+        await pilot.pause()
+        await pilot.press(*keys)
+        await pilot.pause()
+    return screen.sent
+
+
+OUTPUTS = Row("node 5", "outputs", 0, writable=True)
+
+
+@pytest.mark.asyncio
+async def test_a_value_is_written_once_it_was_asked_whether_it_is_meant() -> None:
+    assert await pressed("w", *"1", "full_stop", "5", "enter", "y", row=OUTPUTS) == [
+        Action("write", "node 5", "outputs", "1.5")
+    ]
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    "keys", [("w", "5", "enter", "n"), ("w", "5", "escape"), ("w", "5", "enter", "escape"), ("w", "5")]
+)
+async def test_a_value_that_was_not_confirmed_is_not_written(keys: tuple[str, ...]) -> None:
+    assert await pressed(*keys, row=OUTPUTS) == []
+
+
+@pytest.mark.asyncio
+async def test_what_is_read_only_asks_for_no_value() -> None:
+    assert await pressed("w", "5", "enter", "y", row=OUTPUTS, read_only=True) == []
+    assert await pressed("w", "5", "enter", "y", row=Row("node 5", "inputs", 0)) == []
+
+
+@pytest.mark.asyncio
+async def test_the_node_of_the_selected_row_is_suspended() -> None:
+    assert await pressed("s", row=OUTPUTS) == [Action("suspend", "node 5")]
+
+
 def test_messages_come_back_as_they_were_sent() -> None:
     assert decode_frame(encode(frame())) == frame()
-    assert decode_action(encode(Action("write", "5/1", "2.5"))) == Action("write", "5/1", "2.5")
+    assert decode_action(encode(Action("write", "node 5", "1", "2.5"))) == Action("write", "node 5", "1", "2.5")
     assert encode(frame()).count(b"\n") == 1
 
 

@@ -1,0 +1,47 @@
+"""The question of the screen: which value, and whether it is meant."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Vertical
+from textual.screen import ModalScreen
+from textual.widgets import Input, Label
+
+
+class AskValue(ModalScreen[str | None]):
+    """Asks for a value of `name`, then whether to write it. Its result is the value, or None for no."""
+
+    CSS = """
+    AskValue { align: center bottom; background: ansi_default 0%; }
+    AskValue Vertical { width: 60; height: auto; border: round ansi_blue; background: ansi_default; padding: 0 1; }
+    AskValue Label { color: ansi_default; width: 1fr; }
+    AskValue Input { border: none; height: 1; padding: 0; background: ansi_default; color: ansi_default; }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape,n", "dismiss(None)", show=False),
+        Binding("y", "agree", show=False),
+    ]
+
+    def __init__(self, name: str, unit: str) -> None:
+        super().__init__()
+        self.asked = name
+        self.unit = unit
+        self.value: str | None = None
+
+    def compose(self) -> ComposeResult:
+        with Vertical():
+            yield Label(f"write {self.asked}{f' in {self.unit}' if self.unit else ''}  (Enter; Esc leaves it)")
+            yield Input(placeholder="value")
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        if event.value.strip():
+            self.value = event.value.strip()
+            event.input.remove()
+            self.query_one(Label).update(f"write {self.asked} = {self.value} {self.unit}?  y or n")
+
+    def action_agree(self) -> None:
+        if self.value is not None:
+            self.dismiss(self.value)

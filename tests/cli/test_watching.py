@@ -1,0 +1,119 @@
+"""What a person sees of a bus and may do to it from the screen, on a real bus and an emulated line."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import anyio
+import pytest
+
+from busmaster.bus import Bus
+from busmaster.cli.arguments import View
+from busmaster.cli.messages import Action, Frame
+from busmaster.cli.watching import Watch, count_cycles
+from busmaster.emulator.serve import TcpServer
+from busmaster.handles import Hcp2Controller
+from busmaster.transport.tcp import TcpPort
+
+
+@asynccontextmanager
+async def watched(server: TcpServer, *addresses: int, read_only: bool = False) -> AsyncIterator[Watch]:
+    """A bus that polls outputs and axis 0 of these controllers every 20 ms, and a watch over it."""
+    bus = Bus(TcpPort(server.host, server.port, baudrate=57600))
+    handles = [Hcp2Controller(bus, address) for address in addresses]
+    points = [handle.point(item) for handle in handles for item in ("outputs", "axis0.idle")]
+    async with bus, anyio.create_task_group() as tasks:
+        watch = Watch(bus, "test", View(read_only=read_only))
+        group = bus.poll_group("axes", period=0.02, points=points)
+        watch.add(group)
+        tasks.start_soon(count_cycles, watch, group)
+        tasks.start_soon(watch.listen)
+        yield watch
+        tasks.cancel_scope.cancel()
+
+
+async def seen(watch: Watch, what: Callable[[Frame], bool]) -> Frame:
+    """The first picture that shows it."""
+    with anyio.fail_after(10):
+        while not what(frame := watch.picture()):  # noqa: ASYNC110  # a picture is looked at, it announces nothing
+            await anyio.sleep(0.01)
+    return frame
+
+
+@pytest.mark.asyncio
+async def test_the_picture_has_every_point_its_age_and_its_nodes_health(controllers: TcpServer) -> None:
+    async with watched(controllers, 1, 2) as watch:
+        frame = await seen(watch, lambda frame: all(row.value is not None for row in frame.rows))
+        assert [(row.node, row.item, row.value, row.writable) for row in frame.rows] == [
+            ("node 1", "outputs", 0, True),
+            ("node 1", "axis0.idle", 1, False),
+            ("node 2", "outputs", 0, True),
+            ("node 2", "axis0.idle", 1, False),
+        ]
+        assert all(row.age is not None and 0 <= row.age < 5 for row in frame.rows)
+        frame = await seen(watch, lambda frame: [node.health for node in frame.nodes] == ["up", "up"])
+        assert frame.port == f"{controllers.host}:{controllers.port}  57600 8N1"
+        assert frame.line in ("ready", "settling")
+        assert 0 < frame.utilisation <= 1
+
+
+@pytest.mark.asyncio
+async def test_a_point_that_fails_shows_its_last_good_value_growing_old(controllers: TcpServer) -> None:
+    async with watched(controllers, 3) as watch:
+        await seen(watch, lambda frame: frame.rows[0].value == 0)
+        controllers.call(lambda line, now: line.cut(now, line.device(3)))
+        try:
+            frame = await seen(watch, lambda frame: bool(frame.rows[0].error))
+        finally:
+            controllers.call(lambda line, now: line.restore(now))
+        assert frame.rows[0].value == 0
+        old = frame.rows[0].age
+        assert old is not None
+        assert old > 0.05
+
+
+@pytest.mark.asyncio
+async def test_a_value_written_from_the_screen_reaches_the_node_and_is_an_event(controllers: TcpServer) -> None:
+    async with watched(controllers, 4) as watch:
+        await watch.act(Action("write", "node 4", "outputs", "5"))
+        frame = await seen(watch, lambda frame: frame.rows[0].value == 5)
+        assert frame.events[-1].endswith("node 4 outputs = 5 written")
+        await watch.act(Action("write", "node 4", "outputs", "five"))
+        assert watch.picture().events[-1].endswith("node 4 outputs = five: 'five' is no number")
+        await watch.act(Action("write", "node 4", "axis0.idle", "5"))
+        assert watch.picture().events[-1].endswith("axis0.idle is read-only")
+
+
+@pytest.mark.asyncio
+async def test_a_read_only_view_writes_nothing(controllers: TcpServer) -> None:
+    async with watched(controllers, 5, read_only=True) as watch:
+        await watch.act(Action("write", "node 5", "outputs", "5"))
+        assert not watch.picture().events
+        assert await Hcp2Controller(watch.bus, 5).io.outputs.read() == 0
+        assert watch.picture().read_only
+
+
+@pytest.mark.asyncio
+async def test_pausing_stops_the_cycles_and_the_same_key_goes_on(controllers: TcpServer) -> None:
+    async with watched(controllers, 6) as watch:
+        await seen(watch, lambda frame: frame.groups[0].cycles > 2)
+        await watch.act(Action("pause"))
+        assert watch.picture().groups[0].paused
+        cycles = (await seen(watch, lambda frame: frame.backlog == 0)).groups[0].cycles
+        await watch.act(Action("demand"))
+        await watch.act(Action("pause"))
+        frame = await seen(watch, lambda frame: frame.groups[0].cycles > cycles + 2)
+        assert not frame.groups[0].paused
+
+
+@pytest.mark.asyncio
+async def test_a_node_is_suspended_and_goes_on_with_the_same_key(controllers: TcpServer) -> None:
+    async with watched(controllers, 7) as watch:
+        await seen(watch, lambda frame: frame.rows[0].value == 0)
+        await watch.act(Action("suspend", "node 7"))
+        frame = await seen(watch, lambda frame: bool(frame.rows[0].error))
+        assert frame.nodes[0].health == "suspended"
+        await watch.act(Action("suspend", "node 7"))
+        frame = await seen(watch, lambda frame: not frame.rows[0].error)
+        assert frame.events[-1].endswith("node 7 goes on")
