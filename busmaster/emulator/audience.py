@@ -59,7 +59,7 @@ class Audience:
         for device in routed:
             if device in self.cut_off or (self._faulty(device) and misses(device, start, end, True, self._chance)):
                 self._note(device, end)
-            elif device.attentive or not device.take(frame, end):
+            elif not device.take(frame, end):
                 left.append(device)
             else:
                 self._note(device, end)

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.devices.dc104 import Dc104Drive
 from busmaster.emulator.devices.hostcomms import HCP, HCP2, Framing
+from busmaster.emulator.devices.mentor import SPEED_REFERENCE, MentorDrive
 from busmaster.emulator.devices.microflex import ENABLE, MicroFlexDrive
 from busmaster.emulator.devices.mint import MintController, report_positions
+from busmaster.emulator.devices.msc import RUN_FLAG, MscController
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
 
@@ -24,7 +27,8 @@ def make_device(
 ) -> Device:
     """An emulated slave: `protocol` is hcp, hcp2, microflex, msc, mentor or dc104.
 
-    `lively`: something moves on it from the start. `oracle`: every value is the oracle's.
+    `lively`: something moves on it from the start. `oracle`: every value is the oracle's, whose modulus must be one
+    that the protocol can carry.
     Raises InvalidCommand for a protocol that does not exist.
     """
     maker = MAKERS.get(protocol)
@@ -56,4 +60,30 @@ def _microflex(address: int, delay: Delay, oracle: Oracle | None, lively: bool) 
     return drive
 
 
-MAKERS: dict[str, Maker] = {"hcp": _mint(HCP), "hcp2": _mint(HCP2), "microflex": _microflex}
+def _msc(address: int, delay: Delay, oracle: Oracle | None, lively: bool) -> Device:
+    controller = MscController(address, delay=delay, oracle=oracle)
+    if lively:
+        controller.flags.add(RUN_FLAG)
+    return controller
+
+
+def _mentor(address: int, delay: Delay, oracle: Oracle | None, lively: bool) -> Device:
+    drive = MentorDrive(address, delay=delay, oracle=oracle)
+    if lively:
+        drive.ripple = 0.01
+        drive.set_value(SPEED_REFERENCE, 300 + 50 * (address % 8), 0.0)
+    return drive
+
+
+def _dc104(address: int, delay: Delay, oracle: Oracle | None, lively: bool) -> Device:
+    return Dc104Drive(address, delay=delay, oracle=oracle, lively=lively)
+
+
+MAKERS: dict[str, Maker] = {
+    "hcp": _mint(HCP),
+    "hcp2": _mint(HCP2),
+    "microflex": _microflex,
+    "msc": _msc,
+    "mentor": _mentor,
+    "dc104": _dc104,
+}

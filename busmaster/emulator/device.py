@@ -8,12 +8,13 @@ How the line uses a device
     vain, so there are two ways of hearing, and they must agree:
 
     `hear`  bytes as they come, whoever sent them: cut, garbled, glued, another device's reply. Always right.
-    `take`  one frame, undisturbed, that begins with one of the device's `routes`, while it is in its ground state.
+    `take`  one frame of the host's, undisturbed, that begins with one of the device's `routes`. In mid-frame it
+            refuses.
 
     A device in its ground state (`attentive` False) lets pass unheard what does not begin with one of its routes. A
     device that is in mid-frame, or waits for something (MSC: the host's ACK; Mentor: a short command), sets
-    `attentive` and then hears every byte of everybody. After a reset byte that may as well have been a checksum, either
-    will do. A device never hears what passes while it talks itself.
+    `attentive` and then hears every byte of everybody, but for the frames that it takes. After a reset byte that may
+    as well have been a checksum, either will do. A device never hears what passes while it talks itself.
 
     `hear`, `take`, `wake` and `restart` are the only places where `attentive` and `wakeup` may change.
 """
@@ -140,10 +141,11 @@ class Device(ABC):
         """One byte off the line, which ended at `now`. `reply` answers it. Never raises."""
 
     def take(self, frame: bytes, now: float) -> bool:
-        """A frame that begins with a route, whole and undisturbed, whose last byte ended at `now`; state: ground.
+        """A frame that begins with a route, whole and undisturbed, whose last byte ended at `now`.
 
-        True: it was exactly one request and has been answered (or rightly not). False, and nothing has happened:
-        it is something else, to be heard byte by byte. Must then do just what `hear` would have done.
+        True: it was exactly one request and has been answered (or rightly not), just as `hear` would have done it.
+        False, and nothing has happened: it is something else, or the device is in mid-frame; it is then heard byte by
+        byte.
         """
         return False
 

@@ -101,6 +101,8 @@ class HostCommsDevice(Device):
     # Hearing
 
     def take(self, frame: bytes, now: float) -> bool:
+        if self.attentive:
+            return False
         element = self._known_reads.get(frame)
         if element is not None:
             self._answer_read(element, now)
