@@ -25,11 +25,20 @@ from busmaster.errors import (
     WriteUnconfirmed,
 )
 from busmaster.exchange import ReplyTiming, Timings
-from busmaster.handles import Hcp2Controller, HcpController, MicroFlexDrive
+from busmaster.handles import (
+    Dc104Drive,
+    Hcp2Controller,
+    HcpController,
+    MentorDrive,
+    MicroFlexDrive,
+    MscController,
+)
 from busmaster.node import Node
 from busmaster.points import Point
 from busmaster.polling import GroupStatistics, PollGroup, Quality, Sample, Snapshot, Stream
 from busmaster.profile import LineSettings, Profile
+from busmaster.protocols.microflex import CommandWord, StatusWord
+from busmaster.protocols.msc import ProgramStatus
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.memory import MemoryPort
 from busmaster.transport.serial_port import SerialPort
@@ -40,6 +49,8 @@ __all__ = [
     "Bus",
     "BusClosed",
     "BusError",
+    "CommandWord",
+    "Dc104Drive",
     "GarbledReply",
     "GroupStatistics",
     "Hcp2Controller",
@@ -55,7 +66,9 @@ __all__ = [
     "LineState",
     "LineStatistics",
     "MemoryPort",
+    "MentorDrive",
     "MicroFlexDrive",
+    "MscController",
     "NoReply",
     "NoSuchParameter",
     "Node",
@@ -67,6 +80,7 @@ __all__ = [
     "PollGroup",
     "Priority",
     "Profile",
+    "ProgramStatus",
     "Quality",
     "Quantiles",
     "Refused",
@@ -74,6 +88,7 @@ __all__ = [
     "Sample",
     "SerialPort",
     "Snapshot",
+    "StatusWord",
     "Stream",
     "Superseded",
     "TcpPort",
