@@ -15,8 +15,8 @@ class AskValue(ModalScreen[str | None]):
     """Asks for a value of `name`, then whether to write it. Its result is the value, or None for no."""
 
     CSS = """
-    AskValue { align: center bottom; background: ansi_default 0%; }
-    AskValue Vertical { width: 60; height: auto; border: round ansi_blue; background: ansi_default; padding: 0 1; }
+    AskValue { align: center bottom; background: transparent; }
+    AskValue Vertical { width: 100%; height: auto; border: round ansi_blue; background: ansi_default; padding: 0 1; }
     AskValue Label { color: ansi_default; width: 1fr; }
     AskValue Input { border: none; height: 1; padding: 0; background: ansi_default; color: ansi_default; }
     """

@@ -29,13 +29,19 @@ BARS = "▁▂▃▄▅▆▇█"
 RIPPLE = 0.1
 GAUGE = 20
 EVENTS = 3
-HEALTH_STYLES = {"up": "green", "unknown": "dim", "suspect": "bold magenta", "down": "reverse red"}
-COLUMNS = {"NODE": 8, "ITEM": 16, "VALUE": 10, "UNIT": 6, "TREND": 7, "AGE": 4, "P50 ms": 6, "HEALTH": 7}
+HEALTH_STYLES = {
+    "up": "green",
+    "suspended": "magenta",
+    "unknown": "dim",
+    "suspect": "bold magenta",
+    "down": "reverse red",
+}
+COLUMNS = {"NODE": 8, "ITEM": 16, "VALUE": 10, "UNIT": 6, "TREND": 6, "AGE": 4, "P50ms": 5, "HEALTH": 9}
 """With a space on each side of a column these are the 80 columns of the smallest terminal."""
 GROWTH = {"ITEM": 8, "VALUE": 10, "TREND": 16}
 """How much wider a column gets, in this order, where the terminal is wider."""
 LONGEST_TREND = COLUMNS["TREND"] + GROWTH["TREND"]
-NUMBERS = ("VALUE", "AGE", "P50 ms")
+NUMBERS = ("VALUE", "AGE", "P50ms")
 OLD_AFTER = 3
 """Periods after which a value's age is worth a look."""
 
@@ -125,9 +131,10 @@ class Screen(App[None]):
     #points { height: 1fr; background: ansi_default; color: ansi_default;
         scrollbar-size: 0 1; }
     #points > .datatable--header { background: ansi_default; color: ansi_default; text-style: bold underline; }
-    #points > .datatable--cursor { background: ansi_default; color: ansi_default; text-style: bold; }
+    #points > .datatable--cursor { background: ansi_default; color: ansi_default; text-style: reverse; }
     #points > .datatable--hover { background: ansi_default; }
     #events { height: auto; max-height: 4; text-style: dim; }
+    Toast { background: ansi_default; color: ansi_default; }
     Footer { background: ansi_default; color: ansi_default; }
     FooterKey { background: ansi_default; color: ansi_default; }
     FooterKey .footer-key--key { background: ansi_default; color: ansi_blue; text-style: bold; }
@@ -285,7 +292,7 @@ def node_cells(node: NodeRow, widths: dict[str, int]) -> dict[str, Text]:
     """What is the node's: it stands beside the node's first point."""
     return {
         "NODE": Text(fit(node.label, widths["NODE"]), style="bold"),
-        "P50 ms": right(f"{node.p50 * 1000:.1f}" if node.requests else "", widths["P50 ms"]),
+        "P50ms": right(f"{node.p50 * 1000:.1f}" if node.requests else "", widths["P50ms"]),
         "HEALTH": Text(fit(node.health, widths["HEALTH"]), style=HEALTH_STYLES.get(node.health, "")),
     }
 
