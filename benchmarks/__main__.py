@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import logging
 import sys
 import time
 from pathlib import Path
@@ -30,6 +31,7 @@ SCENARIOS = (
 def main() -> int:
     """Exit status 1 if one of our values was wrong. A figure that misses its claim is said, and fails nothing."""
     arguments = _parse()
+    logging.disable(logging.CRITICAL)
     where = machine()
     versions = ", ".join(f"{name} {version}" for name, version in where["versions"].items())
     print(f"{where['processor']}, {where['cores']} cores, load {where['load']:.1f}, {where['system']}")

@@ -122,7 +122,7 @@ class Lines:
         )
         for fd in self._far:
             os.close(fd)
-        _part_from(self._process.pid, self._settings is not None)
+        part_from(self._process.pid, self._settings is not None)
         self._tell(json.dumps(self._order))
         self._hear()
         return self
@@ -155,7 +155,7 @@ class Lines:
         return report
 
 
-def _part_from(responder: int, paced: bool) -> None:
+def part_from(responder: int, paced: bool) -> None:
     """Give the responder a core of its own; where it keeps time, let nobody else interrupt it there, if we may.
 
     It stands for the wire and the devices, which take no time of the master's and wait for no other program. One that

@@ -1,0 +1,148 @@
+"""The emulated Modbus line, served on a pty from a process of its own, with its faults set from here.
+
+`python -m benchmarks.far_end` is told what to serve in a line of JSON, and prints the path. Each further line there is
+an order: {"unit": 3, "dead": true} takes a unit off the line, {"delay": {...}} changes every unit's reply time, and
+{"log": true} asks for what passed on the line since the last time: (seconds, "host" or "line", bytes, seconds taken).
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import subprocess
+import sys
+from collections.abc import Mapping
+from functools import partial
+from types import TracebackType
+from typing import Any
+
+from benchmarks.lines import ROOT, part_from
+from busmaster.emulator.device import Delay
+from busmaster.emulator.line import Line
+from busmaster.emulator.serve import PtyServer
+from busmaster.profile import LineSettings
+from examples.modbus_rtu import EmulatedUnit
+
+SETTINGS = LineSettings(57600)
+"""8N1 and not Modbus's 8E1: a pty refuses parity, and some masters take that for an error."""
+REGISTERS = 100
+LONGEST_LOG = 100_000
+
+
+def value_of(unit: int, register: int) -> int:
+    """What a register holds: a value that says whose it is."""
+    return unit * 256 + register
+
+
+def emulated_units(count: int, delay: Mapping[str, Any]) -> list[EmulatedUnit]:
+    """Units 1 to `count`, whose registers hold `value_of` them."""
+    registers = range(REGISTERS)
+    return [
+        EmulatedUnit(unit, [value_of(unit, register) for register in registers], delay=delay_of(delay))
+        for unit in range(1, count + 1)
+    ]
+
+
+class LoggedLine(Line):
+    """Keeps what passes: when it began, whose it was, how many bytes, how long it took."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.log: list[tuple[float, str, int, float]] = []
+
+    def send(self, data: bytes, now: float) -> None:
+        self._note(now, "host", len(data))
+        super().send(data, now)
+
+    def receive(self, now: float) -> bytes:
+        data = super().receive(now)
+        if data:
+            self._note(now - len(data) * self.tau, "line", len(data))
+        return data
+
+    def _note(self, start: float, who: str, length: int) -> None:
+        if len(self.log) < LONGEST_LOG:
+            self.log.append((start, who, length, length * self.tau))
+
+
+class FarEnd:
+    """Units 1 to `units` on a paced line of 57600 baud. Use it in `with`; `path` is the port."""
+
+    def __init__(self, units: int, *, delay: dict[str, Any] | None = None, seed: int = 1) -> None:
+        self._order = {"units": units, "delay": delay or {}, "seed": seed}
+        self.path = ""
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> FarEnd:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.far_end"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
+        )
+        part_from(self._process.pid, paced=True)
+        self.path = self._ask(self._order)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait(10)
+
+    def kill(self, unit: int, dead: bool = True) -> None:
+        """Take a unit off the line, or bring it back."""
+        self._ask({"unit": unit, "dead": dead})
+
+    def setdelay_of(self, **delay: Any) -> None:
+        """Of every unit: `busmaster.emulator.device.Delay`."""
+        self._ask({"delay": delay})
+
+    def log(self) -> list[tuple[float, str, int, float]]:
+        """What passed since the last time."""
+        return [(start, who, length, taken) for start, who, length, taken in self._ask({"log": True})]
+
+    def _ask(self, order: dict[str, Any]) -> Any:
+        assert self._process is not None
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps(order).encode() + b"\n")
+        self._process.stdin.flush()
+        return json.loads(self._process.stdout.readline())
+
+
+def _obey(order: dict[str, Any], line: Line, now: float) -> Any:
+    assert isinstance(line, LoggedLine)
+    if "unit" in order:
+        unit = line.device(order["unit"])
+        if order["dead"]:
+            line.cut(now, unit)
+        else:
+            line.restore(now)
+    if "delay" in order:
+        for device in line.devices:
+            device.delay = delay_of(order["delay"])
+    if "log" in order:
+        log, line.log = line.log, []
+        return log
+    return True
+
+
+def delay_of(options: Mapping[str, Any]) -> Delay:
+    """From its parameters, as JSON has them."""
+    straggle = options.get("straggle")
+    return Delay(**{**options, "straggle": tuple(straggle)}) if straggle else Delay(**options)
+
+
+def main() -> None:
+    order = json.loads(sys.stdin.readline())
+    line = LoggedLine(SETTINGS, emulated_units(order["units"], order["delay"]), chance=random.Random(order["seed"]))
+    with PtyServer(line) as server:
+        print(json.dumps(server.path), flush=True)
+        for said in sys.stdin:
+            wish = json.loads(said)
+            answer = server.call(partial(_obey, wish))
+            print(json.dumps(answer), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,272 @@
+"""Ours and the peers as Modbus RTU masters: same frames, windows, gaps and retries, settings as each one's
+documentation has them.
+
+Every adapter reads and writes one holding register of one unit, at once from many tasks. `Failed` is any honest
+failure: no reply, a garbled one, a refusal. What a peer lacks and its documentation leaves to the user is added here
+and said in `settings`: a lock, retries, a thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from importlib import metadata
+from typing import Any, Protocol, TypeVar
+
+from benchmarks.far_end import SETTINGS
+from benchmarks.harness import installed
+from busmaster import Bus, BusError, Node, Priority, ReplyTiming, SerialPort, Timings
+from busmaster.transport.endpoints import Endpoint
+from examples import modbus_rtu
+from examples.modbus_rtu import SILENCE, ReadRegisters, WriteRegisters
+
+T = TypeVar("T")
+
+WINDOW = 0.1
+LATENESS = 0.15
+RETRIES = 2
+PROFILE = replace(modbus_rtu.PROFILE, line=SETTINGS)
+TIMINGS = Timings.uniform(
+    ReplyTiming(nominal=0.05, window=WINDOW, lateness=LATENESS, byte_gap=0.02, turnaround=SILENCE)
+)
+
+
+class Failed(Exception):
+    """No value, and the caller knows it."""
+
+
+class ModbusMaster(Protocol):
+    name: str
+    settings: str
+
+    async def open(self, path: str) -> None: ...
+    async def read(self, unit: int, register: int) -> int: ...
+    async def write(self, unit: int, register: int, value: int) -> None:
+        """As urgently as this master knows how."""
+
+    async def close(self) -> None: ...
+
+
+class Busmaster:
+    name = "busmaster"
+    settings = f"window {WINDOW * 1000:g} ms, lateness {LATENESS * 1000:g} ms, {RETRIES} retries"
+
+    def __init__(self) -> None:
+        self.bus: Bus | None = None
+        self._nodes: dict[int, Node] = {}
+
+    async def open(self, path: str) -> None:
+        await self.open_endpoint(SerialPort(path, baudrate=SETTINGS.baudrate))
+
+    async def open_endpoint(self, endpoint: Endpoint) -> None:
+        self.bus = Bus(endpoint)
+        await self.bus.__aenter__()
+
+    def node(self, unit: int) -> Node:
+        assert self.bus is not None
+        if unit not in self._nodes:
+            self._nodes[unit] = self.bus.node(PROFILE, unit, timings=TIMINGS, retries=RETRIES)
+        return self._nodes[unit]
+
+    async def read(self, unit: int, register: int) -> int:
+        try:
+            return (await self.node(unit).request(ReadRegisters(register)))[0]
+        except BusError as error:
+            raise Failed from error
+
+    async def write(self, unit: int, register: int, value: int) -> None:
+        try:
+            await self.node(unit).request(WriteRegisters(register, (value,)), priority=Priority.URGENT)
+        except BusError as error:
+            raise Failed from error
+
+    async def close(self) -> None:
+        assert self.bus is not None
+        await self.bus.__aexit__(None, None, None)
+
+
+class Pymodbus:
+    name = "pymodbus"
+    settings = f"async client, timeout {WINDOW * 1000:g} ms, {RETRIES} retries, calls serialised by a lock"
+
+    def __init__(self) -> None:
+        self._lock = asyncio.Lock()
+        self._client: Any = None
+
+    async def open(self, path: str) -> None:
+        from pymodbus.client import AsyncModbusSerialClient
+
+        self._client = AsyncModbusSerialClient(path, baudrate=SETTINGS.baudrate, timeout=WINDOW, retries=RETRIES)
+        await self._client.connect()
+
+    async def read(self, unit: int, register: int) -> int:
+        reply = await self._ask(lambda: self._client.read_holding_registers(register, count=1, device_id=unit))
+        return int(reply.registers[0])
+
+    async def write(self, unit: int, register: int, value: int) -> None:
+        await self._ask(lambda: self._client.write_register(register, value, device_id=unit))
+
+    async def _ask(self, call: Callable[[], Awaitable[Any]]) -> Any:
+        from pymodbus.exceptions import ModbusException
+
+        async with self._lock:
+            try:
+                reply = await call()
+            except ModbusException as error:
+                raise Failed from error
+        if reply.isError():
+            raise Failed(str(reply))
+        return reply
+
+    async def close(self) -> None:
+        self._client.close()
+
+
+class Minimalmodbus:
+    name = "minimalmodbus"
+    settings = f"timeout {WINDOW * 1000:g} ms, buffers cleared; {RETRIES} retries, a lock and a thread around it"
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._instruments: dict[int, Any] = {}
+        self._path = ""
+
+    async def open(self, path: str) -> None:
+        self._path = path
+        self._instrument(1)
+
+    async def read(self, unit: int, register: int) -> int:
+        return int(await asyncio.to_thread(self.blocking, lambda: self._instrument(unit).read_register(register)))
+
+    async def write(self, unit: int, register: int, value: int) -> None:
+        write = self._instrument(unit).write_register
+        await asyncio.to_thread(self.blocking, lambda: write(register, value, functioncode=6), 0)
+
+    def blocking(self, call: Callable[[], T], retries: int = RETRIES) -> T:
+        with self._lock:
+            for left in reversed(range(retries + 1)):
+                try:
+                    return call()
+                except OSError as error:  # its own exceptions are all IOError
+                    if not left:
+                        raise Failed from error
+        raise AssertionError("a call either returns or raises")
+
+    def _instrument(self, unit: int) -> Any:
+        import minimalmodbus
+
+        if unit not in self._instruments:
+            instrument = minimalmodbus.Instrument(self._path, unit)
+            instrument.serial.baudrate = SETTINGS.baudrate
+            instrument.serial.timeout = WINDOW
+            self._instruments[unit] = instrument
+        return self._instruments[unit]
+
+    async def close(self) -> None:
+        self._instrument(1).serial.close()
+
+
+class Tmodbus:
+    name = "tmodbus"
+    settings = f"timeout {WINDOW * 1000:g} ms; {RETRIES} retries around it"
+
+    def __init__(self) -> None:
+        self._client: Any = None
+
+    async def open(self, path: str) -> None:
+        from tmodbus import create_async_rtu_client
+
+        options: dict[str, Any] = {"baudrate": SETTINGS.baudrate}
+        self._client = create_async_rtu_client(path, unit_id=1, timeout=WINDOW, **options)
+        await self._client.connect()
+
+    async def read(self, unit: int, register: int) -> int:
+        client = self._client.for_unit_id(unit)
+        return int((await self._ask(lambda: client.read_holding_registers(register, 1), RETRIES))[0])
+
+    async def write(self, unit: int, register: int, value: int) -> None:
+        client = self._client.for_unit_id(unit)
+        await self._ask(lambda: client.write_single_register(register, value), 0)
+
+    async def _ask(self, call: Callable[[], Awaitable[Any]], retries: int) -> Any:
+        from tmodbus.exceptions import TModbusError
+
+        for left in reversed(range(retries + 1)):
+            try:
+                return await call()
+            except (TModbusError, TimeoutError) as error:
+                if not left:
+                    raise Failed from error
+        raise AssertionError("a call either returns or raises")
+
+    async def close(self) -> None:
+        await self._client.disconnect()
+
+
+class Anymodbus:
+    """`late`: with the late-reply window that its documentation offers, off by default."""
+
+    def __init__(self, late: bool) -> None:
+        self.name = "anymodbus, late_reply_window" if late else "anymodbus"
+        self.settings = f"timeout {WINDOW * 1000:g} ms, {RETRIES} retries"
+        if late:
+            self.settings += ", late_reply_window by its own estimate"
+        self._late = late
+        self._bus: Any = None
+
+    async def open(self, path: str) -> None:
+        from anymodbus import BusConfig, RetryPolicy, TimingConfig, open_modbus_rtu
+        from anymodbus.config import estimate_late_reply_window
+
+        window = estimate_late_reply_window(baudrate=SETTINGS.baudrate, max_turnaround=LATENESS, max_reply_bytes=7)
+        config = BusConfig(
+            request_timeout=WINDOW,
+            retries=RetryPolicy(retries=RETRIES),
+            timing=TimingConfig(late_reply_window=window if self._late else 0.0),
+        )
+        self._bus = await open_modbus_rtu(path, baudrate=SETTINGS.baudrate, parity="none", config=config)
+
+    async def read(self, unit: int, register: int) -> int:
+        reply = await self._ask(self._bus.slave(unit).read_holding_registers(register, count=1))
+        return int(reply[0])
+
+    async def write(self, unit: int, register: int, value: int) -> None:
+        await self._ask(self._bus.slave(unit).write_register(register, value))
+
+    async def _ask(self, call: Awaitable[T]) -> T:
+        from anymodbus.exceptions import ModbusError
+
+        try:
+            return await call
+        except ModbusError as error:
+            raise Failed from error
+
+    async def close(self) -> None:
+        await self._bus.aclose()
+
+
+def masters() -> list[Callable[[], ModbusMaster]]:
+    """Ours first, then those that are installed."""
+    makers: list[Callable[[], ModbusMaster]] = [Busmaster]
+    for package, maker in (("pymodbus", Pymodbus), ("minimalmodbus", Minimalmodbus), ("tmodbus", Tmodbus)):
+        if installed(package):
+            makers.append(maker)
+    if installed("anymodbus"):
+        makers += [lambda: Anymodbus(late=False), lambda: Anymodbus(late=True)]
+    return makers
+
+
+def notes() -> list[str]:
+    """What was compared with what settings, and what was not there to be compared."""
+    said = []
+    for maker in masters():
+        master = maker()
+        package = master.name.partition(",")[0]
+        version = "" if package == "busmaster" else f" {metadata.version(package)}"
+        said.append(f"{package}{version}{master.name.removeprefix(package)}: {master.settings}")
+    missing = [name for name in ("pymodbus", "minimalmodbus", "tmodbus", "anymodbus") if not installed(name)]
+    if missing:
+        said.append(f"not installed: {', '.join(missing)} (tmodbus needs Python 3.12, anymodbus 3.13)")
+    return said
