@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from busmaster.capture.decode import Decoder
 from busmaster.capture.dialects import dialect, protocol_of
-from busmaster.capture.frames import UNASKED, Frame, Kind
+from busmaster.capture.frames import UNACKED, UNASKED, Frame, Kind
 from busmaster.capture.pcapng import Direction, Outcome, Packet
 
 SAME_CALLBACK = 0.005
@@ -46,10 +46,11 @@ class _Held:
         """It came from a node, or from who knows where, after the exchange was over, or before any."""
         if frame.sender is Direction.HOST:
             return False
+        if frame.fault == UNASKED or self.request is None or self.released:
+            return True
         last = self.last
         over = last is not None and self.judge()[0] is not Outcome.NO_REPLY
-        odd = frame.kind is Kind.NOISE or (last is not None and last.kind is Kind.NOISE)
-        return frame.fault == UNASKED or self.request is None or (over and odd)
+        return over and (frame.kind is Kind.NOISE or (last is not None and last.kind is Kind.NOISE))
 
     def judge(self) -> tuple[Outcome, str]:
         """By the frames alone."""
@@ -58,6 +59,8 @@ class _Held:
             return Outcome.NONE, ""
         if last is None:
             return (Outcome.OK, "") if self.broadcast else (Outcome.NO_REPLY, "no reply")
+        if last.fault == UNACKED:
+            return Outcome.NO_REPLY, "no ACK came, only a packet that may answer something older"
         if last.fault:
             return Outcome.GARBLED, last.fault
         if last.kind in (Kind.NAK, Kind.EOT):

@@ -9,6 +9,8 @@ from busmaster.capture.pcapng import Direction
 
 UNASKED = "unasked"
 """The fault of a frame from a node that nobody had asked."""
+UNACKED = "before the ACK"
+"""The fault of an MSC packet whose request was not yet acknowledged: it may answer an older one."""
 
 
 class Kind(enum.StrEnum):

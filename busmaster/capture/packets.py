@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
-from busmaster.capture.frames import UNASKED, Frame, Kind
+from busmaster.capture.frames import UNACKED, UNASKED, Frame, Kind
 from busmaster.capture.pcapng import Direction
 from busmaster.wire.checks import sum8, sum16
 
@@ -109,7 +109,7 @@ class MscDialect:
         if asked is None:
             frame.fault = frame.fault or UNASKED
         elif not self._acked:
-            frame.fault = frame.fault or "before the ACK"
+            frame.fault = frame.fault or UNACKED
         elif frame.node != asked.node or frame.command != asked.command:
             frame.fault = frame.fault or f"wrong answer: {asked.command} of unit {asked.node} was asked"
         self._answer = frame.raw

@@ -164,6 +164,22 @@ def test_a_bad_packet_that_is_sent_again_ends_well() -> None:
     ]
 
 
+def test_a_packet_whose_ack_was_lost_is_no_reply() -> None:
+    tape = Tape()
+    tape.sent(1.0, bytes.fromhex("02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74"))
+    tape.heard(1.02, bytes.fromhex("02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"))
+    tape.sent(1.03, ACK)
+    assert [line[2] for line in tape.lines()] == [NONE, NO_REPLY, NONE]
+
+
+def test_a_reply_after_the_masters_verdict_is_a_stray() -> None:
+    tape = Tape()
+    tape.sent(1.0, READ)
+    tape.said(1.1, READ, NO_REPLY, "read element 1: node 2: no reply within 100 ms, 1 attempt")
+    tape.heard(1.12, VALUE)
+    assert [line[1:3] for line in tape.lines()] == [(READ, NONE), (b"", NO_REPLY), (VALUE, STRAY)]
+
+
 def test_a_broadcast_is_over_when_it_is_sent() -> None:
     tape = Tape()
     everybody = bytes.fromhex("04 30 30 30 30 02 30 31 31 37 2B 30 30 30 30 03 2F")
