@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 import warnings
-from collections.abc import Coroutine, Iterable
+from collections.abc import Coroutine, Iterable, Sequence
 from math import inf
 from types import TracebackType
 from typing import Any
@@ -15,15 +15,18 @@ import anyio
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import Event, LineState, NodeChanged, Strayed
+from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import Poll
-from busmaster.arbiter.transaction import Priority
+from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Timings
 from busmaster.logbook import Logbook
+from busmaster.merging import Merge
 from busmaster.node import Node
+from busmaster.planning import Plan, PlannedGroup, Read, bounds, plan
 from busmaster.points import Point
 from busmaster.polling import PollGroup, Sample, Stream
-from busmaster.profile import Profile
+from busmaster.profile import LineSettings, Profile
 from busmaster.transport.endpoints import Endpoint, is_paced
 from busmaster.transport.pump import Pump, Tap
 from busmaster.transport.reconnect import Connection
@@ -62,6 +65,7 @@ class Bus:
             self._arbiter,
             on_cycle=lambda poll: poll.waiter.cycle_finished(),
             on_event=self._on_event,
+            on_written=lambda transaction: self.touched(transaction, transaction.ended_at),
             paced=lambda transport: is_paced(endpoint, transport),
             tap=tap,
         )
@@ -151,15 +155,19 @@ class Bus:
         points: Iterable[Point[Any]],
         phase: float | None = None,
         priority: Priority = Priority.POLL,
+        merge: Sequence[Merge] = (),
     ) -> PollGroup:
         """Read `points` every `period` seconds, on a fixed grid, from now on (R10).
 
         `phase` (seconds, below the period) places the group on the grid; without it, it is placed where it meets the
-        other groups least.
+        other groups least. `merge`: cheaper exchanges to opt in to, such as `protocols.mentor.merge_runs`, beside
+        those that the nodes' profiles have; they are taken where they save line time, and no longer once refused.
         """
         if any(group.name == name for group in self._groups):
             raise InvalidCommand(f"there is a poll group {name!r} already")
-        group = PollGroup(self, name, period, points, phase=phase, priority=priority)
+        for other in self._groups:
+            other.weigh()
+        group = PollGroup(self, name, period, points, phase=phase, priority=priority, merge=merge)
         self._arbiter.add_poll(group.poll, self.now())
         self._groups.append(group)
         self.pump.turn()
@@ -189,9 +197,11 @@ class Bus:
         fresh = [s for s in samples if s.error is None and s.started is not None and s.started >= touched]
         return max(fresh, key=lambda sample: sample.finished, default=None)
 
-    def touched(self, node: Node, point: Point[Any] | None) -> None:
-        """A write to it is over: what was asked before is not newer than the write."""
-        self._touched[node if point is None else point] = self.now()
+    def touched(self, write: Transaction, when: float) -> None:
+        """A write is over: what was asked before is not newer than what it changed."""
+        if write.node.address == write.node.profile.broadcast:
+            self._touched |= dict.fromkeys(self._nodes.values(), when)
+        self._touched[write.touches] = when
 
     def touched_at(self, point: Point[Any]) -> float:
         """When the last write to the point, or to all of its node, ended; -inf if none has."""
@@ -217,8 +227,40 @@ class Bus:
         return self._arbiter.statistics(self.now())
 
     def reset_statistics(self) -> None:
-        """Start all counts of line and nodes again."""
+        """Start all counts of line, nodes and groups again."""
         self._arbiter.reset_statistics(self.now())
+        for group in self._groups:
+            group.reset_statistics()
+
+    def plan(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
+        """What becomes of the groups that run, and of `more`, by the reply times measured so far."""
+        groups = [*(group.planned() for group in self._groups), *more]
+        latency = self.endpoint.receive_latency
+        return plan(
+            groups, line=self._settings(), receive_latency=latency, others=self._asked(), could_merge=could_merge
+        )
+
+    def worst_case_wait(self, priority: Priority = Priority.COMMAND) -> float:
+        """How long, in seconds, a request of this class, made now, waits at the most until it is sent (R9).
+
+        It reckons with what is polled, what waits already, every node's probe, and each kind of command that was
+        asked so far; with nodes that are dead, late or trickling; not with a line that is never silent.
+        """
+        backlog = self._arbiter.dispatcher.backlog
+        polled = [(poll, t) for poll in self._arbiter.dispatcher.schedule.polls for t in poll.results]
+        low = sum(poll.priority is Priority.BACKGROUND for poll, _ in polled)
+        probed = any(node.health is not Health.UP for node in self._nodes.values())
+        reads = [(node.planned(), t.command) for _, t in polled if isinstance(node := t.node.waiter, Node)]
+        bound = bounds(
+            (*reads, *self._asked()),
+            self.byte_time,
+            self.endpoint.receive_latency,
+            polls=1 + max(len(polled) - low, backlog.waiting(Priority.POLL)),
+            background=probed + max(low, backlog.waiting(Priority.BACKGROUND)),
+        )
+        parked = sum(write.phase is Phase.PARKED for node in self._nodes.values() for write in node.record.writes)
+        longest = max((poll.patience for poll, _ in polled), default=1.0)
+        return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 
     def events(self) -> Stream[Event]:
         """What happens to the line and its nodes, from now on (NodeChanged, LineChanged, ...)."""
@@ -247,6 +289,15 @@ class Bus:
         if not isinstance(event, Strayed):
             for stream in self._streams:
                 stream.put(event)
+
+    def _settings(self) -> LineSettings:
+        if self.endpoint.settings is not None:
+            return self.endpoint.settings
+        return next((node.profile.line for node in self._nodes.values()), LineSettings(9600))
+
+    def _asked(self) -> list[Read]:
+        """Every kind of command that was asked of every node."""
+        return [(node.planned(), command) for node in self._nodes.values() for command in node.kinds.values()]
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
         """A task of the bus's own: a task group would tie entering and leaving the bus to one task."""

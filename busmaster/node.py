@@ -12,6 +12,7 @@ from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import Priority, Timeline, Transaction
 from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.exchange import Command
+from busmaster.planning import PlannedNode
 from busmaster.profile import Profile
 
 if TYPE_CHECKING:
@@ -29,6 +30,8 @@ class Node:
     def __init__(self, bus: Bus, record: NodeRecord) -> None:
         self.bus = bus
         self.record = record
+        self.kinds: dict[type, Command[Any]] = {}
+        """Of each kind of command that was asked of it, the first: the worst case reckons with them."""
         self._on_return: Callable[[Node], Awaitable[None]] | None = None
 
     @property
@@ -43,6 +46,11 @@ class Node:
     def label(self) -> str:
         """ "node 5", as messages call it."""
         return self.record.label
+
+    def planned(self) -> PlannedNode:
+        """The node as the planner sees it, with its reply time as measured so far."""
+        record = self.record
+        return PlannedNode(record.profile, record.address, record.timings, record.reply_time)
 
     @property
     def health(self) -> Health:
@@ -83,15 +91,12 @@ class Node:
 
         Raises a BusError subclass. Cancelling it frees the caller at once and never disturbs the line (R6).
         """
-        transaction, future = self._start(command, priority, start_within, retries, idempotent)
+        transaction, future = self._start(command, priority, start_within, retries, idempotent, touches=touches)
         try:
             value: T = await future
         except asyncio.CancelledError:
-            self.bus.pump.cancel(transaction)
+            self._give_up(transaction)
             raise
-        finally:
-            if command.writes:
-                self.bus.touched(self, touches)
         return value
 
     async def timed_request(
@@ -102,11 +107,8 @@ class Node:
         try:
             return await future, transaction.timeline()
         except asyncio.CancelledError:
-            self.bus.pump.cancel(transaction)
+            self._give_up(transaction)
             raise
-        finally:
-            if command.writes:
-                self.bus.touched(self, None)
 
     def _start(
         self,
@@ -115,7 +117,9 @@ class Node:
         start_within: float | None,
         retries: int | None,
         idempotent: bool | None,
+        *,
         probe: bool = False,
+        touches: Point[Any] | None = None,
     ) -> tuple[Transaction, asyncio.Future[Any]]:
         if retries is not None and not 0 <= retries <= 100:
             raise InvalidCommand(f"{self.label}: retries must be 0 to 100, not {retries}")
@@ -136,7 +140,15 @@ class Node:
             idempotent=idempotent,
             probe=probe,
         )
+        transaction.touches = self if touches is None else touches
+        self.kinds.setdefault(type(command), command)
         return transaction, self.bus.pump.transact(transaction)
+
+    def _give_up(self, transaction: Transaction) -> None:
+        """Nobody waits for it any more. A write that is on the wire now is over before anything else can be read."""
+        self.bus.pump.cancel(transaction)
+        if transaction.writes and transaction.attempts:
+            self.bus.touched(transaction, self.bus.now())
 
     async def probe(self) -> bool:
         """Ask the node's cheapest read now, once; True if it answered (a refusal is an answer)."""
@@ -144,7 +156,7 @@ class Node:
         try:
             await future
         except asyncio.CancelledError:
-            self.bus.pump.cancel(transaction)
+            self._give_up(transaction)
             raise
         except BusError:
             return self.health is Health.UP

@@ -12,15 +12,17 @@ never silent nobody waits longer either, but fails with LineNoisy.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 from math import ceil, floor, inf, log10
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 from busmaster.arbiter.schedule import Poll, Priority, Schedule, line_time
 from busmaster.exchange import Command, Exchange, Timings
-from busmaster.profile import Batch, LineSettings, Profile
+from busmaster.merging import Merge, Served, cheapest
+from busmaster.profile import LineSettings, Profile
 
 SHARE = 7
 """Exchanges of higher classes after which a lower class that waits gets a slot (R9)."""
@@ -34,8 +36,6 @@ BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 HORIZON = 10
 """Periods of the slowest group over which the timetable is played through, at most TIMETABLE exchanges."""
 TIMETABLE = 20_000
-
-Merge: TypeAlias = Callable[[Sequence[Command[Any]]], Sequence[Batch]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,51 +71,6 @@ class PlannedGroup:
     phase: float | None = None
     priority: Priority = Priority.POLL
     merge: Sequence[Merge] = ()
-
-
-# cheaper exchanges
-
-
-class Served(NamedTuple):
-    """One exchange, and the indexes of the commands that it stands for.
-
-    A `batch` brings a sequence of their values, and saves so many seconds of the line compared with single commands.
-    """
-
-    command: Command[Any]
-    serves: tuple[int, ...]
-    batch: bool = False
-    saved: float = 0.0
-
-
-def cheapest(
-    node: PlannedNode, commands: Sequence[Command[Any]], merges: Iterable[Merge], byte_time: float
-) -> list[Served]:
-    """The exchanges that serve all these commands of one node in the least line time that the merges offer.
-
-    The greatest saving first; each command is served once, in the order of the first that an exchange serves.
-    """
-    offers = [batch for merge in merges for batch in merge(commands)]
-    if not offers:
-        return [Served(command, (index,)) for index, command in enumerate(commands)]
-    costs = [node.line_time(command, byte_time) for command in commands]
-    weighed = [
-        Served(
-            batch.command,
-            batch.serves,
-            True,
-            sum(costs[index] for index in batch.serves) - node.line_time(batch.command, byte_time),
-        )
-        for batch in offers
-    ]
-    left = set(range(len(commands)))
-    chosen: list[Served] = []
-    for served in sorted(weighed, key=lambda served: -served.saved):
-        if served.saved > 0 and left.issuperset(served.serves):
-            left.difference_update(served.serves)
-            chosen.append(served)
-    chosen += (Served(commands[index], (index,)) for index in left)
-    return sorted(chosen, key=lambda served: min(served.serves))
 
 
 # the worst case
@@ -173,7 +128,7 @@ def bounds(
 ) -> Bounds:
     """The bounds for a line on which nothing else is asked than these, and every node's probe."""
     asked = set(reads)
-    asked |= {(node, node.profile.probe) for node, _ in asked}
+    asked |= {(node, node.profile.probe) for node, _ in asked if node.address != node.profile.broadcast}
     holds = [(longest_hold(node.open(c), byte_time, receive_latency), node.profile.exchange_limit) for node, c in asked]
     return Bounds(
         hold=max((hold + (limit or 0.0) for hold, limit in holds), default=0.0),
@@ -342,7 +297,7 @@ def _exchanges(group: PlannedGroup, merges: Sequence[Merge], byte_time: float) -
         commands.setdefault(node, {})[command] = None
     for node, wanted in commands.items():
         own = () if node.profile.merge is None else (node.profile.merge,)
-        for served in cheapest(node, tuple(wanted), (*own, *merges), byte_time):
+        for served in cheapest(tuple(wanted), (*own, *merges), partial(node.line_time, byte_time=byte_time)):
             yield node, served
 
 

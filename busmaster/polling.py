@@ -1,122 +1,43 @@
-"""Poll groups: points with a period, and the snapshots that their consumers get."""
+"""Poll groups: points with a period, and the exchanges that bring their values."""
 
 from __future__ import annotations
 
-import enum
-from collections import deque
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from functools import partial
+from math import inf
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import anyio
-
-from busmaster.arbiter.counters import Quantiles
 from busmaster.arbiter.schedule import Poll, line_time, set_members
-from busmaster.arbiter.transaction import Priority, Timeline, Transaction
-from busmaster.errors import BusClosed, BusError, GarbledReply, InvalidCommand
+from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.errors import BusClosed, GarbledReply, InvalidCommand, Refused
+from busmaster.exchange import Command
+from busmaster.merging import Merge, Served, cheapest
+from busmaster.planning import PlannedGroup
 from busmaster.points import Point
+from busmaster.profile import Batch
+from busmaster.samples import GroupStatistics, Quality, Sample, Snapshot, Stream, Tally
 
 if TYPE_CHECKING:
     from busmaster.bus import Bus
+    from busmaster.node import Node
 
-T = TypeVar("T")
+__all__ = ["GroupStatistics", "PollGroup", "Quality", "Sample", "Snapshot", "Stream"]
 
-
-class Quality(enum.Enum):
-    """GOOD; LATE: begun after the nominal reply time; STALE: older than a write to it; BAD: no value."""
-
-    GOOD = "good"
-    LATE = "late"
-    STALE = "stale"
-    BAD = "bad"
+REPLIES_REMEMBERED = 32
+WEIGHED_AGAIN = 8
+"""Cycles after which merges are weighed once more: by then reply times are measured."""
 
 
-class Sample(NamedTuple):
-    """One point's outcome in one cycle. Times are the bus's clock (`bus.now()`), in seconds."""
+class _Read(NamedTuple):
+    """One exchange of a group: the points that it serves, each with its place in a batch's value (None: all of it).
 
-    value: Any
-    error: BusError | None
-    due: float
-    started: float | None
-    finished: float
-    quality: Quality
-    timeline: Timeline
+    `bytes_time` is what its bytes take, `legs` how often a reply is waited for.
+    """
 
-    def age(self, now: float) -> float:
-        """Seconds since the value was asked for."""
-        return now - (self.finished if self.started is None else self.started)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Snapshot(Mapping[Point[Any], Sample]):
-    """One cycle of a poll group. `missed` counts the cycles that could not start since the group was made."""
-
-    group: str
-    cycle: int
-    due: float
-    started: float | None
-    finished: float
-    missed: int
-    samples: dict[Point[Any], Sample]
-
-    def __getitem__(self, point: Point[Any]) -> Sample:
-        return self.samples[point]
-
-    def __iter__(self) -> Iterator[Point[Any]]:
-        return iter(self.samples)
-
-    def __len__(self) -> int:
-        return len(self.samples)
-
-
-@dataclass(frozen=True, slots=True)
-class GroupStatistics:
-    """`period` as asked, `achieved` as seen (mean, seconds); `jitter` is from a cycle's due time to its start."""
-
-    cycles: int
-    missed: int
-    period: float
-    achieved: float
-    jitter: Quantiles
-
-
-class Stream(Generic[T]):
-    """One consumer, at its own pace: bounded, it drops the oldest and counts them in `dropped`."""
-
-    def __init__(self, listeners: list[Stream[T]], buffer: int) -> None:
-        if buffer < 1:
-            raise InvalidCommand(f"a buffer holds at least one item, not {buffer}")
-        self._listeners = listeners
-        self._items: deque[T] = deque(maxlen=buffer)
-        self._arrived = anyio.Event()
-        self._closed = False
-        self.dropped = 0
-        listeners.append(self)
-
-    def __aiter__(self) -> AsyncIterator[T]:
-        return self
-
-    async def __anext__(self) -> T:
-        while not self._items:
-            if self._closed:
-                raise StopAsyncIteration
-            self._arrived = anyio.Event()
-            await self._arrived.wait()
-        return self._items.popleft()
-
-    def close(self) -> None:
-        """It gets nothing more; what it holds can still be read."""
-        self._closed = True
-        if self in self._listeners:
-            self._listeners.remove(self)
-        self._arrived.set()
-
-    def put(self, item: T) -> None:
-        """Give the consumer one more; the oldest is dropped where it does not keep up."""
-        if len(self._items) == self._items.maxlen:
-            self.dropped += 1
-        self._items.append(item)
-        self._arrived.set()
+    served: Served
+    points: tuple[tuple[Point[Any], int | None], ...]
+    bytes_time: float
+    legs: int
 
 
 class PollGroup:
@@ -131,18 +52,20 @@ class PollGroup:
         *,
         phase: float | None,
         priority: Priority,
+        merge: Sequence[Merge],
     ) -> None:
         self.name = name
         self.latest: Snapshot | None = None
         self._bus = bus
         self._priority = priority
+        self._merge = tuple(merge)
+        self._refused: set[tuple[Node, Command[Any]]] = set()
         self._poll = Poll(name, period, phase=phase)
         self._poll.waiter = self
         self._points: tuple[Point[Any], ...] = ()
-        self._served: dict[Transaction, tuple[Point[Any], ...]] = {}
+        self._reads: dict[Transaction, _Read] = {}
         self._consumers: list[Stream[Snapshot]] = []
-        self._first_due: float | None = None
-        self._last_due = 0.0
+        self._tally = Tally(self._poll)
         self._set_points(points)
 
     @property
@@ -203,29 +126,42 @@ class PollGroup:
             consumer.close()
 
     def statistics(self) -> GroupStatistics:
-        poll = self._poll
-        achieved = 0.0
-        if self._first_due is not None and poll.cycles > 1:
-            achieved = (self._last_due - self._first_due) / (poll.cycles - 1)
-        return GroupStatistics(poll.cycles, poll.missed, poll.period, achieved, Quantiles.of(poll.jitter))
+        """An immutable snapshot of its counts."""
+        return self._tally.statistics(self._poll)
+
+    def reset_statistics(self) -> None:
+        """Start its counts again; cycles keep their numbers."""
+        self._poll.jitter.clear()
+        self._tally = Tally(self._poll)
+
+    def planned(self) -> PlannedGroup:
+        """The group as the planner sees it, with reply times as measured so far."""
+        reads = [(point.node.planned(), point.command) for point in self._points]
+        merges = [self._sound(merge) for merge in self._merge]
+        return PlannedGroup(self.name, self._poll.period, reads, self._poll.phase, self._priority, merges)
 
     def cycle_finished(self) -> None:
         """The arbiter has run a cycle: make its snapshot and hand it round. Runs in the pump: no user code."""
         poll = self._poll
-        if self._first_due is None:
-            self._first_due = poll.started if poll.started > 0 else poll.due
-        self._last_due = poll.started if poll.started > 0 else poll.due
+        if self._fall_back():
+            return
         samples: dict[Point[Any], Sample] = {}
         for transaction in poll.results:
-            for point in self._served[transaction]:
-                samples[point] = self._sample(point, transaction)
-        started = poll.started if poll.started > 0 else None
+            read = self._reads[transaction]
+            if transaction.error is None:
+                _measure(transaction, read)
+            for point, place in read.points:
+                samples[point] = self._sample(point, place, transaction)
+        self._tally.note(poll)
+        started = poll.started if poll.started > -inf else None
         snapshot = Snapshot(self.name, poll.cycles, poll.due, started, poll.finished, poll.missed, samples)
         self.latest = snapshot
         for consumer in self._consumers:
             consumer.put(snapshot)
+        if poll.cycles == WEIGHED_AGAIN:
+            self._choose()
 
-    def _sample(self, point: Point[Any], transaction: Transaction) -> Sample:
+    def _sample(self, point: Point[Any], place: int | None, transaction: Transaction) -> Sample:
         error = transaction.error
         value = None
         quality = Quality.BAD
@@ -233,30 +169,92 @@ class PollGroup:
             quality = Quality.LATE if transaction.late else Quality.GOOD
             if transaction.started < self._bus.touched_at(point):
                 quality = Quality.STALE
-            value = transaction.value
+            value = transaction.value if place is None else transaction.value[place]
             if point.decode is not None:
                 try:
                     value = point.decode(value)
                 except (ValueError, ArithmeticError) as bad:
-                    value, quality = None, Quality.BAD
                     error = GarbledReply(f"{value!r} is no value of {point.item}: {bad}", node=point.node.label)
+                    value, quality = None, Quality.BAD
+        self._tally.samples[quality] += 1
         timeline = transaction.timeline()
         return Sample(value, error, self._poll.due, timeline.started, transaction.ended_at, quality, timeline)
 
+    # which exchanges bring the values
+
     def _set_points(self, points: Iterable[Point[Any]]) -> None:
-        """Two points with one command behind them cost one exchange."""
         unique = tuple(dict.fromkeys(points))
         for point in unique:
             if point.node.bus is not self._bus:
                 raise InvalidCommand(f"poll group {self.name!r}: {point.key} belongs to another bus")
-        behind: dict[tuple[Any, Any], list[Point[Any]]] = {}
-        for point in unique:
-            behind.setdefault((point.node, point.command), []).append(point)
-        fresh = {Transaction(node.record, command): tuple(served) for (node, command), served in behind.items()}
-        current = {t: self._served[t] for t in self._poll.results if t in self._served}
         self._points = unique
-        self._served = {**current, **fresh}
+        self._choose()
+
+    def _choose(self) -> None:
+        """Two points with one command behind them cost one exchange, and merges are taken where they are cheaper."""
+        behind: dict[Node, dict[Command[Any], list[Point[Any]]]] = {}
+        for point in self._points:
+            behind.setdefault(point.node, {}).setdefault(point.command, []).append(point)
+        reads = [read for node, wanted in behind.items() for read in self._reads_of(node, wanted)]
+        asked = self._poll.fresh if self._poll.fresh is not None else self._poll.results
+        if [self._reads[t].points for t in asked] == [read.points for _, read in reads]:
+            return
+        fresh = {Transaction(node.record, read.served.command): read for node, read in reads}
+        self._reads = {t: self._reads[t] for t in self._poll.results} | fresh
         set_members(self._poll, fresh, self._priority)
-        self._poll.cost = sum(
-            line_time(t.command.open(t.node.address, t.node.timings), self._bus.byte_time) for t in fresh
-        )
+        self.weigh()
+
+    def _reads_of(self, node: Node, wanted: dict[Command[Any], list[Point[Any]]]) -> Iterator[tuple[Node, _Read]]:
+        merges = (*self._merge, node.profile.merge) if node.profile.merge else self._merge
+        planned, byte_time = node.planned(), self._bus.byte_time
+        points = tuple(wanted.values())
+        sound = [self._sound(merge, node) for merge in merges]
+        for served in cheapest(tuple(wanted), sound, partial(planned.line_time, byte_time=byte_time)):
+            serves = tuple(
+                (point, place if served.batch else None)
+                for place, index in enumerate(served.serves)
+                for point in points[index]
+            )
+            exchange = planned.open(served.command)
+            after = exchange.closing * byte_time + exchange.timing.turnaround
+            bytes_time = line_time(exchange, byte_time, 0.0) - after
+            yield node, _Read(served, serves, bytes_time, 1 + len(exchange.later))
+
+    def _sound(self, merge: Merge, node: Node | None = None) -> Merge:
+        """The same merge without what this node (or any, if None) has refused."""
+        refused = {command for who, command in self._refused if node in (None, who)}
+
+        def sound(commands: Sequence[Command[Any]]) -> Sequence[Batch]:
+            return [batch for batch in merge(commands) if batch.command not in refused]
+
+        return sound if refused else merge
+
+    def _fall_back(self) -> bool:
+        """A batch that was refused says nothing of its commands: they are asked at once, one by one."""
+        refused = {
+            (point.node, self._reads[t].served.command)
+            for t in self._poll.results
+            if isinstance(t.error, Refused) and self._reads[t].served.batch
+            for point, _ in self._reads[t].points
+        }
+        if not refused:
+            return False
+        self._refused |= refused
+        self._choose()
+        self._bus.demand(self._poll)
+        return True
+
+    def weigh(self) -> None:
+        """Tell the schedule what a cycle takes, by the reply times measured so far."""
+        asked = self._poll.fresh if self._poll.fresh is not None else self._poll.results
+        byte_time = self._bus.byte_time
+        self._poll.cost = sum(self._reads[t].points[0][0].node.planned().line_time(t.command, byte_time) for t in asked)
+
+
+def _measure(transaction: Transaction, read: _Read) -> None:
+    """A running mean of what the node takes to reply."""
+    node = transaction.node
+    if transaction.attempts == 1:
+        wait = (transaction.last_byte - transaction.started - read.bytes_time) / read.legs
+        known = node.reply_time
+        node.reply_time = wait if known is None else known + (wait - known) / REPLIES_REMEMBERED

@@ -13,7 +13,7 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "busmaster"
 BASE = {"errors", "exchange", "profile"}
-HOLDINGS = {"bus", "logbook", "node", "points", "polling"}
+HOLDINGS = {"bus", "logbook", "node", "points", "polling", "samples"}
 ALL = {entry.stem for entry in PACKAGE.iterdir() if entry.suffix in ("", ".py") and entry.name[0] != "_"}
 
 MAY_IMPORT: dict[str, set[str]] = {
@@ -23,10 +23,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     "wire": {"wire"} | BASE,
     "arbiter": {"arbiter"} | BASE,
     "protocols": {"protocols", "wire"} | BASE,
-    "planning": {"arbiter.schedule"} | BASE,
+    "merging": BASE,
+    "planning": {"arbiter.schedule", "merging"} | BASE,
     "transport": {"transport", "arbiter"} | BASE,
     "transport.memory": {"transport", "arbiter", "emulator.line"} | BASE,
-    **dict.fromkeys(HOLDINGS, HOLDINGS | {"transport", "arbiter", "planning"} | BASE),
+    **dict.fromkeys(HOLDINGS, HOLDINGS | {"transport", "arbiter", "merging", "planning"} | BASE),
     "handles": {"handles", "protocols"} | HOLDINGS | BASE,
     "emulator": {"emulator", "wire"} | BASE,
     "emulator.world": {"emulator", "wire", "arbiter"} | BASE,
@@ -37,7 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "__main__": ALL,
     "cli": ALL,
 }
-TIMELESS = {"errors", "exchange", "profile", "wire", "protocols", "arbiter", "planning", "emulator"}
+TIMELESS = {"errors", "exchange", "profile", "wire", "protocols", "arbiter", "merging", "planning", "emulator"}
 TIMELY = {"emulator.serve"}
 CLOCKS_AND_PORTS = {"asyncio", "anyio", "time", "random", "socket", "serial"}
 SEEDED = {"emulator": {"random"}}

@@ -112,6 +112,7 @@ class Schedule:
         self._heap: list[tuple[float, int, Poll]] = []
         self._order = count()
         self._epoch = inf
+        self._place_at = inf
         self._unplaced: list[Poll] = []
         self.polls: list[Poll] = []
 
@@ -127,6 +128,7 @@ class Schedule:
         self.polls.append(poll)
         if poll.phase is None:
             self._unplaced.append(poll)
+            self._place_at = now
         else:
             self._start(poll, self._epoch + poll.phase, now)
 
@@ -139,13 +141,12 @@ class Schedule:
             heapq.heapify(self._heap)
 
     def next_due(self) -> float:
-        if self._unplaced:
-            return self._epoch
-        return self._heap[0][0] if self._heap else inf
+        due = self._heap[0][0] if self._heap else inf
+        return min(due, self._place_at) if self._unplaced else due
 
     def release(self, now: float) -> list[Poll]:
         """The polls whose cycle starts now, each with `due` set. Cycles that could not start are counted missed."""
-        if self._unplaced:
+        if self._unplaced and self._place_at <= now:
             self._place(now)
         starting: list[Poll] = []
         heap = self._heap

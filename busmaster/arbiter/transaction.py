@@ -79,6 +79,7 @@ class Transaction:
         "start_by",
         "started",
         "superseded",
+        "touches",
         "value",
         "waiter",
         "writes",
@@ -112,6 +113,8 @@ class Transaction:
         self.waiter = waiter
         self.poll = poll
         self.probe = probe
+        self.touches: object = None
+        """What a write changes, for its owner to know."""
         self.refused_until = -inf
         self.refused_cycles = 0
         self.reset()

@@ -8,6 +8,7 @@ user code runs in here.
 from __future__ import annotations
 
 import asyncio
+import select
 import time
 from collections.abc import Callable
 from math import inf
@@ -42,6 +43,7 @@ class Pump(asyncio.Protocol):
         *,
         on_cycle: Callable[[Poll], None],
         on_event: Callable[[Event], None],
+        on_written: Callable[[Transaction], None] = lambda _: None,
         paced: Callable[[asyncio.BaseTransport], bool] = lambda _: False,
         tap: Tap | None = None,
     ) -> None:
@@ -50,9 +52,11 @@ class Pump(asyncio.Protocol):
         self.tap = tap
         self._on_cycle = on_cycle
         self._on_event = on_event
+        self._on_written = on_written
         self._paced = paced
         self._loop: asyncio.AbstractEventLoop | None = None
         self._transport: asyncio.Transport | None = None
+        self._input: Callable[[], bool] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._armed = inf
         self._run_out: anyio.Event | None = None
@@ -108,6 +112,7 @@ class Pump(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
+        self._input = input_of(self._transport)
         self.arbiter.line_up(self.clock(), paced=self._paced(transport))
         self.turn()
 
@@ -120,6 +125,7 @@ class Pump(asyncio.Protocol):
 
     def connection_lost(self, cause: Exception | None) -> None:
         self._transport = None
+        self._input = None
         what = cause.what if isinstance(cause, LineDown) else str(cause or "it was closed")
         self.arbiter.line_down(what, self.clock())
         self.turn()
@@ -129,6 +135,8 @@ class Pump(asyncio.Protocol):
     def _resolve(self, transaction: Transaction) -> None:
         if self.tap is not None:
             self.tap.completed(transaction)
+        if transaction.writes and transaction.attempts:
+            self._on_written(transaction)
         future = transaction.waiter
         if future is None or future.done():
             return
@@ -148,7 +156,8 @@ class Pump(asyncio.Protocol):
     def _on_time(self) -> None:
         self._timer = None
         self._armed = inf
-        self.arbiter.handle_timeout(self.clock())
+        now = self.clock()
+        self.arbiter.handle_timeout(now, unread=self._input is not None and self._input())
         self.turn()
 
     def transact(self, transaction: Transaction) -> asyncio.Future[Any]:
@@ -158,3 +167,18 @@ class Pump(asyncio.Protocol):
         transaction.waiter = future
         self.submit(transaction)
         return future
+
+
+def input_of(transport: asyncio.BaseTransport) -> Callable[[], bool] | None:
+    """Tells whether bytes lie unread, without reading them; None where the transport has no descriptor.
+
+    A loop that was blocked may run a timer before it reads: a late reply would lie there, and the silence that R3
+    waits for would be a mistake.
+    """
+    for name in ("serial", "socket"):
+        port = transport.get_extra_info(name)
+        if port is not None:
+            poller = select.poll()
+            poller.register(port.fileno(), select.POLLIN)
+            return lambda: any(events & select.POLLIN for _, events in poller.poll(0))
+    return None
