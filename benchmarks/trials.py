@@ -62,11 +62,7 @@ async def _for(seconds: float, master: ModbusMaster, path: str, patience: float 
 
 
 async def _ours_in_virtual_time(tries: int, delay: Mapping[str, Any], patience: float | None) -> Counter[str]:
-    registers = range(REGISTERS)
-    units = [
-        EmulatedUnit(unit, [value_of(unit, r) for r in registers], delay=delay_of(delay))
-        for unit in range(1, UNITS + 1)
-    ]
+    units = emulated_units(UNITS, delay)
     counts: Counter[str] = Counter()
     master = Busmaster()
     await master.open_endpoint(MemoryPort(Line(SETTINGS, units, chance=random.Random(1))))
