@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from busmaster.capture.replay import replay
 from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Echo, Line
 from busmaster.errors import NoReply, Refused
-from busmaster.handles import Hcp2Controller, HcpController, MicroFlexDrive
+from busmaster.handles import HANDLES, Hcp2Controller, HcpController, MicroFlexDrive
 from busmaster.profile import LineSettings
 from busmaster.transport.memory import MemoryPort
 
@@ -55,3 +56,36 @@ async def test_every_exchange_of_a_bus_is_recorded_with_its_outcome(tmp_path: Pa
     assert silent[-1].startswith("read element 1: node 9: no reply within 100 ms")
     assert "read element 11: -2.0" in [packet.comment for packet in packets]
     assert exchanges[-1].command in ("read element 100", "read element 115")
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("echo", [False, True])
+@pytest.mark.parametrize(
+    ("protocol", "address", "items"),
+    [
+        ("msc", 3, ("2008", "2008:32", "flag:5", "flags", "status")),
+        ("mentor", 14, ("1.17", "1.18", "15.60:wide")),
+        ("dc104", 0, ("2", "170")),
+    ],
+)
+async def test_each_protocol_reads_back_as_it_was_recorded(
+    tmp_path: Path, protocol: str, address: int, items: tuple[str, ...], echo: bool
+) -> None:
+    path = tmp_path / "line.pcapng"
+    handle = HANDLES[protocol]
+    line = Line(
+        replace(handle.profile.line, baudrate=115200), [make_device(protocol, address)], echo=Echo() if echo else None
+    )
+    with Recorder(path, echo=echo) as tap:
+        async with Bus(MemoryPort(line), tap=tap) as bus:
+            device = handle(bus, address)
+            for item in items:
+                point = device.point(item)
+                value = await point.read()
+                if point.writable:
+                    await point.write(value)
+    with path.open("rb") as file:
+        exchanges = list(replay(read_packets(file)))
+    assert not [f"{one.command}: {one.recorded}, {one.now}" for one in exchanges if one.changed]
+    assert {one.recorded.outcome for one in exchanges} == {Outcome.OK}
+    assert len(exchanges) > len(items)
