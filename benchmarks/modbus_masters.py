@@ -12,7 +12,7 @@ import asyncio
 import threading
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
-from importlib import metadata
+from importlib import import_module, metadata
 from typing import Any, Protocol, TypeVar
 
 from benchmarks.far_end import SETTINGS
@@ -27,6 +27,7 @@ T = TypeVar("T")
 WINDOW = 0.1
 LATENESS = 0.15
 RETRIES = 2
+LONGEST_REPLY = 8
 PROFILE = replace(modbus_rtu.PROFILE, line=SETTINGS)
 TIMINGS = Timings.uniform(
     ReplyTiming(nominal=0.05, window=WINDOW, lateness=LATENESS, byte_gap=0.02, turnaround=SILENCE)
@@ -176,10 +177,8 @@ class Tmodbus:
         self._client: Any = None
 
     async def open(self, path: str) -> None:
-        from tmodbus import create_async_rtu_client
-
         options: dict[str, Any] = {"baudrate": SETTINGS.baudrate}
-        self._client = create_async_rtu_client(path, unit_id=1, timeout=WINDOW, **options)
+        self._client = import_module("tmodbus").create_async_rtu_client(path, unit_id=1, timeout=WINDOW, **options)
         await self._client.connect()
 
     async def read(self, unit: int, register: int) -> int:
@@ -191,12 +190,11 @@ class Tmodbus:
         await self._ask(lambda: client.write_single_register(register, value), 0)
 
     async def _ask(self, call: Callable[[], Awaitable[Any]], retries: int) -> Any:
-        from tmodbus.exceptions import TModbusError
-
+        errors = (import_module("tmodbus.exceptions").TModbusError, TimeoutError)
         for left in reversed(range(retries + 1)):
             try:
                 return await call()
-            except (TModbusError, TimeoutError) as error:
+            except errors as error:
                 if not left:
                     raise Failed from error
         raise AssertionError("a call either returns or raises")
@@ -217,16 +215,15 @@ class Anymodbus:
         self._bus: Any = None
 
     async def open(self, path: str) -> None:
-        from anymodbus import BusConfig, RetryPolicy, TimingConfig, open_modbus_rtu
-        from anymodbus.config import estimate_late_reply_window
-
-        window = estimate_late_reply_window(baudrate=SETTINGS.baudrate, max_turnaround=LATENESS, max_reply_bytes=7)
-        config = BusConfig(
+        anymodbus = import_module("anymodbus")
+        estimate = import_module("anymodbus.config").estimate_late_reply_window
+        window = estimate(baudrate=SETTINGS.baudrate, max_turnaround=LATENESS, max_reply_bytes=LONGEST_REPLY)
+        config = anymodbus.BusConfig(
             request_timeout=WINDOW,
-            retries=RetryPolicy(retries=RETRIES),
-            timing=TimingConfig(late_reply_window=window if self._late else 0.0),
+            retries=anymodbus.RetryPolicy(retries=RETRIES),
+            timing=anymodbus.TimingConfig(late_reply_window=window if self._late else 0.0),
         )
-        self._bus = await open_modbus_rtu(path, baudrate=SETTINGS.baudrate, parity="none", config=config)
+        self._bus = await anymodbus.open_modbus_rtu(path, baudrate=SETTINGS.baudrate, parity="none", config=config)
 
     async def read(self, unit: int, register: int) -> int:
         reply = await self._ask(self._bus.slave(unit).read_holding_registers(register, count=1))
@@ -236,11 +233,9 @@ class Anymodbus:
         await self._ask(self._bus.slave(unit).write_register(register, value))
 
     async def _ask(self, call: Awaitable[T]) -> T:
-        from anymodbus.exceptions import ModbusError
-
         try:
             return await call
-        except ModbusError as error:
+        except import_module("anymodbus.exceptions").ModbusError as error:
             raise Failed from error
 
     async def close(self) -> None:

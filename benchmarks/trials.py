@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from benchmarks.far_end import REGISTERS, SETTINGS, FarEnd, value_of
+from benchmarks.far_end import REGISTERS, SETTINGS, FarEnd, emulated_units, value_of
 from benchmarks.harness import Claim, Options, Outcome, Table
 from benchmarks.modbus_masters import Busmaster, Failed, ModbusMaster, masters, notes
 from busmaster import MemoryPort
