@@ -39,7 +39,7 @@ from busmaster.polling import GroupStatistics, PollGroup, Quality, Sample, Snaps
 from busmaster.profile import LineSettings, Profile
 from busmaster.protocols.microflex import CommandWord, StatusWord
 from busmaster.protocols.msc import ProgramStatus
-from busmaster.transport.endpoints import endpoint
+from busmaster.transport.endpoints import Endpoint, endpoint
 from busmaster.transport.memory import MemoryPort
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -51,6 +51,7 @@ __all__ = [
     "BusError",
     "CommandWord",
     "Dc104Drive",
+    "Endpoint",
     "GarbledReply",
     "GroupStatistics",
     "Hcp2Controller",

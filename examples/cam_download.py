@@ -1,0 +1,35 @@
+"""A CAM table loaded into an MSC controller: in blocks of 32 values, verified, without holding up other traffic.
+
+    python examples/cam_download.py [PORT]    such as /dev/ttyS0; without one, emulated
+
+With a PORT it OVERWRITES the data from address 3000 on of unit 3. Load a table while the program does not use it.
+"""
+
+import math
+import sys
+
+import anyio
+
+from busmaster import Bus, Endpoint, MemoryPort, MscController, endpoint
+from busmaster.emulator.build import make_device
+from busmaster.emulator.line import Line
+
+TABLE = [round(1000 * math.sin(2 * math.pi * step / 64)) for step in range(64)]
+
+
+def show(done: int, total: int) -> None:
+    print(f"{done:4} of {total}: {'#' * (40 * done // total)}")
+
+
+async def main(port: Endpoint) -> None:
+    async with Bus(port) as bus:
+        # The address step is not in the documents: 4 where addresses count bytes. `find_address_step` finds it.
+        press = MscController(bus, 3, symbols={"cam": 3000}, address_step=4)
+        await press.load_cam("cam", TABLE, progress=show)  # what was written and what was verified both count
+        print("the first values are", await press.read_block("cam", 8))
+
+
+if __name__ == "__main__":
+    settings = MscController.profile.line  # 9600 8N1
+    emulated = MemoryPort(Line(settings, [make_device("msc", 3)]))
+    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)

@@ -1,0 +1,33 @@
+"""DC104: the one drive of its line, which has no address; registers of 16 bits.
+
+    python examples/dc104_hello.py [PORT]    such as /dev/ttyS0 or socket://10.0.0.5:4001; without one, emulated
+
+With a PORT it writes parameter 12 back to the value that it has.
+"""
+
+import sys
+
+import anyio
+
+from busmaster import Bus, Dc104Drive, Endpoint, InvalidCommand, MemoryPort, endpoint
+from busmaster.emulator.build import make_device
+from busmaster.emulator.line import Line
+
+
+async def main(port: Endpoint) -> None:
+    async with Bus(port) as bus:
+        drive = Dc104Drive(bus)
+        value = await drive.read(12)
+        print("parameter 12 is", value)
+        await drive.write(12, value, verify=True)  # the drive acknowledges when it has stored the value: up to 0.5 s
+        print("stored and read back")
+        try:
+            await drive.write(12, -1)
+        except InvalidCommand as error:  # nothing was sent
+            print(error)
+
+
+if __name__ == "__main__":
+    settings = Dc104Drive.profile.line  # 19200 8N1
+    emulated = MemoryPort(Line(settings, [make_device("dc104", 0)]))
+    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)

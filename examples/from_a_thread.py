@@ -1,0 +1,35 @@
+"""A program that does not use asyncio: the bus lives in a thread of its own, and any other thread calls it and waits.
+
+    python examples/from_a_thread.py [PORT]    such as /dev/ttyUSB0; without one, emulated
+
+With a PORT it writes Comms(1) of node 5.
+"""
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+from anyio.from_thread import BlockingPortal, start_blocking_portal
+
+from busmaster import Bus, Endpoint, Hcp2Controller, MemoryPort, endpoint
+from busmaster.emulator.build import make_device
+from busmaster.emulator.line import Line
+
+
+def main(port: Endpoint) -> None:
+    with start_blocking_portal() as portal, portal.wrap_async_context_manager(Bus(port)) as bus:
+        controller = portal.call(Hcp2Controller, bus, 5)
+        portal.call(controller.write, 1, 12.5)
+        print("Comms(1) is", portal.call(controller.read, 1))
+        print("adc0 to adc3 are", in_parallel(portal, controller))
+
+
+def in_parallel(portal: BlockingPortal, controller: Hcp2Controller) -> list[float]:
+    """Several threads may ask at once: the bus puts their requests in a row."""
+    with ThreadPoolExecutor() as threads:
+        return list(threads.map(lambda channel: portal.call(controller.io.adc(channel).read), range(4)))
+
+
+if __name__ == "__main__":
+    settings = Hcp2Controller.profile.line
+    emulated = MemoryPort(Line(settings, [make_device("hcp2", 5)]))
+    main(endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)

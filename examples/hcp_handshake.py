@@ -1,0 +1,65 @@
+"""The command handshake of the HCP document: data in Comms(2) to (4), then the command in Comms(1), then wait for zero.
+
+    python examples/hcp_handshake.py [PORT]    such as /dev/ttyUSB0; without one, emulated
+
+The document's Mint program clears Comms(1) whether it has seen a command or not: one that is written between its look
+and its clearing is lost, although the host sees zero. So the effect is checked, and the command is given again: one
+that may be repeated, a move to an absolute position.
+
+With a PORT it MOVES axis 1 of node 2, if that runs the document's program and keeps POS(1) in Comms(10).
+"""
+
+import sys
+from collections.abc import Generator
+
+import anyio
+
+from busmaster import Bus, Endpoint, HcpController, MemoryPort, endpoint
+from busmaster.emulator.devices.hostcomms import HCP
+from busmaster.emulator.devices.mint import MintController, command_handshake
+from busmaster.emulator.line import Line
+
+MOVE_ABSOLUTE = 1
+ATTEMPTS = 20
+
+
+async def give_command(controller: HcpController, command: int, speed: float, target: float) -> None:
+    """The data first, the command last and in a telegram of its own: the program must not act on old data."""
+    await controller.write(2, speed, target, 0)
+    await controller.write(1, command)
+    with anyio.fail_after(10):
+        while True:
+            await anyio.sleep(0.02)
+            if await controller.read(1) == 0:
+                return
+
+
+async def move_to(controller: HcpController, target: float, speed: float) -> int:
+    """Returns after how many attempts the axis is there."""
+    for attempt in range(1, ATTEMPTS + 1):
+        await give_command(controller, MOVE_ABSOLUTE, speed, target)
+        if abs(await controller.read(10) - target) < 0.001:
+            return attempt
+    raise TimeoutError(f"the axis is not at {target} after {ATTEMPTS} commands: does the program run?")
+
+
+async def main(port: Endpoint) -> None:
+    async with Bus(port) as bus:
+        controller = HcpController(bus, 2)
+        for target in (10.0, 25.0, 0.0):
+            attempts = await move_to(controller, target, speed=200.0)
+            lost = f", after {attempts - 1} lost in the race" if attempts > 1 else ""
+            print(f"moved to {target}{lost}")
+
+
+def program(mint: MintController) -> Generator[int, None, None]:
+    """The document's, with one more line: Comms(10) = POS(1)."""
+    for line in command_handshake(mint):
+        mint.comms[10] = mint.axes[1].position(mint.now)
+        yield line
+
+
+if __name__ == "__main__":
+    settings = HcpController.profile.line
+    emulated = MemoryPort(Line(settings, [MintController(2, HCP, program=program)]))
+    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)

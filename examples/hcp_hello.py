@@ -1,0 +1,30 @@
+"""HCP: write to the comms array of a controller, several elements at once, and read it back.
+
+    python examples/hcp_hello.py [PORT]      such as /dev/ttyUSB0 or socket://10.0.0.5:4001; without one, emulated
+
+With a PORT it writes Comms(10) to Comms(12) of node 2.
+"""
+
+import sys
+
+import anyio
+
+from busmaster import Bus, Endpoint, HcpController, MemoryPort, endpoint
+from busmaster.emulator.build import make_device
+from busmaster.emulator.line import Line
+
+
+async def main(port: Endpoint) -> None:
+    async with Bus(port) as bus:
+        winder = HcpController(bus, 2)
+        await winder.write(10, 123.456, -0.5, 1200)  # three elements in one telegram; the controller's ACK is awaited
+        print("Comms(10) is", await winder.read(10))
+        print("Comms(11) is", await winder.read(11))
+        await winder.point("12").write(1500)  # the same, as a point: it can be read, polled and written
+        print("Comms(12) is", await winder.point("12").read())
+
+
+if __name__ == "__main__":
+    settings = HcpController.profile.line  # 57600 8N1
+    emulated = MemoryPort(Line(settings, [make_device("hcp", 2)]))
+    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)

@@ -1,0 +1,34 @@
+"""MSC: data by the names of the controller's program, flags, and what the program is doing.
+
+    python examples/msc_hello.py [PORT]      such as /dev/ttyS0 or socket://10.0.0.5:4001; without one, emulated
+
+With a PORT it writes the data address 2008 and sets and clears flag 200 of unit 3.
+"""
+
+import sys
+
+import anyio
+
+from busmaster import Bus, Endpoint, MemoryPort, MscController, ProgramStatus, endpoint
+from busmaster.emulator.build import make_device
+from busmaster.emulator.line import Line
+
+
+async def main(port: Endpoint) -> None:
+    async with Bus(port) as bus:
+        press = MscController(bus, 3, symbols={"count": 2000, "length": 2008}, address_step=4)
+        status = await press.status()
+        print("the program is", "running" if ProgramStatus.PROGRAM_RUNNING in status else "not running")
+        await press.write("length", 1234)
+        print("length is", await press.read("length"))
+        await press.set_flag(200)
+        print("flag 200 is", await press.flag(200))
+        await anyio.sleep(0.3)
+        print("count is", await press.read("count"))
+        await press.clear_flag(200)
+
+
+if __name__ == "__main__":
+    settings = MscController.profile.line  # 9600 8N1
+    emulated = MemoryPort(Line(settings, [make_device("msc", 3)]))
+    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)

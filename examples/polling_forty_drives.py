@@ -1,0 +1,44 @@
+"""Forty drives polled on one line, one of them dead: the others do not wait for it.
+
+    python examples/polling_forty_drives.py [PORT]    such as /dev/ttyUSB0; without one, emulated
+
+Nothing is written.
+"""
+
+import logging
+import sys
+
+import anyio
+
+from busmaster import Bus, Endpoint, MemoryPort, MicroFlexDrive, endpoint
+from busmaster.emulator.build import make_device
+from busmaster.emulator.line import Line
+
+NODES = range(1, 41)
+CYCLES = 4
+
+
+async def main(port: Endpoint) -> None:
+    async with Bus(port) as bus:
+        drives = [MicroFlexDrive(bus, node) for node in NODES]
+        group = bus.poll_group("speeds", period=0.4, points=[drive.speed_measured for drive in drives])
+        async for snapshot in group:  # a snapshot a cycle; `group.latest` has the last one without waiting
+            speeds = [sample.value for sample in snapshot.values() if sample.error is None]
+            took = snapshot.finished - snapshot.due
+            print(f"cycle {snapshot.cycle}: {len(speeds)} of {len(snapshot)} drives in {took * 1000:.0f} ms")
+            if snapshot.cycle == CYCLES:
+                break
+        group.close()
+        print({drive.node.label: sample.value for drive, sample in zip(drives[:4], snapshot.values(), strict=False)})
+        print(f"{group.statistics().missed} cycles missed, line {bus.statistics().utilisation:.0%} in use")
+
+
+def emulated() -> MemoryPort:
+    line = Line(MicroFlexDrive.profile.line, [make_device("microflex", node, lively=True) for node in NODES])
+    line.device(13).faults.dead = 1.0
+    return MemoryPort(line)
+
+
+if __name__ == "__main__":
+    logging.basicConfig(stream=sys.stdout, format="log: %(message)s")  # speaks when a node goes or comes back
+    anyio.run(main, endpoint(sys.argv[1], defaults=MicroFlexDrive.profile.line) if sys.argv[1:] else emulated())

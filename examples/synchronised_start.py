@@ -1,0 +1,44 @@
+"""Several Mentor II drives started at the same moment: one telegram to all of them.
+
+    python examples/synchronised_start.py [PORT]    such as /dev/ttyS0; without one, emulated
+
+Nobody answers a broadcast, so each drive is asked afterwards whether it has heard it.
+
+With a PORT it gives drives 11, 12 and 13 a speed reference of 20 %: motors that are enabled TURN.
+"""
+
+import sys
+
+import anyio
+
+from busmaster import Bus, Endpoint, MemoryPort, MentorDrive, endpoint
+from busmaster.emulator.build import make_device
+from busmaster.emulator.line import Line
+
+ADDRESSES = (11, 12, 13)
+REFERENCE, FEEDBACK = "1.17", "3.02"
+DECIMALS = {REFERENCE: 1, FEEDBACK: 1}  # both in % with one decimal
+
+
+async def set_all(bus: Bus, drives: list[MentorDrive], percent: float) -> None:
+    """One write to address 0; then a write of its own for whoever missed it."""
+    await MentorDrive(bus, 0, decimals=DECIMALS).write(REFERENCE, percent)
+    for drive in drives:
+        if await drive.read(REFERENCE) != percent:
+            print(drive.node.label, "missed it")
+            await drive.write(REFERENCE, percent, verify=True)
+
+
+async def main(port: Endpoint) -> None:
+    async with Bus(port) as bus:
+        drives = [MentorDrive(bus, address, decimals=DECIMALS) for address in ADDRESSES]
+        await set_all(bus, drives, 20.0)
+        for _ in range(3):
+            print([await drive.read(FEEDBACK) for drive in drives], "%")
+        await set_all(bus, drives, 0.0)
+
+
+if __name__ == "__main__":
+    settings = MentorDrive.profile.line  # 9600 7E1
+    emulated = MemoryPort(Line(settings, [make_device("mentor", address) for address in ADDRESSES]))
+    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)
