@@ -188,7 +188,8 @@ class Arbiter:
         else:
             self._stray(data, now)
 
-    def handle_timeout(self, now: float) -> None:
+    def handle_timeout(self, now: float, *, unread: bool = False) -> None:
+        """`unread`: bytes have come that were not handed over yet, so the silence of the line is not known."""
         deadlines = self._deadlines
         if now >= deadlines.schedule:
             self.dispatcher.release_polls(now)
@@ -197,7 +198,7 @@ class Arbiter:
         if now >= deadlines.health:
             self._enter(self.state, now)
             self.dispatcher.probe(now)
-        if now >= deadlines.line:
+        if now >= deadlines.line and not unread:
             if self.state is LineState.EXCHANGE:
                 self._take(None, now)
             else:
