@@ -79,7 +79,7 @@ def test_r3_a_late_reply_that_lies_unread_is_never_taken_for_the_next_one(
             assert await axis.read(1) == 100
             first = asyncio.ensure_future(axis.read(1))
             second = asyncio.ensure_future(axis.read(1))
-            while not node.asked.is_set() or bus.state is not state:
+            while not node.asked.is_set() or bus.state is not state:  # noqa: ASYNC110  # a thread and the arbiter
                 await asyncio.sleep(0.001)
             expiring = asyncio.ensure_future(axis.read(1, start_within=0.005))
             await asyncio.sleep(0)
