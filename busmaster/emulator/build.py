@@ -71,7 +71,7 @@ def _mentor(address: int, delay: Delay, oracle: Oracle | None, lively: bool) -> 
     drive = MentorDrive(address, delay=delay, oracle=oracle)
     if lively:
         drive.ripple = 0.01
-        drive.set_value(SPEED_REFERENCE, 300 + 50 * (address % 8), 0.0)
+        drive.set_value(SPEED_REFERENCE, 313 + 50 * (address % 8), 0.0)
     return drive
 
 

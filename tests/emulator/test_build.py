@@ -31,6 +31,9 @@ def test_something_moves_on_a_lively_device() -> None:
         ("hcp", "04 32 32 02 31 31 05"),  # Comms(11)
         ("hcp2", "07 30 32 02 36 34 05 07"),  # Comms(100), the position of axis 0
         ("microflex", "07 30 32 02 36 34 05 07"),
+        ("msc", "02 02 00 08 00 00 44 52 45 41 44 2C 07 D0 02 6D"),  # DREAD 2000, what its program counts
+        ("mentor", "04 30 30 32 32 30 33 30 32 05"),  # 03.02, the speed feedback
+        ("dc104", "02 AA 01 AB"),
     ):
         line = line_of(make_device(protocol, 2, lively=True))
         assert len({ask(line, request, now) for now in range(1000, 1005)}) > 3

@@ -1,0 +1,386 @@
+"""An MSC controller, as IB-11A002 describes it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from busmaster.emulator.device import Delay
+from busmaster.emulator.devices.msc import COUNT, RUN_FLAG, MscController, packet
+from busmaster.emulator.line import Line
+from busmaster.emulator.oracle import Oracle, oracle_value
+from busmaster.errors import InvalidCommand
+from tests.emulator.lines import arrivals, ask, ask_bytewise, hexed, line_of
+
+ACK, NAK, SILENCE = "06", "15", ""
+DWRITE = "02 01 00 0D 00 00 44 57 52 49 54 45 2C 07 D8 00 00 04 D2 03 BE"  # the document's example packet
+DREAD = "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74"
+REPLY = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"
+PAUSE = 10.0
+"""Longer than a controller waits for anything."""
+
+
+def request(unit: int, name: str, *operands: int, value: int | None = None) -> str:
+    body = f"{name},".encode() + b"".join(operand.to_bytes(2, "big") for operand in operands)
+    return hexed(packet(unit, body + (b"" if value is None else value.to_bytes(4, "big", signed=True))))
+
+
+def answer(line: Line, text: str, now: float, *, bytewise: bool = False) -> str:
+    """What comes back to a request; its packet, if it has one, is ACKed, and nothing follows."""
+    heard = (ask_bytewise if bytewise else ask)(line, text, now)
+    assert ask(line, ACK, now + 0.5, PAUSE) == SILENCE
+    return heard
+
+
+# The document's packets, and what PROTOCOLS computes from its rules
+
+
+STATUS = "02 01 00 0F 00 00 52 51 53 54 41 54 2C 00 41 00 00 00 00 00 00 02 5C"  # 65: running, auto start
+FLAG_255_ON = "02 0F 00 08 00 00 52 46 4C 41 47 2C 00 01 01 B0"
+FLAGS_ON = "02 03 00 27 00 00 52 46 4C 41 47 53 2C 01 02 00 80" + 27 * " 00" + " 80 03 18"  # 0, 9, 31 and 255
+
+
+@pytest.mark.parametrize("bytewise", [False, True])
+@pytest.mark.parametrize(
+    ("unit", "text", "heard"),
+    [
+        (1, DWRITE, ACK),
+        (1, DREAD, f"{ACK} {REPLY}"),
+        (1, "02 01 00 07 00 00 52 51 53 54 41 54 2C 02 13", f"{ACK} {STATUS}"),
+        (2, "02 02 00 08 00 00 53 46 4C 41 47 2C 00 05 01 A8", ACK),  # SFLAG 5; the unit looks like STX
+        (2, "02 02 00 08 00 00 43 46 4C 41 47 2C 00 05 01 98", ACK),  # CFLAG 5
+        (15, "02 0F 00 08 00 00 52 46 4C 41 47 2C 00 FF 02 AE", f"{ACK} {FLAG_255_ON}"),
+        (3, "02 03 00 07 00 00 52 46 4C 41 47 53 2C 01 F5", f"{ACK} {FLAGS_ON}"),
+    ],
+)
+def test_it_answers_the_packets_of_the_document(unit: int, text: str, heard: str, bytewise: bool) -> None:
+    controller = MscController(unit)
+    controller.flags = {0, 9, 31, 255}
+    controller.set_value(2008, 1234)
+    assert answer(line_of(controller), text, 0.0, bytewise=bytewise) == heard
+
+
+def test_a_value_written_is_stored_signed_and_read_back() -> None:
+    controller = MscController(1)
+    line = line_of(controller)
+    for number, value in enumerate((1234, -1, 0, 2**31 - 1, -(2**31), 0x02020202, 0x06061515)):
+        now = number * 100.0
+        assert answer(line, request(1, "DWRITE", 2008, value=value), now) == ACK
+        assert controller.value(2008) == value
+        read = bytes.fromhex(answer(line, request(1, "DREAD", 2008), now + 50))
+        assert int.from_bytes(read[13:17], "big", signed=True) == value
+
+
+@pytest.mark.parametrize("step", [1, 2, 4])
+def test_a_block_is_32_values_one_address_step_apart(step: int) -> None:
+    controller = MscController(4, address_step=step)
+    line = line_of(controller)
+    values = list(range(-16, 16))
+    block = b"BWRITE," + (2008).to_bytes(2, "big") + b"".join(v.to_bytes(4, "big", signed=True) for v in values)
+    assert answer(line, hexed(packet(4, block)), 0.0) == ACK
+    assert [controller.value(2008 + i * step) for i in range(32)] == values
+    read = bytes.fromhex(answer(line, request(4, "BREAD", 2008), 20.0))
+    assert read[1:] == packet(4, b"BREAD," + block[9:])
+    assert len(read) == 1 + 142
+
+
+def test_flags_are_set_cleared_and_read() -> None:
+    controller = MscController(1, read_only_flags=frozenset({7}))
+    line = line_of(controller)
+    assert answer(line, request(1, "SFLAG", 5), 0.0) == ACK
+    assert controller.flags == {5}
+    assert answer(line, request(1, "RFLAG", 5), 20.0).endswith("00 01 01 A2")
+    assert answer(line, request(1, "CFLAG", 5), 40.0) == ACK
+    assert answer(line, request(1, "CFLAG", 5), 60.0) == ACK  # it is off already
+    assert answer(line, request(1, "RFLAG", 5), 80.0).endswith("00 00 01 A1")
+    assert answer(line, request(1, "SFLAG", 7), 100.0) == NAK  # an input
+    assert controller.flags == set()
+
+
+# What it refuses
+
+
+@pytest.mark.parametrize("bytewise", [False, True])
+@pytest.mark.parametrize(
+    "text",
+    [
+        DREAD[:-2] + "75",  # "an incorrect Packet Checksum"
+        request(1, "PEEK", 2008),
+        hexed(packet(1, b"DREAD")),  # no comma
+        hexed(packet(1, b"")),
+        hexed(packet(1, b"DREAD,\x07\xd8\x00")),  # a body of another length
+        request(1, "DREAD"),
+        request(1, "DREAD", 0x7FFD),  # three bytes of the data area are left there
+        request(1, "DWRITE", 0xFFFF, value=1),
+        request(1, "BREAD", 0x8000 - 31 * 4),  # the last of 32 values is outside
+        request(1, "SFLAG", 256),
+        request(1, "RFLAG", 256),
+        hexed(packet(1, b"BWRITE," + bytes(234))),  # 241 bytes: longer than any body
+        hexed(packet(1, b"DWRITE," + bytes(1000))),
+    ],
+)
+def test_it_says_nak_to_what_is_unsound_unknown_or_not_there(text: str, bytewise: bool) -> None:
+    controller = MscController(1)
+    assert answer(line_of(controller), text, 0.0, bytewise=bytewise) == NAK
+    assert not any(controller.value(address) for address in range(0, 0x7FFC, 4))
+
+
+@pytest.mark.parametrize(("model", "known"), [("MSC-250", True), ("MSC-850/32", True), ("MSC-850", False)])
+def test_only_two_models_know_rflags(model: str, known: bool) -> None:
+    heard = answer(line_of(MscController(1, model=model)), request(1, "RFLAGS"), 0.0)
+    assert heard.startswith(ACK if known else NAK)
+
+
+def test_a_packet_that_is_not_completed_is_refused_after_half_a_second() -> None:
+    line = line_of(MscController(1, delay=Delay(0.0)))
+    line.prompt = False
+    line.send(bytes.fromhex(DREAD)[:-1], 0.0)
+    [(when, heard)] = arrivals(line, 5.0)
+    assert heard == NAK
+    assert when == pytest.approx(0.5, abs=0.001)
+    assert answer(line, DREAD, 5.0).startswith(ACK)
+
+
+def test_another_units_packet_that_is_not_completed_is_passed_over() -> None:
+    line = line_of(MscController(1))
+    assert ask(line, "02 02 00 08 00", 0.0, 5.0) == SILENCE
+    assert ask(line, "02", 5.0, 5.0) == SILENCE
+    assert answer(line, DREAD, 10.0).startswith(ACK)
+
+
+@pytest.mark.parametrize(
+    ("before", "heard"),
+    [
+        ("00 FF 15 06", ACK),
+        ("02 10", ACK),  # there is no unit 16
+        ("02 00", ACK),
+        ("02 07 00 03 00 00 44 02 01 00 4F", ACK),  # a packet to unit 7 that holds the beginning of one to unit 1
+        ("02", SILENCE),  # with what follows it reads as a packet to unit 2, 256 bytes long
+    ],
+)
+def test_noise_and_other_units_packets_in_front_of_a_request(before: str, heard: str) -> None:
+    assert ask(line_of(MscController(1)), f"{before} {DREAD}")[:2] == heard
+
+
+# Who a packet is for
+
+
+def test_other_units_hear_requests_and_replies_and_say_nothing() -> None:
+    devices = [MscController(unit) for unit in range(1, 16)]
+    line = line_of(*devices)
+    for unit in range(1, 16):
+        heard = answer(line, request(unit, "DREAD", 2008), unit * 20.0)
+        assert heard == f"{ACK} {hexed(packet(unit, b'DREAD,' + bytes(4)))}"
+    assert line.collisions == 0
+
+
+@pytest.mark.parametrize(
+    "body", [b"DREAD," + bytes(4), b"BREAD," + bytes(128), b"RFLAGS," + bytes(32), b"RQSTAT,\x00\x41" + bytes(6)]
+)
+def test_a_reply_packet_of_its_own_number_is_no_request(body: bytes) -> None:
+    for asking in (ask, ask_bytewise):
+        assert asking(line_of(MscController(5)), hexed(packet(5, body))) == SILENCE
+
+
+# "The MSC will retransmit the Packet up to 5 times if necessary"
+
+
+def test_a_packet_is_sent_again_on_each_nak_five_times_at_most() -> None:
+    controller = MscController(1)
+    line = line_of(controller)
+    controller.set_value(2008, 1234)
+    assert ask(line, DREAD, 0.0) == f"{ACK} {REPLY}"
+    for number in range(1, 6):
+        assert controller.unacknowledged
+        assert ask(line, NAK, number) == REPLY
+    assert ask(line, NAK, 6.0, PAUSE) == SILENCE
+    assert controller.retransmitted == 5
+    assert not controller.unacknowledged
+
+
+def test_a_packet_is_sent_again_each_second_in_which_no_ack_comes() -> None:
+    controller = MscController(1, delay=Delay(0.002), packet_delay=Delay(0.0))
+    line = line_of(controller)
+    line.prompt = False
+    line.send(bytes.fromhex(DREAD), 0.0)
+    times = [when for when, heard in arrivals(line, 30.0) if heard != ACK]
+    gaps = [later - earlier for earlier, later in pairwise(times)]
+    assert len(times) == 6
+    assert gaps == pytest.approx([1.002 + 18 * line.tau] * 5)
+    assert not controller.attentive
+
+
+def test_nothing_is_sent_again_after_the_hosts_ack() -> None:
+    controller = MscController(1)
+    line = line_of(controller)
+    ask(line, DREAD, 0.0)
+    assert ask(line, ACK, 0.5, PAUSE) == SILENCE
+    assert ask(line, NAK, 20.0, PAUSE) == SILENCE
+    assert controller.retransmitted == 0
+
+
+def test_a_new_request_takes_the_place_of_a_packet_that_was_not_acknowledged() -> None:
+    for asking in (ask, ask_bytewise):
+        controller = MscController(1)
+        line = line_of(controller)
+        controller.set_value(2008, 7)
+        asking(line, DREAD, 0.0)
+        assert asking(line, request(1, "RFLAG", 0), 0.6) == f"{ACK} {hexed(packet(1, b'RFLAG,' + bytes(2)))}"
+        assert hexed(packet(1, b"RFLAG," + bytes(2))) == ask(line, NAK, 1.1)
+
+
+def test_a_packet_waits_while_another_units_request_passes() -> None:
+    controller = MscController(1, delay=Delay(0.0), packet_delay=Delay(0.0))
+    line = line_of(controller)
+    ask(line, DREAD, 0.0)
+    start = line.next_event() - 0.001
+    long = request(2, "BWRITE", *range(60))
+    assert ask_bytewise(line, long, start, 0.9) == hexed(packet(1, b"DREAD," + bytes(4)))
+    assert line.collisions == 0
+
+
+def test_what_is_refused_left_out_and_damaged_for_a_test() -> None:
+    controller = MscController(1)
+    controller.set_value(2008, 1234)
+    controller.naks_ahead, controller.missing_acks_ahead, controller.bad_packets_ahead = 2, 1, 2
+    line = line_of(controller)
+    damaged = REPLY[:-2] + "6C"
+    assert ask(line, DREAD, 0.0) == NAK
+    assert ask(line, DREAD, 1.0) == NAK
+    assert ask(line, DREAD, 2.0) == damaged  # without its ACK
+    assert ask(line, NAK, 2.5) == damaged
+    assert ask(line, NAK, 3.0) == REPLY
+
+
+def test_ack_and_packet_come_apart_or_in_one_piece() -> None:
+    line = line_of(MscController(1, delay=Delay(0.01), packet_delay=Delay(0.02)))
+    line.prompt = False
+    line.send(bytes.fromhex(DREAD), 0.0)
+    (acked, ack), (replied, _) = arrivals(line, 0.5)
+    assert ack == ACK
+    assert acked == pytest.approx(0.01 + 17 * line.tau)
+    assert replied - acked == pytest.approx(0.02 + 18 * line.tau)
+
+
+def test_only_the_ack_of_a_late_answer_is_late() -> None:
+    controller = MscController(1)
+    controller.faults.late = 1.0
+    line = line_of(controller)
+    line.prompt = False
+    line.send(bytes.fromhex(DREAD), 0.0)
+    (acked, _), (replied, _) = arrivals(line, 0.5)
+    assert acked > 0.01
+    assert replied - acked == pytest.approx(0.002 + 18 * line.tau)
+
+
+# Its program, its memory
+
+
+def test_the_program_counts_while_its_flag_is_on() -> None:
+    controller = MscController(1, period=0.1)
+    line = line_of(controller)
+
+    def count(now: float) -> int:
+        return int.from_bytes(bytes.fromhex(answer(line, request(1, "DREAD", COUNT), now))[13:17], "big", signed=True)
+
+    assert count(0.0) == count(20.0) == 0
+    answer(line, request(1, "SFLAG", RUN_FLAG), 40.0)
+    first = count(60.0)
+    assert count(80.0) - first == 200
+    controller.set_value(COUNT, 2**31 - 1)
+    assert count(80.0 + 20.05) < -(2**31) + 300  # 32 bits
+    answer(line, request(1, "CFLAG", RUN_FLAG), 120.0)
+    assert count(140.0) == count(160.0)
+    controller.status = 0
+    answer(line, request(1, "SFLAG", RUN_FLAG), 180.0)
+    assert count(200.0) == count(220.0)
+
+
+def test_a_power_failure_clears_program_and_data_unless_there_is_a_battery() -> None:
+    for battery, status, value in ((False, 0b1100, 0), (True, 65, 1234)):
+        controller = MscController(1, battery=battery)
+        controller.set_value(2008, 1234)
+        line = line_of(controller)
+        ask(line, DREAD, 0.0)
+        line.restart(controller, 0.5)
+        assert not controller.unacknowledged
+        assert controller.value(2008) == value
+        assert answer(line, request(1, "RQSTAT"), 1.0).split()[14:16] == ["00", f"{status:02X}"]
+
+
+def test_the_oracle_holds_data_values_and_counts_writes() -> None:
+    oracle = Oracle(5, 2**31)
+    line = line_of(MscController(5, oracle=oracle))
+    sent = oracle_value(5, 2008, 0, 2**31)
+    answer(line, request(5, "DWRITE", 2008, value=sent), 0.0)
+    assert (oracle.writes[2008], oracle.strays) == (1, 0)
+    block = bytes.fromhex(answer(line, request(5, "BREAD", 2008), 20.0))[13:-2]
+    values = [int.from_bytes(block[i : i + 4], "big") for i in range(0, 128, 4)]
+    assert values == [oracle_value(5, 2008 + 4 * i, int(i == 0), 2**31) for i in range(32)]
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        lambda: MscController(0),
+        lambda: MscController(16),
+        lambda: MscController(1, model="MSC-1000"),
+        lambda: MscController(1, address_step=3),
+        lambda: MscController(1, oracle=Oracle(1)),
+    ],
+)
+def test_what_no_msc_is_cannot_be_made(bad: object) -> None:
+    assert callable(bad)
+    with pytest.raises(InvalidCommand):
+        bad()
+
+
+# Properties
+
+
+@given(st.lists(st.binary(max_size=30), max_size=5), st.booleans())
+@settings(max_examples=60)
+def test_whatever_it_hears_it_listens_again_when_time_has_passed(chunks: list[bytes], acked: bool) -> None:
+    controller = MscController(1)
+    line = line_of(controller)
+    for number, chunk in enumerate(chunks):
+        line.send(chunk, number * 0.1)
+    arrivals(line, 10.0)
+    assert controller.attentive is False
+    assert ask(line, DREAD, 10.0).startswith(ACK)
+
+
+FRAMES = [DREAD, DWRITE, request(1, "RQSTAT"), request(2, "DREAD", 2008), REPLY, ACK, NAK, "02", DREAD[:-2] + "75"]
+
+
+@given(st.lists(st.tuples(st.sampled_from(FRAMES), st.integers(0, 30)), max_size=6), st.floats(0.01, 0.6))
+@settings(max_examples=150)
+def test_taking_a_packet_in_one_piece_and_hearing_it_byte_by_byte_do_the_same(
+    frames: list[tuple[str, int]], apart: float
+) -> None:
+    whole, bytewise = MscController(1), MscController(1)
+    for device in (whole, bytewise):
+        for number, (text, cut) in enumerate(frames):
+            frame = bytes.fromhex(text)[: cut or None]
+            now = 1.0 + number * apart
+            if now >= device.wakeup:
+                device.wake(device.wakeup)
+            taken = device is whole and frame.startswith(device.routes) and device.take(frame, now)
+            if not taken:
+                device.hear(frame, now)
+    assert whole.outbox == bytewise.outbox
+    assert (whole.attentive, whole.wakeup) == (bytewise.attentive, bytewise.wakeup)
+    assert whole.value(2008) == bytewise.value(2008)
+
+
+def test_a_disguised_packet_comes_from_another_unit_with_a_right_checksum() -> None:
+    controller = MscController(1)
+    line = line_of(controller)
+    controller.faults.wrong = 1.0
+    heard = bytes.fromhex(ask(line, DREAD))
+    assert heard[0] == 0x06
+    assert heard[2] in range(2, 16)
+    assert heard[1:] == packet(heard[2], b"DREAD," + bytes(4))
