@@ -23,6 +23,7 @@ from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command
 from busmaster.handles import Dc104Drive, Handle, MentorDrive, MscController
 from busmaster.handles.comms import CommsHandle
+from busmaster.handles.msc_blocks import writes
 from busmaster.points import Point
 from busmaster.protocols.comms import telegrams
 
@@ -52,9 +53,9 @@ async def write(
 ) -> None:
     bus = connection.open_bus()
     handle = connection.open_handle(bus, address)
-    writes = [(item, prepare(handle, item, values, verify)) for item, values in pairs]
+    prepared = [(item, prepare(handle, item, values, verify)) for item, values in pairs]
     async with bus:
-        for item, sends in writes:
+        for item, sends in prepared:
             for send in sends:
                 await send()
             emit(json_line(node=connection.node_number(address), item=item, ok=True) if as_json else f"{item} ok")
@@ -81,11 +82,12 @@ def comms_write(handle: CommsHandle, item: str, values: tuple[float, ...], verif
 
 
 def block_write(handle: MscController, item: str, values: tuple[Any, ...], verify: bool) -> Write:
-    """Consecutive data addresses, in blocks."""
+    """Consecutive data addresses, in blocks and one by one."""
     name, _, count = item.partition(":")
     if count and count != str(len(values)):
         raise InvalidCommand(f"{item} takes {count} values, not {len(values)}")
-    writable(handle.point(f"{name}:{len(values)}"))(values)
+    writable(handle.point(name))
+    writes(handle.address_of(name), values, handle.address_step)
     return lambda: handle.write_block(name, values, verify=verify)
 
 
