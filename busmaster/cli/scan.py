@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-
 import anyio
 import click
 
 from busmaster.cli.arguments import Connection, connected, json_option, nodes_option
 from busmaster.cli.output import emit, json_line, json_value, value_text
+from busmaster.cli.progress import Bar
 from busmaster.errors import GarbledReply, NodeDown, NoReply, Refused
 from busmaster.node import Node
 
@@ -31,14 +30,16 @@ async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool
     bus = connection.open_bus()
     handles = [connection.open_handle(bus, address) for address in addresses]
     async with bus:
-        with click.progressbar(handles, label="scanning", file=sys.stderr, hidden=not sys.stderr.isatty()) as asked:
-            for handle in asked:
+        with Bar("scanning", len(handles)) as bar:
+            for handle in handles:
                 answer = await ask(handle.node)
                 if answer is not None:
                     value, outcome = answer
                     number = connection.node_number(handle.node.address)
                     found = json_line(node=number, value=json_value(value), answer=outcome)
-                    emit(found if as_json else f"{handle.node.address} {outcome}")
+                    with bar.aside():
+                        emit(found if as_json else f"{handle.node.address} {outcome}")
+                bar.advance()
 
 
 async def ask(node: Node) -> tuple[object, str] | None:
