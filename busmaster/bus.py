@@ -306,10 +306,14 @@ class Bus:
         task.add_done_callback(self._tasks.discard)
 
     async def _run_hook(self, node: Node) -> None:
-        """A hook that fails must not take the bus down: the node's polls resume all the same."""
+        """A hook that fails must not take the bus down: the node's polls resume all the same.
+
+        A node that comes back again while its hook still runs gets another run of it, after that one.
+        """
         try:
-            if node.on_return is not None:
-                await node.on_return(node)
+            async with node.returning:
+                if node.on_return is not None:
+                    await node.on_return(node)
         except Exception as error:
             self._logbook.failed_hook(node.label, error)
         finally:

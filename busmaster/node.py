@@ -32,6 +32,8 @@ class Node:
         self.record = record
         self.kinds: dict[type, Command[Any]] = {}
         """Of each kind of command that was asked of it, the first: the worst case reckons with them."""
+        self.returning = asyncio.Lock()
+        """Held while its hook runs."""
         self._on_return: Callable[[Node], Awaitable[None]] | None = None
 
     @property

@@ -1,0 +1,276 @@
+"""The grid of polls, the choice of their phases (R10), and line time."""
+
+from __future__ import annotations
+
+import random
+import time
+from math import inf
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given, settings
+
+from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.schedule import (
+    LONGEST_PATIENCE,
+    Poll,
+    Schedule,
+    begin_cycle,
+    common_divisor,
+    line_time,
+    quietest_offset,
+    set_members,
+)
+from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.errors import InvalidCommand
+from busmaster.profile import LineSettings
+from busmaster.protocols import hcp2, msc
+
+TAU = LineSettings(57600).byte_time
+PERIODS = st.sampled_from([0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0])
+
+
+def running(*polls: Poll, now: float = 0.0) -> Schedule:
+    schedule = Schedule()
+    for poll in polls:
+        schedule.add(poll, now)
+    return schedule
+
+
+def released(schedule: Schedule, until: float) -> list[tuple[float, str]]:
+    """When which poll was due, if the clock stops at every due time and cycles take no time."""
+    seen = []
+    while (now := schedule.next_due()) <= until:
+        seen += [(poll.due, poll.name) for poll in schedule.release(now)]
+    return seen
+
+
+def members(*addresses: int) -> list[Transaction]:
+    nodes = [NodeRecord(hcp2.PROFILE, address, hcp2.PROFILE.timings, 2) for address in addresses]
+    return [Transaction(node, hcp2.Read(1)) for node in nodes]
+
+
+def test_r10_a_poll_is_due_on_a_fixed_grid_from_its_phase_on() -> None:
+    schedule = running(Poll("a", 0.25, phase=0.1), now=10.0)
+    assert [due for due, _ in released(schedule, 10.9)] == pytest.approx([10.1, 10.35, 10.6, 10.85])
+
+
+def test_r10_a_poll_added_later_joins_the_grid_of_the_first() -> None:
+    schedule = running(Poll("a", 0.25, phase=0.0), now=10.0)
+    late = Poll("b", 0.25, phase=0.1)
+    schedule.add(late, 10.2)
+    assert late.base == pytest.approx(10.35)
+
+
+def test_r10_the_grid_does_not_drift_in_a_million_cycles() -> None:
+    poll = Poll("a", 0.1, phase=0.0)
+    schedule = running(poll)
+    schedule.release(0.0)
+    poll.number = 1_000_000
+    assert poll.next_due() == pytest.approx(100_000.0, abs=1e-9)
+
+
+def test_r10_what_could_not_start_while_the_owner_slept_is_missed_and_not_caught_up() -> None:
+    poll = Poll("a", 0.1, phase=0.0)
+    schedule = running(poll)
+    schedule.release(0.0)
+    assert schedule.release(0.55) == [poll]
+    assert poll.due == pytest.approx(0.5)
+    assert poll.missed == 4
+    assert schedule.next_due() == pytest.approx(0.6)
+
+
+def test_r10_a_cycle_that_still_runs_makes_the_next_one_missed() -> None:
+    poll = Poll("a", 0.1, phase=0.0)
+    schedule = running(poll)
+    schedule.release(0.0)
+    poll.remaining = 1
+    assert schedule.release(0.1) == []
+    assert poll.missed == 1
+    poll.remaining = 0
+    assert schedule.release(0.2) == [poll]
+    assert poll.missed == 1
+
+
+def test_a_paused_poll_neither_starts_nor_misses_and_resumes_on_the_grid() -> None:
+    poll = Poll("a", 0.1, phase=0.0)
+    schedule = running(poll)
+    poll.paused = True
+    assert schedule.release(0.35) == []
+    poll.paused = False
+    assert schedule.next_due() == pytest.approx(0.4)
+    assert poll.missed == 0
+
+
+def test_a_removed_poll_is_not_due_again_and_cannot_come_back() -> None:
+    poll, other = Poll("a", 0.1, phase=0.0), Poll("b", 0.3, phase=0.0)
+    schedule = running(poll, other)
+    begin_cycle(poll, 0.0)
+    schedule.remove(poll)
+    assert {name for _, name in released(schedule, 1.0)} == {"b"}
+    with pytest.raises(InvalidCommand, match="make a new one"):
+        schedule.add(poll, 1.0)
+
+
+def test_a_poll_that_was_never_placed_can_be_removed() -> None:
+    poll = Poll("a", 0.1)
+    schedule = running(poll)
+    schedule.remove(poll)
+    assert schedule.next_due() == inf
+    assert schedule.release(1.0) == []
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, 0.0009, inf, float("nan")])
+def test_a_period_that_cannot_be_is_refused(period: float) -> None:
+    with pytest.raises(InvalidCommand, match="a period is at least"):
+        Poll("a", period)
+
+
+@pytest.mark.parametrize("phase", [-0.1, 0.5, 1.0, float("nan")])
+def test_a_phase_outside_the_period_is_refused(phase: float) -> None:
+    with pytest.raises(InvalidCommand, match="phase"):
+        Poll("a", 0.5, phase=phase)
+
+
+def test_a_cycle_begins_with_fresh_transactions_that_want_to_be_done_within_the_period() -> None:
+    poll = Poll("a", 0.5, phase=0.0)
+    set_members(poll, members(1, 2), Priority.POLL)
+    running(poll).release(0.0)
+    cycle = begin_cycle(poll, 0.001)
+    assert [(t.queued, t.deadline) for t in cycle] == [(0.001, 0.5)] * 2
+    assert poll.remaining == 2
+
+
+def test_r9_a_slow_poll_waits_no_longer_for_later_fast_ones_than_its_patience() -> None:
+    poll = Poll("hourly", 3600.0, phase=0.0)
+    set_members(poll, members(1))
+    running(poll).release(0.0)
+    assert begin_cycle(poll, 0.0)[0].deadline == LONGEST_PATIENCE
+
+
+def test_r11_a_node_that_was_never_heard_is_read_in_background() -> None:
+    poll = Poll("a", 0.5, phase=0.0)
+    heard, absent = members(1, 2)
+    heard.node.last_reply = 0.0
+    set_members(poll, [heard, absent])
+    running(poll).release(0.0)
+    assert [t.priority for t in begin_cycle(poll, 0.0)] == [Priority.POLL, Priority.BACKGROUND]
+
+
+def test_new_members_are_asked_from_the_next_cycle_on() -> None:
+    poll = Poll("a", 0.5, phase=0.0)
+    old, new = members(1, 2)
+    set_members(poll, [old])
+    begin_cycle(poll, 0.0)
+    set_members(poll, [new])
+    assert list(poll.results) == [old]
+    assert begin_cycle(poll, 0.5) == [new]
+
+
+# phases
+
+
+def test_r10_the_first_poll_starts_at_once() -> None:
+    poll = Poll("a", 0.5, cost=0.1)
+    schedule = running(poll, now=3.0)
+    assert schedule.next_due() == 3.0
+    assert schedule.release(3.0) == [poll]
+
+
+def test_r10_polls_added_together_do_not_meet() -> None:
+    """60 polls of one exchange, a third each at 0.25, 0.5 and 1 s: 67 % of the line, and not one has to wait."""
+    exchange = 0.0048
+    polls = [Poll(f"{period} {n}", period, cost=exchange) for period in (0.25, 0.5, 1.0) for n in range(20)]
+    random.Random(1).shuffle(polls)
+    starts = sorted(due for due, _ in released(running(*polls), 2.999) if 1.0 <= due)
+    assert len(starts) == 2 * 140
+    assert min(b - a for a, b in zip(starts, starts[1:], strict=False)) >= exchange
+
+
+def test_r10_phases_do_not_depend_on_what_replies_were_thought_to_take() -> None:
+    """At first reply times are guesses, all too long by the same factor: the polls spread all the same."""
+    polls = [Poll(f"{period} {n}", period, cost=0.0285) for period in (0.25, 0.5, 1.0) for n in range(20)]
+    starts = sorted(due for due, _ in released(running(*polls), 2.999) if 1.0 <= due)
+    assert min(b - a for a, b in zip(starts, starts[1:], strict=False)) >= 0.0048
+
+
+def test_r10_a_poll_added_to_a_running_line_goes_where_there_is_room() -> None:
+    first = Poll("first", 0.2, phase=0.0, cost=0.1)
+    schedule = running(first)
+    schedule.release(0.0)
+    later = Poll("later", 0.4, cost=0.05)
+    schedule.add(later, 1.03)
+    schedule.release(1.03)
+    into = later.base % 0.2
+    assert 0.1 <= into <= 0.15
+
+
+def test_a_long_cycle_meets_as_little_as_can_be() -> None:
+    """It cannot avoid polls that are due more often than it lasts, but it can avoid the other slow one."""
+    polls = [Poll("fast", 0.05, phase=0.0, cost=0.01), Poll("slow", 2.0, phase=0.0, cost=0.4)]
+    schedule = running(*polls)
+    schedule.release(0.0)
+    assert 0.4 <= quietest_offset(Poll("another", 2.0, cost=0.4), polls, 0.0) <= 1.6
+
+
+def test_choosing_a_phase_among_many_polls_is_quick() -> None:
+    """The 60th group costs the running line less than 5 ms, however its period relates to the others'."""
+    chance = random.Random(3)
+    for period in (0.25, 10.0, 0.007, 3600.0, 0.333):
+        others = [Poll(str(n), chance.choice([0.1, 0.25, 0.3, 1.0, 60.0]), cost=0.005) for n in range(59)]
+        for other in others:
+            other.base = chance.uniform(0.0, other.period)
+        before = time.process_time()
+        offset = quietest_offset(Poll("sixtieth", period, cost=0.005), others, 0.0)
+        assert time.process_time() - before < 0.005
+        assert 0 <= offset < period
+
+
+def overlap(poll: Poll, offset: float, others: list[Poll], until: float) -> float:
+    """By counting, cycle by cycle."""
+    total = 0.0
+    for k in range(round(until / poll.period)):
+        start = offset + k * poll.period
+        for other in others:
+            for n in range(-1, round(until / other.period) + 2):
+                at = other.base + n * other.period
+                total += max(0.0, min(start + poll.cost, at + other.cost) - max(start, at))
+    return total
+
+
+@given(st.lists(st.tuples(PERIODS, st.floats(0.001, 0.04), st.floats(0, 0.99)), min_size=1, max_size=4), PERIODS)
+@settings(max_examples=40)
+def test_no_offset_is_quieter_than_the_one_chosen(others: list[tuple[float, float, float]], period: float) -> None:
+    polls = []
+    for n, (other_period, cost, phase) in enumerate(others):
+        polls.append(Poll(str(n), other_period, cost=min(cost, other_period)))
+        polls[-1].base = phase * other_period
+    poll = Poll("new", period, cost=0.01)
+    offset = quietest_offset(poll, polls, 0.0)
+    chosen = overlap(poll, offset, polls, 2.0)
+    tried = [overlap(poll, n / 40 * period, polls, 2.0) for n in range(40)]
+    assert chosen <= min(tried) + 1e-6
+
+
+def test_the_common_divisor_of_two_periods() -> None:
+    assert common_divisor(0.25, 1.0) == pytest.approx(0.25)
+    assert common_divisor(0.6, 0.25) == pytest.approx(0.05)
+    assert common_divisor(1.0, 1 / 3) == pytest.approx(1 / 3)
+    assert common_divisor(0.5, 0.5) == 0.5
+
+
+# line time
+
+
+def test_line_time_of_a_read_counts_bytes_both_ways_and_one_wait() -> None:
+    """HCP2 read: 8 bytes there; STX, 2, 7 typical, ETX and a checksum back."""
+    read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
+    assert line_time(read, TAU, 0.002) == pytest.approx((8 + 12) * TAU + 0.002)
+    assert line_time(read, TAU) == pytest.approx((8 + 12) * TAU + 0.025)
+
+
+def test_line_time_of_a_conversation_counts_each_leg_and_the_closing_ack() -> None:
+    """MSC DREAD: a packet of 16 bytes, ACK, a packet of 18 bytes, ACK."""
+    tau = msc.PROFILE.line.byte_time
+    read = msc.DataRead(2008).open(1, msc.PROFILE.timings)
+    assert line_time(read, tau, 0.01) == pytest.approx((16 + 1 + 18 + 1) * tau + 2 * 0.01)
