@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import time
+from itertools import pairwise
 from math import inf
 
 import hypothesis.strategies as st
@@ -182,16 +183,16 @@ def test_r10_polls_added_together_do_not_meet() -> None:
     exchange = 0.0048
     polls = [Poll(f"{period} {n}", period, cost=exchange) for period in (0.25, 0.5, 1.0) for n in range(20)]
     random.Random(1).shuffle(polls)
-    starts = sorted(due for due, _ in released(running(*polls), 2.999) if 1.0 <= due)
+    starts = sorted(due for due, _ in released(running(*polls), 2.999) if due >= 1.0)
     assert len(starts) == 2 * 140
-    assert min(b - a for a, b in zip(starts, starts[1:], strict=False)) >= exchange
+    assert min(b - a for a, b in pairwise(starts)) >= exchange
 
 
 def test_r10_phases_do_not_depend_on_what_replies_were_thought_to_take() -> None:
     """At first reply times are guesses, all too long by the same factor: the polls spread all the same."""
     polls = [Poll(f"{period} {n}", period, cost=0.0285) for period in (0.25, 0.5, 1.0) for n in range(20)]
-    starts = sorted(due for due, _ in released(running(*polls), 2.999) if 1.0 <= due)
-    assert min(b - a for a, b in zip(starts, starts[1:], strict=False)) >= 0.0048
+    starts = sorted(due for due, _ in released(running(*polls), 2.999) if due >= 1.0)
+    assert min(b - a for a, b in pairwise(starts)) >= 0.0048
 
 
 def test_r10_a_poll_added_to_a_running_line_goes_where_there_is_room() -> None:
