@@ -155,7 +155,7 @@ class Screen(App[None]):
         self.connection = connection
         self.writer: asyncio.StreamWriter | None = None
         self.frame: Frame | None = None
-        self.trends: defaultdict[tuple[str, str], deque[float | None]] = defaultdict(
+        self.trends: defaultdict[tuple[int, str, str], deque[float | None]] = defaultdict(
             lambda: deque(maxlen=LONGEST_TREND)
         )
         self.shown: list[tuple[str, str]] = []
@@ -255,25 +255,21 @@ class Screen(App[None]):
         if keys != self.shown:
             table.clear()
             self.shown = keys
-            for row in frame.rows:
-                table.add_row(*(Text() for _ in COLUMNS), key=self.row_key(row))
+            for number in range(len(keys)):
+                table.add_row(*(Text() for _ in COLUMNS), key=str(number))
         old = OLD_AFTER * max((group.period for group in frame.groups), default=1.0)
         before = ""
-        for row in frame.rows:
-            trend = self.trends[row.node, row.item]
+        for number, row in enumerate(frame.rows):
+            trend = self.trends[number, row.node, row.item]
             trend.append(row.value if isinstance(row.value, int | float) and not row.error else None)
             cells = point_cells(row, list(trend)[-self.widths["TREND"] :], old, self.widths)
-            if row.node != before and row.node in nodes:
-                cells |= node_cells(nodes[row.node], self.widths)
+            if row.node != before:
+                cells |= node_cells(nodes.get(row.node, NodeRow(row.node, "")), self.widths)
             for name, cell in cells.items():
-                shown = table.get_cell(self.row_key(row), name)
+                shown = table.get_cell(str(number), name)
                 if (shown, shown.style) != (cell, cell.style):
-                    table.update_cell(self.row_key(row), name, cell)
+                    table.update_cell(str(number), name, cell)
             before = row.node
-
-    @staticmethod
-    def row_key(row: Row) -> str:
-        return f"{row.node}/{row.item}"
 
 
 def point_cells(row: Row, trend: list[float | None], old: float, widths: dict[str, int]) -> dict[str, Text]:

@@ -11,6 +11,8 @@ from rich.cells import cell_len
 from busmaster.cli.live import COLUMNS, Screen, age_text, clock_text, column_widths, sparkline
 from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row, decode_action, decode_frame, encode
 
+OUTPUTS = Row("node 5", "outputs", 0, writable=True)
+
 
 def frame(rows: int = 3, *, now: float = 61.0, paused: bool = False) -> Frame:
     points = [Row(f"node {n}", "axis0.position", n + 0.5, "mm", 0.1) for n in range(1, rows)]
@@ -51,6 +53,20 @@ async def test_the_picture_fits_80_by_24_and_says_what_the_frame_says() -> None:
     assert "quit" in lines[-1]
     dead = next(line for line in lines if line.strip().startswith("node 9") and "axis0" in line)
     assert dead.split()[3:] == ["-", "mm", "12s", "down"]
+
+
+@pytest.mark.asyncio
+async def test_two_groups_may_hold_the_same_point_and_the_rows_may_change() -> None:
+    screen = Screen(None)
+    async with screen.run_test(size=(80, 24)) as pilot:
+        for rows in ((OUTPUTS, OUTPUTS), (OUTPUTS,), (Row("node 6", "inputs", 7), OUTPUTS)):
+            screen.take_frame(msgspec.structs.replace(frame(), rows=rows))
+        await pilot.pause()
+        lines = picture(screen)
+    assert [line.split()[2:4] for line in lines if line.startswith(" node ")] == [
+        ["inputs", "7"],
+        ["outputs", "0"],
+    ]
 
 
 @pytest.mark.asyncio
@@ -110,9 +126,6 @@ async def pressed(*keys: str, row: Row, read_only: bool = False) -> list[Action]
         await pilot.press(*keys)
         await pilot.pause()
     return screen.sent
-
-
-OUTPUTS = Row("node 5", "outputs", 0, writable=True)
 
 
 @pytest.mark.asyncio
