@@ -10,6 +10,7 @@ import contextlib
 import fcntl
 import grp
 import os
+import re
 import stat
 import termios
 from collections.abc import Iterator
@@ -25,6 +26,9 @@ SLOW_LATENCY_TIMER = 2
 FLAGS = 4
 ASYNC_LOW_LATENCY = 1 << 13
 """Of struct serial_struct (linux/serial.h, linux/tty_flags.h): where its flags are, and the one that we look for."""
+TIOCGRS485 = 0x542E
+SER_RS485_ENABLED = 1
+"""Of linux/serial.h: the flags are the first word of struct serial_rs485."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +109,16 @@ def low_latency(descriptor: int) -> bool | None:
     return bool(settings[FLAGS] & ASYNC_LOW_LATENCY)
 
 
+def rs485_mode(descriptor: int) -> bool | None:
+    """Whether the driver of an open port switches the transmitter by itself; None if it cannot."""
+    settings = array.array("I", [0] * 32)  # struct serial_rs485, with room to grow
+    try:
+        fcntl.ioctl(descriptor, TIOCGRS485, settings)
+    except OSError:
+        return None
+    return bool(settings[0] & SER_RS485_ENABLED)
+
+
 def _existence(path: str) -> Finding:
     if not os.path.exists(path):
         if os.path.islink(path):
@@ -128,7 +142,8 @@ def _permission(path: str) -> Finding:
 
 
 def _holders(path: str, proc: Path) -> Finding:
-    found = [str(holder) for holder in holders(path, proc=proc)]
+    device = os.path.realpath(path)
+    found = [str(holder) for holder in holders(path, proc=proc) if not _serves(proc / str(holder.pid), device)]
     if not found:
         return Finding("holders", True, "no other program has it open")
     return Finding(
@@ -176,6 +191,16 @@ def _open_files(process: Path) -> set[str]:
             with contextlib.suppress(OSError):
                 found.add(os.readlink(link.path))
     return found
+
+
+def _serves(process: Path, device: str) -> bool:
+    """Whether it has the other end of this pseudo-terminal open: then it is the line, not a second master."""
+    for descriptor in process.glob("fdinfo/*"):
+        with contextlib.suppress(OSError):
+            index = re.search(r"^tty-index:\s*(\d+)$", descriptor.read_text(), re.MULTILINE)
+            if index is not None and device == f"/dev/pts/{index[1]}":
+                return True
+    return False
 
 
 def _holder(pid: int, proc: Path) -> Holder:

@@ -13,7 +13,16 @@ from pathlib import Path
 import pytest
 
 from busmaster.transport import adapters
-from busmaster.transport.adapters import Finding, Holder, holders, inspect, latency_timer, lock_owner, low_latency
+from busmaster.transport.adapters import (
+    Finding,
+    Holder,
+    holders,
+    inspect,
+    latency_timer,
+    lock_owner,
+    low_latency,
+    rs485_mode,
+)
 from tests.transport.fakes import FarEnd, plugged
 
 
@@ -107,6 +116,13 @@ def test_who_holds_and_who_locks_a_port_is_found_through_its_link(tmp_path: Path
         assert lock_owner(str(link)) == holder
 
 
+def test_whoever_emulates_the_line_on_a_pty_is_no_second_master(far_end: FarEnd) -> None:
+    """An emulator has the port open too, so that clients may come and go."""
+    with open(far_end.path, "rb", buffering=0):
+        assert holders(far_end.path)
+        assert topics(inspect(far_end.path))["holders"]
+
+
 def test_a_process_that_cannot_be_seen_into_is_another_program(tmp_path: Path, far_end: FarEnd) -> None:
     inode = os.stat(far_end.path)
     place = f"{os.major(inode.st_dev):02x}:{os.minor(inode.st_dev):02x}:{inode.st_ino}"
@@ -122,6 +138,13 @@ def test_a_system_without_these_trees_knows_nothing(tmp_path: Path, far_end: Far
     assert lock_owner(far_end.path, proc=tmp_path / "proc") is None
     assert lock_owner(str(tmp_path / "gone")) is None
     assert holders(far_end.path, proc=tmp_path / "proc") == ()
+
+
+def test_a_pty_has_no_rs485_mode_and_a_driver_tells_its_own(far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert rs485_mode(far_end.fd) is None
+    for flags in (0, 1, 2 | 4):
+        monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings, flags=flags: settings.__setitem__(0, flags))
+        assert rs485_mode(far_end.fd) is bool(flags & 1)
 
 
 def test_a_pty_has_no_low_latency_flag_and_a_driver_tells_its_own(
