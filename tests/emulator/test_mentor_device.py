@@ -326,6 +326,7 @@ def test_a_disguised_reply_names_another_parameter_with_a_right_bcc() -> None:
         assert heard[1:5] != b"0117"
         assert heard[5:10] == b"-0476"
         assert heard[-1] == bcc(heard[1:-1])
+    assert ask(line, write(12, "0117-0476"), 5.0) == ACK  # it names nothing
 
 
 def test_it_does_not_wait_for_anything_between_requests_to_others() -> None:

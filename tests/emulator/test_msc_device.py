@@ -165,6 +165,11 @@ def test_noise_and_other_units_packets_in_front_of_a_request(before: str, heard:
     assert ask(line_of(MscController(1)), f"{before} {DREAD}")[:2] == heard
 
 
+def test_what_never_pauses_is_passed_over_after_half_a_second_too() -> None:
+    line = line_of(MscController(1))
+    assert ask(line, f"02 02 F0 00 {3000 * '00 '} {DREAD}", 0.0, 1.0).startswith(ACK)
+
+
 # Who a packet is for
 
 
@@ -366,7 +371,7 @@ def test_taking_a_packet_in_one_piece_and_hearing_it_byte_by_byte_do_the_same(
         for number, (text, cut) in enumerate(frames):
             frame = bytes.fromhex(text)[: cut or None]
             now = 1.0 + number * apart
-            if now >= device.wakeup:
+            while now >= device.wakeup:
                 device.wake(device.wakeup)
             taken = device is whole and frame.startswith(device.routes) and device.take(frame, now)
             if not taken:
@@ -384,3 +389,4 @@ def test_a_disguised_packet_comes_from_another_unit_with_a_right_checksum() -> N
     assert heard[0] == 0x06
     assert heard[2] in range(2, 16)
     assert heard[1:] == packet(heard[2], b"DREAD," + bytes(4))
+    assert ask(line, DWRITE, 0.5) == ACK  # it names nothing

@@ -164,27 +164,21 @@ class MscController(Device):
             frame.append(byte)
             self._go_on(now)
         elif byte == STX:
-            self._begin(now)
+            frame.append(STX)
+            self._size = FRAMING
+            self._complete_by = now + COMPLETION
         elif self._packet and byte == ACK_BYTE:
             self._packet = b""
         elif self._packet and byte == NAK_BYTE:
             self._transmit_again(now)
         self._settle(now)
 
-    def _begin(self, now: float) -> None:
-        self._frame.append(STX)
-        self._complete_by = now + COMPLETION
-        self._size = FRAMING
-
     def _go_on(self, now: float) -> None:
         """Any byte can stand anywhere in a packet: whoever it is for, its length alone says where it ends."""
         frame = self._frame
         length = len(frame)
         if length == 2 and frame[1] not in UNITS:
-            again = frame[1] == STX
             frame.clear()
-            if again:
-                self._begin(now)
         elif length == 4:
             self._size = int.from_bytes(frame[2:4], "big") + FRAMING
         elif length == self._size:
@@ -195,12 +189,11 @@ class MscController(Device):
 
     def wake(self, now: float) -> None:
         if self._frame:
-            if now >= self._complete_by:
-                mine = self._frame[1:2] == self.routes[0][1:]
-                self._frame.clear()
-                if mine:
-                    self.reply(NAK, now)
-        elif self._packet and now >= self._retransmit_at:
+            mine = self._frame.startswith(self.routes)
+            self._frame.clear()
+            if mine:
+                self.reply(NAK, now)
+        else:
             self._transmit_again(now)
         self._settle(now)
 
