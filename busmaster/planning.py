@@ -95,6 +95,11 @@ def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: flo
     return worst + exchange.closing * byte_time + exchange.timing.turnaround
 
 
+def _unanswered(exchange: Exchange[Any], byte_time: float) -> float:
+    """Likewise, if no byte of a reply comes."""
+    return len(exchange.request) * byte_time + max(exchange.timing.lateness, exchange.timing.turnaround)
+
+
 @dataclass(frozen=True, slots=True)
 class Bounds:
     """How long a request of each class can wait until it is sent (R9), with so many exchanges polled on the line.
@@ -187,8 +192,8 @@ class GroupPlan:
 class Plan:
     """What a line will be like. `utilisation` is the share of it that the schedule asks for: above 1 it does not fit.
 
-    `worst_waits` are the bounds of R9 for one more request of each class; on a healthy line a command waits at most
-    for one exchange, `typical_wait`. `fitting_baudrate` is the lowest usual one at which the schedule would fit
+    A command waits at most for `typical_wait` on a healthy line (one exchange), for `dead_wait` behind a node that does
+    not answer. `worst_waits` are the bounds of R9 for one more request of each class. `fitting_baudrate` is the lowest usual one at which the schedule would fit
     comfortably; None where it does as it is, or where none is enough.
     """
 
@@ -196,6 +201,7 @@ class Plan:
     utilisation: float
     groups: tuple[GroupPlan, ...]
     typical_wait: float
+    dead_wait: float
     worst_waits: Mapping[Priority, float]
     fitting_baudrate: int | None
 
@@ -235,6 +241,7 @@ def plan(
         utilisation=utilisation,
         groups=tuple(draft.planned(utilisation, bound, could_merge) for draft in drafts),
         typical_wait=max((cost for draft in drafts for cost in draft.costs), default=0.0),
+        dead_wait=max((_unanswered(node.open(c), line.byte_time) + receive_latency for node, c in asked), default=0.0),
         worst_waits={priority: bound.wait(priority) for priority in Priority},
         fitting_baudrate=_fitting_baudrate(drafts, line) if utilisation > COMFORT else None,
     )

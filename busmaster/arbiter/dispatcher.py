@@ -281,7 +281,7 @@ class Dispatcher:
 
     def release_node(self, node: NodeRecord) -> None:
         """Its hook has run: its polls resume with their next cycle, unless it has died and come back meanwhile."""
-        node.holds -= 1
+        node.holds = max(0, node.holds - 1)
 
     def plan_probes(self) -> None:
         """Set the deadline of the next probe. One probe at a time is out."""

@@ -20,7 +20,8 @@ PROBE_JITTER = 0.2
 STEADY = 30.0
 """Seconds a node must stay up before its next death starts with the first probe delay again: no flapping."""
 UP_AFTER_REPLIES = 3
-"""Replies in a row after which a SUSPECT node is UP: one that flaps is not reported again and again."""
+UP_AFTER_CALM = 5.0
+"""A SUSPECT node is UP after so many replies, and seconds, without a failure: one that flaps is reported once."""
 
 BUDGET_SHARE = 0.02
 BUDGET_IDLE_SHARE = 0.25
@@ -46,6 +47,7 @@ class NodeRecord:
     __slots__ = (
         "address",
         "counters",
+        "failed_at",
         "failures",
         "has_hook",
         "health",
@@ -74,8 +76,10 @@ class NodeRecord:
         self.health = Health.UNKNOWN
         self.failures = 0
         """Transactions in a row that failed without a valid reply."""
+        self.failed_at = -inf
+        """When the last of its transactions failed so."""
         self.replies = 0
-        """Replies in a row since it became SUSPECT."""
+        """Replies in a row since then."""
         self.reply_time: float | None = None
         """Seconds from a request to its reply, as poll groups measured them; None until they have."""
         self.last_reply = -inf
@@ -152,7 +156,7 @@ def note_success(node: NodeRecord, now: float) -> None:
     node.failures = 0
     if node.health is Health.SUSPECT:
         node.replies += 1
-        if node.replies < UP_AFTER_REPLIES:
+        if node.replies < UP_AFTER_REPLIES or now - node.failed_at < UP_AFTER_CALM:
             return
     else:
         node.up_since = now
@@ -163,6 +167,7 @@ def note_success(node: NodeRecord, now: float) -> None:
 def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> None:
     """A transaction failed without a valid reply. The caller reports the change of health."""
     node.failures += 1
+    node.failed_at = now
     node.replies = 0
     if node.health is Health.DOWN:
         if now >= node.probe_at:
