@@ -53,9 +53,9 @@ def main() -> int:
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(figures, indent=1))
     if arguments.plots is not None:
-        from benchmarks import plots
+        from benchmarks.plots import draw
 
-        plots.draw(outcomes, arguments.plots)
+        draw(outcomes, arguments.plots)
     wrong = {name: outcome.wrong for name, outcome in outcomes.items() if outcome.wrong}
     if wrong:
         print(f"WRONG VALUES: {wrong}", file=sys.stderr)

@@ -18,6 +18,7 @@ from typing import Any, Protocol, TypeVar
 from benchmarks.far_end import SETTINGS
 from benchmarks.harness import installed
 from busmaster import Bus, BusError, Node, Priority, ReplyTiming, SerialPort, Timings
+from busmaster.planning import longest_hold
 from busmaster.transport.endpoints import Endpoint
 from examples import modbus_rtu
 from examples.modbus_rtu import SILENCE, ReadRegisters, WriteRegisters
@@ -54,8 +55,11 @@ class Busmaster:
     name = "busmaster"
     settings = f"window {WINDOW * 1000:g} ms, lateness {LATENESS * 1000:g} ms, {RETRIES} retries"
 
-    def __init__(self) -> None:
+    def __init__(self, timings: Timings = TIMINGS) -> None:
         self.bus: Bus | None = None
+        self.waits: list[float] = []
+        """Of each write: seconds until it was sent."""
+        self._timings = timings
         self._nodes: dict[int, Node] = {}
 
     async def open(self, path: str) -> None:
@@ -68,7 +72,7 @@ class Busmaster:
     def node(self, unit: int) -> Node:
         assert self.bus is not None
         if unit not in self._nodes:
-            self._nodes[unit] = self.bus.node(PROFILE, unit, timings=TIMINGS, retries=RETRIES)
+            self._nodes[unit] = self.bus.node(PROFILE, unit, timings=self._timings, retries=RETRIES)
         return self._nodes[unit]
 
     async def read(self, unit: int, register: int) -> int:
@@ -79,9 +83,18 @@ class Busmaster:
 
     async def write(self, unit: int, register: int, value: int) -> None:
         try:
-            await self.node(unit).request(WriteRegisters(register, (value,)), priority=Priority.URGENT)
+            command = WriteRegisters(register, (value,))
+            _, timeline = await self.node(unit).timed_request(command, priority=Priority.URGENT)
         except BusError as error:
             raise Failed from error
+        if timeline.started is not None:
+            self.waits.append(timeline.started - timeline.queued)
+
+    @property
+    def longest_hold(self) -> float:
+        """Seconds for which one exchange can keep an urgent one waiting, in the worst case (W_urgent)."""
+        assert self.bus is not None
+        return longest_hold(ReadRegisters(0).open(1, self._timings), self.bus.byte_time)
 
     async def close(self) -> None:
         assert self.bus is not None
@@ -139,13 +152,16 @@ class Minimalmodbus:
         self._instrument(1)
 
     async def read(self, unit: int, register: int) -> int:
-        return int(await asyncio.to_thread(self.blocking, lambda: self._instrument(unit).read_register(register)))
+        return await asyncio.to_thread(self.read_blocking, unit, register)
+
+    def read_blocking(self, unit: int, register: int) -> int:
+        return int(self._retried(lambda: self._instrument(unit).read_register(register)))
 
     async def write(self, unit: int, register: int, value: int) -> None:
         write = self._instrument(unit).write_register
-        await asyncio.to_thread(self.blocking, lambda: write(register, value, functioncode=6), 0)
+        await asyncio.to_thread(self._retried, lambda: write(register, value, functioncode=6), 0)
 
-    def blocking(self, call: Callable[[], T], retries: int = RETRIES) -> T:
+    def _retried(self, call: Callable[[], T], retries: int = RETRIES) -> T:
         with self._lock:
             for left in reversed(range(retries + 1)):
                 try:
