@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from busmaster.arbiter.counters import LineStatistics, NodeStatistics, Quantiles
 from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, LineState, NodeChanged
 from busmaster.arbiter.health import Health
@@ -43,6 +45,9 @@ from busmaster.transport.endpoints import Endpoint, endpoint
 from busmaster.transport.memory import MemoryPort
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
+
+if TYPE_CHECKING:
+    from busmaster.config.line import open_line
 
 __all__ = [
     "BacklogFull",
@@ -98,4 +103,14 @@ __all__ = [
     "VerifyFailed",
     "WriteUnconfirmed",
     "endpoint",
+    "open_line",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """What needs more than a bus is imported when it is asked for."""
+    if name != "open_line":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from busmaster.config.line import open_line
+
+    return open_line

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import random
 import threading
-from collections.abc import Iterable
 
 import click
 
@@ -15,23 +14,28 @@ from busmaster.cli.arguments import (
     option_type,
     parse_host_port,
     parsed,
-    protocol_option,
     seconds_option,
     slaves_of,
 )
+from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import emit
+from busmaster.config import ConfiguredLine, LineFile, emulated_line
 from busmaster.emulator.build import make_device
-from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, serve_pty, serve_tcp
 from busmaster.errors import LineDown
 from busmaster.handles import HANDLES
-from busmaster.profile import LineSettings
+from busmaster.transport.serial_port import SerialPort
+from busmaster.transport.tcp import TcpPort
 
 
 @click.command(short_help="Emulate drives on a pseudo-terminal or a TCP port.")
-@protocol_option
+@file_argument(required=False)
+@click.option(
+    "--protocol", type=click.Choice(list(HANDLES)), metavar="P", help=f"One of {', '.join(HANDLES)}; without a file."
+)
 @nodes_option
 @click.option(
     "--pty", is_flag=False, flag_value="", metavar="[LINK]", help="A pseudo-terminal (the default), and a link to it."
@@ -52,10 +56,11 @@ from busmaster.profile import LineSettings
     metavar="NAME=VALUE",
     help="What goes wrong with every drive, like lost=0.1. Again for more.",
 )
-@click.option("--seed", type=int, default=1, metavar="N", help="Of all that is random; 1 by default.")
+@click.option("--seed", type=int, metavar="N", help="Of all that is random; the file's or 1 by default.")
 @seconds_option
 def command(
-    protocol: str,
+    path: str | None,
+    protocol: str | None,
     nodes: tuple[int, ...] | None,
     pty: str | None,
     tcp: tuple[str, int] | None,
@@ -63,29 +68,65 @@ def command(
     paced: bool,
     reply_delay: Delay | None,
     faults: tuple[str, ...],
-    seed: int,
+    seed: int | None,
     seconds: float | None,
 ) -> None:
     """Emulate the drives of a line until Ctrl-C. The first line printed is the PORT to use.
 
-    Node 1 alone unless --nodes names others.
+    With LINE.toml all its nodes, as its [emulator] says, at its port: a TCP port of this machine, or a link to a
+    pseudo-terminal, which is never made under /dev. Without a file node 1 alone unless --nodes names others.
     """
     if pty is not None and tcp is not None:
         raise click.UsageError("either --pty or --tcp, not both")
-    profile = HANDLES[protocol].profile
-    devices = [make_device(protocol, address, delay=reply_delay) for address in slaves_of(profile, nodes)]
-    line = make_line(line_settings(profile, baud), devices, parsed(Faults.parse, faults), seed, paced)
+    if path is not None:
+        if protocol is not None or nodes is not None or baud is not None:
+            raise click.UsageError("the file says protocol, nodes and baud rate")
+        file = load(path)
+        if pty is None and tcp is None:
+            pty, tcp = own_port(file.port)
+        line = line_of(file, reply_delay, faults, seed, paced)
+    else:
+        line = drives(protocol, nodes, baud, reply_delay, faults, seed, paced)
     with serve(line, pty, tcp) as server:
         emit(server.path)
         threading.Event().wait(seconds)
 
 
-def make_line(settings: LineSettings, devices: Iterable[Device], faults: Faults, seed: int, paced: bool) -> Line:
-    """The faults strike every device; they share one seeded source of chance."""
-    line = Line(settings, devices, chance=random.Random(seed), paced=paced)
+def line_of(file: LineFile, delay: Delay | None, faults: tuple[str, ...], seed: int | None, paced: bool) -> Line:
+    """The file's line; what the command line says goes before what the file says."""
+    ConfiguredLine(file, outputs=False)  # what is wrong in it is said here as everywhere
+    line = emulated_line(file, paced=paced or None, seed=seed)
     for device in line.devices:
-        device.faults = faults
+        device.delay = delay or device.delay
+        device.faults = parsed(Faults.parse, faults) if faults else device.faults
     return line
+
+
+def own_port(port: SerialPort | TcpPort) -> tuple[str | None, tuple[str, int] | None]:
+    """The link, or the address, by which `busmaster run` with the same file will find the line."""
+    if isinstance(port, TcpPort):
+        return None, (port.host, port.port)
+    return None if os.path.abspath(port.path).startswith("/dev/") else port.path, None
+
+
+def drives(
+    protocol: str | None,
+    nodes: tuple[int, ...] | None,
+    baud: int | None,
+    delay: Delay | None,
+    faults: tuple[str, ...],
+    seed: int | None,
+    paced: bool,
+) -> Line:
+    if protocol is None:
+        raise click.UsageError("name a LINE.toml, or the drives: --protocol P")
+    profile = HANDLES[protocol].profile
+    devices = [make_device(protocol, address, delay=delay) for address in slaves_of(profile, nodes)]
+    wrong = parsed(Faults.parse, faults)
+    for device in devices:
+        device.faults = wrong
+    chance = random.Random(1 if seed is None else seed)
+    return Line(line_settings(profile, baud), devices, chance=chance, paced=paced)
 
 
 def serve(line: Line, link: str | None, address: tuple[str, int] | None) -> LineServer:

@@ -12,15 +12,15 @@ from typing import Any
 
 import anyio
 
-from busmaster.arbiter.events import Event, LatenessRaised, LineChanged, LineState, NodeChanged
+from busmaster.arbiter.events import LineState
 from busmaster.bus import Bus
 from busmaster.cli.app import OK
 from busmaster.cli.arguments import View, parse_value
 from busmaster.cli.drawing import draw
 from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row
-from busmaster.cli.output import emit_all, json_line, json_value, note, value_text
+from busmaster.cli.output import emit_all, json_line, note, value_text
 from busmaster.errors import BusError, InvalidCommand
-from busmaster.node import Health
+from busmaster.outputs.values import cycle_fields, event_text
 from busmaster.points import Point
 from busmaster.polling import PollGroup, Quality, Sample, Snapshot
 
@@ -55,8 +55,8 @@ class Watch:
         self._group_rows: tuple[GroupRow, ...] = ()
         self._loads: deque[tuple[float, float]] = deque()
 
-    def since(self, time: float | None) -> float | None:
-        return None if time is None else round(time - self.start, 6)
+    def since(self, time: float) -> float:
+        return round(time - self.start, 6)
 
     def add(self, group: PollGroup) -> None:
         self.groups.append(group)
@@ -211,39 +211,8 @@ def short_unit(unit: str) -> str:
     return unit.partition(" of ")[0]
 
 
-def event_text(event: Event) -> str:
-    match event:
-        case NodeChanged() if event.before is not Health.UNKNOWN or event.after is not Health.UP:
-            return f"{event.node.label} is {event.after.value}, was {event.before.value}"
-        case LatenessRaised():
-            return (
-                f"{event.node.label} answered after {event.age * 1000:.0f} ms: "
-                f"its lateness is now {event.lateness * 1000:.0f} ms"
-            )
-        case LineChanged():
-            return f"the line is {event.change.value}" + (f": {event.cause}" if event.cause else "")
-        case _:
-            return ""
-
-
 def json_cycle(watch: Watch, snapshot: Snapshot) -> str:
-    samples = {
-        point.key: {
-            "value": json_value(sample.value),
-            "error": None if sample.error is None else sample.error.what,
-            "late": sample.quality is Quality.LATE,
-        }
-        for point, sample in snapshot.samples.items()
-    }
-    return json_line(
-        group=snapshot.group,
-        cycle=snapshot.cycle,
-        due=watch.since(snapshot.due),
-        started=watch.since(snapshot.started),
-        finished=watch.since(snapshot.finished),
-        missed=snapshot.missed,
-        samples=samples,
-    )
+    return json_line(**cycle_fields(snapshot, watch.since))
 
 
 def plain_cycle(watch: Watch, snapshot: Snapshot) -> Iterator[str]:
@@ -279,7 +248,9 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
     `beside` runs meanwhile, and is cancelled at the end.
     """
     view = watch.view
-    on_screen = not view.plain and not view.as_json and screen_available()
+    on_screen = shown_on_screen(view)
+    if not on_screen and wants_screen(view):
+        note("the live view needs the extra named tui (pip install 'busmaster[tui]'); plain lines instead")
     status = OK
     try:
         with anyio.move_on_after(view.seconds):
@@ -300,11 +271,11 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
     return status
 
 
-def screen_available() -> bool:
-    """A terminal on both sides, and the library that draws."""
-    if not sys.stdout.isatty() or not sys.stdin.isatty():
-        return False
-    if find_spec("textual") is None:
-        note("the live view needs the extra named tui (pip install 'busmaster[tui]'); plain lines instead")
-        return False
-    return True
+def wants_screen(view: View) -> bool:
+    """A terminal on both sides, and nobody who would rather have it otherwise."""
+    return not view.plain and not view.as_json and sys.stdout.isatty() and sys.stdin.isatty()
+
+
+def shown_on_screen(view: View) -> bool:
+    """And the library that draws is there."""
+    return wants_screen(view) and find_spec("textual") is not None

@@ -1,0 +1,115 @@
+"""`busmaster plan`: does the schedule of a file fit its line?"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import click
+
+from busmaster.cli.app import FAILED, OK
+from busmaster.cli.arguments import json_option
+from busmaster.cli.lines import file_argument, load
+from busmaster.cli.output import emit, emit_all, json_line
+from busmaster.config import ConfiguredLine
+from busmaster.planning import GroupPlan, Plan
+
+HEAD = ("GROUP", "PERIOD", "VALUES", "EXCHANGES", "LINE", "CYCLE", "LONGEST", "AT WORST", "MISSED")
+
+
+@click.command(short_help="Does the schedule of a file fit its line?")
+@file_argument()
+@json_option
+def command(path: str, as_json: bool) -> int:
+    """Reckon how busy LINE.toml's poll groups will keep its line, and what would fit. Nothing is opened.
+
+    Reply times are the file's `reply_time`, else half of the nominal one. The exit status is 1 if cycles will be
+    missed.
+    """
+    line = ConfiguredLine(load(path), outputs=False)
+    plan = line.plan()
+    if as_json:
+        emit(json_line(**fields(plan)))
+    else:
+        emit_all(page(line.file.title, plan))
+    return OK if plan.fits else FAILED
+
+
+def page(title: str, plan: Plan) -> list[str]:
+    """What a person wants to know: a table of the groups, the waits, and what would fit."""
+    rows = [HEAD, *(row(group) for group in plan.groups)]
+    widths = [max(len(cells[column]) for cells in rows) for column in range(len(HEAD))]
+    table = [
+        "  ".join(
+            cell.rjust(width) if column else cell.ljust(width)
+            for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
+        )
+        for cells in rows
+    ]
+    verdict = "it fits" if plan.fits else "it does not fit"
+    waits = ", ".join(f"{priority.name.lower()} {time_text(wait)}" for priority, wait in plan.worst_waits.items())
+    return [
+        f"{title}: {plan.line.baudrate} {plan.line.framing}",
+        *(table if plan.groups else ["no poll groups"]),
+        f"the schedule asks for {plan.utilisation:.0%} of the line: {verdict}",
+        f"a command waits {time_text(plan.typical_wait)} on a healthy line; at the worst: {waits}",
+        *plan.advice,
+    ]
+
+
+def row(group: GroupPlan) -> tuple[str, ...]:
+    return (
+        group.name,
+        time_text(group.period),
+        str(group.values),
+        str(group.exchanges),
+        f"{group.utilisation:.0%}",
+        time_text(group.cycle),
+        time_text(group.longest_cycle),
+        time_text(group.worst_cycle),
+        f"{group.missed:.0%}",
+    )
+
+
+def time_text(seconds: float) -> str:
+    if not math.isfinite(seconds):
+        return "never"
+    return f"{seconds * 1000:.3g} ms" if seconds < 0.9995 else f"{seconds:.3g} s"
+
+
+def fields(plan: Plan) -> dict[str, Any]:
+    """For JSON. Times in seconds; null for what never comes."""
+    return {
+        "fits": plan.fits,
+        "utilisation": plan.utilisation,
+        "line": {"baudrate": plan.line.baudrate, "framing": plan.line.framing},
+        "groups": [
+            {
+                "group": group.name,
+                "period": group.period,
+                "values": group.values,
+                "exchanges": group.exchanges,
+                "utilisation": group.utilisation,
+                "line_time": group.line_time,
+                "cycle": finite(group.cycle),
+                "longest_cycle": finite(group.longest_cycle),
+                "worst_wait": finite(group.worst_wait),
+                "worst_cycle": finite(group.worst_cycle),
+                "missed": group.missed,
+                "achieved": finite(group.achieved),
+                "fitting_period": group.fitting_period,
+                "merged": [
+                    {"node": m.node, "command": m.command, "serves": m.serves, "saved": m.saved} for m in group.merged
+                ],
+            }
+            for group in plan.groups
+        ],
+        "typical_wait": plan.typical_wait,
+        "worst_waits": {priority.name.lower(): finite(wait) for priority, wait in plan.worst_waits.items()},
+        "fitting_baudrate": plan.fitting_baudrate,
+        "advice": list(plan.advice),
+    }
+
+
+def finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None

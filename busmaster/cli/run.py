@@ -1,0 +1,64 @@
+"""`busmaster run`: poll what a file says, with its outputs."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import anyio
+import click
+
+from busmaster.cli.arguments import View, viewed
+from busmaster.cli.capturing import capture_option, capturing
+from busmaster.cli.lines import file_argument, load, other_port, port_option
+from busmaster.cli.output import note
+from busmaster.cli.watching import Watch, follow, shown_on_screen
+from busmaster.config import ConfiguredLine
+from busmaster.outputs.base import OutputStatistics
+
+
+@click.command(short_help="Poll what a file says, with its outputs.")
+@file_argument()
+@port_option
+@capture_option
+@viewed
+def command(path: str, port: str | None, capture: str | None, view: View) -> int:
+    """Poll the groups of LINE.toml until Ctrl-C, and feed the outputs that it enables.
+
+    On a terminal a live table; else, or with --plain, a line a value; with --json a line a cycle. A summary on
+    standard error ends it: of groups, of nodes, and of what each output has written and dropped. An output that is
+    slow or down never holds up the line.
+    """
+    file = load(path)
+    endpoint = other_port(file, port)
+    where = endpoint or file.port
+    protocols = {node.protocol for node in file.nodes.values()}
+    only = protocols.pop() if len(protocols) == 1 else ""
+    with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
+        return anyio.run(run, ConfiguredLine(file, port=endpoint, tap=recorder), view)
+
+
+async def run(line: ConfiguredLine, view: View) -> int:
+    entered = False
+    try:
+        async with line:
+            entered = True
+            watch = Watch(line.bus, line.file.title, view)
+            for group in line.groups.values():
+                watch.add(group)
+            line.outputs.tell = partial(tell, watch)
+            return await follow(watch)
+    finally:
+        for counts in line.outputs.statistics() if entered else ():
+            note(output_text(counts))
+
+
+def tell(watch: Watch, text: str) -> None:
+    """What happens to an output: an event on the screen, else a line on standard error."""
+    watch.tell(text)
+    if not shown_on_screen(watch.view):
+        note(text)
+
+
+def output_text(counts: OutputStatistics) -> str:
+    text = f"{counts.kind}: {counts.written} written, {counts.dropped} dropped"
+    return f"{text}, down: {counts.error}" if counts.error else text

@@ -1,0 +1,10 @@
+"""LINE.toml: one file that describes a line, for `open_line` and for `busmaster run`, `plan` and `emulate`."""
+
+from __future__ import annotations
+
+from busmaster.config.emulated import emulated_line
+from busmaster.config.line import ConfiguredLine, open_line
+from busmaster.config.sections import LineFile, load
+from busmaster.config.source import FileError
+
+__all__ = ["ConfiguredLine", "FileError", "LineFile", "emulated_line", "load", "open_line"]

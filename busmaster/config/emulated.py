@@ -1,0 +1,36 @@
+"""The line of a file, emulated: every node that it names, with the reply delays and faults of its `[emulator]`."""
+
+from __future__ import annotations
+
+import random
+
+from busmaster.config.sections import LineFile
+from busmaster.emulator.build import make_device
+from busmaster.emulator.device import Device
+from busmaster.emulator.line import Echo, Line
+from busmaster.profile import LineSettings
+
+
+def emulated_line(file: LineFile, *, paced: bool | None = None, seed: int | None = None) -> Line:
+    """Not yet served: `serve_pty`, `serve_tcp` or a MemoryPort puts it to use. `paced` and `seed` go before its own."""
+    emulator = file.emulator
+    return Line(
+        line_settings(file),
+        [_device(file, name) for name in file.nodes],
+        chance=random.Random(emulator.seed if seed is None else seed),
+        paced=emulator.paced if paced is None else paced,
+        echo=Echo() if file.port.echo else None,
+    )
+
+
+def line_settings(file: LineFile) -> LineSettings:
+    """Those of the port; behind a TCP port that does not say, those of the first node's protocol."""
+    profiles = [node.profile for node in file.nodes.values()]
+    return file.port.settings or (profiles[0].line if profiles else LineSettings(57600))
+
+
+def _device(file: LineFile, name: str) -> Device:
+    node, emulator = file.nodes[name], file.emulator
+    device = make_device(node.protocol, node.address, delay=emulator.delays[name], lively=emulator.lively)
+    device.faults = emulator.faults[name]
+    return device

@@ -1,0 +1,212 @@
+"""The line that a file describes: a bus, its nodes by name, its poll groups by name, and its outputs."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Callable, Iterable, Iterator
+from types import TracebackType
+from typing import Any
+
+from busmaster.bus import Bus
+from busmaster.config.names import expanded, listed
+from busmaster.config.points import NamedPoint, Scale
+from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
+from busmaster.config.table import nearest
+from busmaster.errors import InvalidCommand
+from busmaster.handles import HANDLES, Handle
+from busmaster.outputs.fan import Fan
+from busmaster.outputs.settings import MqttSettings
+from busmaster.planning import Plan, PlannedGroup
+from busmaster.points import Point
+from busmaster.polling import PollGroup
+from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.pump import Tap
+
+WHOLE = ("msc", "mentor", "dc104")
+"""Protocols whose numbers are whole."""
+
+
+class ConfiguredLine:
+    """A line made of a file. Use it in `async with`: entering opens the port and starts groups and outputs.
+
+    `nodes` are the handles by the file's names; `groups` the poll groups, once it is entered. Raises FileError, which
+    names line and key, for what the protocols or the outputs cannot do. `port` is used instead of the file's. `tap`
+    sees every byte. Without `outputs` nothing is recorded or published. `tell` is called, on the loop, with what
+    happens to the outputs.
+    """
+
+    def __init__(
+        self,
+        file: LineFile,
+        *,
+        port: Endpoint | None = None,
+        outputs: bool = True,
+        tap: Tap | None = None,
+        tell: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.file = file
+        self.bus = Bus(port or file.port, tap=tap)
+        self.nodes: dict[str, Handle] = {name: self._handle(node) for name, node in file.nodes.items()}
+        self.groups: dict[str, PollGroup] = {}
+        self._points: dict[str, NamedPoint] = {}
+        self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
+        self.outputs = Fan(self.bus, tell)
+        if outputs:
+            self._add_outputs()
+
+    async def __aenter__(self) -> ConfiguredLine:
+        """Raises LineDown if the port cannot be opened."""
+        await self.bus.__aenter__()
+        try:
+            for group in self.file.groups.values():
+                with group.table.at():
+                    self.groups[group.name] = self.bus.poll_group(
+                        group.name,
+                        period=group.period,
+                        phase=group.phase,
+                        priority=group.priority,
+                        points=self._wanted[group.name],
+                    )
+            self.outputs.start(self.groups.values())
+        except BaseException:
+            await self.__aexit__(None, None, None)
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """The line is closed first; the outputs then have a few seconds to write what they still hold."""
+        try:
+            await self.bus.__aexit__(kind, error, traceback)
+        finally:
+            await self.outputs.close()
+
+    def point(self, name: str) -> Point[Any]:
+        """The point that the file calls so: "winder/position", "press/2008:32". Raises InvalidCommand."""
+        node, slash, item = name.partition("/")
+        if not slash or node not in self.nodes:
+            raise InvalidCommand(f"no such point {name!r}: use NODE/ITEM with one of {', '.join(self.nodes)}")
+        return self._point(node, item)
+
+    def plan(self) -> Plan:
+        """Whether the file's poll groups fit its line. Pure arithmetic: nothing is opened."""
+        planned = (
+            PlannedGroup(
+                group.name,
+                group.period,
+                [(point.node.planned(), point.command) for point in self._wanted[group.name]],
+                phase=group.phase,
+                priority=group.priority,
+            )
+            for group in self.file.groups.values()
+            if group.name not in self.groups
+        )
+        return self.bus.plan(*planned)
+
+    # inside
+
+    def _handle(self, node: NodeSection) -> Handle:
+        options = dict(node.options)
+        if node.protocol == "mentor":
+            options["decimals"] = _decimals(node)
+        with node.table.at():
+            make: Callable[..., Handle] = HANDLES[node.protocol]
+            handle = make(self.bus, node.address, timings=node.timings, retries=node.retries, **options)
+            if node.reply_time is not None:
+                handle.node.record.reply_time = node.reply_time  # until it is measured
+            if not node.name.isdigit():
+                handle.node.record.label = node.name  # what messages and the screen call it
+        for point in node.points.values():
+            with point.table.at(*(["item"] if "item" in point.table else [])):
+                handle.point(point.item)
+        return handle
+
+    def _members(self, group: GroupSection) -> Iterator[NamedPoint]:
+        for number, text in enumerate(group.points):
+            with group.table.at("points", number):
+                for name in self._names(text):
+                    point = self._point(*name)
+                    point.command.open(point.node.address, point.node.record.timings)
+                    yield point
+
+    def _names(self, text: str) -> Iterator[tuple[str, str]]:
+        """Nodes and items of `drive4-8/speed_measured,current`. Raises InvalidCommand."""
+        nodes, slash, items = text.partition("/")
+        if not slash:
+            raise InvalidCommand(f"a point is written NODE/ITEM, not {text!r}")
+        for node in (name for part in listed(nodes) for name in expanded(part, self.nodes)):
+            if node not in self.nodes:
+                raise InvalidCommand(f"no such node {node!r}; {nearest(node, self.nodes)}")
+            section = self.file.nodes[node]
+            known = {*section.points, *section.options.get("symbols", ())}
+            for item in (name for part in listed(items) for name in expanded(part, known)):
+                yield node, item
+
+    def _point(self, where: str, name: str) -> NamedPoint:
+        key = f"{where}/{name}"
+        if key not in self._points:
+            self._points[key] = self._make_point(where, name)
+        return self._points[key]
+
+    def _make_point(self, where: str, name: str) -> NamedPoint:
+        node = self.file.nodes[where]
+        section = node.points.get(name)
+        handle = self.nodes[where]
+        if section is None:
+            source = _known(handle, name, node.points)
+            return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
+        decimals = 0 if node.protocol == "mentor" else section.decimals
+        scale = Scale.of(section.factor, section.offset, decimals, whole=node.protocol in WHOLE)
+        return NamedPoint.of(handle.point(section.item), where=where, name=name, unit=section.unit, scale=scale)
+
+    def _add_outputs(self) -> None:
+        for kind, settings in self.file.outputs.items():
+            table = self.file.table.table("outputs").table(kind)
+            writable: dict[str, Point[Any]] = {}
+            if isinstance(settings, MqttSettings):
+                for number, text in enumerate(settings.allow):
+                    with table.at("allow_commands", number):
+                        writable |= {point.key: point for point in map(self._writable, self._names(text))}
+            with table.at():
+                self.outputs.add(kind, settings, title=self.file.title, commands=writable)
+
+    def _writable(self, name: tuple[str, str]) -> Point[Any]:
+        point = self._point(*name)
+        if not point.writable:
+            raise InvalidCommand(f"{point.key} is read-only")
+        return point
+
+
+def _known(handle: Handle, item: str, points: Iterable[str]) -> Point[Any]:
+    try:
+        return handle.point(item)
+    except InvalidCommand:
+        near = difflib.get_close_matches(item, list(points), n=1)
+        if near:
+            raise InvalidCommand(f"no such item {item!r}: did you mean {near[0]!r}?") from None
+        raise
+
+
+def _decimals(node: NodeSection) -> dict[str, int]:
+    """Of a Mentor II drive's parameters: its handle rounds by them."""
+    decimals: dict[str, int] = {}
+    for point in node.points.values():
+        parameter = point.item.partition(":")[0]
+        if decimals.setdefault(parameter, point.decimals) != point.decimals:
+            raise point.table.error(f"{parameter} has {decimals[parameter]} decimals elsewhere")
+    return {parameter: digits for parameter, digits in decimals.items() if digits}
+
+
+def open_line(path: str | os.PathLike[str], *, outputs: bool = True, tap: Tap | None = None) -> ConfiguredLine:
+    """The line that a LINE.toml describes, to be used in `async with`.
+
+        async with open_line("line.toml") as line:
+            await line.nodes["winder"].write(1, 123.456)
+            async for snapshot in line.groups["axes"]: ...
+
+    Its outputs run too, unless `outputs` is False. Raises OSError if the file cannot be read, and InvalidCommand,
+    naming file, line and key, for what is wrong in it, or for an output whose extra is not installed.
+    """
+    return ConfiguredLine(load(path), outputs=outputs, tap=tap)

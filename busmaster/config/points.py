@@ -1,0 +1,116 @@
+"""The points of a file: what the protocol has, under a name, in a unit, on a scale."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+from busmaster.errors import InvalidCommand
+from busmaster.exchange import Command
+from busmaster.points import Point
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """What a number on the line means: value = number / 10**decimals x factor + offset.
+
+    Reckoned in whole numbers and divided once, so that 3 x 0.1 is 0.3. `whole`: the line carries whole numbers, to
+    which a written value is rounded, half away from zero.
+    """
+
+    factor: Fraction
+    offset: Fraction
+    whole: bool
+
+    @classmethod
+    def of(cls, factor: float = 1, offset: float = 0, decimals: int = 0, whole: bool = False) -> Scale:
+        """Raises InvalidCommand for a factor of 0."""
+        if not factor:
+            raise InvalidCommand("a factor of 0 makes every value the same")
+        return cls(Fraction(repr(factor)) / 10**decimals, Fraction(repr(offset)), whole)
+
+    @property
+    def trivial(self) -> bool:
+        return self.factor == 1 and not self.offset
+
+    def reader(self) -> Callable[[Any], Any]:
+        """From the line to the value. Words, flags and texts are left as they are; of a run every number is scaled."""
+        below = self.factor.denominator * self.offset.denominator
+        times = self.factor.numerator * self.offset.denominator
+        plus = self.offset.numerator * self.factor.denominator
+
+        def read(number: Any) -> Any:
+            if type(number) is int or type(number) is float:
+                return (number * times + plus) / below
+            return tuple(map(read, number)) if type(number) is tuple else number
+
+        return read
+
+    def write(self, value: Any) -> Any:
+        """From the value to the line."""
+        if isinstance(value, list | tuple):
+            return tuple(map(self.write, value))
+        if type(value) is int or (type(value) is float and math.isfinite(value)):
+            exact = (Fraction(repr(value)) - self.offset) / self.factor
+            return rounded(exact) if self.whole else float(exact)
+        return value
+
+
+def rounded(number: Fraction) -> int:
+    """Half away from zero."""
+    magnitude = (2 * abs(number.numerator) + number.denominator) // (2 * number.denominator)
+    return magnitude if number >= 0 else -magnitude
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamedPoint(Point[Any]):
+    """A point under the file's names for its node and itself. `source` is the protocol's own."""
+
+    where: str = field(compare=False)
+    source: Point[Any] = field(compare=False)
+    scale: Scale = field(compare=False)
+
+    @classmethod
+    def of(cls, source: Point[Any], *, where: str, name: str, unit: str, scale: Scale) -> NamedPoint:
+        decode, encode = source.decode, source.encode
+        if not scale.trivial:
+            decode = _after(source.decode, scale.reader())
+            encode = None if source.encode is None else _before(scale.write, source.encode)
+        return cls(
+            source.node,
+            name,
+            source.command,
+            unit=unit or source.unit,
+            decode=decode,
+            encode=encode,
+            where=where,
+            source=source,
+            scale=scale,
+        )
+
+    @property
+    def key(self) -> str:
+        """The node's name in the file, and the point's."""
+        return f"{self.where}/{self.item}"
+
+    @property
+    def writable(self) -> bool:
+        return self.source.writable
+
+    async def write(self, value: Any, **options: Any) -> None:
+        """As `Point.write`. A run is written in as many exchanges as it takes."""
+        if self.source.writable and self.encode is None:
+            await self.source.write(value if self.scale.trivial else self.scale.write(value), **options)
+        else:
+            await Point.write(self, value, **options)
+
+
+def _after(decode: Callable[[Any], Any] | None, scaled: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return scaled if decode is None else lambda raw: scaled(decode(raw))
+
+
+def _before(unscaled: Callable[[Any], Any], encode: Callable[[Any], Command[None]]) -> Callable[[Any], Command[None]]:
+    return lambda value: encode(unscaled(value))

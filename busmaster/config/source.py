@@ -1,0 +1,187 @@
+"""A TOML file whose values know where they stand, so that whatever is wrong with one is said with its line.
+
+The standard library's reader keeps no places. `places` walks the text once more, which is simple where that reader has
+found it right: only strings, comments and brackets have to be told apart.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from busmaster.errors import InvalidCommand
+
+Key: TypeAlias = tuple[str | int, ...]
+"""The way to a value: names of tables and keys, numbers of array elements."""
+
+TOKEN = re.compile(
+    r"""
+      (?P<comment>\#[^\n]*)
+    | (?P<string>\"\"\"(?:\\.|[^\\])*?\"\"\"+ | '''.*?'''+ | "(?:\\.|[^"\\\n])*" | '[^'\n]*')
+    | (?P<newline>\n)
+    | (?P<mark>[\[\]{}=,.])
+    | (?P<bare>[^\s\[\]{}=,.\#"']+)
+    """,
+    re.VERBOSE | re.DOTALL,
+)
+AT = re.compile(r" \(at (?:line (\d+), column \d+|end of document)\)$")
+
+
+class FileError(InvalidCommand):
+    """Something is wrong in a file; the text says where."""
+
+
+class Source:
+    """The values of one file, and where each of them stands."""
+
+    def __init__(self, name: str, text: str) -> None:
+        """Raises FileError, with the line, for what is no TOML."""
+        self.name = name
+        try:
+            self.data: dict[str, Any] = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            found = AT.search(str(error))
+            line = (found and found[1]) or len(text.splitlines())
+            what = AT.sub("", str(error))
+            raise FileError(f"{name}:{line}: this is no TOML: {what[:1].lower()}{what[1:]}") from None
+        self._places = places(text.replace("\r\n", "\n"))
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Source:
+        """Raises OSError where it cannot be read, and FileError for what is no TOML."""
+        name = os.fspath(path)
+        try:
+            return cls(name, Path(path).read_bytes().decode())
+        except UnicodeDecodeError as error:
+            line = error.object[: error.start].count(b"\n") + 1
+            raise FileError(f"{name}:{line}: this is no TOML: it is not written in UTF-8") from None
+
+    def line(self, key: Key) -> int:
+        """Where `key` stands, or what it would be part of."""
+        while key and key not in self._places:
+            key = key[:-1]
+        return self._places.get(key, 1)
+
+    def error(self, key: Key, text: str) -> FileError:
+        """What is wrong at `key`, with its place: "line.toml:12: nodes.winder.address: ..."."""
+        shown = "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in key).lstrip(".")
+        return FileError(f"{self.name}:{self.line(key)}: {shown}: {text}" if key else f"{self.name}: {text}")
+
+
+def places(text: str) -> dict[Key, int]:
+    """The line, from 1, on which each table, key and array element of a valid TOML text begins."""
+    return _Walk(text).places
+
+
+class _Walk:
+    def __init__(self, text: str) -> None:
+        self.places: dict[Key, int] = {}
+        self._tokens: list[tuple[str, str, int]] = []
+        self._next = 0
+        line = 1
+        for match in TOKEN.finditer(text):
+            kind, token = str(match.lastgroup), match[0]
+            if kind != "comment":
+                self._tokens.append((kind, token, line))
+            line += token.count("\n")
+        self._tokens.append(("mark", "", line))
+        self._arrays: dict[Key, int] = {}
+        self._file()
+
+    def _file(self) -> None:
+        table: Key = ()
+        while self._skip() != "":
+            if self._peek() == "[":
+                table = self._header()
+            else:
+                self._pair(table)
+
+    def _header(self) -> Key:
+        """`[table]`, or one more `[[element]]`."""
+        line = self._line()
+        brackets = 0
+        while self._peek() == "[":
+            self._take()
+            brackets += 1
+        key = self._inside(self._names("]"))
+        for _ in range(brackets):
+            self._take()
+        if brackets == 2:
+            self._arrays[key] = number = self._arrays.get(key, -1) + 1
+            self.places.setdefault(key, line)
+            key = (*key, number)
+        self.places.setdefault(key, line)
+        return key
+
+    def _inside(self, names: Key) -> Key:
+        """A name on the way that is an array of tables means its last element."""
+        key: Key = ()
+        for name in names[:-1]:
+            key = (*key, name)
+            if key in self._arrays:
+                key = (*key, self._arrays[key])
+        return key + names[-1:]
+
+    def _pair(self, table: Key) -> None:
+        line = self._line()
+        names = self._names("=")
+        self._take()
+        for depth in range(len(names)):
+            self.places.setdefault((*table, *names[: depth + 1]), line)
+        self._value((*table, *names))
+
+    def _value(self, key: Key) -> None:
+        opening = self._peek()
+        if opening == "[":
+            self._members("]", lambda number: self._element((*key, number)))
+        elif opening == "{":
+            self._members("}", lambda _: self._pair(key))
+        else:
+            while self._peek() not in ("\n", ",", "]", "}", ""):
+                self._take()
+
+    def _members(self, closing: str, member: Callable[[int], None]) -> None:
+        self._take()
+        number = 0
+        while self._skip() != closing:
+            if self._peek() == ",":
+                self._take()
+                continue
+            member(number)
+            number += 1
+        self._take()
+
+    def _element(self, key: Key) -> None:
+        self.places[key] = self._line()
+        self._value(key)
+
+    def _names(self, end: str) -> Key:
+        names: list[str] = []
+        while self._peek() != end:
+            kind, token = self._take()
+            if kind == "string":
+                names.append(tomllib.loads(f"name = {token}")["name"])
+            elif kind == "bare":
+                names.append(token)
+        return tuple(names)
+
+    def _skip(self) -> str:
+        """To the next token that is no new line."""
+        while self._peek() == "\n":
+            self._take()
+        return self._peek()
+
+    def _peek(self) -> str:
+        return self._tokens[self._next][1]
+
+    def _line(self) -> int:
+        return self._tokens[self._next][2]
+
+    def _take(self) -> tuple[str, str]:
+        kind, token, _ = self._tokens[self._next]
+        self._next += 1
+        return kind, token

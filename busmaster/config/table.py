@@ -1,0 +1,144 @@
+"""One table of the file, read key by key: what is wrong with a value is said with its place and its nearest name."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, Final, TypeVar
+
+from busmaster.config.source import FileError, Key, Source
+from busmaster.errors import InvalidCommand
+
+T = TypeVar("T")
+
+
+class _Required:
+    """Stands for a default where there is none."""
+
+
+REQUIRED: Final = _Required()
+MILLION = 1_000_000
+
+
+class Table:
+    """Every reading raises FileError for a value of another kind, and for one that is missing without a default."""
+
+    def __init__(self, source: Source, key: Key = (), data: dict[str, Any] | None = None) -> None:
+        self.source = source
+        self.key = key
+        self.data = source.data if data is None else data
+
+    @property
+    def name(self) -> str:
+        return str(self.key[-1])
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.data
+
+    def only(self, *known: str) -> None:
+        """Raises FileError for a key that is none of these."""
+        for key in self.data:
+            if key not in known:
+                raise self.error(f"no such key; {nearest(key, known)}", key)
+
+    def error(self, text: str, *way: str | int) -> FileError:
+        return self.source.error((*self.key, *way), text)
+
+    @contextmanager
+    def at(self, *way: str | int) -> Iterator[None]:
+        """What is wrong inside gets this place."""
+        try:
+            yield
+        except FileError:
+            raise
+        except InvalidCommand as error:
+            raise self.error(str(error), *way) from None
+
+    # values
+
+    def text(self, key: str, default: T | _Required = REQUIRED) -> str | T:
+        value: str | T = self._take(key, str, default, "a text in quotes")
+        return value
+
+    def flag(self, key: str, default: bool) -> bool:
+        value: bool = self._take(key, bool, default, "true or false")
+        return value
+
+    def whole(self, key: str, default: T | _Required = REQUIRED, *, least: int = 0, most: int = MILLION) -> int | T:
+        value: int | T = self._take(key, int, default, "a whole number")
+        if key in self.data and isinstance(value, int) and not least <= value <= most:
+            raise self.error(f"must be {least} to {most}, not {value}", key)
+        return value
+
+    def number(self, key: str, default: T | _Required = REQUIRED) -> float | T:
+        value: float | T = self._take(key, (int, float), default, "a number")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise self.error(f"must be finite, not {value}", key)
+        return value
+
+    def seconds(self, key: str, default: T | _Required = REQUIRED) -> float | T:
+        """0 or more."""
+        value: float | T = self._take(key, (int, float), default, "a number of seconds")
+        if isinstance(value, int | float) and not 0 <= value < math.inf:
+            raise self.error(f"must be a number of seconds, 0 or more, not {value}", key)
+        return value
+
+    def choice(self, key: str, known: Iterable[str], default: T | _Required = REQUIRED) -> str | T:
+        known = tuple(known)
+        value = self.text(key, default)
+        if key in self.data and value not in known:
+            raise self.error(f"no such {key} {value!r}; {nearest(str(value), known)}", key)
+        return value
+
+    def texts(self, key: str, default: T | _Required = REQUIRED) -> tuple[str, ...] | T:
+        """One text or several."""
+        if key in self.data and isinstance(self.data[key], str):
+            return (self.data[key],)
+        values: list[Any] | T = self._take(key, list, default, "a list of texts")
+        if not isinstance(values, list):
+            return values
+        for number, value in enumerate(values):
+            if not isinstance(value, str):
+                raise self.error(f"must be a text in quotes, not {value!r}", key, number)
+        return tuple(values)
+
+    # tables
+
+    def table(self, key: str) -> Table:
+        """An empty one where there is none."""
+        return Table(self.source, (*self.key, key), self._take(key, dict, {}, f"a table: [{self._path(key)}]"))
+
+    def tables(self, key: str) -> Iterator[Table]:
+        """Each of the tables in it: `[nodes.winder]`, `[nodes.press]`."""
+        return self.table(key).each()
+
+    def each(self) -> Iterator[Table]:
+        return map(self.table, self.data)
+
+    def _path(self, key: str) -> str:
+        return ".".join(str(part) for part in (*self.key, key))
+
+    def _take(self, key: str, kind: type | tuple[type, ...], default: Any, meant: str) -> Any:
+        if key not in self.data:
+            if default is REQUIRED:
+                raise self.error(f"{key!r} is missing: {meant}")
+            return default
+        value = self.data[key]
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            raise self.error(f"must be {meant}, not {shown(value)}", key)
+        return value
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """What may have been meant."""
+    known = tuple(known)
+    near = difflib.get_close_matches(name, known, n=1)
+    if near:
+        return f"did you mean {near[0]!r}?"
+    return f"there are {', '.join(known)}" if known else "there are none"
+
+
+def shown(value: object) -> str:
+    return {dict: "a table", list: "a list", bool: str(value).lower()}.get(type(value), repr(value))

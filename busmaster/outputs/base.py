@@ -1,0 +1,248 @@
+"""What every output is: something that is offered what has passed on a line, and deals with it in its own thread.
+
+Theory of operation. `offer` runs on the loop that owns the line: it appends to a queue and returns. The thread looks
+into the queue every TICK, so that it is never woken by the line, takes what is there piece by piece, and lets go of
+the interpreter after each piece. What it holds is bounded: when it cannot get rid of it, the oldest is dropped.
+
+Each count has one writer, the loop or the thread, so that they are exact without a lock:
+`offered` = `written` + `dropped` + what waits.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeAlias, TypeVar
+
+from busmaster.errors import InvalidCommand
+from busmaster.outputs.settings import Settings
+from busmaster.polling import Snapshot
+
+Formatted = TypeVar("Formatted")
+
+TICK = 0.05
+PAUSE = 0.0002
+"""Seconds for which the thread lets go of the interpreter after each cycle that it has formatted."""
+BATCH = 2_000
+"""Values that are written at once."""
+FIRST_RETRY, LAST_RETRY = 0.5, 10.0
+"""Seconds from a failure to the next try: doubled each time."""
+
+
+class Happening(NamedTuple):
+    """An event, as a sentence. `node` is its label, "" for the line as a whole; `time` is the bus's."""
+
+    time: float
+    node: str
+    text: str
+
+
+Item: TypeAlias = Snapshot | Happening
+
+
+def size_of(item: Item) -> int:
+    """In values; an event counts as one."""
+    return len(item.samples) if isinstance(item, Snapshot) else 1
+
+
+@dataclass(frozen=True, slots=True)
+class OutputStatistics:
+    """Counts of values and events. `error` is why it is down, "" while it is not."""
+
+    kind: str
+    written: int
+    dropped: int
+    waiting: int
+    error: str
+
+
+def reason(error: BaseException) -> str:
+    """On one line."""
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return " ".join(text.split()) or type(error).__name__
+
+
+def check_folder(path: str) -> None:
+    """Raises InvalidCommand where no file can ever be made: that is better said before anything starts."""
+    folder = os.path.dirname(path)
+    if folder and not os.path.isdir(folder):
+        raise InvalidCommand(f"{path}: there is no folder {folder}")
+
+
+def check_extra(package: str, extra: str) -> None:
+    """Raises InvalidCommand, saying what to install, where the package of an extra is not there."""
+    if importlib.util.find_spec(package) is None:
+        raise InvalidCommand(
+            f"this output needs {package}, which the extra named {extra} brings: pip install 'busmaster[{extra}]'"
+        )
+
+
+class Output(ABC):
+    """One output. `clock` is the bus's; `say` is called from any thread with what happens to the output."""
+
+    def __init__(
+        self,
+        kind: str,
+        settings: Settings,
+        clock: Callable[[], float] = time.monotonic,
+        say: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.kind = kind
+        self.groups = settings.groups
+        self.error = ""
+        self.offered = self.dropped = self.written = 0
+        self._capacity = settings.buffer
+        self._clock = clock
+        self._say = say
+        self._waiting: deque[Item] = deque()
+        self._stop = threading.Event()
+        self._retry = FIRST_RETRY
+        self._thread = threading.Thread(target=self._run, name=f"busmaster {kind}", daemon=True)
+
+    # on the loop that owns the line
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def offer(self, item: Item) -> None:
+        """Never waits. Drops the oldest where the output does not keep up."""
+        self._waiting.append(item)
+        self.offered += size_of(item)
+        while self.offered - self.dropped - self.written > self._capacity:
+            try:
+                oldest = self._waiting.popleft()
+            except IndexError:
+                break  # the rest is in the thread's hands
+            self.dropped += size_of(oldest)
+
+    def miss(self, values: int) -> None:
+        """So many were lost before they could be offered."""
+        self.offered += values
+        self.dropped += values
+
+    def statistics(self) -> OutputStatistics:
+        waiting = self.offered - self.written - self.dropped
+        return OutputStatistics(self.kind, self.written, self.dropped, waiting, self.error)
+
+    # off the loop
+
+    def close(self, within: float) -> None:
+        """Let it write what waits, for so many seconds; what is left is dropped. Nothing is offered any more."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(within)
+        self.dropped = self.offered - self.written
+
+    # on the thread
+
+    @abstractmethod
+    def work(self) -> None:
+        """Take what is offered until it is stopped, then the rest. Called again, later, if it raises."""
+
+    def take(self) -> Item | None:
+        """The oldest that waits."""
+        try:
+            return self._waiting.popleft()
+        except IndexError:
+            return None
+
+    def up(self) -> None:
+        """It works."""
+        self._retry = FIRST_RETRY
+        if self.error:
+            self.error = ""
+            self._say(f"{self.kind} is up again")
+
+    def down(self, error: BaseException) -> None:
+        text = reason(error)
+        if text != self.error:
+            self.error = text
+            self._say(f"{self.kind} is down: {text}")
+
+    def wall_clock(self) -> Callable[[float], float]:
+        """From the bus's time to seconds since 1970, by the machine's clock as it goes now."""
+        offset = time.time() - self._clock()
+        return lambda moment: round(moment + offset, 6)
+
+    def _run(self) -> None:
+        """Whatever goes wrong is told and tried again: it must not end the thread."""
+        while True:
+            last = self._stop.is_set()
+            try:
+                self.work()
+                return
+            except Exception as error:
+                self.down(error)
+            if last:
+                return
+            self._stop.wait(self._retry)
+            self._retry = min(2 * self._retry, LAST_RETRY)
+
+
+class BatchOutput(Output, Generic[Formatted]):
+    """An output that writes batch by batch: all of a batch, or nothing of it."""
+
+    def __init__(
+        self,
+        kind: str,
+        settings: Settings,
+        clock: Callable[[], float] = time.monotonic,
+        say: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        super().__init__(kind, settings, clock, say)
+        self._batch: list[Formatted] = []
+        self._size = 0
+
+    @abstractmethod
+    def format(self, item: Item, time_of: Callable[[float], float]) -> Formatted | None:
+        """None for what is not written here."""
+
+    @abstractmethod
+    def commit(self, batch: list[Formatted]) -> None:
+        """Write it whole. Raises, having written nothing, where that fails."""
+
+    @abstractmethod
+    def shut(self) -> None:
+        """Let go of what `commit` opened. Never raises."""
+
+    def work(self) -> None:
+        try:
+            stopped = False
+            while not stopped:
+                stopped = self._stop.wait(TICK)
+                while self._fill():
+                    self.commit(self._batch)
+                    self._batch = []
+                    self.written += self._size
+                    self._size = 0
+                    self.up()
+        finally:
+            self.shut()
+
+    def _fill(self) -> bool:
+        """Format what waits, up to a batch; the batch that could not be written first."""
+        for item in self._items():
+            formatted = self.format(item, self.wall_clock())
+            if formatted is not None:
+                self._batch.append(formatted)
+            self._size += size_of(item)
+            if not self._stop.is_set():
+                time.sleep(PAUSE)
+        if not self._batch:
+            self.written += self._size
+            self._size = 0
+        return bool(self._batch)
+
+    def _items(self) -> Iterator[Item]:
+        while self._size < BATCH and (item := self.take()) is not None:
+            yield item

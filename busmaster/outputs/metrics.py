@@ -1,0 +1,205 @@
+"""OpenMetrics: the counts of line, nodes, groups and outputs, for a Prometheus that comes and asks.
+
+A scrape is served by a thread. Each number is read on the loop that owns the line, a node at a time, so that no scrape
+keeps it for more than some ten microseconds.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import accumulate
+from typing import TYPE_CHECKING, TypeVar
+
+from busmaster.arbiter.counters import NodeStatistics
+from busmaster.arbiter.health import Health
+from busmaster.arbiter.transaction import Priority
+from busmaster.bus import Bus
+from busmaster.node import Node
+from busmaster.outputs.base import Output, OutputStatistics, check_extra
+from busmaster.outputs.settings import MetricsSettings
+
+if TYPE_CHECKING:
+    from prometheus_client.core import HistogramMetricFamily, Metric
+
+T = TypeVar("T")
+
+EDGES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+"""Of the latency histogram's buckets, in seconds."""
+PATIENCE = 2.0
+"""Seconds for which a scrape waits for a loop that is busy."""
+OUTCOMES = ("ok", "no_reply", "garbled", "refused")
+COUNTS = {
+    "attempts": "Exchanges that were begun with this node",
+    "late": "Replies after the nominal time, accepted all the same",
+    "retries": "Reads that were tried again",
+    "unheard": "Replies to callers that had gone",
+    "failed": "Transactions that ended with an error, retries and all",
+    "probes": "Probes of the node while it was down",
+}
+LINE_COUNTS = {
+    "exchanges": "Exchanges on the line",
+    "cancelled": "Transactions whose callers had gone",
+    "stray_bytes": "Bytes that nobody had asked for",
+    "tainted": "Replies that came sooner than the baud rate allows",
+    "collisions": "Echoes that differ from what was sent",
+    "settles": "Times the line was left to settle",
+    "noisy": "Times the line would not be silent",
+    "losses": "Times the port was lost",
+}
+
+
+class MetricsOutput(Output):
+    """Serves until it is closed. Raises InvalidCommand if the extra is missing."""
+
+    def __init__(
+        self,
+        kind: str,
+        settings: MetricsSettings,
+        bus: Bus,
+        say: Callable[[str], None] = lambda _: None,
+        outputs: Callable[[], Sequence[OutputStatistics]] = tuple,
+    ) -> None:
+        check_extra("prometheus_client", "metrics")
+        super().__init__(kind, settings, bus.now, say)
+        self.port = settings.port
+        """The one that is served, where 0 was asked for."""
+        self._host = settings.host
+        self._bus = bus
+        self._others = outputs
+        self._owner: asyncio.AbstractEventLoop | None = None
+
+    def start(self) -> None:
+        self._owner = asyncio.get_running_loop()
+        super().start()
+
+    def offer(self, item: object) -> None:
+        """Nothing waits here: what is asked for is read then."""
+
+    def miss(self, values: int) -> None:
+        """Likewise."""
+
+    # on threads
+
+    def work(self) -> None:
+        from prometheus_client import start_http_server
+        from prometheus_client.core import CollectorRegistry
+
+        registry = CollectorRegistry()
+        registry.register(self)
+        server, thread = start_http_server(self.port, self._host, registry)
+        self.port = server.server_port
+        self.up()
+        try:
+            self._stop.wait()
+        finally:
+            server.shutdown()
+            thread.join()
+            server.server_close()
+
+    def describe(self) -> Iterable[Metric]:
+        """Nothing: so that registering does not ask the line."""
+        return ()
+
+    def collect(self) -> Iterator[Metric]:
+        """Asked for by a scrape, on its thread. Raises TimeoutError where the loop does not answer."""
+        yield from self._of_line()
+        yield from self._of_nodes()
+        yield from self._of_groups()
+        yield from self._of_outputs()
+
+    def _ask(self, read: Callable[[], T]) -> T:
+        """Have the loop that owns the line call `read`."""
+
+        async def asked() -> T:
+            return read()
+
+        assert self._owner is not None
+        return asyncio.run_coroutine_threadsafe(asked(), self._owner).result(PATIENCE)
+
+    def _of_line(self) -> Iterator[Metric]:
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        line = self._ask(self._bus.statistics)
+        yield GaugeMetricFamily(
+            "busmaster_line_utilisation_ratio", "Share of the time in which the line was in use", value=line.utilisation
+        )
+        yield CounterMetricFamily("busmaster_line_busy_seconds", "Time in exchanges", value=line.busy)
+        yield CounterMetricFamily("busmaster_line_settling_seconds", "Time spent settling", value=line.settling)
+        yield GaugeMetricFamily("busmaster_line_backlog", "Transactions that wait", value=line.backlog)
+        for name, text in LINE_COUNTS.items():
+            yield CounterMetricFamily(f"busmaster_line_{name}", text, value=getattr(line, name))
+        waits = GaugeMetricFamily(
+            "busmaster_line_wait_p99_seconds", "From being queued to being sent, 99 of 100", labels=["priority"]
+        )
+        for priority in Priority:
+            waits.add_metric([priority.name.lower()], line.waits[priority].p99)
+        yield waits
+
+    def _of_nodes(self) -> Iterator[Metric]:
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+
+        counters = {
+            name: CounterMetricFamily(f"busmaster_node_{name}", text, labels=["node"]) for name, text in COUNTS.items()
+        }
+        outcomes = CounterMetricFamily(
+            "busmaster_node_exchanges", "Exchanges by their outcome", labels=["node", "outcome"]
+        )
+        health = GaugeMetricFamily("busmaster_node_up", "1 while the node answers, 0 while it is down", labels=["node"])
+        latency = HistogramMetricFamily(
+            "busmaster_node_latency_seconds", "From the start of a request to the end of its reply", labels=["node"]
+        )
+        for node in self._bus.nodes:
+            counts, buckets, total = self._ask(lambda node=node: read_node(node))  # type: ignore[misc]
+            for name, family in counters.items():
+                family.add_metric([node.label], getattr(counts, name))
+            for outcome in OUTCOMES:
+                outcomes.add_metric([node.label, outcome], getattr(counts, outcome))
+            health.add_metric([node.label], float(node.health is not Health.DOWN))
+            add_histogram(latency, node.label, buckets, total)
+        yield from (*counters.values(), outcomes, health, latency)
+
+    def _of_groups(self) -> Iterator[Metric]:
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        cycles = CounterMetricFamily("busmaster_group_cycles", "Cycles that were polled", labels=["group"])
+        missed = CounterMetricFamily("busmaster_group_missed", "Cycles that could not start", labels=["group"])
+        wanted = GaugeMetricFamily("busmaster_group_period_seconds", "Period as asked for", labels=["group"])
+        achieved = GaugeMetricFamily("busmaster_group_achieved_period_seconds", "Period as seen", labels=["group"])
+        for group in self._bus.groups:
+            counts = self._ask(group.statistics)
+            cycles.add_metric([group.name], counts.cycles)
+            missed.add_metric([group.name], counts.missed)
+            wanted.add_metric([group.name], counts.period)
+            achieved.add_metric([group.name], counts.achieved)
+        yield from (cycles, missed, wanted, achieved)
+
+    def _of_outputs(self) -> Iterator[Metric]:
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        written = CounterMetricFamily("busmaster_output_written", "Values and events written", labels=["output"])
+        dropped = CounterMetricFamily("busmaster_output_dropped", "Values and events dropped", labels=["output"])
+        waiting = GaugeMetricFamily("busmaster_output_waiting", "Values and events that wait", labels=["output"])
+        up = GaugeMetricFamily("busmaster_output_up", "1 while the output works", labels=["output"])
+        for counts in self._others():
+            written.add_metric([counts.kind], counts.written)
+            dropped.add_metric([counts.kind], counts.dropped)
+            waiting.add_metric([counts.kind], counts.waiting)
+            up.add_metric([counts.kind], float(not counts.error))
+        yield from (written, dropped, waiting, up)
+
+
+def read_node(node: Node) -> tuple[NodeStatistics, list[tuple[float, int]], float]:
+    """Its counts, and its latencies: (upper edge, count) of the buckets in use, and their sum."""
+    latency = node.record.counters.latency
+    return node.statistics(), latency.buckets(), latency.total
+
+
+def add_histogram(family: HistogramMetricFamily, node: str, buckets: Sequence[tuple[float, int]], total: float) -> None:
+    """Our fine buckets in a few: each counted with the first edge that is not below its own."""
+    counts = [0] * (len(EDGES) + 1)
+    for upper, count in buckets:
+        counts[bisect_left(EDGES, upper)] += count
+    edges = (*map(str, EDGES), "+Inf")
+    family.add_metric([node], list(zip(edges, accumulate(counts), strict=True)), total)

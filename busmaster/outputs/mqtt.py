@@ -1,0 +1,257 @@
+"""MQTT: values and health out, and, where the file allows it, commands in.
+
+    PREFIX/values/NODE/ITEM   {"time": ..., "value": 12.5, "unit": "mm", "error": null, "late": false}
+    PREFIX/cycles/GROUP       a whole cycle, as `busmaster run --json` prints it (messages = "cycle")
+    PREFIX/health/NODE        {"time": ..., "health": "up"}, retained
+    PREFIX/line               {"time": ..., "line": "ready"}, retained; "offline" while the port is gone
+    PREFIX/events             {"time": ..., "node": "winder", "text": "winder is down, was suspect"}
+    PREFIX/status             online, or offline, which is also the last will; retained
+
+    PREFIX/set/NODE/ITEM      a number, or several as a JSON list, to be written
+    PREFIX/result/NODE/ITEM   {"ok": true}, or {"ok": false, "error": "..."}
+
+Times are seconds since 1970. What was not acknowledged when the broker went away is sent again when it is back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import ssl
+import time
+from collections.abc import Callable, Iterator, Mapping
+from math import isfinite
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import anyio
+from anyio.abc import TaskGroup
+
+from busmaster.arbiter.events import LineState
+from busmaster.bus import Bus
+from busmaster.errors import BusError, InvalidCommand
+from busmaster.outputs.base import TICK, Item, Output, check_extra, reason, size_of
+from busmaster.outputs.settings import MqttSettings
+from busmaster.outputs.values import cycle_fields, sample_fields
+from busmaster.points import Point
+from busmaster.polling import Snapshot
+
+if TYPE_CHECKING:
+    from aiomqtt import Client, Message
+
+AT_ONCE = 500
+"""Values on their way to the broker, not yet acknowledged."""
+TIMEOUT = 5.0
+"""Seconds in which a broker must answer."""
+KEEP_ALIVE = 15
+START_WITHIN = 1.0
+"""Seconds after which a command that could not be sent to its node is not sent any more."""
+COMMANDS_AT_ONCE = 16
+
+
+class Outgoing(NamedTuple):
+    topic: str
+    payload: str
+    retain: bool = False
+
+
+class MqttOutput(Output):
+    """`commands` are the points, by their key, that may be written. Raises InvalidCommand if the extra is missing."""
+
+    def __init__(
+        self,
+        kind: str,
+        settings: MqttSettings,
+        bus: Bus,
+        say: Callable[[str], None] = lambda _: None,
+        *,
+        title: str = "",
+        commands: Mapping[str, Point[Any]] | None = None,
+    ) -> None:
+        check_extra("aiomqtt", "mqtt")
+        super().__init__(kind, settings, bus.now, say)
+        self._settings = settings
+        self._secrets = secrets(settings)
+        self._bus = bus
+        self._title = title
+        self._commands = {topic_part(key): point for key, point in (commands or {}).items()}
+        self._owner: asyncio.AbstractEventLoop | None = None
+        self._held: list[Item] = []
+        self._published: dict[str, str] = {}
+        self._running = 0
+        self._quiet = logging.getLogger("busmaster.mqtt")
+        self._quiet.addHandler(logging.NullHandler())
+        self._quiet.propagate = False
+
+    def start(self) -> None:
+        self._owner = asyncio.get_running_loop()
+        super().start()
+
+    # on the thread
+
+    def work(self) -> None:
+        asyncio.run(self._connected())
+
+    async def _connected(self) -> None:
+        async with self._client() as client, anyio.create_task_group() as tasks:
+            self._published.clear()
+            await self._send(client, [Outgoing(self._topic("status"), "online", True)])
+            self.up()
+            if self._commands:
+                await client.subscribe(self._topic("set/#"), qos=1)
+                tasks.start_soon(self._listen, client, tasks)
+            stopped = False
+            while not stopped:
+                stopped = self._stop.is_set()
+                await self._send(client, list(self._changes()))
+                while self._fill():
+                    await self._send(client, [message for item in self._held for message in self._messages(item)])
+                    self.written += sum(map(size_of, self._held))
+                    self._held.clear()
+                await anyio.sleep(0 if stopped else TICK)
+            await self._send(client, [Outgoing(self._topic("status"), "offline", True)])
+            tasks.cancel_scope.cancel()
+
+    def _client(self) -> Client:
+        import aiomqtt
+
+        settings = self._settings
+        username, password, tls = self._secrets
+        client = aiomqtt.Client(
+            settings.host,
+            settings.port,
+            username=username,
+            password=password,
+            tls_context=tls,
+            will=aiomqtt.Will(self._topic("status"), "offline", qos=1, retain=True),
+            keepalive=KEEP_ALIVE,
+            timeout=TIMEOUT,
+            logger=self._quiet,
+        )
+        client.pending_calls_threshold = AT_ONCE
+        return client
+
+    async def _send(self, client: Client, messages: list[Outgoing]) -> None:
+        """In order, and acknowledged at QoS 1. Raises what went wrong first."""
+        results = await asyncio.gather(
+            *(
+                client.publish(topic, payload, qos=self._settings.qos, retain=retain)
+                for topic, payload, retain in messages
+            ),
+            return_exceptions=True,
+        )
+        for result in results:
+            if isinstance(result, BaseException):
+                raise result
+
+    def _fill(self) -> bool:
+        """What was not acknowledged comes first."""
+        size = sum(map(size_of, self._held))
+        while size < AT_ONCE and (item := self.take()) is not None:
+            self._held.append(item)
+            size += size_of(item)
+        return bool(self._held)
+
+    def _messages(self, item: Item) -> Iterator[Outgoing]:
+        time_of = self.wall_clock()
+        settings = self._settings
+        if not isinstance(item, Snapshot):
+            fields = {"time": time_of(item.time), "node": item.node or None, "text": item.text}
+            yield Outgoing(self._topic("events"), json.dumps(fields))
+        elif settings.messages == "cycle":
+            payload = json.dumps(cycle_fields(item, time_of))
+            yield Outgoing(self._topic("cycles", item.group), payload, settings.retain)
+        else:
+            for point, sample in item.samples.items():
+                fields = {"time": time_of(sample.finished), "unit": point.unit, **sample_fields(sample)}
+                yield Outgoing(self._topic("values", topic_part(point.key)), json.dumps(fields), settings.retain)
+
+    def _changes(self) -> Iterator[Outgoing]:
+        """What is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
+        now = {"line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")}
+        for node in self._bus.nodes:
+            now[f"health/{topic_part(node.label.removeprefix('node '))}"] = ("health", node.health.value)
+        for topic, (name, state) in now.items():
+            if self._published.get(topic) != state:
+                self._published[topic] = state
+                payload = json.dumps({"time": round(time.time(), 3), name: state})
+                yield Outgoing(self._topic(topic), payload, True)
+
+    def _topic(self, *parts: str) -> str:
+        return "/".join((self._settings.prefix, *parts))
+
+    # commands
+
+    async def _listen(self, client: Client, tasks: TaskGroup) -> None:
+        async for message in client.messages:
+            name = str(message.topic).removeprefix(self._topic("set/"))
+            refusal = self._refusal(name, message)
+            if refusal:
+                tasks.start_soon(self._answer, client, name, refusal)
+            else:
+                self._running += 1
+                tasks.start_soon(self._obey, client, name, message.payload)
+
+    def _refusal(self, name: str, message: Message) -> str:
+        """Why a command is not obeyed, "" if it is."""
+        if name not in self._commands:
+            return "the line's file does not allow this: see allow_commands"
+        if message.retain:
+            return "a retained command is not obeyed: nobody knows how old it is"
+        if self._running >= COMMANDS_AT_ONCE:
+            return f"{COMMANDS_AT_ONCE} commands are being written already"
+        return ""
+
+    async def _obey(self, client: Client, name: str, payload: object) -> None:
+        try:
+            await self._write(self._commands[name], payload)
+        except (BusError, InvalidCommand) as error:
+            refusal = reason(error)
+        else:
+            refusal = ""
+        finally:
+            self._running -= 1
+        await self._answer(client, name, refusal)
+
+    async def _write(self, point: Point[Any], payload: object) -> None:
+        """On the loop that owns the line."""
+        value = command_value(payload)
+        assert self._owner is not None
+        work = point.write(value, start_within=START_WITHIN)
+        await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self._owner))
+
+    async def _answer(self, client: Client, name: str, refusal: str) -> None:
+        fields = {"ok": False, "error": refusal} if refusal else {"ok": True}
+        await self._send(client, [Outgoing(self._topic("result", name), json.dumps(fields))])
+
+
+def command_value(payload: object) -> Any:
+    """The number, or the several, that somebody wants to have written. Raises InvalidCommand for anything else."""
+    text = bytes(payload).decode(errors="replace") if isinstance(payload, bytes | bytearray) else str(payload)
+    try:
+        value = json.loads(text, parse_constant=lambda name: name)
+    except ValueError:
+        value = None
+    numbers = value if isinstance(value, list) else [value]
+    if not numbers or not all(type(n) is int or (type(n) is float and isfinite(n)) for n in numbers):
+        raise InvalidCommand(f"{text[:40]!r} is neither a number nor a list of numbers")
+    return value
+
+
+def topic_part(name: str) -> str:
+    """Without what has a meaning in topics."""
+    return name.replace("+", "_").replace("#", "_")
+
+
+def secrets(settings: MqttSettings) -> tuple[str | None, str | None, ssl.SSLContext | None]:
+    """User name, password and TLS context. Raises InvalidCommand for a file that cannot be read."""
+    password = tls = None
+    try:
+        if settings.password_file is not None:
+            with open(settings.password_file, encoding="utf-8") as file:
+                password = file.read().strip()
+        if settings.tls:
+            tls = ssl.create_default_context(cafile=settings.ca_file)
+    except OSError as error:
+        raise InvalidCommand(reason(error)) from None
+    return settings.username, password, tls

@@ -1,0 +1,66 @@
+"""What each output is told, as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from busmaster.errors import InvalidCommand
+
+BUFFER = 50_000
+"""Values that may wait, some 500 bytes each: ten minutes of 80 a second."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """`groups`: the poll groups whose values it gets, all if there are none. `buffer`: values that may wait for it."""
+
+    groups: tuple[str, ...] = ()
+    buffer: int = BUFFER
+
+    def __post_init__(self) -> None:
+        if self.buffer < 1:
+            raise InvalidCommand(f"a buffer holds at least one value, not {self.buffer}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileSettings(Settings):
+    """`path` may hold fields of a date (line-%Y-%m-%d.csv): a new file begins when the name changes."""
+
+    path: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SqliteSettings(Settings):
+    """Values older than `keep_days` are deleted; None keeps all."""
+
+    path: str
+    keep_days: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MqttSettings(Settings):
+    """`messages`: one for each "point", or one for each "cycle". `qos` 0 may lose values unseen, 1 does not.
+
+    `allow` names the points ("winder/1") that commands may write; without any, no command is listened to.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 1883
+    prefix: str = "busmaster"
+    messages: Literal["point", "cycle"] = "point"
+    qos: int = 1
+    retain: bool = True
+    username: str | None = None
+    password_file: str | None = None
+    tls: bool = False
+    ca_file: str | None = None
+    allow: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MetricsSettings(Settings):
+    """Where it is served: only there."""
+
+    host: str = "127.0.0.1"
+    port: int = 9464

@@ -1,0 +1,151 @@
+"""SQLite: the embedded default. Points, samples and events in one file that any tool reads while it grows.
+
+select * from history where node = 'winder' and item = 'position' and time > unixepoch('now', '-1 hour')
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple, TypeAlias
+
+from busmaster.errors import InvalidCommand
+from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
+from busmaster.outputs.settings import SqliteSettings
+from busmaster.outputs.values import json_value
+from busmaster.points import Point
+
+VERSION = 1
+SCHEMA = """
+create table if not exists points (
+    id integer primary key, node text not null, item text not null, unit text not null, unique (node, item)
+);
+create table if not exists samples (
+    time real not null,       -- seconds since 1970
+    point integer not null references points (id),
+    value,                    -- a number; JSON for several; null where there is an error
+    quality text not null,    -- good, late, stale or bad
+    error text
+);
+create index if not exists samples_of_point on samples (point, time);
+create table if not exists events (time real not null, node text, text text not null);
+create view if not exists history as
+    select time, node, item, value, unit, quality, error from samples join points on points.id = samples.point;
+"""
+BUSY = 1.0
+"""Seconds for which a lock of another program is waited for, before the batch is kept for later."""
+CLEAN_EVERY = 60.0
+CLEANED_AT_ONCE = 20_000
+"""Rows; so that no deletion holds the file for long."""
+DAY = 86_400.0
+
+SampleRow: TypeAlias = tuple[float, int, Any, str, str | None]
+
+
+class Rows(NamedTuple):
+    """Of one cycle, or one event: points whose number is not known yet, by their place in `samples`."""
+
+    samples: list[tuple[float, Point[Any], Any, str, str | None]]
+    event: tuple[float, str | None, str] | None
+
+
+class SqliteOutput(BatchOutput[Rows]):
+    """A transaction a batch."""
+
+    def __init__(
+        self,
+        kind: str,
+        settings: SqliteSettings,
+        clock: Callable[[], float] = time.monotonic,
+        say: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        super().__init__(kind, settings, clock, say)
+        check_folder(settings.path)
+        self._path = settings.path
+        self._keep_days = settings.keep_days
+        self._cleaned = 0.0
+        self._database: sqlite3.Connection | None = None
+        self._numbers: dict[str, int] = {}
+
+    def format(self, item: Item, time_of: Callable[[float], float]) -> Rows:
+        if isinstance(item, Happening):
+            return Rows([], (time_of(item.time), item.node or None, item.text))
+        samples = [
+            (
+                time_of(sample.finished),
+                point,
+                column(sample.value),
+                sample.quality.value,
+                sample.error.what if sample.error else None,
+            )
+            for point, sample in item.samples.items()
+        ]
+        return Rows(samples, None)
+
+    def commit(self, batch: list[Rows]) -> None:
+        database = self._open()
+        self._clean(database)
+        with database:
+            samples = list(self._samples(database, batch))
+            database.executemany("insert into samples values (?, ?, ?, ?, ?)", samples)
+            events = [rows.event for rows in batch if rows.event is not None]
+            database.executemany("insert into events values (?, ?, ?)", events)
+
+    def shut(self) -> None:
+        if self._database is not None:
+            self._database.close()
+            self._database = None
+        self._numbers.clear()  # of a transaction that was undone, perhaps
+
+    def _samples(self, database: sqlite3.Connection, batch: list[Rows]) -> Iterator[SampleRow]:
+        numbers = self._numbers
+        for rows in batch:
+            for moment, point, value, quality, error in rows.samples:
+                number = numbers.get(point.key)
+                if number is None:
+                    number = numbers[point.key] = number_of(database, point)
+                yield moment, number, value, quality, error
+
+    def _open(self) -> sqlite3.Connection:
+        if self._database is None:
+            database = self._database = sqlite3.connect(self._path, timeout=BUSY)
+            [version] = database.execute("pragma user_version").fetchone()
+            [tables] = database.execute("select count(*) from sqlite_master").fetchone()
+            if version != VERSION and tables:
+                raise InvalidCommand(f"{self._path} is a database of something else")
+            database.execute("pragma journal_mode = wal")
+            database.execute("pragma synchronous = normal")
+            database.executescript(SCHEMA)
+            database.execute(f"pragma user_version = {VERSION}")
+        return self._database
+
+    def _clean(self, database: sqlite3.Connection) -> None:
+        """Delete the oldest, a piece at a time."""
+        now = time.time()
+        if self._keep_days is None or now < self._cleaned + CLEAN_EVERY:
+            return
+        self._cleaned = now
+        with database:
+            database.execute(
+                "delete from samples where time < ? and rowid < (select coalesce(min(rowid), 0) from samples) + ?",
+                (now - self._keep_days * DAY, CLEANED_AT_ONCE),
+            )
+
+
+def number_of(database: sqlite3.Connection, point: Point[Any]) -> int:
+    """The point's row; made if there is none, and with the unit that the point has now."""
+    node, _, item = point.key.partition("/")
+    row = database.execute(
+        "insert into points (node, item, unit) values (?, ?, ?)"
+        " on conflict (node, item) do update set unit = excluded.unit returning id",
+        (node, item, point.unit),
+    ).fetchone()
+    return int(row[0])
+
+
+def column(value: Any) -> Any:
+    """SQLite holds numbers and texts; several values are JSON."""
+    plain = json_value(value)
+    return json.dumps(plain) if isinstance(plain, list) else plain

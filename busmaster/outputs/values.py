@@ -1,0 +1,120 @@
+"""How values and events are written: as text on one line, and as JSON."""
+
+from __future__ import annotations
+
+import enum
+import json
+import math
+from collections.abc import Callable
+from collections.abc import Set as AbstractSet
+from decimal import Decimal
+from typing import Any
+
+from busmaster.arbiter.events import Event, LatenessRaised, LineChanged, NodeChanged
+from busmaster.arbiter.health import Health
+from busmaster.polling import Quality, Sample, Snapshot
+
+
+def number_text(value: float) -> str:
+    """Shortest exact, without an exponent: 12.5, -0.0001, 1234; whole numbers without ".0", zero without a sign."""
+    if isinstance(value, int):
+        return str(int(value))
+    if not math.isfinite(value):
+        return str(value)
+    text = format(Decimal(repr(value)), "f")
+    if "." in text:
+        text = text.rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
+
+
+def word_text(word: enum.Flag) -> str:
+    """The number and the names of the bits that are set: `65 PROGRAM_RUNNING|AUTO_START_ENABLED`."""
+    number: int = word.value
+    names, rest = [], number
+    for member in type(word):
+        if number & member.value == member.value:
+            names.append(str(member.name))
+            rest &= ~member.value
+    if rest:
+        names.append(hex(rest))
+    return f"{number} {'|'.join(names)}" if names else str(number)
+
+
+def value_text(value: Any) -> str:
+    """One value on one line. A set of numbers (flags that are on) as `0,5,31`, or `none`."""
+    match value:
+        case None:
+            return "-"
+        case enum.Flag():
+            return word_text(value)
+        case enum.Enum():
+            return f"{number_text(value.value)} {value.name}"
+        case int() | float():
+            return number_text(value)
+        case AbstractSet():
+            return ",".join(str(number) for number in sorted(value)) or "none"
+        case list() | tuple():
+            return ",".join(value_text(item) for item in value)
+        case _:
+            return str(value)
+
+
+def json_value(value: Any) -> Any:
+    """The same for JSON: words as numbers, sets and runs as lists, whole numbers without a fraction, NaN as null."""
+    match value:
+        case enum.Enum():
+            return json_value(value.value)
+        case bool() | int():
+            return int(value)
+        case float():
+            if not math.isfinite(value):
+                return None
+            return int(value) if value.is_integer() and abs(value) < 2**53 else value
+        case AbstractSet():
+            return sorted(value)
+        case list() | tuple():
+            return [json_value(item) for item in value]
+        case _:
+            return value
+
+
+def json_line(**fields: Any) -> str:
+    return json.dumps(fields, ensure_ascii=False)
+
+
+def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[str, Any]:
+    """One cycle as a JSON object; `time_of` makes its times of the bus's."""
+    return {
+        "group": snapshot.group,
+        "cycle": snapshot.cycle,
+        "due": time_of(snapshot.due),
+        "started": None if snapshot.started is None else time_of(snapshot.started),
+        "finished": time_of(snapshot.finished),
+        "missed": snapshot.missed,
+        "samples": {point.key: sample_fields(sample) for point, sample in snapshot.samples.items()},
+    }
+
+
+def sample_fields(sample: Sample) -> dict[str, Any]:
+    """A value, or what went wrong."""
+    return {
+        "value": json_value(sample.value),
+        "error": None if sample.error is None else sample.error.what,
+        "late": sample.quality is Quality.LATE,
+    }
+
+
+def event_text(event: Event) -> str:
+    """What a person wants to know of, in a sentence; "" for the rest."""
+    match event:
+        case NodeChanged() if event.before is not Health.UNKNOWN or event.after is not Health.UP:
+            return f"{event.node.label} is {event.after.value}, was {event.before.value}"
+        case LatenessRaised():
+            return (
+                f"{event.node.label} answered after {event.age * 1000:.0f} ms: "
+                f"its lateness is now {event.lateness * 1000:.0f} ms"
+            )
+        case LineChanged():
+            return f"the line is {event.change.value}" + (f": {event.cause}" if event.cause else "")
+        case _:
+            return ""
