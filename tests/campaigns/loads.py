@@ -17,6 +17,7 @@ from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.world import World
 from busmaster.exchange import Command, Timings
+from busmaster.planning import Bounds, PlannedNode, bounds
 from busmaster.profile import LineSettings, Profile
 from busmaster.protocols import hcp2
 
@@ -137,6 +138,13 @@ class Load:
         elif isinstance(event, NodeChanged):
             self.changes.append((self.now, event))
             self.on_change(event)
+
+    def bounds(self) -> Bounds:
+        """The published bounds of this line: of its polls and its nodes' probes."""
+        polled = [(poll, t) for poll in self.polls for t in (*poll.results, *(poll.fresh or ()))]
+        low = sum(poll.priority is Priority.BACKGROUND for poll, _ in polled)
+        reads = [(PlannedNode(t.node.profile, t.node.address, t.node.timings), t.command) for _, t in polled]
+        return bounds(reads, self.world.arbiter.byte_time, polls=len(polled) - low, background=low)
 
 
 def quantile(values: Sequence[float], q: float) -> float:

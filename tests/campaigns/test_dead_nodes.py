@@ -1,4 +1,4 @@
-"""Dead nodes on a busy line of 57600 baud, with a 100 ms window: what the living keep, and how the dead return (R11)."""
+"""Dead nodes at 57600 baud with a 100 ms window: what the living keep, and how the dead return (R11)."""
 
 from __future__ import annotations
 
