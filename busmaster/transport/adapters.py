@@ -54,7 +54,7 @@ class Holder:
 
 def inspect(path: str, *, proc: Path = PROC, sys: Path = SYS) -> tuple[Finding, ...]:
     """Everything that can be said of the port at `path` without opening it."""
-    found = [_existence(path)]
+    found = [_existence(path, sys)]
     if found[0].ok:
         found += [_permission(path), _holders(path, proc), *_driver(path, sys), *_latency_timer(path, sys)]
     return tuple(found)
@@ -119,13 +119,16 @@ def rs485_mode(descriptor: int) -> bool | None:
     return bool(settings[0] & SER_RS485_ENABLED)
 
 
-def _existence(path: str) -> Finding:
+def _existence(path: str, sys: Path) -> Finding:
     if not os.path.exists(path):
         if os.path.islink(path):
             return Finding("port", False, f"{path} points to {os.readlink(path)}, which is gone", "plug it in again")
         return Finding("port", False, f"{path} does not exist", "see `python -m serial.tools.list_ports`")
     if not stat.S_ISCHR(os.stat(path).st_mode):
         return Finding("port", False, f"{path} is no device", "give the path of a serial port")
+    subsystem = _entry(path, sys) / "subsystem"
+    if subsystem.exists() and subsystem.resolve().name != "tty":
+        return Finding("port", False, f"{path} is no serial port", "see `python -m serial.tools.list_ports`")
     return Finding("port", True, f"{path} is {os.path.realpath(path)}" if os.path.islink(path) else f"{path} exists")
 
 
@@ -170,6 +173,12 @@ def _latency_timer(path: str, sys: Path) -> Iterator[Finding]:
     else:
         file = _device(path, sys) / "latency_timer"
         yield Finding("latency", False, what, f"open it with low_latency=True, or write 1 to {file}")
+
+
+def _entry(path: str, sys: Path) -> Path:
+    """Where the kernel describes this device; a pseudo-terminal is not there."""
+    number = os.stat(path).st_rdev
+    return sys / f"dev/char/{os.major(number)}:{os.minor(number)}"
 
 
 def _device(path: str, sys: Path) -> Path:

@@ -83,7 +83,13 @@ def test_a_quick_adapter_is_in_order(far_end: FarEnd, sysfs: Path) -> None:
 def test_what_is_no_port_is_said_first_and_alone(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to("/dev/pts/99999")
-    for name, says in (("file", "is no device"), ("link", "which is gone"), ("none", "does not exist")):
+    (tmp_path / "null").symlink_to("/dev/null")
+    for name, says in (
+        ("file", "is no device"),
+        ("link", "which is gone"),
+        ("none", "does not exist"),
+        ("null", "is no serial port"),
+    ):
         (finding,) = inspect(str(tmp_path / name))
         assert not finding.ok
         assert says in finding.what

@@ -1,0 +1,103 @@
+"""`busmaster doctor`: what is wrong with this port, adapter or line, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import anyio
+import click
+
+from busmaster.cli.arguments import (
+    Connection,
+    checked,
+    nodes_option,
+    only_address,
+    option_type,
+    parse_milliseconds,
+    parsed,
+)
+from busmaster.cli.capturing import capture_option, capturing
+from busmaster.cli.examination import Patient, examine
+from busmaster.cli.output import emit_all, note
+from busmaster.handles import HANDLES
+from busmaster.profile import LineSettings, Profile
+from busmaster.transport.adapters import Finding
+from busmaster.transport.endpoints import endpoint
+
+FAILED = 1
+TOPIC = 10
+"""Columns of a finding's topic."""
+USUAL = LineSettings(9600)
+"""What a port is opened with where neither a protocol nor the user says."""
+
+
+@click.command(short_help="What is wrong with this port, adapter or line?")
+@click.argument("port")
+@click.option("--protocol", type=click.Choice(list(HANDLES)), metavar="P", help=f"One of {', '.join(HANDLES)}.")
+@nodes_option
+@click.option("--baud", type=click.IntRange(min=1), metavar="N", help="Baud rate; the protocol's by default.")
+@click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire).")
+@click.option(
+    "--timeout", type=option_type(parse_milliseconds), metavar="MS", help="The reply window, in milliseconds."
+)
+@capture_option
+def command(
+    port: str,
+    protocol: str | None,
+    nodes: tuple[int, ...] | None,
+    baud: int | None,
+    echo: bool,
+    timeout: float | None,
+    capture: str | None,
+) -> int:
+    """Examine PORT and, with --protocol, the nodes on it. Whatever is not in order comes with what to do.
+
+    Nothing but reads is sent, and nothing at all while another program holds the port or another master is heard. All
+    addresses of the protocol are asked unless --nodes names some.
+    """
+    patient = patient_of(Connection(port, protocol or "", baud, echo, timeout), nodes)
+    wrong = 0
+
+    def tell(finding: Finding) -> None:
+        nonlocal wrong
+        wrong += not finding.ok
+        emit_all(lines_of(finding))
+
+    name = patient.endpoint.name
+    with capturing(capture, port=name, protocol=protocol or "", echo=patient.endpoint.echo) as recorder:
+        anyio.run(examine, patient, tell, recorder)
+    if wrong:
+        note(f"{name}: {wrong} thing{'' if wrong == 1 else 's'} to mend")
+        return FAILED
+    return 0
+
+
+def patient_of(connection: Connection, nodes: Sequence[int] | None) -> Patient:
+    """What the options say. Raises UsageError."""
+    if connection.protocol:
+        where = parsed(lambda _: connection.endpoint(), connection.port)
+        addresses = nodes_to_ask(connection.profile, nodes)
+        return Patient(where, connection.protocol, connection.timings, addresses, nodes is not None)
+    if nodes is not None:
+        raise click.UsageError("--nodes needs a --protocol, to ask them in")
+    settings = USUAL if connection.baud is None else replace(USUAL, baudrate=connection.baud)
+    where = parsed(lambda port: endpoint(port, defaults=settings), connection.port)
+    return Patient(replace(where, echo=True) if connection.echo else where)
+
+
+def nodes_to_ask(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
+    """Raises UsageError for addresses that no node can have."""
+    if nodes is None:
+        return tuple(profile.addresses) if profile.addressed else (only_address(profile),)
+    if profile.broadcast in nodes:
+        raise click.UsageError(f"{profile.name}: no node has address {profile.broadcast}, which means all of them")
+    return checked(profile, nodes)
+
+
+def lines_of(finding: Finding) -> Iterator[str]:
+    """`ok`; `note`: in order, but could be better; `MEND`: not in order."""
+    mark = "MEND" if not finding.ok else "note" if finding.advice else "ok"
+    yield f"{mark:4}  {finding.topic:{TOPIC}}  {finding.what}"
+    if finding.advice:
+        yield f"{'':4}  {'':{TOPIC}}  -> {finding.advice}"

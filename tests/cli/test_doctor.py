@@ -1,0 +1,385 @@
+"""The doctor's findings: on emulated lines in virtual time; as a command, on ptys and TCP ports.
+
+A wrong baud rate cannot be had on a pty, whose speed is a number that nobody heeds: there the far end looks at the
+number, and is deaf while it is another than its own.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import termios
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from busmaster.capture.pcapng import read_packets
+from busmaster.cli import diagnosis, examination
+from busmaster.cli.examination import HARMLESS, Patient, examine, other_settings
+from busmaster.cli.probing import Outcome, Prober, opened
+from busmaster.emulator.build import make_device
+from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.devices.msc import MscController
+from busmaster.emulator.faults import Faults
+from busmaster.emulator.line import Echo, Line
+from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
+from busmaster.handles import HANDLES
+from busmaster.profile import LineSettings
+from busmaster.testing import run_in_virtual_time
+from busmaster.transport.adapters import Finding
+from busmaster.transport.memory import MemoryPort
+from tests.cli.conftest import Command
+from tests.cli.conftest import Outcome as Ended
+from tests.transport.fakes import plugged
+
+HCP2 = ("--protocol", "hcp2")
+
+
+def line_of(protocol: str, devices: Iterable[Device], **options: object) -> Line:
+    chance = random.Random(1)
+    return Line(HANDLES[protocol].profile.line, devices, chance=chance, **options)  # type: ignore[arg-type]  # Line's own
+
+
+def hcp2(address: int, delay: Delay | None = None, **faults: float) -> Device:
+    device = make_device("hcp2", address, delay=delay)
+    device.faults = Faults(**faults)
+    return device
+
+
+def examined(line: Line, addresses: Iterable[int], protocol: str = "hcp2", port: MemoryPort | None = None) -> Findings:
+    """In virtual time. What is not in order must say what to do."""
+    findings = Findings()
+    patient = Patient(port or MemoryPort(line), protocol, addresses=tuple(addresses), named=True)
+    run_in_virtual_time(examine(patient, findings.append))
+    assert all(finding.advice for finding in findings if not finding.ok)
+    return findings
+
+
+class Findings(list[Finding]):
+    def on(self, topic: str) -> Finding:
+        (finding,) = [finding for finding in self if finding.topic == topic]
+        return finding
+
+    @property
+    def wrong(self) -> set[str]:
+        return {finding.topic for finding in self if not finding.ok}
+
+
+@dataclass(frozen=True)
+class Claiming(MemoryPort):
+    """A port whose owner says of the echo whatever he likes."""
+
+    claim: bool = False
+
+    @property
+    def echo(self) -> bool:
+        return self.claim
+
+
+class Chatterbox(Device):
+    """Says the same again and again, whatever it hears."""
+
+    def __init__(self, words: bytes) -> None:
+        super().__init__(99)
+        self.words = words
+        self.wakeup = 0.0
+
+    def hear_byte(self, byte: int, now: float) -> None:
+        pass
+
+    def wake(self, now: float) -> None:
+        self.reply(self.words, now, 0.0)
+        self.wakeup = now + 0.2
+
+
+# A line in order
+
+
+def test_on_a_line_in_order_every_node_is_measured_and_nothing_is_to_be_mended() -> None:
+    findings = examined(line_of("hcp2", [hcp2(1), hcp2(2, Delay(0.010, 0.020))]), (1, 2))
+    assert findings.wrong == set()
+    assert [finding.topic for finding in findings] == ["open", "silence", "echo", "node 1", "node 2", "windows"]
+    assert (
+        findings.on("node 1").what == "answers after 2.2 / 2.2 / 2.2 ms (least / median / p99 of 25): read element 1: 0"
+    )
+    assert findings.on("windows").what.endswith("set are 50 / 100 / 150 ms (nominal / window / lateness)")
+
+
+@pytest.mark.parametrize("protocol", list(HANDLES))
+def test_every_protocol_is_asked_its_cheapest_read(protocol: str) -> None:
+    address = HANDLES[protocol].profile.addresses.start
+    findings = examined(line_of(protocol, [make_device(protocol, address)]), (address,), protocol)
+    assert findings.wrong == set()
+    label = HANDLES[protocol].profile.label(address)
+    assert str(HANDLES[protocol].profile.probe) in findings.on(label).what
+
+
+def test_a_node_is_left_with_nothing_unacknowledged() -> None:
+    """MSC sends a packet again until the host ACKs it."""
+
+    async def ask() -> None:
+        async with opened(MemoryPort(line)) as wire:
+            prober = Prober(wire, profile, profile.timings, profile.line.byte_time, echo=False)
+            assert (await prober.ask(3)).outcome is Outcome.ANSWERED
+            assert await wire.hear_all(5.0) == b""
+
+    profile = HANDLES["msc"].profile
+    controller = MscController(3)
+    line = line_of("msc", [controller])
+    run_in_virtual_time(ask())
+    assert (controller.unacknowledged, controller.retransmitted) == (False, 0)
+
+
+# Before anybody is asked
+
+
+def test_the_harmless_bytes_begin_no_frame_and_acknowledge_nothing() -> None:
+    for protocol, handle in HANDLES.items():
+        profile = handle.profile
+        request = profile.probe.open(profile.addresses.start, profile.timings).request
+        assert not set(HARMLESS) & {request[0], 0x02, 0x04, 0x06, 0x07, 0x08, 0x15}, protocol
+
+
+def test_where_another_master_is_heard_nothing_is_sent() -> None:
+    request = bytes.fromhex("07 30 35 02 30 31 05 03")  # HCP2: read element 1 of node 5
+    findings = examined(line_of("hcp2", [Chatterbox(request), hcp2(1)]), (1,))
+    assert findings[-1] is findings.on("silence")
+    assert "somebody speaks already, so nothing was sent" in findings[-1].what
+
+
+def test_noise_is_described_and_the_nodes_are_asked_all_the_same() -> None:
+    line = line_of("hcp2", [Chatterbox(bytes(5)), hcp2(1)])
+    findings = examined(line, (1,))
+    assert findings.on("silence").what.startswith("5 bytes came unasked: 00 00 00 00 00 (zeros: ")
+    assert "node 1" in {finding.topic for finding in findings}
+
+
+@pytest.mark.parametrize(("present", "declared"), [(True, False), (False, True), (True, True), (False, False)])
+def test_an_echo_is_found_and_what_was_declared_is_checked(present: bool, declared: bool) -> None:
+    line = line_of("hcp2", [hcp2(1)], echo=Echo(0.003) if present else None)
+    findings = examined(line, (1,), port=Claiming(line, declared))
+    assert findings.wrong == (set() if present == declared else {"echo"})
+    assert findings.on("node 1").ok
+    if present and not declared:
+        assert "--echo" in findings.on("echo").advice
+
+
+def test_an_echo_that_differs_from_what_was_sent_is_shown() -> None:
+    line = line_of("hcp2", [], echo=Echo(corrupt=1.0))
+    assert "after 00 55 00 came " in examined(line, (1,)).on("echo").what
+
+
+# Nodes in trouble
+
+
+@pytest.mark.parametrize("second", [Delay(0.012), Delay(0.04)])
+def test_two_nodes_with_one_address_that_answer_after_each_other_are_found(second: Delay) -> None:
+    """Within the silence after a reply, or so late that the reply comes to the next request."""
+    findings = examined(line_of("hcp2", [hcp2(5), hcp2(5, second), hcp2(6)]), (5, 6))
+    assert findings.wrong == {"node 5"}
+    assert "there is another node with address 5" in findings.on("node 5").what
+
+
+def test_two_nodes_with_one_address_that_talk_at_once_are_found() -> None:
+    twins = [hcp2(5, Delay(0.002, 0.004)), hcp2(5, Delay(0.002, 0.004))]
+    findings = examined(line_of("hcp2", [*twins, hcp2(6)]), (5, 6))
+    assert findings.wrong == {"node 5"}
+    assert "there is another node with address 5" in findings.on("node 5").what
+
+
+def test_a_node_that_is_garbled_while_the_others_are_clean_may_have_a_twin() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5, flip=0.3), hcp2(6)]), (5, 6))
+    assert findings.wrong == {"node 5"}
+    assert "replies garbled" in findings.on("node 5").what
+    assert "another node with address 5" in findings.on("node 5").advice
+
+
+def test_where_all_nodes_are_garbled_the_line_is_suspected() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5), hcp2(6)], faults=Faults(flip=0.4)), (5, 6))
+    assert {"node 5", "node 6"} <= findings.wrong
+    assert "termination" in findings.on("node 5").advice
+
+
+def test_a_node_that_sometimes_does_not_answer_is_said_so() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5, lost=0.3)]), (5,))
+    assert findings.wrong == {"node 5"}
+    assert "requests, although it lives: read element 1: 0" in findings.on("node 5").what
+
+
+def test_a_named_node_that_is_not_there_is_named_and_the_others_are_measured() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5)]), (5, 9))
+    assert findings.wrong == {"node 9"}
+    assert findings.on("node 9").what == "does not answer"
+
+
+def test_where_nobody_answers_that_is_one_finding() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5)]), (6, 7))
+    assert findings.wrong == {"nodes"}
+    assert findings.on("nodes").what == "no answer from nodes 6, 7 at 57600 8N1"
+
+
+@pytest.mark.parametrize(
+    ("milliseconds", "wrong", "advice"),
+    [(30, False, ""), (70, False, "counted late: a nominal time of 110 ms would fit"), (120, True, "--timeout 365")],
+)
+def test_windows_are_suggested_from_what_was_measured(milliseconds: int, wrong: bool, advice: str) -> None:
+    findings = examined(line_of("hcp2", [hcp2(5, Delay(milliseconds / 1000))]), (5,))
+    assert findings.wrong == ({"windows"} if wrong else set())
+    assert advice in findings.on("windows").advice
+
+
+@pytest.mark.parametrize(
+    ("data", "guess"),
+    [
+        ("00 00 80", "zeros"),
+        ("ff ff fe", "ones"),
+        ("82 30 31 b1 03", ""),
+        ("82 30 b1 b2 03", "even parity"),
+        ("02 b0 31 32 83", "odd parity"),
+        ("11 22", ""),
+    ],
+)
+def test_garbage_is_shown_with_what_it_looks_like(data: str, guess: str) -> None:
+    text = diagnosis.garbage(bytes.fromhex(data))
+    assert text.startswith(data)
+    assert guess in text
+    assert bool(guess) == ("(" in text)
+
+
+# As a command
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """These take their time in earnest."""
+    monkeypatch.setattr(examination, "LISTENING", 0.05)
+    monkeypatch.setattr(examination, "ECHOING", 0.03)
+    monkeypatch.setattr(examination, "PROBES", 4)
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_pty_is_examined_and_the_status_is_0_if_all_is_well(busmaster: Command) -> None:
+    with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
+        done = busmaster("doctor", server.path, *HCP2, "--nodes", "1")
+    assert (done.status, done.err) == (0, "")
+    assert [line.split()[1] for line in done.lines if line[:4].strip()] == [
+        *("port", "permission", "holders", "open", "driver", "rs485", "silence", "echo", "node", "windows")
+    ]
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_tcp_port_is_examined_as_far_as_it_can_be(busmaster: Command, controllers: TcpServer, tmp_path: Path) -> None:
+    file = tmp_path / "line.pcapng"
+    done = busmaster("doctor", controllers.path, *HCP2, "--nodes", "8,77", "--capture", str(file))
+    assert done.status == 1
+    assert "the adapter checks do not apply to a TCP port" in done.out
+    assert "MEND  node 77     does not answer\n" in done.out
+    assert done.err == f"busmaster: {controllers.path.removeprefix('socket://')}: 1 thing to mend\n"
+    with file.open("rb") as capture:
+        assert bytes.fromhex("07 30 38 02 30 31 05 0E") in [packet.frame for packet in read_packets(capture)]
+
+
+@pytest.mark.usefixtures("hasty")
+def test_without_a_protocol_no_node_is_asked(busmaster: Command, controllers: TcpServer) -> None:
+    done = busmaster("doctor", controllers.path)
+    assert done.status == 0
+    assert "no node was asked" in done.out
+
+
+@pytest.mark.parametrize("port", ["/dev/absent", "/dev/null", "socket://127.0.0.1:1"])
+def test_a_port_that_does_not_open_is_a_finding(busmaster: Command, port: str) -> None:
+    done = busmaster("doctor", port)
+    assert done.status == 1
+    assert done.lines[-2].startswith("MEND")
+    assert done.lines[-1].strip().startswith("-> ")
+
+
+def test_while_another_program_has_the_port_it_is_not_even_opened(busmaster: Command) -> None:
+    with plugged() as far_end:
+        hold = f"f = open({far_end.path!r}); print(flush=True); input()"
+        with subprocess.Popen([sys.executable, "-ISc", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+            assert other.stdout is not None
+            other.stdout.readline()
+            done = busmaster("doctor", far_end.path, *HCP2)
+            assert far_end.read(0) == b""
+            other.communicate(b"\n")
+    assert done.status == 1
+    assert f"(process {other.pid})" in done.out
+    assert "open " not in [line[6:16] for line in done.lines]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("PORT", "--nodes", "1"), "--nodes needs a --protocol"),
+        (("PORT", "--protocol", "mentor", "--nodes", "0-3"), "means all of them"),
+        (("PORT", "--protocol", "dc104", "--nodes", "1"), "has no addresses"),
+        (("PORT?baud=3",), "did you mean 'baudrate'?"),
+        (("PORT", "--protocol", "hcp4"), "is not one of"),
+    ],
+)
+def test_wrong_usage_is_status_2_and_nothing_is_examined(
+    busmaster: Command, arguments: tuple[str, ...], complaint: str
+) -> None:
+    done = busmaster("doctor", *arguments)
+    assert (done.status, done.out) == (2, "")
+    assert complaint in done.err
+
+
+# Other settings
+
+
+class Deaf(PtyServer):
+    """A line that hears only while the port is set to its own rate."""
+
+    def __init__(self, line: Line, rate: int) -> None:
+        self.rate = rate
+        super().__init__(line)
+
+    def setting(self) -> int:
+        port = os.open(self.path, os.O_RDWR | os.O_NOCTTY)
+        try:
+            return int(termios.tcgetattr(port)[5])
+        finally:
+            os.close(port)
+
+    def _read(self, source: int) -> bytes:
+        data = super()._read(source)
+        return data if self.setting() == self.rate else b""
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_wrong_rate_is_found_and_the_port_is_left_as_it_was(busmaster: Command) -> None:
+    with Deaf(line_of("hcp2", [hcp2(1)], paced=False), termios.B9600) as server:
+        done = doctor_of_a_paced(server, busmaster)
+        assert server.setting() == termios.B57600
+    assert done.status == 1
+    assert "no answer from node 1 at 57600 8N1" in done.out
+    assert "node 1 answers at 9600 8N1\n" in done.out
+    assert "add ?baudrate=9600&bytesize=8&parity=N to the port" in done.out
+
+
+@pytest.mark.usefixtures("hasty")
+def test_where_no_rate_helps_it_is_said_what_was_tried(busmaster: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(examination, "RATES", (9600, 19200))
+    monkeypatch.setattr(examination, "FRAMINGS", ())
+    with serve_pty(line_of("hcp2", [], paced=False)) as server:
+        done = doctor_of_a_paced(server, busmaster)
+    assert "no answer with 2 other settings either" in done.out
+
+
+def doctor_of_a_paced(server: PtyServer, busmaster: Callable[..., Ended]) -> Ended:
+    """Where it is told that the port is paced, a rate matters."""
+    return busmaster("doctor", f"{server.path}?paced=1", *HCP2, "--nodes", "1")
+
+
+def test_other_rates_are_tried_before_other_framings_and_none_twice() -> None:
+    candidates = other_settings(LineSettings(9600, 7, "E"))
+    assert len(set(candidates)) == len(candidates)
+    assert LineSettings(9600, 7, "E") not in candidates
+    framings = [candidate.framing for candidate in candidates]
+    assert framings == sorted(framings, key=["7E1", "8N1", "8E1"].index)
