@@ -84,7 +84,7 @@ async def examine(patient: Patient, tell: Tell, tap: Tap | None = None) -> None:
                 tell(finding)
             await examine_line(patient, wire, tell)
     except LineDown as error:
-        tell(Finding("open", False, error.what, error.hint))
+        tell(Finding("port", False, error.what, error.hint))
 
 
 def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
