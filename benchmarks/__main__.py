@@ -55,7 +55,7 @@ def main() -> int:
     if arguments.plots is not None:
         from benchmarks.plots import draw
 
-        draw(outcomes, arguments.plots)
+        print(*draw(outcomes, arguments.plots), sep="\n")
     wrong = {name: outcome.wrong for name, outcome in outcomes.items() if outcome.wrong}
     if wrong:
         print(f"WRONG VALUES: {wrong}", file=sys.stderr)

@@ -2,7 +2,8 @@
 
 One register of each of eight units, every 100 ms. Ours is a poll group; the others get a task that reads one unit
 after another and sleeps until the next point of the same grid, from which no sum of sleeps can drift. Ten commands a
-second disturb; after a while one unit is dead. A value's delay is from the grid to its end; jitter is how far it lies from the median of its unit.
+second disturb; after a while one unit is dead. A value's delay is from the grid to its end; jitter is how far it lies
+from the median of its unit.
 """
 
 from __future__ import annotations
@@ -39,12 +40,14 @@ class Unit(ModbusUnit):
 
 def run(options: Options) -> Outcome:
     outcome = Outcome()
-    table = Table(f"{UNITS} units polled every {PERIOD * 1000:g} ms, ten commands a second", COLUMNS, notes=notes())
+    table = Table(
+        f"{UNITS} units polled every {PERIOD * 1000:g} ms, ten commands a second", COLUMNS, notes=notes(options)
+    )
     table.notes.append(
         "not in time: of the values that the grid asks for, those that came after the next was due, or never"
     )
-    cycles = options.pick(100, 8)
-    for maker in masters():
+    cycles = options.pick(100, 5)
+    for maker in masters(options):
         master = maker()
         with FarEnd(UNITS, delay=DELAY) as line:
             alive, dead, wrong = asyncio.run(_measure(master, line, cycles))

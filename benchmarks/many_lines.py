@@ -60,7 +60,7 @@ def run(options: Options) -> Outcome:
     asks = hcp2_asks()
     table = Table(f"Lines of {SETTINGS.baudrate} baud, HCP2, reply time {DELAY * 1000:g} ms, one process", COLUMNS)
     limit = 1 / mean(wire_time(ask, SETTINGS, DELAY) for ask in asks)
-    seconds = options.pick(4.0, 0.6)
+    seconds = options.pick(4.0, 0.5)
     _, unpaced_cpu = asyncio.run(_measure(1, asks, None, seconds))
     alone = 0.0
     for count in options.pick(COUNTS, (1, 64)):

@@ -16,7 +16,7 @@ from importlib import import_module, metadata
 from typing import Any, Protocol, TypeVar
 
 from benchmarks.far_end import SETTINGS
-from benchmarks.harness import installed
+from benchmarks.harness import Options, installed
 from busmaster import Bus, BusError, Node, Priority, ReplyTiming, SerialPort, Timings
 from busmaster.planning import longest_hold
 from busmaster.transport.endpoints import Endpoint
@@ -258,26 +258,31 @@ class Anymodbus:
         await self._bus.aclose()
 
 
-def masters() -> list[Callable[[], ModbusMaster]]:
+PEERS: dict[str, list[Callable[[], ModbusMaster]]] = {
+    "pymodbus": [Pymodbus],
+    "minimalmodbus": [Minimalmodbus],
+    "tmodbus": [Tmodbus],
+    "anymodbus": [lambda: Anymodbus(late=False), lambda: Anymodbus(late=True)],
+}
+IN_A_HURRY = 2
+"""How many packages a quick run compares."""
+
+
+def masters(options: Options) -> list[Callable[[], ModbusMaster]]:
     """Ours first, then those that are installed."""
-    makers: list[Callable[[], ModbusMaster]] = [Busmaster]
-    for package, maker in (("pymodbus", Pymodbus), ("minimalmodbus", Minimalmodbus), ("tmodbus", Tmodbus)):
-        if installed(package):
-            makers.append(maker)
-    if installed("anymodbus"):
-        makers += [lambda: Anymodbus(late=False), lambda: Anymodbus(late=True)]
-    return makers
+    present = [makers for package, makers in PEERS.items() if installed(package)]
+    return [Busmaster, *(maker for makers in options.pick(present, present[:IN_A_HURRY]) for maker in makers)]
 
 
-def notes() -> list[str]:
+def notes(options: Options) -> list[str]:
     """What was compared with what settings, and what was not there to be compared."""
     said = []
-    for maker in masters():
+    for maker in masters(options):
         master = maker()
         package = master.name.partition(",")[0]
         version = "" if package == "busmaster" else f" {metadata.version(package)}"
         said.append(f"{package}{version}{master.name.removeprefix(package)}: {master.settings}")
-    missing = [name for name in ("pymodbus", "minimalmodbus", "tmodbus", "anymodbus") if not installed(name)]
+    missing = [package for package in PEERS if not installed(package)]
     if missing:
         said.append(f"not installed: {', '.join(missing)} (tmodbus needs Python 3.12, anymodbus 3.13)")
     return said

@@ -31,7 +31,7 @@ def run(options: Options) -> Outcome:
     paced = f"{SETTINGS.baudrate} baud, reply time {DELAY * 1000:g} ms, each master's own silence between frames"
     outcome.tables.append(asyncio.run(_measure(paced, SETTINGS, options, outcome)))
     outcome.tables.append(asyncio.run(_measure("Not paced; ours without a silence", None, options, outcome)))
-    outcome.tables[0].notes += notes()
+    outcome.tables[0].notes += notes(options)
     outcome.tables[0].notes.append("Modbus asks for 1.75 ms of silence between frames; pymodbus does not keep it")
     return outcome
 
@@ -47,7 +47,7 @@ def asks() -> list[Ask]:
 
 
 async def _measure(title: str, settings: LineSettings | None, options: Options, outcome: Outcome) -> Table:
-    compared: list[ModbusMaster] = [maker() for maker in masters()]
+    compared: list[ModbusMaster] = [maker() for maker in masters(options)]
     if settings is None:
         compared[0] = Busmaster(NO_GAP)
     bare = Bare(asks())

@@ -29,9 +29,9 @@ def compare(title: str, what: str, delay: Mapping[str, Any], patience: float | N
     `patience`: callers are cancelled after 0 to so many seconds, evenly spread; None: never.
     """
     outcome = Outcome()
-    table = Table(title, COLUMNS, notes=notes())
-    seconds = options.pick(15.0, 0.7)
-    for maker in masters():
+    table = Table(title, COLUMNS, notes=notes(options))
+    seconds = options.pick(15.0, 0.5)
+    for maker in masters(options):
         master = maker()
         with FarEnd(UNITS, delay=dict(delay)) as line:
             counts, taken = asyncio.run(_for(seconds, master, line.path, patience))

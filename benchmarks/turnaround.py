@@ -17,7 +17,7 @@ from benchmarks.lines import Kind, Lines
 from benchmarks.masters import Bare, Blocking, Master, Ours, Streams
 from busmaster.protocols import hcp2
 
-WARM_UP = 200
+WARM_UP = 100
 OTHER_WORK = 500e-6
 COLUMNS = ("master", "wrong", "us each", "x bare", "CPU us", "dead us p50", "dead us p99")
 BUSY_COLUMNS = ("master", "wrong", "us each", "iterations each", "dead us p50", "iterations dead")
@@ -51,7 +51,8 @@ async def _idle(loop: str, kind: Kind, options: Options, outcome: Outcome) -> No
             await master.run(WARM_UP)
         lines.dead_times()
         runs = {master.name: master.run for master in masters}
-        timings = await alternate(runs, options.pick(400, 100), options.pick(60, 15))
+        rounds = options.pick(60, 15 if kind is Kind.PTY and loop == "asyncio" else 3)
+        timings = await alternate(runs, options.pick(400, 80), rounds)
         dead = lines.dead_times()
         for master in masters:
             await master.close()

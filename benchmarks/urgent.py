@@ -39,8 +39,8 @@ class Tally:
 
 def run(options: Options) -> Outcome:
     outcome = Outcome()
-    table = Table("From the call of an urgent write to its confirmation", COLUMNS, notes=notes())
-    for maker in masters():
+    table = Table("From the call of an urgent write to its confirmation", COLUMNS, notes=notes(options))
+    for maker in masters(options):
         master = maker()
         with FarEnd(UNITS, delay={"low": DELAY}) as line:
             asyncio.run(_measure(master, line, options, table, outcome))
@@ -54,7 +54,7 @@ async def _measure(master: ModbusMaster, line: FarEnd, options: Options, table: 
     pollers = [asyncio.create_task(_poll(master, unit, alive)) for unit in range(1, UNITS + 1)]
     await asyncio.sleep(0.3)
     writes = options.pick(400, 20)
-    seconds = options.pick(30.0, 0.8)
+    seconds = options.pick(30.0, 0.5)
     await _write(master, writes, seconds, alive)
     waits = list(master.waits) if isinstance(master, Busmaster) else []
     await asyncio.to_thread(line.kill, DEAD)

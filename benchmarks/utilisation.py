@@ -49,14 +49,14 @@ async def _measure(
     settings = LineSettings(baudrate)
     limit = 1 / mean(wire_time(ask, settings, delay) for ask in asks)
     ours, bare = Ours(profile, asks), Bare(asks)
-    round_length = options.pick(0.5, 0.1)
+    round_length = options.pick(0.5, 0.05)
     transactions = max(1, round(round_length * limit / len(asks))) * len(asks)
     replies = {ask.request: ask.reply for ask in asks}
     with Lines(2, replies, settings=settings, delay=delay, swallow=asks[0].closing) as lines:
         await ours.open(lines.ports[0])
         await bare.open(lines.ports[1])
         await bare.run(1)
-        timings = await alternate({"ours": ours.run, "bare": bare.run}, transactions, options.pick(9, 3))
+        timings = await alternate({"ours": ours.run, "bare": bare.run}, transactions, options.pick(9, 2))
         await ours.close()
         await bare.close()
     share = 100 / timings["ours"].each / limit
