@@ -315,18 +315,23 @@ def _play(drafts: Sequence[_Draft]) -> None:
         schedule.add(draft.poll, 0.0)
     waiting: list[tuple[float, int, float, _Draft]] = []
     background: list[tuple[float, int, float, _Draft]] = []
+
+    def release(now: float) -> None:
+        for poll in schedule.release(now):
+            draft: _Draft = poll.waiter
+            queue = background if draft.group.priority is Priority.BACKGROUND else waiting
+            poll.remaining = len(draft.costs)
+            for cost in draft.costs:
+                heapq.heappush(queue, (poll.due + poll.patience, next(order), cost, draft))
+
     end = HORIZON * max((draft.group.period for draft in drafts), default=0.0)
     now, streak = 0.0, 0
     for _ in range(TIMETABLE):
         if not waiting and not background:
             now = max(now, schedule.next_due())
+            release(now)
         if now >= end:
             break
-        for poll in schedule.release(now):
-            queue = background if poll.waiter.group.priority is Priority.BACKGROUND else waiting
-            poll.remaining = len(poll.waiter.costs)
-            for cost in poll.waiter.costs:
-                heapq.heappush(queue, (poll.due + poll.patience, next(order), cost, poll.waiter))
         if background and (streak >= SHARE or not waiting):
             streak = 0
             _, _, cost, draft = heapq.heappop(background)
@@ -336,6 +341,7 @@ def _play(drafts: Sequence[_Draft]) -> None:
         else:
             continue
         now += cost
+        release(now)
         draft.poll.remaining -= 1
         if not draft.poll.remaining:
             draft.note_cycle(now - draft.poll.due)
