@@ -7,7 +7,9 @@ import importlib.metadata
 import importlib.util
 import logging
 import os
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -87,6 +89,7 @@ def cli() -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """The exit status: 0 all good, 1 an error from the line, 2 wrong usage, 130 after Ctrl-C. Never raises."""
     listen_quietly()
+    end_in_order()
     try:
         result = cli.main(args=arguments, prog_name="busmaster", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -99,6 +102,12 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except (click.Abort, KeyboardInterrupt):
         return INTERRUPTED
     return result if isinstance(result, int) else OK
+
+
+def end_in_order() -> None:
+    """SIGTERM unwinds as Ctrl-C does, so that ports, links and files are given back; the exit status is the usual."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
 
 
 def listen_quietly() -> None:

@@ -29,6 +29,8 @@ from busmaster.emulator.faults import Faults, Said, distort, flipped
 from busmaster.emulator.wave import Wave
 from busmaster.profile import LineSettings
 
+PIECE = 0.005
+"""Seconds of a frame that a port hands over at once."""
 ROUNDING = 1e-6
 """Of a byte: times are floats."""
 
@@ -89,7 +91,11 @@ class Line:
         self.latency = latency
         self.turnaround = turnaround
         self.prompt = True
-        """A frame's first byte is an event of its own. Needless if the host asks at each of its deadlines."""
+        """A frame's first byte is an event of its own, and so is each piece of a long one, as on a real port.
+
+        Needless if the host asks at each of its deadlines.
+        """
+        self._piece = max(1, int(PIECE / self.tau)) if self.tau else 0
         self.collisions = 0
         """Talks that started while another was on the wire."""
         self._active: Talk | None = None
@@ -189,8 +195,8 @@ class Line:
         if talk is not None:
             end = talk.end
             chunk = talk.chunk or self.chunk
-            if self.prompt and not talk.given:
-                chunk = 1
+            if self.prompt:
+                chunk = min(chunk or self._piece, self._piece) if talk.given else 1
             if chunk and talk.wave is None and self._heard_at_once(talk):
                 end = min(end, talk.start + (talk.given + chunk) * self.tau)
             if self._pending and self._pending[0][0] < talk.end - self._rounding:

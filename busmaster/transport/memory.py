@@ -12,9 +12,6 @@ from busmaster.emulator.line import Line
 from busmaster.profile import LineSettings
 from busmaster.transport.clock import clock_of
 
-PIECE = 0.005
-"""Seconds of a reply that come at once: well within every protocol's byte gap."""
-
 
 @dataclass(frozen=True, slots=True)
 class MemoryPort:
@@ -116,5 +113,4 @@ class MemoryTransport(asyncio.Transport):
         data = self._line.receive(now)
         if data:
             self._protocol.data_received(data)
-        due = self._line.next_event()
-        self._arm(min(due, now + PIECE) if data and due < inf else due)
+        self._arm(self._line.next_event())

@@ -55,6 +55,14 @@ def test_a_value_goes_there_and_back_over_an_emulated_pty_by_its_link(tmp_path: 
     assert not os.path.lexists(link)
 
 
+def test_emulate_takes_its_link_away_when_it_is_terminated(tmp_path: Path) -> None:
+    link = str(tmp_path / "line")
+    with emulated("--pty", link) as (process, _):
+        process.terminate()
+        assert process.wait(5.0) == 128 + signal.SIGTERM
+    assert not os.path.lexists(link)
+
+
 def test_emulate_ends_by_itself_after_its_seconds() -> None:
     done = run("emulate", *HCP2, "--tcp", "127.0.0.1:0", "--seconds", "0.1")
     assert done.returncode == 0

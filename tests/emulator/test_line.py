@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from random import Random
 
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.faults import HEARING, SPEAKING, Faults
-from busmaster.emulator.line import Echo, Line
+from busmaster.emulator.line import PIECE, Echo, Line
 from busmaster.emulator.wave import Wave
 from busmaster.errors import InvalidCommand
 from busmaster.profile import LineSettings
@@ -65,6 +66,17 @@ def test_the_first_byte_is_an_event_unless_the_host_asks_in_time_by_itself() -> 
     line = line_of(mint())
     line.send(READ_2, 0.0)
     assert [data for _, data in arrivals(line, 1.0)] == ["02", "30 31 30 03 32"]
+
+
+def test_a_long_frame_comes_in_pieces_without_a_pause_that_would_look_like_its_end() -> None:
+    line = line_of(mint())
+    line.send(READ_2, 0.0)
+    line.receive(1.0)
+    line.devices[0].reply(bytes(100), 1.0, delay=0.0)
+    times = [when for when, _ in arrivals(line, 2.0)]
+    gaps = [after - before for before, after in itertools.pairwise(times)]
+    assert len(gaps) > 2
+    assert max(gaps) <= PIECE + TAU
 
 
 def test_chunks_split_a_reply_evenly() -> None:
