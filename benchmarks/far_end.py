@@ -8,6 +8,7 @@ an order: {"unit": 3, "dead": true} takes a unit off the line, {"delay": {...}} 
 from __future__ import annotations
 
 import json
+import os
 import random
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from functools import partial
 from types import TracebackType
 from typing import Any
 
-from benchmarks.lines import ROOT, part_from
+from benchmarks.lines import CORES, ROOT, part_from
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer
@@ -85,9 +86,9 @@ class FarEnd:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         assert self._process is not None
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait(10)
+        with self._process as process:
+            process.communicate(timeout=10)
+        os.sched_setaffinity(0, CORES)
 
     def kill(self, unit: int, dead: bool = True) -> None:
         """Take a unit off the line, or bring it back."""

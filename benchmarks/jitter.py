@@ -40,12 +40,9 @@ class Unit(ModbusUnit):
 
 def run(options: Options) -> Outcome:
     outcome = Outcome()
-    table = Table(
-        f"{UNITS} units polled every {PERIOD * 1000:g} ms, ten commands a second", COLUMNS, notes=notes(options)
-    )
-    table.notes.append(
-        "not in time: of the values that the grid asks for, those that came after the next was due, or never"
-    )
+    title = f"{UNITS} units polled every {PERIOD * 1000:g} ms, ten commands a second"
+    table = Table(title, COLUMNS, notes=notes(options))
+    table.notes.append("not in time: of the values that the grid asks for, those after the next was due, or never")
     cycles = options.pick(100, 5)
     for maker in masters(options):
         master = maker()

@@ -131,9 +131,9 @@ class Lines:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         assert self._process is not None
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait(10)
+        with self._process as process:
+            process.communicate(timeout=10)
+        os.sched_setaffinity(0, CORES)
         for fd in self._kept:
             os.close(fd)
 

@@ -39,7 +39,7 @@ def compare(title: str, what: str, delay: Mapping[str, Any], patience: float | N
         outcome.series[master.name] = dict(counts)
         outcome.wrong += counts["wrong"] if isinstance(master, Busmaster) else 0
     tries = options.pick(TRIES, QUICK_TRIES)
-    counts = run_in_virtual_time(_ours_in_virtual_time(tries, delay, patience))
+    counts = run_in_virtual_time(ours_in_virtual_time(tries, delay, patience))
     _row(table, f"busmaster, {tries} tries in virtual time", counts, None)
     outcome.wrong += counts["wrong"]
     outcome.claims.append(Claim(f"wrong values of busmaster, {what}, {tries} tries and more", outcome.wrong, 0))
@@ -61,7 +61,7 @@ async def _for(seconds: float, master: ModbusMaster, path: str, patience: float 
     return counts, taken
 
 
-async def _ours_in_virtual_time(tries: int, delay: Mapping[str, Any], patience: float | None) -> Counter[str]:
+async def ours_in_virtual_time(tries: int, delay: Mapping[str, Any], patience: float | None) -> Counter[str]:
     units = emulated_units(UNITS, delay)
     counts: Counter[str] = Counter()
     master = Busmaster()
