@@ -192,9 +192,9 @@ class GroupPlan:
 class Plan:
     """What a line will be like. `utilisation` is the share of it that the schedule asks for: above 1 it does not fit.
 
-    A command waits at most for `typical_wait` on a healthy line (one exchange), for `dead_wait` behind a node that does
-    not answer. `worst_waits` are the bounds of R9 for one more request of each class. `fitting_baudrate` is the lowest usual one at which the schedule would fit
-    comfortably; None where it does as it is, or where none is enough.
+    A command waits at most for `typical_wait` on a healthy line (one exchange), and for `dead_wait` behind a node that
+    does not answer. `worst_waits` are the bounds of R9 for one more request of each class. `fitting_baudrate` is the
+    lowest usual one at which the schedule would fit comfortably; None where it does as it is, or where none is enough.
     """
 
     line: LineSettings

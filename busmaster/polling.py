@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["GroupStatistics", "PollGroup", "Quality", "Sample", "Snapshot", "Stream"]
 
-REPLIES_REMEMBERED = 32
+REPLIES_REMEMBERED = 256
 WEIGHED_AGAIN = 8
 """Cycles after which merges are weighed once more: by then reply times are measured."""
 
@@ -136,7 +137,11 @@ class PollGroup:
 
     def planned(self) -> PlannedGroup:
         """The group as the planner sees it, with reply times as measured so far."""
-        reads = [(point.node.planned(), point.command) for point in self._points]
+        nodes = {node: node.planned() for node in {point.node for point in self._points}}
+        for node, plan in nodes.items():
+            if self._refused and plan.profile.merge is not None:
+                nodes[node] = replace(plan, profile=replace(plan.profile, merge=self._sound(plan.profile.merge, node)))
+        reads = [(nodes[point.node], point.command) for point in self._points]
         merges = [self._sound(merge) for merge in self._merge]
         return PlannedGroup(self.name, self._poll.period, reads, self._poll.phase, self._priority, merges)
 
@@ -252,9 +257,10 @@ class PollGroup:
 
 
 def _measure(transaction: Transaction, read: _Read) -> None:
-    """A running mean of what the node takes to reply."""
+    """The mean of what the node takes to reply, over the last of its replies."""
     node = transaction.node
     if transaction.attempts == 1:
         wait = (transaction.last_byte - transaction.started - read.bytes_time) / read.legs
-        known = node.reply_time
-        node.reply_time = wait if known is None else known + (wait - known) / REPLIES_REMEMBERED
+        node.measured = min(node.measured + 1, REPLIES_REMEMBERED)
+        known = wait if node.reply_time is None else node.reply_time
+        node.reply_time = known + (wait - known) / node.measured

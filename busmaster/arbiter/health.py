@@ -54,6 +54,7 @@ class NodeRecord:
         "holds",
         "label",
         "last_reply",
+        "measured",
         "probe_at",
         "probe_delay",
         "profile",
@@ -82,6 +83,8 @@ class NodeRecord:
         """Replies in a row since then."""
         self.reply_time: float | None = None
         """Seconds from a request to its reply, as poll groups measured them; None until they have."""
+        self.measured = 0
+        """How many replies that is the mean of."""
         self.last_reply = -inf
         self.up_since = -inf
         self.writes: deque[Transaction] = deque()

@@ -1,0 +1,511 @@
+"""Poll groups on a whole bus, in virtual time: what consumers get, what a write makes stale, what was merged."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import AsyncIterator, Awaitable, Callable
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from busmaster.arbiter.events import Event, NodeChanged
+from busmaster.arbiter.health import Health
+from busmaster.arbiter.schedule import line_time
+from busmaster.bus import Bus
+from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.devices.mentor import MentorDrive
+from busmaster.emulator.devices.mint import MintController
+from busmaster.emulator.devices.msc import MscController as EmulatedMsc
+from busmaster.emulator.line import Line
+from busmaster.errors import NodeDown, NoReply, Refused
+from busmaster.handles import Hcp2Controller, MscController
+from busmaster.handles import MentorDrive as MentorHandle
+from busmaster.node import Node, Priority
+from busmaster.polling import PollGroup, Quality, Snapshot
+from busmaster.profile import LineSettings
+from busmaster.protocols import hcp2, mentor
+from busmaster.testing.virtual_time import run_in_virtual_time
+from busmaster.transport.memory import MemoryPort
+
+Story = Callable[[Bus], Awaitable[None]]
+
+
+def on_a_bus(story: Story, *devices: Device, settings: LineSettings | None = None) -> None:
+    """Run it on a line with these devices; two HCP2 controllers, 1 and 2, by default."""
+
+    async def run() -> None:
+        chosen = devices or (MintController(1), MintController(2))
+        line = Line(settings or LineSettings(57600), chosen, chance=random.Random(1))
+        async with Bus(MemoryPort(line), seed=1) as bus:
+            await story(bus)
+
+    run_in_virtual_time(run())
+
+
+async def cycles(group: PollGroup, count: int) -> list[Snapshot]:
+    """So many snapshots from now on."""
+    consumer = group.subscribe(buffer=count)
+    try:
+        return [await anext(consumer) for _ in range(count)]
+    finally:
+        consumer.close()
+
+
+# consumers
+
+
+def test_two_consumers_of_a_group_cost_one_wire_read() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        group = bus.poll_group("g", period=0.1, points=[point])
+        first, second = await asyncio.gather(cycles(group, 5), cycles(group, 5))
+        assert [s.cycle for s in first] == [s.cycle for s in second]
+        assert point.node.statistics().attempts == first[-1].cycle
+
+    on_a_bus(story)
+
+
+def test_a_slow_consumer_loses_the_oldest_and_knows_how_many() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")])
+        slow = group.subscribe(buffer=3)
+        await cycles(group, 10)
+        assert slow.dropped == 7
+        assert [(await anext(slow)).cycle for _ in range(3)] == [8, 9, 10]
+
+    on_a_bus(story)
+
+
+def test_r10_snapshots_come_on_the_grid_and_say_when_they_were_due() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")])
+        snapshots = await cycles(group, 6)
+        assert [b.due - a.due for a, b in pairwise(snapshots)] == pytest.approx([0.1] * 5)
+        assert all(s.started is not None and s.started - s.due < 0.001 for s in snapshots[1:])
+
+    on_a_bus(story)
+
+
+def test_points_come_and_go_while_it_runs() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        group = bus.poll_group("g", period=0.1, points=[axis.point("7")])
+        await cycles(group, 2)
+        group.add(axis.point("8"), axis.point("7"))
+        assert set((await cycles(group, 2))[-1]) == {axis.point("7"), axis.point("8")}
+        group.remove(axis.point("7"))
+        assert set((await cycles(group, 2))[-1]) == {axis.point("8")}
+
+    on_a_bus(story)
+
+
+def test_a_pause_and_a_demand() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=10.0, points=[Hcp2Controller(bus, 1).point("7")])
+        await cycles(group, 1)
+        asked = bus.now()
+        group.demand()
+        assert (await cycles(group, 1))[0].due == asked
+        group.pause()
+        await asyncio.sleep(35.0)
+        assert group.statistics().cycles == 2
+        group.resume()
+        snapshot = (await cycles(group, 1))[0]
+        assert snapshot.missed == 0
+        assert snapshot.due - asked > 35.0
+
+    on_a_bus(story)
+
+
+def test_statistics_say_what_was_asked_and_what_was_had() -> None:
+    async def story(bus: Bus) -> None:
+        points = [Hcp2Controller(bus, address).point("7") for address in (1, 2)]
+        group = bus.poll_group("g", period=0.1, points=points)
+        await cycles(group, 21)
+        counts = group.statistics()
+        assert (counts.cycles, counts.missed, counts.good, counts.bad) == (21, 0, 42, 0)
+        assert counts.period == 0.1
+        assert counts.achieved == pytest.approx(0.1, rel=0.01)
+        assert counts.cycle_time.count == 21
+        assert counts.cycle_time.p50 == pytest.approx(0.009, abs=0.002)
+        bus.reset_statistics()
+        assert group.statistics().cycles == 0
+        assert (await cycles(group, 2))[-1].cycle == 23
+        assert group.statistics().good == 4
+
+    on_a_bus(story)
+
+
+def test_a_sample_says_what_it_waited_for() -> None:
+    """Node 2 is dead: its failed request, and the settle after it, is what the poll waited for."""
+
+    async def story(bus: Bus) -> None:
+        dead = bus.node(hcp2.PROFILE, 9)
+        group = bus.poll_group("g", period=0.5, points=[Hcp2Controller(bus, 1).point("7")])
+        due = (await cycles(group, 2))[-1].due + 0.5
+        await asyncio.sleep(due - bus.now() - 0.010)
+        with pytest.raises(NoReply):
+            await dead.request(hcp2.Read(1), retries=0)
+        sample = (await cycles(group, 1))[0][Hcp2Controller(bus, 1).point("7")]
+        assert sample.due == pytest.approx(due)
+        assert sample.started is not None
+        assert sample.started - sample.due == pytest.approx(0.150 - 0.010, abs=0.002)
+        assert sample.timeline.exchanges_ahead == 1
+        assert sample.timeline.settling_ahead == pytest.approx(0.050, abs=0.001)
+        assert group.statistics().exchanges_ahead > 0
+        assert group.statistics().settling_ahead > 0
+
+    on_a_bus(story)
+
+
+# stale
+
+
+def test_a_sample_read_before_a_write_to_its_point_ended_is_stale() -> None:
+    """The write goes between two reads of one cycle: what was read before it is marked, what comes after is not."""
+
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        before, after, other = axis.point("1"), axis.point("99"), Hcp2Controller(bus, 2).point("1")
+        between = [axis.point(str(element)) for element in range(10, 30)]
+        group = bus.poll_group("g", period=1.0, points=[before, other, *between, after])
+        await cycles(group, 1)
+        group.demand()
+        await asyncio.sleep(0.030)
+        await before.write(5.0)
+        await after.write(6.0)
+        snapshot = (await cycles(group, 1))[0]
+        assert snapshot[before].quality is Quality.STALE
+        assert snapshot[before].value == 0.0
+        assert snapshot[after].quality is Quality.GOOD
+        assert snapshot[after].value == 6.0
+        assert snapshot[other].quality is Quality.GOOD
+        assert group.statistics().stale == 1
+        fresh = (await cycles(group, 1))[0]
+        assert (fresh[before].value, fresh[before].quality) == (5.0, Quality.GOOD)
+
+    on_a_bus(story)
+
+
+def test_a_write_that_names_no_point_makes_all_of_its_node_stale() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        mine, other = [axis.point(str(e)) for e in range(1, 20)], Hcp2Controller(bus, 2).point("1")
+        group = bus.poll_group("g", period=1.0, points=[other, *mine])
+        await cycles(group, 1)
+        group.demand()
+        await asyncio.sleep(0.040)
+        await axis.node.request(hcp2.Write(50, (1.0,)))
+        snapshot = (await cycles(group, 1))[0]
+        assert snapshot[other].quality is Quality.GOOD
+        assert snapshot[mine[0]].quality is Quality.STALE
+        assert snapshot[mine[-1]].quality is Quality.GOOD
+
+    on_a_bus(story)
+
+
+def test_a_read_that_starts_as_the_write_ends_is_not_stale() -> None:
+    """It starts in the same moment, before the writer has even woken up."""
+
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("1")
+        group = bus.poll_group("g", period=1.0, points=[point])
+        await cycles(group, 1)
+        writing = asyncio.create_task(point.write(5.0))
+        await asyncio.sleep(0)
+        group.demand()
+        sample = (await cycles(group, 1))[0][point]
+        await writing
+        assert (sample.value, sample.quality) == (5.0, Quality.GOOD)
+        assert sample.timeline.exchanges_ahead == 1
+
+    on_a_bus(story)
+
+
+def test_a_write_whose_caller_gave_up_on_the_wire_makes_stale_too() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("1")
+        group = bus.poll_group("g", period=1.0, points=[point])
+        await cycles(group, 1)
+        writing = asyncio.create_task(point.write(5.0))
+        await asyncio.sleep(0)
+        assert bus.latest(point) is not None
+        writing.cancel()
+        await asyncio.sleep(0)
+        assert bus.latest(point) is None
+
+    on_a_bus(story)
+
+
+def test_a_write_that_was_never_sent_makes_nothing_stale() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        point = axis.point("1")
+        group = bus.poll_group("g", period=1.0, points=[point])
+        await cycles(group, 1)
+        reading = asyncio.create_task(axis.read(9))
+        await asyncio.sleep(0)
+        writing = asyncio.create_task(point.write(5.0))
+        await asyncio.sleep(0)
+        writing.cancel()
+        await reading
+        assert bus.latest(point) is not None
+
+    on_a_bus(story)
+
+
+def test_a_broadcast_makes_every_drive_stale() -> None:
+    async def story(bus: Bus) -> None:
+        point = MentorHandle(bus, 11).point("1.17")
+        group = bus.poll_group("g", period=5.0, points=[point])
+        await cycles(group, 1)
+        assert bus.latest(point) is not None
+        await bus.node(mentor.PROFILE, 0).request(mentor.Write(1, 17, 100))
+        assert bus.latest(point) is None
+
+    on_a_bus(story, MentorDrive(11), settings=mentor.PROFILE.line)
+
+
+def test_reading_with_a_greatest_age_takes_the_polled_sample_until_a_write_makes_it_stale() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("1")
+        group = bus.poll_group("g", period=1.0, points=[point])
+        await cycles(group, 1)
+        asked = point.node.statistics().attempts
+        assert await point.read(max_age=0.5) == 0.0
+        assert point.node.statistics().attempts == asked
+        await point.write(5.0)
+        assert await point.read(max_age=0.5) == 5.0
+        await asyncio.sleep(0.6)
+        await point.read(max_age=0.5)
+        assert point.node.statistics().attempts == asked + 3
+
+    on_a_bus(story)
+
+
+# cheaper exchanges
+
+
+def mscs(values: int = 40, **options: Any) -> tuple[EmulatedMsc, LineSettings]:
+    """An MSC with values from 100 up at the addresses from 2000 on."""
+    device = EmulatedMsc(3, delay=Delay(0.005), packet_delay=Delay(0.005), **options)
+    device.set_value(2000, *range(100, 100 + values))
+    return device, LineSettings(9600)
+
+
+def test_neighbouring_values_come_in_one_exchange_and_points_stay_what_they_are() -> None:
+    async def story(bus: Bus) -> None:
+        press = MscController(bus, 3, address_step=4, model="MSC-250")
+        points = [press.point(str(2000 + 4 * n)) for n in range(8)]
+        flags = [press.point(f"flag:{n}") for n in (3, 5)]
+        group = bus.poll_group("g", period=1.0, points=[*points, *flags])
+        snapshot = (await cycles(group, 1))[0]
+        assert [snapshot[point].value for point in points] == [100 + n for n in range(8)]
+        assert [snapshot[flag].value for flag in flags] == [True, False]
+        assert press.node.statistics().attempts == 2
+        merged = bus.plan().groups[0].merged
+        assert [m.serves for m in merged] == [8, 2]
+
+    device, settings = mscs()
+    device.flags.add(3)
+    on_a_bus(story, device, settings=settings)
+
+
+def test_what_is_merged_is_weighed_again_when_reply_times_are_known() -> None:
+    """Three values: one block while replies are thought to be slow, three reads when they turn out to be quick."""
+
+    async def story(bus: Bus) -> None:
+        press = MscController(bus, 3, address_step=4)
+        group = bus.poll_group("g", period=1.0, points=[press.point(str(2000 + 4 * n)) for n in range(3)])
+        assert bus.plan().groups[0].exchanges == 1
+        await cycles(group, 9)
+        assert press.node.statistics().attempts == 8 + 3
+        assert bus.plan().groups[0].exchanges == 3
+
+    device, settings = mscs()
+    on_a_bus(story, device, settings=settings)
+
+
+def test_a_refused_batch_falls_back_to_single_reads_in_the_same_period() -> None:
+    """The block would reach past the last address that exists: the controller says NAK, and no snapshot shows it."""
+
+    async def story(bus: Bus) -> None:
+        press = MscController(bus, 3, address_step=4)
+        points = [press.point(str(2000 + 4 * n)) for n in range(6)]
+        group = bus.poll_group("g", period=4.0, points=points)
+        started = bus.now()
+        snapshots = await cycles(group, 3)
+        assert [[s[point].value for point in points] for s in snapshots] == [[100 + n for n in range(6)]] * 3
+        assert snapshots[0].finished - started < 4.0
+        assert bus.plan().groups[0].merged == ()
+
+    device, settings = mscs(values=6, addresses=2024)
+    on_a_bus(story, device, settings=settings)
+
+
+def test_a_refused_value_that_stands_alone_is_refused() -> None:
+    async def story(bus: Bus) -> None:
+        press = MscController(bus, 3, address_step=4)
+        point = press.point("60000")
+        group = bus.poll_group("g", period=4.0, points=[point])
+        assert isinstance((await cycles(group, 1))[0][point].error, Refused)
+
+    device, settings = mscs()
+    on_a_bus(story, device, settings=settings)
+
+
+def test_runs_of_parameters_are_chained_only_by_those_who_opt_in() -> None:
+    async def story(bus: Bus) -> None:
+        drive = MentorHandle(bus, 11)
+        points = [drive.point(f"1.{number}") for number in (17, 18, 19)]
+        single = bus.poll_group("single", period=1.0, points=points)
+        chained = bus.poll_group("chained", period=1.0, points=points, merge=[mentor.merge_runs])
+        first, second = await asyncio.gather(cycles(single, 2), cycles(chained, 2))
+        assert [first[1][p].value for p in points] == [second[1][p].value for p in points]
+        one, other = bus.plan().groups
+        assert (one.exchanges, other.exchanges) == (3, 1)
+        assert other.merged[0].saved > 0
+
+    on_a_bus(story, MentorDrive(11), settings=mentor.PROFILE.line)
+
+
+# plans and bounds of the running bus
+
+
+def test_the_plan_of_a_running_bus_is_what_it_does() -> None:
+    """With reply times as measured, whatever the values' lengths: within 2 percentage points."""
+
+    async def story(bus: Bus) -> None:
+        axes = [Hcp2Controller(bus, address) for address in (1, 2)]
+        for period in (0.2, 0.5):
+            bus.poll_group(f"{period}", period=period, points=[a.point(str(e)) for a in axes for e in range(1, 6)])
+        await asyncio.sleep(5.0)
+        bus.reset_statistics()
+        await asyncio.sleep(20.0)
+        prediction = bus.plan()
+        assert bus.statistics().utilisation == pytest.approx(prediction.utilisation, abs=0.02)
+        assert prediction.fits
+        for group, planned in zip(bus.groups, prediction.groups, strict=True):
+            assert group.statistics().cycle_time.mean == pytest.approx(planned.cycle, rel=0.1)
+            assert group.statistics().cycle_time.highest <= planned.worst_cycle
+
+    devices = [MintController(address, delay=Delay(0.001, 0.009)) for address in (1, 2)]
+    devices[0].comms = [-1234567.8912] * 100
+    on_a_bus(story, *devices)
+
+
+def test_a_plan_of_what_might_be_added() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        group = bus.poll_group("now", period=0.1, points=[axis.point("1")])
+        await cycles(group, 10)
+        greedy = PollGroup(
+            bus,
+            "greedy",
+            0.05,
+            [axis.point(str(e)) for e in range(1, 40)],
+            phase=None,
+            priority=Priority.POLL,
+            merge=(),
+        )
+        assert bus.plan().fits
+        assert not bus.plan(greedy.planned()).fits
+
+    on_a_bus(story)
+
+
+def test_r9_the_worst_case_wait_of_the_line_at_hand() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        await axis.read(1)
+        alone = bus.worst_case_wait(Priority.COMMAND)
+        reading = [asyncio.create_task(axis.read(e)) for e in range(1, 10)]
+        await asyncio.sleep(0)
+        assert bus.worst_case_wait(Priority.COMMAND) == pytest.approx(alone / 2 * (1 + 8 + 2))
+        assert bus.worst_case_wait(Priority.URGENT) == pytest.approx(alone / 2)
+        await asyncio.gather(*reading)
+        group = bus.poll_group("g", period=0.5, points=[axis.point(str(e)) for e in range(1, 5)])
+        await cycles(group, 1)
+        assert bus.worst_case_wait(Priority.POLL) == pytest.approx(0.5 + 8 * 5 * alone / 2)
+        with pytest.raises(NoReply):
+            await bus.node(hcp2.PROFILE, 9).request(hcp2.Read(1), retries=0)
+        assert bus.worst_case_wait(Priority.POLL) == pytest.approx(0.5 + 16 * 5 * alone / 2)
+
+    on_a_bus(story)
+
+
+# dead nodes, seen by an application
+
+
+def test_r11_the_hook_of_a_node_that_returns_runs_before_its_polls_and_health_is_told() -> None:
+    device = MintController(1)
+
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        order: list[str] = []
+
+        async def restore(node: Node) -> None:
+            order.append("hook begins")
+            await asyncio.sleep(1.0)
+            await point.write(42.0)
+            order.append("hook ends")
+
+        point.node.on_return = restore
+        health = bus.events()
+        group = bus.poll_group("g", period=0.1, points=[point])
+        await cycles(group, 3)
+        device.faults.dead = 1.0
+        await asyncio.sleep(10.0)
+        assert isinstance(group.latest[point].error if group.latest else None, NodeDown)
+        device.faults.dead = 0.0
+        async for snapshot in group:
+            if snapshot[point].error is None:
+                break
+        order.append("polled")
+        assert snapshot[point].value == 42.0
+        assert order == ["hook begins", "hook ends", "polled"]
+        assert [h async for h in until_back(health)] == [Health.UP, Health.SUSPECT, Health.DOWN, Health.UP]
+
+    on_a_bus(story, device)
+
+
+async def until_back(events: AsyncIterator[Event]) -> AsyncIterator[Health]:
+    """The changes of health up to a return from DOWN."""
+    async for event in events:
+        if isinstance(event, NodeChanged):
+            yield event.after
+            if event.before is Health.DOWN:
+                return
+
+
+def test_a_suspended_node_rests_and_comes_back_by_itself() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        group = bus.poll_group("g", period=0.1, points=[point])
+        await cycles(group, 1)
+        point.node.suspend(for_=2.0)
+        with pytest.raises(NodeDown, match="suspended"):
+            await point.read()
+        assert isinstance((await cycles(group, 3))[-1][point].error, NodeDown)
+        await asyncio.sleep(2.0)
+        assert (await cycles(group, 1))[0][point].error is None
+
+    on_a_bus(story)
+
+
+def test_what_a_cycle_takes_is_a_guess_until_it_is_measured() -> None:
+    """The phases of groups that are added later rest on it."""
+
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        group = bus.poll_group("g", period=0.1, points=[axis.point("1")])
+        guessed = group.poll.cost
+        await cycles(group, 5)
+        bus.poll_group("h", period=0.1, points=[axis.point("2")])
+        read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
+        assert guessed == pytest.approx(line_time(read, bus.byte_time))
+        assert group.poll.cost == pytest.approx(0.002 + (8 + 6) * bus.byte_time, abs=0.0005)
+
+    on_a_bus(story)
