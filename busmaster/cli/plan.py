@@ -7,14 +7,19 @@ from typing import Any
 
 import click
 
+from busmaster.arbiter.transaction import Priority
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import json_option
 from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import emit, emit_all, json_line
 from busmaster.config import ConfiguredLine
 from busmaster.planning import GroupPlan, Plan
+from busmaster.profile import LineSettings
+from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.serial_port import SerialPort
 
-HEAD = ("GROUP", "PERIOD", "VALUES", "EXCHANGES", "LINE", "CYCLE", "LONGEST", "AT WORST", "MISSED")
+SHOWN = (Priority.URGENT, Priority.COMMAND, Priority.POLL)
+HEAD = ("GROUP", "PERIOD", "VALUES", "EXCHANGES", "LINE", "CYCLE", "LONGEST", "MISSED")
 
 
 @click.command(short_help="Does the schedule of a file fit its line?")
@@ -31,11 +36,11 @@ def command(path: str, as_json: bool) -> int:
     if as_json:
         emit(json_line(**fields(plan)))
     else:
-        emit_all(page(line.file.title, plan))
+        emit_all(page(f"{line.file.title}: {port_text(line.bus.endpoint, plan.line)}", plan))
     return OK if plan.fits else FAILED
 
 
-def page(title: str, plan: Plan) -> list[str]:
+def page(head: str, plan: Plan) -> list[str]:
     """What a person wants to know: a table of the groups, the waits, and what would fit."""
     rows = [HEAD, *(row(group) for group in plan.groups)]
     widths = [max(len(cells[column]) for cells in rows) for column in range(len(HEAD))]
@@ -46,15 +51,21 @@ def page(title: str, plan: Plan) -> list[str]:
         )
         for cells in rows
     ]
-    verdict = "it fits" if plan.fits else "it does not fit"
-    waits = ", ".join(f"{priority.name.lower()} {time_text(wait)}" for priority, wait in plan.worst_waits.items())
+    verdict = "it fits" if plan.fits and not plan.advice else "it fits, barely" if plan.fits else "it does not fit"
+    share = f"the schedule asks for {plan.utilisation:.0%} of the line"
+    waits = (f"{priority.name.lower()} {time_text(plan.worst_waits[priority])}" for priority in SHOWN)
     return [
-        f"{title}: {plan.line.baudrate} {plan.line.framing}",
+        head,
         *(table if plan.groups else ["no poll groups"]),
-        f"the schedule asks for {plan.utilisation:.0%} of the line: {verdict}",
-        f"a command waits {time_text(plan.typical_wait)} on a healthy line; at the worst: {waits}",
-        *plan.advice,
+        *((f"{verdict}:", *plan.advice) if plan.advice else (f"{verdict}: {share}",)),
+        f"a command waits {time_text(plan.typical_wait)} on a healthy line; at the very worst: {', '.join(waits)}",
     ]
+
+
+def port_text(endpoint: Endpoint, line: LineSettings) -> str:
+    """Behind a TCP port the framing is the server's business."""
+    framing = f" {line.framing}" if isinstance(endpoint, SerialPort) else ""
+    return f"{endpoint.name}, {line.baudrate} baud{framing}"
 
 
 def row(group: GroupPlan) -> tuple[str, ...]:
@@ -66,7 +77,6 @@ def row(group: GroupPlan) -> tuple[str, ...]:
         f"{group.utilisation:.0%}",
         time_text(group.cycle),
         time_text(group.longest_cycle),
-        time_text(group.worst_cycle),
         f"{group.missed:.0%}",
     )
 

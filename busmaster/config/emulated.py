@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 from busmaster.config.sections import LineFile
 from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Echo, Line
 from busmaster.profile import LineSettings
+from busmaster.transport.serial_port import SerialPort
 
 
 def emulated_line(file: LineFile, *, paced: bool | None = None, seed: int | None = None) -> Line:
@@ -24,9 +26,11 @@ def emulated_line(file: LineFile, *, paced: bool | None = None, seed: int | None
 
 
 def line_settings(file: LineFile) -> LineSettings:
-    """Those of the port; behind a TCP port that does not say, those of the first node's protocol."""
-    profiles = [node.profile for node in file.nodes.values()]
-    return file.port.settings or (profiles[0].line if profiles else LineSettings(57600))
+    """Those of a serial port; behind a TCP port those of the first node's protocol, at the port's baud rate."""
+    if isinstance(file.port, SerialPort):
+        return file.port.settings
+    own = next(iter(file.nodes.values())).profile.line
+    return replace(own, baudrate=file.port.baudrate or own.baudrate)
 
 
 def _device(file: LineFile, name: str) -> Device:

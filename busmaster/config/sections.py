@@ -113,7 +113,7 @@ def read(source: Source) -> LineFile:
     top.only("title", "port", "protocols", "nodes", "groups", "outputs", "emulator")
     nodes = {node.name: node for node in _nodes(top, _defaults(top))}
     groups = {table.name: _group(table) for table in top.tables("groups")}
-    return LineFile(
+    file = LineFile(
         path=source.name,
         title=top.text("title", os.path.basename(source.name)),
         port=read_port(top, [node.profile for node in nodes.values()]),
@@ -123,6 +123,9 @@ def read(source: Source) -> LineFile:
         emulator=_emulator(top.table("emulator"), nodes),
         table=top,
     )
+    if not nodes:
+        raise top.error("there are no nodes: describe each in a table of its own, [nodes.NAME]")
+    return file
 
 
 # nodes
@@ -269,7 +272,9 @@ def _group(table: Table) -> GroupSection:
 def _emulator(table: Table, nodes: Mapping[str, NodeSection]) -> EmulatorSection:
     table.only("paced", "seed", "lively", "reply_delay", "faults", "nodes")
     delays = dict.fromkeys(nodes, _delay(table, Delay()))
-    faults = {name: _faults(table.table("faults"), {}) for name in nodes}
+    shared = table.table("faults")
+    shared.only(*NAMES)
+    faults = {name: _faults(shared, {}) for name in nodes}
     for one in table.tables("nodes"):
         one.only("reply_delay", "faults")
         with one.at():
@@ -278,7 +283,7 @@ def _emulator(table: Table, nodes: Mapping[str, NodeSection]) -> EmulatorSection
             if name not in nodes:
                 raise one.error(f"no such node {name!r}; {nearest(name, nodes)}")
             delays[name] = _delay(one, delays[name])
-            faults[name] = _faults(one.table("faults"), table.table("faults").data)
+            faults[name] = _faults(one.table("faults"), shared.data)
     return EmulatorSection(
         paced=table.flag("paced", True),
         seed=table.whole("seed", 1),

@@ -114,7 +114,8 @@ class _Walk:
             self._arrays[key] = number = self._arrays.get(key, -1) + 1
             self.places.setdefault(key, line)
             key = (*key, number)
-        self.places.setdefault(key, line)
+        for depth in range(len(key)):
+            self.places.setdefault(key[: depth + 1], line)
         return key
 
     def _inside(self, names: Key) -> Key:
