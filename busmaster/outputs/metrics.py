@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import accumulate
 from typing import TYPE_CHECKING, TypeVar
 
@@ -151,7 +152,7 @@ class MetricsOutput(Output):
             "busmaster_node_latency_seconds", "From the start of a request to the end of its reply", labels=["node"]
         )
         for node in self._bus.nodes:
-            counts, buckets, total = self._ask(lambda node=node: read_node(node))  # type: ignore[misc]
+            counts, buckets, total = self._ask(partial(read_node, node))
             for name, family in counters.items():
                 family.add_metric([node.label], getattr(counts, name))
             for outcome in OUTCOMES:

@@ -99,7 +99,7 @@ class MqttOutput(Output):
             self.up()
             if self._commands:
                 await client.subscribe(self._topic("set/#"), qos=1)
-                tasks.start_soon(self._listen, client, tasks)
+            tasks.start_soon(self._listen, client, tasks)
             stopped = False
             while not stopped:
                 stopped = self._stop.is_set()
@@ -183,6 +183,7 @@ class MqttOutput(Output):
     # commands
 
     async def _listen(self, client: Client, tasks: TaskGroup) -> None:
+        """Raises MqttError when the broker goes away, also while there is nothing to send."""
         async for message in client.messages:
             name = str(message.topic).removeprefix(self._topic("set/"))
             refusal = self._refusal(name, message)

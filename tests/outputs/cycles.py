@@ -1,0 +1,51 @@
+"""Cycles for the outputs, made without a line."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from busmaster.bus import Bus
+from busmaster.emulator.line import Line
+from busmaster.errors import NoReply
+from busmaster.handles import Hcp2Controller
+from busmaster.node import Timeline
+from busmaster.outputs.base import Output
+from busmaster.points import Point
+from busmaster.polling import Quality, Sample, Snapshot
+from busmaster.protocols import hcp2
+from busmaster.transport.memory import MemoryPort
+
+BUS = Bus(MemoryPort(Line(hcp2.PROFILE.line)))
+NODE = Hcp2Controller(BUS, 5)
+PATIENCE = 10.0
+
+
+def point(item: str) -> Point[Any]:
+    return NODE.point(item)
+
+
+def cycle(number: int, *values: Any, group: str = "axes", at: float | None = None) -> Snapshot:
+    """A cycle that read these values of elements 1, 2, ...; an exception is what went wrong with one."""
+    now = time.monotonic() if at is None else at
+    samples = {}
+    for element, value in enumerate(values, 1):
+        error = value if isinstance(value, NoReply) else None
+        quality = Quality.GOOD if error is None else Quality.BAD
+        timeline = Timeline(now, now, now, now, 1, 0, 0.0)
+        samples[point(str(element))] = Sample(None if error else value, error, now, now, now + 0.001, quality, timeline)
+    return Snapshot(group, number, now, now, now + 0.002, 0, samples)
+
+
+def settled(output: Output) -> bool:
+    """Nothing waits any more."""
+    return output.statistics().waiting == 0
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait for a thread, a short while."""
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.002)

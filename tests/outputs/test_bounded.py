@@ -1,0 +1,143 @@
+"""An output that is slow or down: what it holds is bounded, what is dropped is counted, nobody waits for it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from busmaster.outputs.base import BatchOutput, Happening, Item, Output
+from busmaster.outputs.settings import Settings
+from busmaster.polling import Snapshot
+from tests.outputs.cycles import cycle, settled, until
+
+
+class Shelf(BatchOutput[Item]):
+    """Puts everything into a list, when it is let."""
+
+    def __init__(self, buffer: int = 100, say: Callable[[str], None] = lambda _: None) -> None:
+        super().__init__("shelf", Settings(buffer=buffer), say=say)
+        self.shelf: list[Item] = []
+        self.let = threading.Event()
+        self.let.set()
+        self.broken: Exception | None = None
+
+    def format(self, item: Item, time_of: Callable[[float], float]) -> Item | None:
+        return None if isinstance(item, Happening) else item
+
+    def commit(self, batch: list[Item]) -> None:
+        self.let.wait(10)
+        if self.broken is not None:
+            raise self.broken
+        self.shelf += batch
+
+    def shut(self) -> None:
+        pass
+
+    @property
+    def cycles(self) -> list[int]:
+        return [item.cycle for item in self.shelf if isinstance(item, Snapshot)]
+
+
+def offer(output: Output, first: int, last: int) -> None:
+    for number in range(first, last + 1):
+        output.offer(cycle(number, 1.0, 2.0))
+
+
+def test_everything_is_written_in_order() -> None:
+    output = Shelf()
+    output.start()
+    offer(output, 1, 20)
+    output.close(5)
+    assert output.cycles == list(range(1, 21))
+    assert output.statistics().written == 40
+
+
+def test_one_that_is_stuck_drops_the_oldest_and_counts_what_it_drops() -> None:
+    output = Shelf(buffer=10)
+    output.let.clear()
+    output.start()
+    offer(output, 1, 1)
+    until(lambda: not output._waiting)  # the thread has it, and is stuck
+    offer(output, 2, 12)
+    counts = output.statistics()
+    assert (counts.dropped, counts.written, counts.waiting) == (14, 0, 10)
+    output.let.set()
+    output.close(5)
+    assert output.cycles == [1, 9, 10, 11, 12]
+    counts = output.statistics()
+    assert (counts.dropped, counts.written, counts.waiting) == (14, 10, 0)
+
+
+def test_offering_never_waits_for_the_thread() -> None:
+    output = Shelf(buffer=10)
+    output.let.clear()
+    output.start()
+    started = time.perf_counter()
+    offer(output, 1, 200)
+    assert time.perf_counter() - started < 1
+    output.let.set()
+    output.close(5)
+    assert output.written + output.dropped == output.offered == 400
+
+
+def test_what_failed_is_written_when_it_works_again_and_both_are_told() -> None:
+    said: list[str] = []
+    output = Shelf(say=said.append)
+    output._retry = 0.01
+    output.broken = OSError(28, "No space left on device", "/disk/x")
+    output.start()
+    offer(output, 1, 3)
+    until(lambda: bool(said))
+    assert output.statistics().error == "/disk/x: No space left on device"
+    output.broken = None
+    offer(output, 4, 5)
+    until(lambda: settled(output))
+    assert said == ["shelf is down: /disk/x: No space left on device", "shelf is up again"]
+    output.close(5)
+    assert output.cycles == [1, 2, 3, 4, 5]
+    assert output.statistics().error == ""
+
+
+def test_a_bug_in_an_output_does_not_end_it() -> None:
+    output = Shelf()
+    output._retry = 0.01
+    output.broken = ZeroDivisionError("division by zero")
+    output.start()
+    offer(output, 1, 1)
+    until(lambda: output.statistics().error == "division by zero")
+    output.broken = None
+    until(lambda: settled(output))
+    output.close(5)
+    assert output.cycles == [1]
+
+
+def test_what_is_left_when_it_is_closed_is_counted_as_dropped() -> None:
+    output = Shelf()
+    output.broken = OSError("gone")
+    output.start()
+    offer(output, 1, 5)
+    output.close(5)
+    assert (output.written, output.dropped) == (0, 10)
+
+
+def test_one_that_hangs_is_not_waited_for() -> None:
+    output = Shelf()
+    output.let.clear()
+    output.start()
+    offer(output, 1, 1)
+    until(lambda: not output._waiting)
+    started = time.perf_counter()
+    output.close(0.01)
+    assert time.perf_counter() - started < 1
+    assert output.dropped == 2
+    output.let.set()
+
+
+def test_what_an_output_does_not_write_is_no_loss_and_what_was_lost_before_it_is() -> None:
+    output = Shelf()
+    output.start()
+    output.offer(Happening(0.0, "winder", "winder is down"))
+    output.miss(3)
+    output.close(5)
+    assert (output.written, output.dropped, output.offered) == (1, 3, 4)

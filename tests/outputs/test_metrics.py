@@ -1,0 +1,96 @@
+"""OpenMetrics, scraped over HTTP as Prometheus does, and read by its own parser."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import socket
+import urllib.request
+from importlib.util import find_spec
+
+import pytest
+
+from busmaster.bus import Bus
+from busmaster.emulator.build import make_device
+from busmaster.emulator.line import Line
+from busmaster.errors import NoReply
+from busmaster.handles import Hcp2Controller
+from busmaster.outputs.base import OutputStatistics
+from busmaster.outputs.metrics import MetricsOutput
+from busmaster.outputs.settings import MetricsSettings
+from busmaster.protocols import hcp2
+from busmaster.transport.memory import MemoryPort
+from tests.outputs.brokers import free_port
+from tests.outputs.cycles import BUS, until
+
+pytestmark = pytest.mark.skipif(
+    find_spec("prometheus_client") is None, reason="needs prometheus-client (the extra named metrics)"
+)
+Metrics = dict[tuple[str, frozenset[tuple[str, str]]], float]
+
+
+def scraped(port: int) -> Metrics:
+    parser = importlib.import_module("prometheus_client.openmetrics.parser")
+    request = urllib.request.Request(
+        f"http://127.0.0.1:{port}/metrics", headers={"Accept": "application/openmetrics-text; version=1.0.0"}
+    )
+    with urllib.request.urlopen(request, timeout=10) as answer:
+        text = answer.read().decode()
+    return {
+        (sample.name, frozenset(sample.labels.items())): sample.value
+        for family in parser.text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def of(metrics: Metrics, name: str, **labels: str) -> float:
+    return metrics[f"busmaster_{name}", frozenset(labels.items())]
+
+
+@pytest.mark.asyncio
+async def test_a_scrape_has_the_counts_of_nodes_groups_line_and_outputs() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
+    controller, absent = Hcp2Controller(bus, 5), Hcp2Controller(bus, 6)
+    counts = OutputStatistics("sqlite", 10, 2, 3, "disk full")
+    output = MetricsOutput("metrics", MetricsSettings(port=0), bus, outputs=lambda: (counts,))
+    async with bus:
+        output.start()
+        group = bus.poll_group("axes", period=0.02, points=[controller.point("1")])
+        async for snapshot in group:
+            if snapshot.cycle == 3:
+                break
+        group.pause()
+        with pytest.raises(NoReply):
+            await absent.read(1, retries=0)
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, 5)
+    assert of(metrics, "node_attempts_total", node="node 5") == 3
+    assert of(metrics, "node_exchanges_total", node="node 5", outcome="ok") == 3
+    assert of(metrics, "node_exchanges_total", node="node 6", outcome="no_reply") == 1
+    assert of(metrics, "node_latency_seconds_count", node="node 5") == 3
+    assert of(metrics, "node_latency_seconds_bucket", node="node 5", le="0.001") == 0
+    assert of(metrics, "node_latency_seconds_bucket", node="node 5", le="0.5") == 3
+    assert 0.001 < of(metrics, "node_latency_seconds_sum", node="node 5") < 1
+    assert of(metrics, "group_cycles_total", group="axes") == 3
+    assert of(metrics, "group_missed_total", group="axes") == 0
+    assert of(metrics, "group_period_seconds", group="axes") == 0.02
+    assert of(metrics, "group_achieved_period_seconds", group="axes") > 0.019
+    assert 0 < of(metrics, "line_utilisation_ratio") <= 1
+    assert of(metrics, "output_dropped_total", output="sqlite") == 2
+    assert of(metrics, "output_up", output="sqlite") == 0
+
+
+@pytest.mark.asyncio
+async def test_a_port_that_is_taken_is_told_and_tried_again() -> None:
+    said: list[str] = []
+    port = free_port()
+    with socket.create_server(("127.0.0.1", port)):
+        output = MetricsOutput("metrics", MetricsSettings(port=port), BUS, said.append)
+        output._retry = 0.01
+        output.start()
+        await asyncio.to_thread(until, lambda: bool(said))
+    await asyncio.to_thread(until, lambda: said[-1] == "metrics is up again")
+    await asyncio.to_thread(scraped, port)
+    await asyncio.to_thread(output.close, 5)
+    assert said == ["metrics is down: Address already in use", "metrics is up again"]

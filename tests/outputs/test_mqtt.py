@@ -1,0 +1,250 @@
+"""MQTT, to a real mosquitto: values, health, last will, a broker that goes and comes back, and commands in."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from busmaster.bus import Bus
+from busmaster.emulator.build import make_device
+from busmaster.emulator.line import Line
+from busmaster.errors import InvalidCommand, NoReply
+from busmaster.handles import Hcp2Controller
+from busmaster.outputs.base import Happening
+from busmaster.outputs.mqtt import MqttOutput, command_value
+from busmaster.outputs.settings import MqttSettings
+from busmaster.transport.memory import MemoryPort
+from tests.outputs.brokers import Broker, free_port, needs_mosquitto, running
+from tests.outputs.cycles import BUS, cycle, until
+
+if TYPE_CHECKING:
+    from aiomqtt import Client
+
+Heard = tuple[str, Any, bool]
+"""Topic, payload, and whether it was retained."""
+
+pytestmark = needs_mosquitto
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    with running(tmp_path) as found:
+        yield found
+
+
+class Seen(MqttOutput):
+    """Whose connection can be cut."""
+
+    client: Client
+
+    def _client(self) -> Client:
+        self.client = super()._client()
+        return self.client
+
+    def cut(self) -> None:
+        connection = self.client._client.socket()
+        assert isinstance(connection, socket.socket)
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+def emulated(handle: type[Hcp2Controller], address: int) -> Bus:
+    return Bus(MemoryPort(Line(handle.profile.line, [make_device("hcp2", address)])))
+
+
+@asynccontextmanager
+async def publishing(
+    broker: Broker, bus: Bus = BUS, say: Callable[[str], None] = lambda _: None, **options: Any
+) -> AsyncIterator[Seen]:
+    commands = options.pop("commands", {})
+    settings = MqttSettings(port=broker.port, prefix="line", **options)
+    output = Seen("mqtt", settings, bus, say, commands=commands)
+    output._retry = 0.02
+    output.start()
+    try:
+        yield output
+    finally:
+        await asyncio.to_thread(output.close, 5)
+
+
+@asynccontextmanager
+async def listening(broker: Broker, *topics: str, **options: Any) -> AsyncIterator[Client]:
+    import aiomqtt
+
+    async with aiomqtt.Client("127.0.0.1", broker.port, **options) as client:
+        for topic in topics:
+            await client.subscribe(topic, qos=1)
+        yield client
+
+
+async def heard(client: Client, count: int) -> list[Heard]:
+    found: list[Heard] = []
+    async with asyncio.timeout(10):
+        async for message in client.messages:
+            text = bytes(message.payload).decode()
+            found.append((str(message.topic), json.loads(text) if text[:1] in "{[" else text, message.retain))
+            if len(found) == count:
+                break
+    return found
+
+
+async def settled(output: MqttOutput) -> None:
+    await asyncio.to_thread(until, lambda: output.statistics().waiting == 0)
+
+
+@pytest.mark.asyncio
+async def test_values_and_events_are_published_each_under_its_name(broker: Broker) -> None:
+    async with listening(broker, "line/values/#", "line/events") as client, publishing(broker) as output:
+        output.offer(cycle(1, 12.5, NoReply("no reply")))
+        output.offer(Happening(BUS.now(), "winder", "winder is down"))
+        first, second, event = await heard(client, 3)
+    assert first[0] == "line/values/5/1"
+    assert {key: first[1][key] for key in ("value", "unit", "error", "late")} == {
+        "value": 12.5,
+        "unit": "",
+        "error": None,
+        "late": False,
+    }
+    assert (second[0], second[1]["value"], second[1]["error"]) == ("line/values/5/2", None, "no reply")
+    assert (event[0], event[1]["text"]) == ("line/events", "winder is down")
+    assert output.statistics().written == 3
+
+
+@pytest.mark.asyncio
+async def test_the_last_values_are_retained_and_a_cycle_may_be_one_message(broker: Broker) -> None:
+    async with publishing(broker, messages="cycle") as output:
+        output.offer(cycle(1, 1.0, 2.0))
+        output.offer(cycle(2, 3.0, 4.0))
+        await settled(output)
+    async with listening(broker, "line/cycles/#") as client:
+        [(topic, payload, retained)] = await heard(client, 1)
+    assert (topic, retained, payload["cycle"]) == ("line/cycles/axes", True, 2)
+    assert payload["samples"]["5/2"]["value"] == 4
+
+
+@pytest.mark.asyncio
+async def test_it_says_that_it_is_there_and_the_broker_says_so_when_it_is_not(broker: Broker) -> None:
+    async with listening(broker, "line/status") as client:
+        async with publishing(broker) as output:
+            said = await heard(client, 1)
+            output.cut()
+            said += await heard(client, 2)
+        said += await heard(client, 1)
+    assert [payload for _, payload, _ in said] == ["online", "offline", "online", "offline"]
+
+
+@pytest.mark.asyncio
+async def test_health_of_line_and_nodes_is_retained_and_told_when_it_changes(broker: Broker) -> None:
+    bus = emulated(Hcp2Controller, 5)
+    controller = Hcp2Controller(bus, 5)
+    async with publishing(broker, bus), listening(broker, "line/line", "line/health/#") as client:
+        before = await heard(client, 2)
+        async with bus:
+            await controller.read(1)
+            after = await heard(client, 2)
+    states = [
+        {topic: payload.get("health", payload.get("line")) for topic, payload, _ in found} for found in (before, after)
+    ]
+    assert states == [
+        {"line/line": "offline", "line/health/5": "unknown"},
+        {"line/line": "ready", "line/health/5": "up"},
+    ]
+
+
+@pytest.mark.asyncio
+async def test_a_broker_that_is_down_for_a_while_costs_nothing(broker: Broker) -> None:
+    """Sent again is what it had not acknowledged: values may come twice, in order, but none is missing."""
+    session = {"identifier": "historian", "clean_session": False}
+    said: list[str] = []
+    async with listening(broker, "line/values/#", **session):
+        pass
+    async with publishing(broker, say=said.append) as output:
+        for number in range(1, 31):
+            output.offer(cycle(number, float(number)))
+            if number == 10:
+                await settled(output)
+                await asyncio.to_thread(broker.stop)
+                await asyncio.to_thread(until, lambda: "down" in "".join(said))
+        broker.start()
+        await settled(output)
+    assert (output.written, output.dropped) == (30, 0)
+    assert said[-1] == "mqtt is up again"
+    async with listening(broker, **session) as client:
+        found = [payload["value"] for _, payload, _ in await heard(client, 30)]
+    assert found == list(range(1, 31))
+
+
+@pytest.mark.asyncio
+async def test_without_a_broker_the_oldest_are_dropped_and_counted() -> None:
+    output = MqttOutput("mqtt", MqttSettings(port=free_port(), buffer=10), BUS)
+    output.start()
+    for number in range(100):
+        output.offer(cycle(number, 1.0, 2.0))
+    await asyncio.to_thread(until, lambda: bool(output.error))
+    counts = output.statistics()
+    assert (counts.written, counts.dropped, counts.waiting) == (0, 190, 10)
+    assert "refused" in counts.error
+    await asyncio.to_thread(output.close, 5)
+    assert output.dropped == 200
+
+
+@pytest.mark.asyncio
+async def test_a_command_is_obeyed_where_the_file_allows_it_and_every_one_is_answered(broker: Broker) -> None:
+    bus = emulated(Hcp2Controller, 5)
+    controller = Hcp2Controller(bus, 5)
+    commands = {"5/1": controller.point("1"), "5/100": controller.element(100)}
+    async with listening(broker, "line/result/#") as client:
+        await client.publish("line/set/5/1", "99", qos=1, retain=True)
+        async with bus, publishing(broker, bus, commands=commands):
+            [retained] = await heard(client, 1)
+            await client.publish("line/set/5/1", None, qos=1, retain=True)
+            await heard(client, 1)
+            answers = {}
+            for topic, payload in (("5/1", "12.5"), ("5/2", "1"), ("5/1", "on"), ("5/100", "1")):
+                await client.publish(f"line/set/{topic}", payload, qos=1)
+                [(where, answer, _)] = await heard(client, 1)
+                answers[topic, payload] = (where, answer["ok"], answer.get("error", ""))
+            assert await controller.read(1) == 12.5
+    assert "retained" in retained[1]["error"]
+    assert answers["5/1", "12.5"] == ("line/result/5/1", True, "")
+    assert answers["5/2", "1"][:2] == ("line/result/5/2", False)
+    assert "allow_commands" in answers["5/2", "1"][2]
+    assert "'on' is neither a number" in answers["5/1", "on"][2]
+    assert "refused" in answers["5/100", "1"][2]
+
+
+@pytest.mark.asyncio
+async def test_without_an_allow_list_nobody_listens(broker: Broker) -> None:
+    """Where somebody does, everything is answered."""
+    async with listening(broker, "line/status", "line/result/#") as client:
+        async with publishing(broker):
+            said = await heard(client, 1)
+            await client.publish("line/set/5/1", "1", qos=1)
+        said += await heard(client, 1)
+    assert [payload for _, payload, _ in said] == ["online", "offline"]
+
+
+@pytest.mark.parametrize(
+    ("payload", "value"), [(b"12.5", 12.5), (b"-1", -1), (b" [1, 2.5] ", [1, 2.5]), (bytearray(b"0"), 0)]
+)
+def test_a_command_is_a_number_or_a_list_of_numbers(payload: bytes, value: object) -> None:
+    assert command_value(payload) == value
+
+
+@pytest.mark.parametrize(
+    "payload", [b"", b"on", b"true", b"null", b"NaN", b"[]", b"{}", b'["1"]', b"[true]", b"\xff", None]
+)
+def test_anything_else_is_refused(payload: bytes | None) -> None:
+    with pytest.raises(InvalidCommand):
+        command_value(payload)
+
+
+def test_a_password_file_that_is_not_there_is_said_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InvalidCommand, match="No such file"):
+        MqttOutput("mqtt", MqttSettings(password_file=str(tmp_path / "none")), BUS)
