@@ -1,57 +1,24 @@
-"""Poll groups on a whole bus, in virtual time: what consumers get, what a write makes stale, what was merged."""
+"""Poll groups in virtual time: what consumers get, what a write makes stale, what is merged."""
 
 from __future__ import annotations
 
 import asyncio
-import random
-from collections.abc import AsyncIterator, Awaitable, Callable
 from itertools import pairwise
 from typing import Any
 
 import pytest
 
-from busmaster.arbiter.events import Event, NodeChanged
-from busmaster.arbiter.health import Health
-from busmaster.arbiter.schedule import line_time
 from busmaster.bus import Bus
-from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.device import Delay
 from busmaster.emulator.devices.mentor import MentorDrive
-from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.devices.msc import MscController as EmulatedMsc
-from busmaster.emulator.line import Line
-from busmaster.errors import NodeDown, NoReply, Refused
+from busmaster.errors import NoReply, Refused
 from busmaster.handles import Hcp2Controller, MscController
 from busmaster.handles import MentorDrive as MentorHandle
-from busmaster.node import Node, Priority
-from busmaster.polling import PollGroup, Quality, Snapshot
+from busmaster.polling import Quality
 from busmaster.profile import LineSettings
 from busmaster.protocols import hcp2, mentor
-from busmaster.testing.virtual_time import run_in_virtual_time
-from busmaster.transport.memory import MemoryPort
-
-Story = Callable[[Bus], Awaitable[None]]
-
-
-def on_a_bus(story: Story, *devices: Device, settings: LineSettings | None = None) -> None:
-    """Run it on a line with these devices; two HCP2 controllers, 1 and 2, by default."""
-
-    async def run() -> None:
-        chosen = devices or (MintController(1), MintController(2))
-        line = Line(settings or LineSettings(57600), chosen, chance=random.Random(1))
-        async with Bus(MemoryPort(line), seed=1) as bus:
-            await story(bus)
-
-    run_in_virtual_time(run())
-
-
-async def cycles(group: PollGroup, count: int) -> list[Snapshot]:
-    """So many snapshots from now on."""
-    consumer = group.subscribe(buffer=count)
-    try:
-        return [await anext(consumer) for _ in range(count)]
-    finally:
-        consumer.close()
-
+from tests.stories import cycles, on_a_bus
 
 # consumers
 
@@ -369,143 +336,3 @@ def test_runs_of_parameters_are_chained_only_by_those_who_opt_in() -> None:
         assert other.merged[0].saved > 0
 
     on_a_bus(story, MentorDrive(11), settings=mentor.PROFILE.line)
-
-
-# plans and bounds of the running bus
-
-
-def test_the_plan_of_a_running_bus_is_what_it_does() -> None:
-    """With reply times as measured, whatever the values' lengths: within 2 percentage points."""
-
-    async def story(bus: Bus) -> None:
-        axes = [Hcp2Controller(bus, address) for address in (1, 2)]
-        for period in (0.2, 0.5):
-            bus.poll_group(f"{period}", period=period, points=[a.point(str(e)) for a in axes for e in range(1, 6)])
-        await asyncio.sleep(5.0)
-        bus.reset_statistics()
-        await asyncio.sleep(20.0)
-        prediction = bus.plan()
-        assert bus.statistics().utilisation == pytest.approx(prediction.utilisation, abs=0.02)
-        assert prediction.fits
-        for group, planned in zip(bus.groups, prediction.groups, strict=True):
-            assert group.statistics().cycle_time.mean == pytest.approx(planned.cycle, rel=0.1)
-            assert group.statistics().cycle_time.highest <= planned.worst_cycle
-
-    devices = [MintController(address, delay=Delay(0.001, 0.009)) for address in (1, 2)]
-    devices[0].comms = [-1234567.8912] * 100
-    on_a_bus(story, *devices)
-
-
-def test_a_plan_of_what_might_be_added() -> None:
-    async def story(bus: Bus) -> None:
-        axis = Hcp2Controller(bus, 1)
-        group = bus.poll_group("now", period=0.1, points=[axis.point("1")])
-        await cycles(group, 10)
-        greedy = PollGroup(
-            bus,
-            "greedy",
-            0.05,
-            [axis.point(str(e)) for e in range(1, 40)],
-            phase=None,
-            priority=Priority.POLL,
-            merge=(),
-        )
-        assert bus.plan().fits
-        assert not bus.plan(greedy.planned()).fits
-
-    on_a_bus(story)
-
-
-def test_r9_the_worst_case_wait_of_the_line_at_hand() -> None:
-    async def story(bus: Bus) -> None:
-        axis = Hcp2Controller(bus, 1)
-        await axis.read(1)
-        alone = bus.worst_case_wait(Priority.COMMAND)
-        reading = [asyncio.create_task(axis.read(e)) for e in range(1, 10)]
-        await asyncio.sleep(0)
-        assert bus.worst_case_wait(Priority.COMMAND) == pytest.approx(alone / 2 * (1 + 8 + 2))
-        assert bus.worst_case_wait(Priority.URGENT) == pytest.approx(alone / 2)
-        await asyncio.gather(*reading)
-        group = bus.poll_group("g", period=0.5, points=[axis.point(str(e)) for e in range(1, 5)])
-        await cycles(group, 1)
-        assert bus.worst_case_wait(Priority.POLL) == pytest.approx(0.5 + 8 * 5 * alone / 2)
-        with pytest.raises(NoReply):
-            await bus.node(hcp2.PROFILE, 9).request(hcp2.Read(1), retries=0)
-        assert bus.worst_case_wait(Priority.POLL) == pytest.approx(0.5 + 16 * 5 * alone / 2)
-
-    on_a_bus(story)
-
-
-# dead nodes, seen by an application
-
-
-def test_r11_the_hook_of_a_node_that_returns_runs_before_its_polls_and_health_is_told() -> None:
-    device = MintController(1)
-
-    async def story(bus: Bus) -> None:
-        point = Hcp2Controller(bus, 1).point("7")
-        order: list[str] = []
-
-        async def restore(node: Node) -> None:
-            order.append("hook begins")
-            await asyncio.sleep(1.0)
-            await point.write(42.0)
-            order.append("hook ends")
-
-        point.node.on_return = restore
-        health = bus.events()
-        group = bus.poll_group("g", period=0.1, points=[point])
-        await cycles(group, 3)
-        device.faults.dead = 1.0
-        await asyncio.sleep(10.0)
-        assert isinstance(group.latest[point].error if group.latest else None, NodeDown)
-        device.faults.dead = 0.0
-        async for snapshot in group:
-            if snapshot[point].error is None:
-                break
-        order.append("polled")
-        assert snapshot[point].value == 42.0
-        assert order == ["hook begins", "hook ends", "polled"]
-        assert [h async for h in until_back(health)] == [Health.UP, Health.SUSPECT, Health.DOWN, Health.UP]
-
-    on_a_bus(story, device)
-
-
-async def until_back(events: AsyncIterator[Event]) -> AsyncIterator[Health]:
-    """The changes of health up to a return from DOWN."""
-    async for event in events:
-        if isinstance(event, NodeChanged):
-            yield event.after
-            if event.before is Health.DOWN:
-                return
-
-
-def test_a_suspended_node_rests_and_comes_back_by_itself() -> None:
-    async def story(bus: Bus) -> None:
-        point = Hcp2Controller(bus, 1).point("7")
-        group = bus.poll_group("g", period=0.1, points=[point])
-        await cycles(group, 1)
-        point.node.suspend(for_=2.0)
-        with pytest.raises(NodeDown, match="suspended"):
-            await point.read()
-        assert isinstance((await cycles(group, 3))[-1][point].error, NodeDown)
-        await asyncio.sleep(2.0)
-        assert (await cycles(group, 1))[0][point].error is None
-
-    on_a_bus(story)
-
-
-def test_what_a_cycle_takes_is_a_guess_until_it_is_measured() -> None:
-    """The phases of groups that are added later rest on it."""
-
-    async def story(bus: Bus) -> None:
-        axis = Hcp2Controller(bus, 1)
-        group = bus.poll_group("g", period=0.1, points=[axis.point("1")])
-        guessed = group.poll.cost
-        await cycles(group, 5)
-        bus.poll_group("h", period=0.1, points=[axis.point("2")])
-        read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
-        assert guessed == pytest.approx(line_time(read, bus.byte_time))
-        assert group.poll.cost == pytest.approx(0.002 + (8 + 6) * bus.byte_time, abs=0.0005)
-
-    on_a_bus(story)

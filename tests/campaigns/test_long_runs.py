@@ -25,6 +25,7 @@ def jitters(line: Load, since: float = 1.0) -> list[float]:
     return [begun - due for cycles in line.cycles.values() for due, begun, _ in cycles if due >= since]
 
 
+@pytest.mark.timeout(300)
 def test_r10_sixty_points_at_67_percent_of_the_line_start_on_time_for_an_hour() -> None:
     line = Load(8, spread=SPREAD)
     for period in PERIODS:
@@ -124,6 +125,7 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
+@pytest.mark.timeout(300)
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the resident size is read from /proc")
 def test_r12_a_million_requests_with_callers_that_give_up_at_random_leave_nothing_behind() -> None:
     requests = 1_000_000

@@ -1,0 +1,38 @@
+"""A story told on a bus with an emulated line, in virtual time."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Awaitable, Callable
+
+from busmaster.bus import Bus
+from busmaster.emulator.device import Device
+from busmaster.emulator.devices.mint import MintController
+from busmaster.emulator.line import Line
+from busmaster.polling import PollGroup, Snapshot
+from busmaster.profile import LineSettings
+from busmaster.testing.virtual_time import run_in_virtual_time
+from busmaster.transport.memory import MemoryPort
+
+Story = Callable[[Bus], Awaitable[None]]
+
+
+def on_a_bus(story: Story, *devices: Device, settings: LineSettings | None = None) -> None:
+    """Run it on a line with these devices; two HCP2 controllers, 1 and 2, by default."""
+
+    async def run() -> None:
+        chosen = devices or (MintController(1), MintController(2))
+        line = Line(settings or LineSettings(57600), chosen, chance=random.Random(1))
+        async with Bus(MemoryPort(line), seed=1) as bus:
+            await story(bus)
+
+    run_in_virtual_time(run())
+
+
+async def cycles(group: PollGroup, count: int) -> list[Snapshot]:
+    """So many snapshots from now on."""
+    consumer = group.subscribe(buffer=count)
+    try:
+        return [await anext(consumer) for _ in range(count)]
+    finally:
+        consumer.close()
