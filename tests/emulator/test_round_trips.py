@@ -9,6 +9,8 @@ from random import Random
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from busmaster.arbiter.transaction import Phase, Transaction
 from busmaster.emulator.build import make_device
@@ -182,6 +184,23 @@ def test_a_device_does_not_hear_what_another_is_asked(protocol: str, address: in
     }
     for other in others:
         assert master.asks(untouched.get(protocol, mentor.Read(1, 17)), other.address) == 0
+
+
+words = st.integers(0, 65535)
+
+
+@given(st.integers(-(2**31), 2**31 - 1), words, words, st.integers(-1000, 1000), st.sampled_from([1, 2, 4]))
+@settings(max_examples=30)
+def test_every_value_comes_back_as_it_was_written(value: int, wide: int, word: int, speed: int, step: int) -> None:
+    press = Master(msc.PROFILE, MscController(2, address_step=step, addresses=0x10000))
+    block = tuple((value * place) % 2**32 - 2**31 for place in range(32))
+    press.tries([(msc.DataWrite(0xFFFF - 4, value), None), (msc.DataRead(0xFFFF - 4), value)])
+    press.tries([(msc.BlockWrite(word // 2, block), None), (msc.BlockRead(word // 2), block)])
+    drive = Master(mentor.PROFILE, MentorDrive(42))
+    drive.tries([(mentor.Write(15, 63, wide, wide=True), None), (mentor.Read(15, 63), wide)])
+    drive.tries([(mentor.Write(1, 36, speed), None), (mentor.Read(1, 36), speed)])
+    motor = Master(dc104.PROFILE, Dc104Drive())
+    motor.tries([(dc104.Write(1 + word % 255, wide), None), (dc104.Read(1 + word % 255), wide)])
 
 
 def test_a_broadcast_reaches_all_and_the_line_goes_on() -> None:
