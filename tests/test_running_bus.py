@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator
 
 import pytest
@@ -13,7 +14,7 @@ from busmaster.arbiter.schedule import line_time
 from busmaster.bus import Bus
 from busmaster.emulator.device import Delay
 from busmaster.emulator.devices.mint import MintController
-from busmaster.errors import NodeDown, NoReply
+from busmaster.errors import BusError, NodeDown, NoReply
 from busmaster.handles import Hcp2Controller
 from busmaster.node import Node, Priority
 from busmaster.polling import PollGroup
@@ -116,6 +117,41 @@ def test_r11_the_hook_of_a_node_that_returns_runs_before_its_polls_and_health_is
         assert snapshot[point].value == 42.0
         assert order == ["hook begins", "hook ends", "polled"]
         assert [h async for h in until_back(health)] == [Health.UP, Health.SUSPECT, Health.DOWN, Health.UP]
+
+    on_a_bus(story, device)
+
+
+def test_r11_a_node_that_returns_again_while_its_hook_runs_gets_another_run_after_it() -> None:
+    device = MintController(1)
+
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        order: list[str] = []
+
+        async def restore(node: Node) -> None:
+            order.append("begins")
+            await asyncio.sleep(20.0)
+            order.append("ends")
+
+        point.node.on_return = restore
+        group = bus.poll_group("g", period=0.5, points=[point])
+        await cycles(group, 3)
+
+        async def wait_for(health: Health) -> None:
+            while point.node.health is not health:
+                await cycles(group, 1)
+                with contextlib.suppress(BusError):
+                    await point.read()
+
+        for _ in range(2):
+            device.faults.dead = 1.0
+            await wait_for(Health.DOWN)
+            device.faults.dead = 0.0
+            await wait_for(Health.UP)
+        assert order == ["begins"]
+        while (await cycles(group, 1))[0][point].error is not None:
+            pass
+        assert order == ["begins", "ends", "begins", "ends"]
 
     on_a_bus(story, device)
 

@@ -217,12 +217,13 @@ def test_r12_writes_that_wait_behind_one_that_is_repeated_are_bounded_too() -> N
 
 def test_r12_a_repeated_request_ends_although_its_time_to_start_is_over() -> None:
     desk = Desk()
-    blocked, late = desk.submit(), desk.submit(start_by=1.5)
+    desk.submit()
+    late, after = desk.submit(start_by=1.5), desk.submit()
     desk.finish()
     desk.finish(ok=False)
+    assert (desk.on_wire, late.phase) == (after, Phase.QUEUED)
     desk.dispatcher.expire(desk.now)
     desk.run_out()
-    assert blocked.error is None
     assert late.error is None
     assert late.attempts == 2
 
