@@ -64,11 +64,11 @@ def controllers() -> Iterator[TcpServer]:
         yield server
 
 
-def started(*arguments: str) -> subprocess.Popen[str]:
+def started(*arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:
     """A command as a process of its own, in a session of its own: Ctrl-C reaches it alone."""
     return subprocess.Popen(
         [sys.executable, "-m", "busmaster", *arguments],
-        cwd=ROOT,
+        cwd=cwd,
         env=ENVIRONMENT,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,

@@ -1,0 +1,206 @@
+"""run, plan and emulate with a LINE.toml, as CLI.md has them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import pytest
+
+from busmaster.capture.pcapng import read_packets
+from busmaster.emulator.serve import TcpServer
+from tests.cli.conftest import ROOT, Command, started
+
+PATIENCE = 20.0
+EXAMPLES = ROOT / "examples"
+TEXT = """
+title = "Slitter"
+port = "PORT"
+[nodes.winder]
+protocol = "hcp2"
+address = 1
+points.force = { item = "10", unit = "N", factor = 0.1 }
+[nodes.drive2-3]
+protocol = "hcp2"
+address = "2-3"
+[groups.fast]
+period = 0.02
+points = ["winder/force", "drive2-3/1"]
+[groups.slow]
+period = 0.1
+points = ["winder/axis0.idle"]
+"""
+SQLITE = '[outputs.sqlite]\npath = "FOLDER/x.db"\n'
+
+
+@pytest.fixture
+def line(tmp_path: Path, controllers: TcpServer) -> Path:
+    """On the controllers that are served, with a database."""
+    path = tmp_path / "line.toml"
+    path.write_text((TEXT + SQLITE).replace("PORT", controllers.path).replace("FOLDER", str(tmp_path)))
+    return path
+
+
+def test_run_prints_a_line_a_value_and_a_summary_of_groups_nodes_and_outputs(
+    busmaster: Command, line: Path, tmp_path: Path
+) -> None:
+    ran = busmaster("run", str(line), "--seconds", "0.6", "--plain")
+    assert ran.status == 0
+    values = {words[1]: words[2] for words in map(str.split, ran.lines)}
+    assert values.keys() == {"winder/force", "drive2/1", "drive3/1", "winder/axis0.idle"}
+    assert values["winder/axis0.idle"] == "1"
+    summary = ran.err.splitlines()
+    assert [text.split()[1] for text in summary] == ["fast:", "slow:", "winder:", "drive2:", "drive3:", "sqlite:"]
+    assert summary[-1].endswith(" written, 0 dropped")
+    with closing(sqlite3.connect(tmp_path / "x.db")) as database:
+        [found] = database.execute("select count(distinct node || '/' || item) from history").fetchone()
+    assert found == 4
+
+
+def test_run_as_json_is_a_line_a_cycle_under_the_files_names(busmaster: Command, line: Path) -> None:
+    ran = busmaster("run", str(line), "--seconds", "0.4", "--json")
+    cycles = [cycle for cycle in map(json.loads, ran.lines) if cycle["group"] == "fast"]
+    assert [cycle["cycle"] for cycle in cycles] == list(range(1, len(cycles) + 1))
+    assert cycles[0]["samples"].keys() == {"winder/force", "drive2/1", "drive3/1"}
+    assert cycles[0]["samples"]["drive2/1"].keys() == {"value", "error", "late"}
+
+
+def test_run_takes_another_port_and_records_the_line(busmaster: Command, line: Path, controllers: TcpServer) -> None:
+    line.write_text(line.read_text().replace(controllers.path, "socket://127.0.0.1:1"))
+    capture = line.parent / "x.pcapng"
+    ran = busmaster("run", str(line), "--seconds", "0.3", "--port", controllers.path, "--capture", str(capture))
+    assert ran.status == 0
+    with open(capture, "rb") as file:
+        assert sum(1 for _ in read_packets(file)) > 4
+
+
+def test_run_on_a_port_that_is_not_there_is_one_line_and_status_1(busmaster: Command, line: Path) -> None:
+    ran = busmaster("run", str(line), "--port", "socket://127.0.0.1:1")
+    assert (ran.status, ran.out) == (1, "")
+    assert ran.err.startswith("busmaster: 127.0.0.1:1 refused the connection")
+    assert ran.err.count("\n") == 1
+
+
+def test_an_output_that_is_down_is_said_and_the_line_runs_on(busmaster: Command, line: Path, tmp_path: Path) -> None:
+    (tmp_path / "x.db").mkdir()
+    ran = busmaster("run", str(line), "--seconds", "0.4")
+    assert ran.status == 0
+    assert ran.lines
+    said = ran.err.splitlines()
+    assert said[0] == "busmaster: sqlite is down: unable to open database file"
+    assert said[-1].startswith("busmaster: sqlite: 0 written, ")
+    assert said[-1].endswith("dropped, down: unable to open database file")
+
+
+@pytest.mark.parametrize("command", ["run", "plan", "emulate"])
+def test_a_file_that_is_wrong_is_one_line_that_names_line_and_key_and_status_2(
+    busmaster: Command, tmp_path: Path, command: str
+) -> None:
+    path = tmp_path / "line.toml"
+    path.write_text(TEXT.replace("PORT", "socket://127.0.0.1:1").replace("winder/force", "winder/forse"))
+    outcome = busmaster(command, str(path))
+    assert (outcome.status, outcome.out) == (2, "")
+    assert outcome.err == f"busmaster: {path}:13: groups.fast.points[1]: no such item 'forse': did you mean 'force'?\n"
+    missing = busmaster(command, str(tmp_path / "none.toml"))
+    assert (missing.status, missing.out) == (2, "")
+    assert "does not exist" in missing.err
+
+
+def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
+    text = (
+        line.read_text()
+        .replace("period = 0.02", "period = 0.5")
+        .replace("[groups.slow]", "[groups.slow]\nphase = 0.05")
+    )
+    line.write_text(text)
+    outcome = busmaster("plan", str(line))
+    assert (outcome.status, outcome.err) == (0, "")
+    assert outcome.lines[0].startswith("Slitter: 127.0.0.1:")
+    assert [row.split()[0] for row in outcome.lines[1:4]] == ["GROUP", "fast", "slow"]
+    assert outcome.lines[4].startswith("it fits: the schedule asks for ")
+
+
+def test_plan_says_what_would_fit_where_it_does_not_and_ends_with_1(busmaster: Command, line: Path) -> None:
+    outcome = busmaster("plan", str(line))
+    assert (outcome.status, outcome.err) == (1, "")
+    assert "it does not fit:" in outcome.lines
+    assert any("group 'fast' will miss" in text for text in outcome.lines)
+    plan = json.loads(busmaster("plan", str(line), "--json").out)
+    assert plan["fits"] is False
+    assert [group["group"] for group in plan["groups"]] == ["fast", "slow"]
+    assert plan["groups"][0]["values"] == 3
+    assert plan["worst_waits"].keys() == {"urgent", "command", "poll", "background"}
+
+
+@contextmanager
+def emulated(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """`busmaster emulate` as a process, and where it says that it listens."""
+    with started("emulate", *arguments) as process:
+        assert process.stdout is not None
+        try:
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.kill()
+
+
+def test_emulate_serves_a_file_where_run_looks_for_it(busmaster: Command, tmp_path: Path) -> None:
+    path = tmp_path / "line.toml"
+    link = tmp_path / "tty"
+    path.write_text(TEXT.replace("PORT", str(link)))
+    with emulated(str(path)) as (process, where):
+        assert where == str(link)
+        ran = busmaster("run", str(path), "--seconds", "0.5", "--json")
+        assert ran.status == 0
+        assert all(sample["error"] is None for text in ran.lines for sample in json.loads(text)["samples"].values())
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130
+    assert not os.path.lexists(link)
+
+
+def test_emulate_puts_no_link_under_dev_and_goes_where_it_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "line.toml"
+    path.write_text(TEXT.replace("PORT", "/dev/ttyUSB99"))
+    with emulated(str(path), "--fault", "dead=1", "--paced") as (_, where):
+        assert where.startswith("/dev/pts/")
+    with emulated(str(path), "--tcp", "127.0.0.1:0") as (_, where):
+        assert where.startswith("socket://127.0.0.1:")
+
+
+def test_what_the_file_says_is_not_said_again(busmaster: Command, line: Path) -> None:
+    outcome = busmaster("emulate", str(line), "--protocol", "hcp2")
+    assert (outcome.status, outcome.out) == (2, "")
+    assert "the file says protocol, nodes and baud rate" in outcome.err
+    assert "--protocol P" in busmaster("emulate").err
+
+
+def test_ctrl_c_ends_a_run_with_its_summary_and_everything_written(line: Path, tmp_path: Path) -> None:
+    with started("run", str(line), "--json") as process:
+        assert process.stdout is not None
+        assert json.loads(process.stdout.readline())["cycle"] == 1
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert err.splitlines()[-1].endswith(" written, 0 dropped")
+
+
+@pytest.mark.slow
+def test_the_example_runs_on_its_own_emulation(tmp_path: Path) -> None:
+    """As a newcomer types it; the database is where it was started."""
+    example = str(EXAMPLES / "line.toml")
+    with emulated(example, "--tcp", "127.0.0.1:0") as (_, where):
+        process = started("run", example, "--port", f"{where}?baudrate=57600", "--seconds", "3", cwd=tmp_path)
+        out, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
+    assert {line.split()[1].partition("/")[0] for line in out.splitlines()} == {
+        *("winder", "unwinder"),
+        *(f"drive{number}" for number in range(4, 8)),
+    }
+    assert "axes: " in err
+    assert (tmp_path / "line.sqlite").exists()
