@@ -246,18 +246,27 @@ class PortTransport(_SerialTransport):
             self._protocol.connection_lost(cause)
 
 
-def is_pty(fd: int) -> bool:
-    """By the device number: a name can be a symlink to anything."""
-    major = os.major(os.fstat(fd).st_rdev)
+def is_pty(device: int | str) -> bool:
+    """By the device number of a descriptor or a path: a name can be a symlink to anything."""
+    major = os.major(os.stat(device).st_rdev)
     return major in UNIX98_PTYS or major == BSD_PTYS
+
+
+def _names_pty(path: str) -> bool:
+    """False also where nothing is there: opening it will say so."""
+    try:
+        return is_pty(path)
+    except OSError:
+        return False
 
 
 def _open(port: SerialPort) -> tuple[serial.Serial, bool]:
     """Open and configure the device; also says whether it is paced. Blocks. Raises LineDown."""
     device = serial.Serial()
     device.port = port.path
-    device.baudrate, device.bytesize = port.baudrate, port.bytesize
-    device.parity, device.stopbits = port.parity, port.stopbits
+    device.baudrate, device.stopbits = port.baudrate, port.stopbits
+    if not _names_pty(port.path):  # a pty stays at 8N1, and the C library calls a change that changes nothing an error
+        device.bytesize, device.parity = port.bytesize, port.parity
     device.rtscts = port.rtscts
     device.exclusive = True if port.exclusive else None
     device.timeout = device.write_timeout = 0

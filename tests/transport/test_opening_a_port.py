@@ -127,6 +127,13 @@ async def test_the_port_is_configured_in_a_thread_alone(far_end: FarEnd, monkeyp
 
 
 @pytest.mark.asyncio
+async def test_a_pty_opens_again_and_again_whatever_framing_the_protocol_has(far_end: FarEnd) -> None:
+    for _ in range(3):
+        transport, recorder = await opened(far_end.path, bytesize=7, parity="E")
+        await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
 async def test_descriptors_above_1023_work() -> None:
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)
     if limit[1] != resource.RLIM_INFINITY and limit[1] < 1200:
