@@ -222,13 +222,12 @@ class Arbiter:
         return self._deadlines.earliest()
 
     def reset_statistics(self, now: float) -> None:
-        self._counters.reset(now)
+        self._counters.reset(self.state, now)
         for node in self.dispatcher.nodes:
             node.counters.reset()
 
     def statistics(self, now: float) -> LineStatistics:
-        self._counters.spend(self.state, now)
-        return self._counters.snapshot(now, len(self.dispatcher.backlog))
+        return self._counters.snapshot(self.state, now, len(self.dispatcher.backlog))
 
     # one exchange
 

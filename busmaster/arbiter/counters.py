@@ -115,6 +115,7 @@ class NodeCounters:
 
 class LineCounters:
     __slots__ = (
+        "_before",
         "_entered",
         "_spent",
         "cancelled",
@@ -132,14 +133,17 @@ class LineCounters:
     )
 
     def __init__(self, since: float) -> None:
-        self.reset(since)
-
-    def reset(self, since: float) -> None:
-        self.since = since
-        self.exchanges = self.completed = self.cancelled = self.stray_bytes = self.noise_bytes = 0
-        self.tainted = self.collisions = self.settles = self.noisy = self.losses = 0
+        self.exchanges = 0
+        """Ever, as `settling` is: what a request waited for is counted across a reset."""
         self._entered = since
         self._spent = [0.0] * len(LineState)
+        self.reset(LineState.OFFLINE, since)
+
+    def reset(self, state: LineState, since: float) -> None:
+        self.since = since
+        self.completed = self.cancelled = self.stray_bytes = self.noise_bytes = 0
+        self.tainted = self.collisions = self.settles = self.noisy = self.losses = 0
+        self._before = (self.exchanges, self._times(state, since))
         self.waits = (Histogram(), Histogram(), Histogram(), Histogram())
 
     def spend(self, state: LineState, now: float) -> float:
@@ -153,11 +157,20 @@ class LineCounters:
     def settling(self) -> float:
         return self._spent[LineState.SETTLING]
 
-    def snapshot(self, now: float, backlog: int) -> LineStatistics:
+    def _times(self, state: LineState, now: float) -> list[float]:
+        """Seconds ever spent in each state, up to now."""
+        times = self._spent.copy()
+        times[state] += now - self._entered
+        return times
+
+    def snapshot(self, state: LineState, now: float, backlog: int) -> LineStatistics:
+        """Changes nothing: whoever looks does not cut the pauses, from which probes are paid, into pieces."""
         first, second, third, fourth = self.waits
+        exchanges, times = self._before
+        spent = [time - before for time, before in zip(self._times(state, now), times, strict=True)]
         return LineStatistics(
             now - self.since,
-            self.exchanges,
+            self.exchanges - exchanges,
             self.completed,
             self.cancelled,
             self.stray_bytes,
@@ -165,8 +178,8 @@ class LineCounters:
             self.tainted,
             self.collisions,
             self.settles,
-            self.settling,
-            self._spent[LineState.EXCHANGE] + self._spent[LineState.HOLDOFF],
+            spent[LineState.SETTLING],
+            spent[LineState.EXCHANGE] + spent[LineState.HOLDOFF],
             self.noisy,
             self.losses,
             backlog,

@@ -70,11 +70,12 @@ class Dispatcher:
         """Queue it, or end it at once with the reason why not."""
         node = transaction.node
         transaction.queued = now
-        transaction.exchanges_ahead = self.counters.exchanges
-        transaction.settling_ahead = self.counters.settling
+        self._waits(transaction)
         if self.fault is not None:
             self._end(transaction, now, _named(self.fault(), transaction))
             return
+        if transaction.writes and transaction.priority is Priority.URGENT:
+            self._supersede(node, now)
         waiting = max(self.backlog.waiting(transaction.priority), len(node.writes) if transaction.writes else 0)
         if waiting >= self._capacity:
             self._end(transaction, now, _error(BacklogFull, f"{waiting} requests are waiting already", transaction))
@@ -82,8 +83,6 @@ class Dispatcher:
         if not self._may_ask(transaction, now):
             return
         if transaction.writes:
-            if transaction.priority is Priority.URGENT:
-                self._supersede(node, now)
             node.writes.append(transaction)
         if transaction.deadline == inf:
             transaction.deadline = now + RETRY_PATIENCE
@@ -107,7 +106,7 @@ class Dispatcher:
         """The transaction that may be sent now, or None."""
         while (transaction := self.backlog.pop()) is not None:
             node = transaction.node
-            if transaction.start_by < now and not transaction.attempts:
+            if transaction.start_by < now and transaction.queued < now and not transaction.attempts:
                 self._end(transaction, now, _not_started(transaction, now))
             elif transaction.writes and node.writes[0] is not transaction:
                 self._park(transaction)
@@ -123,8 +122,7 @@ class Dispatcher:
         counters = self.counters
         if transaction.attempts == 0:
             counters.waits[transaction.priority].record(now - transaction.queued)
-            transaction.exchanges_ahead = counters.exchanges - transaction.exchanges_ahead
-            transaction.settling_ahead = counters.settling - transaction.settling_ahead
+            self._count_ahead(transaction)
             poll = transaction.poll
             if poll is not None and poll.started == -inf:
                 poll.started = now
@@ -134,6 +132,7 @@ class Dispatcher:
         transaction.attempts += 1
         transaction.started = now
         transaction.first_byte = -inf
+        transaction.late = False
 
     # what came of an attempt
 
@@ -247,8 +246,7 @@ class Dispatcher:
 
     def _start_cycle(self, poll: Poll, now: float) -> None:
         for transaction in begin_cycle(poll, now):
-            transaction.exchanges_ahead = self.counters.exchanges
-            transaction.settling_ahead = self.counters.settling
+            self._waits(transaction)
             error = self._reason_to_park(transaction, now)
             if error is None:
                 self.backlog.push(transaction)
@@ -308,6 +306,7 @@ class Dispatcher:
         probe = Transaction(node, node.profile.probe, priority=Priority.BACKGROUND, retries=0, probe=True)
         probe.paid = cost
         probe.queued = now
+        self._waits(probe)
         probe.deadline = now + RETRY_PATIENCE
         node.counters.probes += 1
         self._probe = probe
@@ -373,7 +372,7 @@ class Dispatcher:
             self.backlog.promote(first, write.priority)
 
     def _supersede(self, node: NodeRecord, now: float) -> None:
-        """An urgent write overtakes: what it overtakes is never sent after it (R7)."""
+        """An urgent write overtakes: what it overtakes is never sent after it, nor if it cannot be sent itself (R7)."""
         for write in list(node.writes):
             if write.phase is Phase.ON_WIRE:
                 write.superseded = True
@@ -394,6 +393,8 @@ class Dispatcher:
         """Exactly once (R8). A write that was on the wire before something else ended it may have been carried out."""
         if transaction.writes and transaction.attempts and error is not None and not isinstance(error, TELLING):
             error = _error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
+        if not transaction.attempts:
+            self._count_ahead(transaction)
         transaction.phase = Phase.ENDED
         transaction.ended_at = now
         transaction.error = error
@@ -415,6 +416,16 @@ class Dispatcher:
         elif transaction.heard:
             self.counters.completed += 1
             self.events.append(Completed(transaction))
+
+    def _waits(self, transaction: Transaction) -> None:
+        """What the line has counted so far is not what it waits for."""
+        transaction.exchanges_ahead = self.counters.exchanges
+        transaction.settling_ahead = self.counters.settling
+
+    def _count_ahead(self, transaction: Transaction) -> None:
+        """It has waited: until now it held what `_waits` noted."""
+        transaction.exchanges_ahead = self.counters.exchanges - transaction.exchanges_ahead
+        transaction.settling_ahead = self.counters.settling - transaction.settling_ahead
 
     def _next_write(self, transaction: Transaction) -> None:
         writes = transaction.node.writes

@@ -103,12 +103,10 @@ class Transaction:
         self.priority = priority
         self.writes = command.writes
         self.idempotent = command.idempotent if idempotent is None else idempotent
-        if retries is not None:
-            self.retries = retries
-        elif probe or (self.writes and not self.idempotent):
+        if probe or (self.writes and not self.idempotent):
             self.retries = 0
         else:
-            self.retries = node.retries
+            self.retries = node.retries if retries is None else retries
         self.start_by = start_by
         self.waiter = waiter
         self.poll = poll

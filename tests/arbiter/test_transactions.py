@@ -5,12 +5,14 @@ from __future__ import annotations
 import pytest
 
 from busmaster.arbiter.events import LineState
+from busmaster.arbiter.health import Health
 from busmaster.arbiter.transaction import Phase, Priority
 from busmaster.errors import (
     BacklogFull,
     BusClosed,
     GarbledReply,
     LineDown,
+    NodeDown,
     NoReply,
     NotStarted,
     Superseded,
@@ -308,3 +310,69 @@ def test_a_timeline_says_what_a_request_waited_for() -> None:
     assert timeline.exchanges_ahead == 1
     assert timeline.settling_ahead == pytest.approx(0.050)
     assert timeline.attempts == 1
+
+
+def test_r7_a_number_of_retries_alone_does_not_make_a_write_repeatable() -> None:
+    """Writing Comms 1 to 5 starts a Mint event even of an equal value (AN00110): only `idempotent` says it may be."""
+    bench = Bench()
+    asked = bench.ask(bench.node(), write(5), retries=2)
+    assert bench.sent() == WRITE_5
+    bench.wait(5.0)
+    assert WRITE_5 not in bench.sent()
+    assert asked.attempts == 1
+    assert isinstance(asked.error, WriteUnconfirmed)
+
+
+def test_r7_an_urgent_write_that_is_not_worth_line_time_still_supersedes_what_waits() -> None:
+    """A disable that fails with NodeDown must not be followed by the enable that was asked before it."""
+    bench = Bench()
+    dead, other = bench.node(1), bench.node(2)
+    bench.ask(dead, retries=0)
+    bench.wait(0.2)
+    assert dead.health is Health.DOWN
+    bench.ask(other)
+    enable = bench.ask(dead, write(5))
+    bench.arbiter.dispatcher._budget.tokens = 0.0
+    disable = bench.ask(dead, write(0), priority=Priority.URGENT)
+    assert isinstance(disable.error, NodeDown)
+    assert isinstance(enable.error, Superseded)
+    assert enable.attempts == 0
+
+
+def test_a_value_that_came_in_time_is_not_late_because_an_earlier_attempt_was() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node())
+    bench.sent()
+    bench.hear("02 30", after=0.080)
+    bench.until_sent()
+    bench.hear(FIVE, after=0.004)
+    assert (read.value, read.attempts, read.late) == (5.0, 2, False)
+
+
+def test_r12_a_request_that_is_to_start_at_once_starts_on_a_free_line() -> None:
+    """The clock has gone on between the caller's look at it and the arbiter's."""
+    bench = Bench()
+    node = bench.node()
+    bench.wait(1.0)
+    first = bench.ask(node, start_by=bench.now - 1e-6)
+    second = bench.ask(node, hcp2.Read(2), start_by=bench.now)
+    assert bench.sent() == READ_1_OF_NODE_1
+    bench.hear(FIVE, after=0.004)
+    assert first.value == 5.0
+    assert isinstance(second.error, NotStarted)
+
+
+def test_a_timeline_that_spans_a_reset_of_the_statistics_counts_on() -> None:
+    bench = Bench()
+    node = bench.node()
+    for _ in range(3):
+        bench.ask(node, retries=0)
+        bench.hear(FIVE, after=0.004)
+    bench.ask(node, retries=0)
+    waiting = bench.ask(node)
+    bench.arbiter.reset_statistics(bench.now)
+    bench.wait(0.160)
+    timeline = waiting.timeline()
+    assert timeline.exchanges_ahead == 1
+    assert timeline.settling_ahead == pytest.approx(0.050, abs=0.002)
+    assert bench.arbiter.statistics(bench.now).exchanges == 1
