@@ -25,7 +25,8 @@ from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
-REPLY_DEADLINE = 0.1
+REPLY_DEADLINE = 1.0
+"""Seconds. Long: a machine that is busy with something else must not end a benchmark."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ without the silence between frames where a master can do without it, so that the
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ from benchmarks.far_end import SETTINGS, value_of
 from benchmarks.harness import Options, Outcome, Table, alternate
 from benchmarks.lines import Lines
 from benchmarks.masters import Ask, Bare
-from benchmarks.modbus_masters import PROFILE, TIMINGS, Busmaster, Minimalmodbus, ModbusMaster, masters, notes
+from benchmarks.modbus_masters import PROFILE, TIMINGS, Busmaster, Failed, Minimalmodbus, ModbusMaster, masters, notes
 from busmaster import SerialPort, Timings
 from busmaster.profile import LineSettings
 from examples.modbus_rtu import ReadRegisters, with_crc
@@ -23,7 +24,7 @@ DELAY = 0.002
 CALLERS = 4
 NO_GAP = Timings.uniform(replace(TIMINGS.read, turnaround=0.0))
 NAMED = [(unit, register) for unit in range(1, 5) for register in (0, 7, 99)]
-COLUMNS = ("master", "wrong", "/s", "us each", "x ours", "CPU us", "x ours")
+COLUMNS = ("master", "wrong", "failed", "/s", "us each", "x ours", "CPU us", "x ours")
 
 
 def run(options: Options) -> Outcome:
@@ -53,12 +54,16 @@ async def _measure(title: str, settings: LineSettings | None, options: Options, 
     bare = Bare(asks())
     replies = {ask.request: ask.reply for ask in asks()}
     runs: dict[str, Callable[[int], Awaitable[int]]] = {}
+    failed: Counter[str] = Counter()
     delay = DELAY if settings is not None else 0.0
     with Lines(len(compared) + 1, replies, settings=settings, delay=delay) as lines:
         for master, port in zip(compared, lines.ports, strict=False):
             assert isinstance(port, SerialPort)
             await master.open(port.path)
-            runs[master.name] = _blocking(master) if isinstance(master, Minimalmodbus) else _concurrent(master)
+            if isinstance(master, Minimalmodbus):
+                runs[master.name] = _blocking(master, failed)
+            else:
+                runs[master.name] = _concurrent(master, failed)
             await runs[master.name](len(NAMED))
         await bare.open(lines.ports[-1])
         runs[bare.name] = bare.run
@@ -73,34 +78,40 @@ async def _measure(title: str, settings: LineSettings | None, options: Options, 
     table = Table(title, COLUMNS)
     for name, own in timings.items():
         cpu = own.cpu_each / ours.cpu_each
-        table.row(name, own.wrong, 1 / own.each, own.each * 1e6, own.ratio(ours), own.cpu_each * 1e6, cpu)
+        table.row(name, own.wrong, failed[name], 1 / own.each, own.each * 1e6, own.ratio(ours), own.cpu_each * 1e6, cpu)
     outcome.wrong += ours.wrong
     return table
 
 
-def _concurrent(master: ModbusMaster) -> Callable[[int], Awaitable[int]]:
+def _concurrent(master: ModbusMaster, failed: Counter[str]) -> Callable[[int], Awaitable[int]]:
     async def run(transactions: int) -> int:
-        return sum(await asyncio.gather(*(_call(master, n, transactions // CALLERS) for n in range(CALLERS))))
+        return sum(await asyncio.gather(*(_call(master, n, transactions // CALLERS, failed) for n in range(CALLERS))))
 
     return run
 
 
-async def _call(master: ModbusMaster, number: int, transactions: int) -> int:
+async def _call(master: ModbusMaster, number: int, transactions: int, failed: Counter[str]) -> int:
     wrong = 0
     for n in range(transactions):
         unit, register = NAMED[(number + n) % len(NAMED)]
-        wrong += await master.read(unit, register) != value_of(unit, register)
+        try:
+            wrong += await master.read(unit, register) != value_of(unit, register)
+        except Failed:
+            failed[master.name] += 1
     return wrong
 
 
-def _blocking(master: Minimalmodbus) -> Callable[[int], Awaitable[int]]:
+def _blocking(master: Minimalmodbus, failed: Counter[str]) -> Callable[[int], Awaitable[int]]:
     """Without the thread that the other scenarios need: as it is used in a plain script."""
 
     async def run(transactions: int) -> int:
         wrong = 0
         for n in range(transactions):
             unit, register = NAMED[n % len(NAMED)]
-            wrong += master.read_blocking(unit, register) != value_of(unit, register)
+            try:
+                wrong += master.read_blocking(unit, register) != value_of(unit, register)
+            except Failed:
+                failed[master.name] += 1
         return wrong
 
     return run
