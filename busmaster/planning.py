@@ -366,7 +366,8 @@ def _rounded_up(seconds: float) -> float:
 
 
 def _advice(plan: Plan) -> Iterator[str]:
-    if plan.utilisation <= COMFORT and plan.fits:
+    tight = any(group.longest_cycle > COMFORT * group.period for group in plan.groups)
+    if plan.utilisation <= COMFORT and plan.fits and not tight:
         return
     yield f"the schedule asks for {plan.utilisation:.0%} of the line; comfortable is up to {COMFORT:.0%}"
     for group in plan.groups:
@@ -375,6 +376,8 @@ def _advice(plan: Plan) -> Iterator[str]:
                 f"group {group.name!r} will miss {group.missed:.0%} of its cycles: "
                 f"one every {group.achieved:.3g} s in place of {group.period:g} s"
             )
+        elif group.longest_cycle > COMFORT * group.period:
+            yield f"group {group.name!r} has no time to spare: a cycle takes up to {group.longest_cycle:.3g} s"
         if group.fitting_period is not None:
             yield f"it would fit with a period of {group.fitting_period:g} s for group {group.name!r}"
         if group.could_save:

@@ -113,6 +113,13 @@ def test_a_group_in_background_gets_what_the_others_leave_and_an_eighth() -> Non
     assert history.cycle == pytest.approx(8 * 10 * EXCHANGE, rel=0.05)
 
 
+def test_a_group_without_time_to_spare_is_named_although_it_fits() -> None:
+    tight = planned(group("tight", 11 * EXCHANGE, 10, phase=0.0), group("easy", 5.0, 1))
+    assert tight.fits
+    assert any("'tight' has no time to spare" in line for line in tight.advice)
+    assert not any("'easy'" in line and "spare" in line for line in tight.advice)
+
+
 # what would fit
 
 
