@@ -112,7 +112,7 @@ class Arbiter:
         self.dispatcher.nodes.append(node)
         if profile.listen is not None and self._strays.listener is None:
             self._strays.listener = profile.listen()
-        self._quarantine = max(self._quarantine, self._up_at + node.lateness)
+        self._quarantine = max(self._quarantine, self._up_at + node.lateness + self._leg.latency)
         return node
 
     def submit(self, transaction: Transaction, now: float) -> None:
@@ -163,7 +163,7 @@ class Arbiter:
         self._events.append(LineChanged(LineChange.UP))
         lateness = max((node.lateness for node in self.dispatcher.nodes), default=UNKNOWN_LATENESS)
         self._up_at = now
-        self._quarantine = now + lateness
+        self._quarantine = now + lateness + self._leg.latency
         self._settle(now)
 
     def line_down(self, cause: str, now: float) -> None:
@@ -268,12 +268,9 @@ class Arbiter:
 
     def _read(self, data: bytes, now: float) -> None:
         """Bytes while an exchange is on the wire."""
-        if not self._leg.begun:
-            data = self._begin_reply(data, now)
-            if not data:
-                return
-        self._strays.last_byte = now
-        self._take(data, now)
+        if self._leg.begun or (data := self._begin_reply(data, now)):
+            self._strays.last_byte = now
+            self._take(data, now)
 
     def _begin_reply(self, data: bytes, now: float) -> bytes:
         """The first bytes of a leg: returns those that may be its reply."""
@@ -292,6 +289,7 @@ class Arbiter:
         if transaction.node.profile.noise_tolerant:
             kept = data.lstrip(bytes(set(data) - set(exchange.starts)))
             self._counters.noise_bytes += len(data) - len(kept)
+            self._strays.last_byte = now
             if not kept:
                 return b""
             data = kept
@@ -344,7 +342,7 @@ class Arbiter:
         self.dispatcher.succeeded(transaction, step.value, now)
         if step.rest:
             self._strays.note(step.rest, now, self._leg.quiet())
-        if step.rest or self._strayed_within:
+        if step.rest or self._strayed_within or (self._echo.owed and not answered):
             self._settle(now)
             return
         self._strays.answered()
@@ -441,7 +439,8 @@ class Arbiter:
         if self.state is LineState.OFFLINE:
             return
         self._settle(now)
-        self._answer_stray(strays.reply_to(data), now)
+        if not self.noisy:
+            self._answer_stray(strays.reply_to(data), now)
         if strays.babbling(now) and not self.noisy:
             self.noisy = True
             self._counters.noisy += 1

@@ -39,6 +39,7 @@ REFUSED_POLL_PAUSE = 10.0
 RETRY_PATIENCE = 1.0
 """Seconds after which a request in POLL or BACKGROUND wants to be answered; the period, for a poll."""
 EXPIRY_SLACK = 64
+SUSPENDED = "suspended for maintenance"
 TELLING = (Refused, Superseded, WriteUnconfirmed)
 """Errors that say themselves what may have become of a write that was on the wire."""
 
@@ -110,7 +111,9 @@ class Dispatcher:
                 self._end(transaction, now, _not_started(transaction, now))
             elif transaction.writes and node.writes[0] is not transaction:
                 self._park(transaction)
-            elif (node.health is not Health.DOWN and node.suspended_until <= now) or self._may_ask(transaction, now):
+            elif (node.health is not Health.DOWN and not node.holds and node.suspended_until <= now) or self._may_ask(
+                transaction, now
+            ):
                 return transaction
         return None
 
@@ -258,7 +261,7 @@ class Dispatcher:
         if self.fault is not None:
             return _named(self.fault(), transaction)
         if now < node.suspended_until:
-            return _error(NodeDown, "suspended for maintenance", transaction)
+            return _error(NodeDown, SUSPENDED, transaction)
         if node.health is Health.DOWN:
             return _error(NodeDown, "down: it is probed, its polls wait", transaction)
         if node.holds:
@@ -314,19 +317,22 @@ class Dispatcher:
         self.backlog.push(probe)
 
     def _may_ask(self, transaction: Transaction, now: float) -> bool:
-        """Whether a node that is down or suspended is worth this request's line time; if not, it is ended."""
+        """Whether a node that is down, back or suspended is worth this request's line time; if not, it is ended."""
         node = transaction.node
-        if now < node.suspended_until:
-            self._end(transaction, now, _error(NodeDown, "suspended for maintenance", transaction))
-            return False
-        if node.health is not Health.DOWN or transaction.paid or transaction.probe:
-            return True
-        if transaction.poll is None and self._budget.take(node.lateness, now):
-            transaction.paid = node.lateness
-            transaction.retries = 0
-            return True
-        self._end(transaction, now, _error(NodeDown, "down: no answer for a while", transaction))
-        return False
+        error: BusError | None = None
+        if transaction.poll is not None:
+            error = self._reason_to_park(transaction, now)
+        elif now < node.suspended_until:
+            error = _error(NodeDown, SUSPENDED, transaction)
+        elif node.health is Health.DOWN and not (transaction.paid or transaction.probe):
+            if self._budget.take(node.lateness, now):
+                transaction.paid = node.lateness
+                transaction.retries = 0
+            else:
+                error = _error(NodeDown, "down: no answer for a while", transaction)
+        if error is not None:
+            self._end(transaction, now, error)
+        return error is None
 
     def _heard(self, node: NodeRecord, now: float) -> None:
         before = node.health

@@ -14,14 +14,14 @@ TAINT_SHARE = 0.9
 class Leg:
     """The leg on the wire, or the last one. `latency`: how long received bytes may lie in an adapter, in seconds."""
 
-    __slots__ = ("_latency", "_limit", "_taint_until", "begun", "end", "timing")
+    __slots__ = ("_limit", "_taint_until", "begun", "end", "latency", "timing")
 
     def __init__(self, timing: ReplyTiming, latency: float) -> None:
         self.timing = timing
         self.begun = False
         self.end = -inf
         """When the last byte sent is on the wire."""
-        self._latency = latency
+        self.latency = latency
         self._limit = inf
         self._taint_until = -inf
 
@@ -30,7 +30,7 @@ class Leg:
         self.timing = timing
         self.begun = False
         self.end = end = now + said
-        due = end + timing.window + self._latency
+        due = end + timing.window + self.latency
         self._limit = due + longest + timing.byte_gap
         return due
 
@@ -42,18 +42,18 @@ class Leg:
         return now < self._taint_until
 
     def late(self, now: float) -> bool:
-        return now > self.end + self.timing.nominal + self._latency
+        return now > self.end + self.timing.nominal + self.latency
 
     def gap_over(self, now: float) -> float:
         """When the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
-        due = now + self.timing.byte_gap + self._latency
+        due = now + self.timing.byte_gap + self.latency
         return due if due < self._limit else self._limit
 
     def echoed(self, now: float) -> float:
         """The last byte of its echo came: its times start here. When its reply must begin."""
         self._limit += now - self.end
         self.end = now
-        return now + self.timing.window + self._latency
+        return now + self.timing.window + self.latency
 
     def quiet(self) -> float:
         """The silence, in seconds, after which nothing more of a frame can come."""
@@ -61,4 +61,4 @@ class Leg:
 
     def past(self) -> float:
         """From then on, no reply to it can begin (R3)."""
-        return self.end + self.timing.lateness + self._latency
+        return self.end + self.timing.lateness + self.latency

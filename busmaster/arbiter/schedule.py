@@ -153,6 +153,8 @@ class Schedule:
         while heap and heap[0][0] <= now:
             poll = heap[0][2]
             behind = floor((now - poll.base) / poll.period) - poll.number
+            if poll.base + (poll.number + max(behind, 0) + 1) * poll.period <= now:
+                behind = max(behind, 0) + 1  # rounding
             if behind > 0:
                 poll.number += behind
                 poll.missed += 0 if poll.paused else behind

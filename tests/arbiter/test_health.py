@@ -480,3 +480,26 @@ def test_r11_whoever_looks_at_the_statistics_does_not_shorten_the_pauses_that_pa
         tokens.append(budget.tokens)
     assert tokens[0] == pytest.approx(tokens[1])
     assert tokens[0] > 0.4
+
+
+def test_r11_polls_that_wait_already_do_not_go_before_the_hook_of_a_node_that_returns() -> None:
+    bench = Bench()
+    node, other = bench.node(1), bench.node(2)
+    node.has_hook = True
+    for address in (node, other):
+        bench.ask(address)
+        bench.hear(FIVE, after=0.004)
+    bench.wait(1.5)
+    poll = bench.poll(node, 5.0, 1)
+    bench.ask(other)
+    bench.to(bench.now + 0.001)
+    assert poll.remaining
+    node.health, node.failures = Health.DOWN, 3
+    bench.ask(node, hcp2.Read(1))
+    bench.hear(FIVE, after=0.004)
+    bench.sent()
+    bench.hear(FIVE, after=0.004)
+    assert node.health is Health.UP
+    assert node.holds == 1
+    assert bench.sent() == ""
+    assert isinstance(poll.results[0].error, NodeDown)

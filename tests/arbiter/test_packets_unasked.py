@@ -121,3 +121,18 @@ def test_a_stale_packet_while_the_line_settles_is_acked_too() -> None:
     line.sent()
     line.hear(REPLY_1234, after=0.1)
     assert line.sent() == ACK
+
+
+def test_r3_on_a_noisy_line_nothing_is_sent_not_even_an_ack() -> None:
+    line = bench()
+    line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    for _ in range(100):
+        line.hear("FF", after=0.015)
+    assert line.arbiter.noisy
+    line.hear(REPLY_1234, after=0.015)
+    assert line.sent() == ""
+    line.wait(2.0)
+    line.sent()
+    line.hear(REPLY_1234)
+    assert line.sent() == ACK

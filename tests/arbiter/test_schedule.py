@@ -275,3 +275,17 @@ def test_line_time_of_a_conversation_counts_each_leg_and_the_closing_ack() -> No
     tau = msc.PROFILE.line.byte_time
     read = msc.DataRead(2008).open(1, msc.PROFILE.timings)
     assert line_time(read, tau, 0.01) == pytest.approx((16 + 1 + 18 + 1) * tau + 2 * 0.01)
+
+
+@given(st.floats(0.001, 10.0), st.floats(0.0, 100.0), st.integers(2, 1000))
+def test_r10_an_owner_who_was_late_starts_a_poll_once_even_if_the_clock_stands_on_its_grid(
+    period: float, start: float, cycles: int
+) -> None:
+    """Rounding may put the time before the cycle that is due just then."""
+    schedule = Schedule()
+    poll = Poll("g", period, phase=0.0)
+    schedule.add(poll, start)
+    starting = schedule.release(poll.base + cycles * period)
+    assert starting == [poll]
+    assert poll.missed == cycles
+    assert poll.next_due() > poll.base + cycles * period

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, LineState, Strayed
 from busmaster.errors import GarbledReply, LineNoisy, Refused
-from busmaster.protocols import hcp2
+from busmaster.exchange import ReplyTiming, Timings
+from busmaster.protocols import hcp2, mentor
 from tests.arbiter.bench import ACK, ANOTHER_ELEMENT, FIVE, NAK, READ_1_OF_NODE_1, SEVEN, TAU, WRITE_5, Bench
 
 REQUEST = 8 * TAU
@@ -219,3 +222,35 @@ def test_an_echo_that_never_comes_is_named_in_the_error() -> None:
     read = bench.ask(bench.node(), retries=0)
     bench.wait(0.2)
     assert "no echo" in str(read.error)
+
+
+def test_r3_behind_a_slow_adapter_an_earlier_masters_reply_is_waited_out_for_as_much_longer() -> None:
+    bench = Bench(latency=0.016)
+    bench.arbiter.line_down("unplugged", bench.now)
+    bench.arbiter.line_up(bench.now)
+    up = bench.now
+    bench.node()
+    read = bench.poll(bench.node(), 10.0, 1)
+    bench.until_sent()
+    assert read.running
+    assert bench.now - up == pytest.approx(0.150 + 0.016)
+
+
+def test_r3_noise_that_a_tolerant_profile_skips_is_no_silence() -> None:
+    bench = Bench()
+    patient = Timings.uniform(ReplyTiming(0.05, 0.1, 0.1, 0.02))
+    node = bench.node(profile=replace(hcp2.PROFILE, noise_tolerant=True), timings=patient)
+    bench.ask(node)
+    bench.sent()
+    bench.hear("FF", after=REQUEST + 0.099)
+    assert bench.until_sent() == pytest.approx(0.020)
+
+
+def test_a_broadcast_whose_echo_never_came_leaves_nothing_to_be_taken_for_a_collision() -> None:
+    bench = Bench(echo=True)
+    everyone = bench.node(0, mentor.PROFILE)
+    for _ in range(3):
+        bench.ask(everyone, mentor.Write(1, 17, 100))
+        bench.wait(1.0)
+        bench.sent()
+    assert bench.arbiter._echo.owed == b""
