@@ -60,5 +60,5 @@ def tell(watch: Watch, text: str) -> None:
 
 
 def output_text(counts: OutputStatistics) -> str:
-    text = f"{counts.kind}: {counts.written} written, {counts.dropped} dropped"
+    text = f"{counts.kind}: {counts.written} {counts.what}, {counts.dropped} dropped"
     return f"{text}, down: {counts.error}" if counts.error else text

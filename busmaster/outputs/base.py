@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeAlias, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TypeAlias, TypeVar
 
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.settings import Settings
@@ -33,6 +34,7 @@ BATCH = 2_000
 """Values that are written at once."""
 FIRST_RETRY, LAST_RETRY = 0.5, 10.0
 """Seconds from a failure to the next try: doubled each time."""
+ERROR_NUMBER = re.compile(r"^\[Errno -?\d+\] ")
 
 
 class Happening(NamedTuple):
@@ -53,9 +55,13 @@ def size_of(item: Item) -> int:
 
 @dataclass(frozen=True, slots=True)
 class OutputStatistics:
-    """Counts of values and events. `error` is why it is down, "" while it is not."""
+    """Counts of values and events; of answers where it only answers (`what`: "answered").
+
+    `error` is why it is down, "" while it is not.
+    """
 
     kind: str
+    what: str
     written: int
     dropped: int
     waiting: int
@@ -69,7 +75,7 @@ def reason(error: BaseException) -> str:
     text = str(error)
     if isinstance(error, OSError) and error.strerror:
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return " ".join(text.split()) or type(error).__name__
+    return " ".join(ERROR_NUMBER.sub("", text).split()) or type(error).__name__
 
 
 def check_folder(path: str) -> None:
@@ -89,6 +95,8 @@ def check_extra(package: str, extra: str) -> None:
 
 class Output(ABC):
     """One output. `clock` is the bus's; `say` is called from any thread with what happens to the output."""
+
+    what: ClassVar[str] = "written"
 
     def __init__(
         self,
@@ -132,7 +140,7 @@ class Output(ABC):
 
     def statistics(self) -> OutputStatistics:
         waiting = self.offered - self.written - self.dropped
-        return OutputStatistics(self.kind, self.written, self.dropped, waiting, self.error)
+        return OutputStatistics(self.kind, self.what, self.written, self.dropped, waiting, self.error)
 
     # off the loop
 

@@ -11,7 +11,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import accumulate
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health
@@ -53,6 +53,8 @@ LINE_COUNTS = {
 
 class MetricsOutput(Output):
     """Serves until it is closed. Raises InvalidCommand if the extra is missing."""
+
+    what: ClassVar[str] = "answered"
 
     def __init__(
         self,
@@ -109,6 +111,8 @@ class MetricsOutput(Output):
         yield from self._of_nodes()
         yield from self._of_groups()
         yield from self._of_outputs()
+        self.offered += 1
+        self.written = self.offered
 
     def _ask(self, read: Callable[[], T]) -> T:
         """Have the loop that owns the line call `read`."""

@@ -51,7 +51,7 @@ def of(metrics: Metrics, name: str, **labels: str) -> float:
 async def test_a_scrape_has_the_counts_of_nodes_groups_line_and_outputs() -> None:
     bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
     controller, absent = Hcp2Controller(bus, 5), Hcp2Controller(bus, 6)
-    counts = OutputStatistics("sqlite", 10, 2, 3, "disk full")
+    counts = OutputStatistics("sqlite", "written", 10, 2, 3, "disk full")
     output = MetricsOutput("metrics", MetricsSettings(port=0), bus, outputs=lambda: (counts,))
     async with bus:
         output.start()
