@@ -5,7 +5,10 @@ Inside and outside the master's assumption (R3: one request causes at most one r
 lateness, no value that the master delivers may be wrong. `BEYOND` it the replies' anonymity or an 8-bit checksum
 makes a wrong value possible, and the campaigns count how often.
 
-Faults of a line strike every frame on it, the host's too; those of a device what it hears and says.
+Faults of a line strike every frame on it, the host's too; those of a device what it hears and says. There are two
+that are `WITHIN` only as a device's: a request that is heard `doubled` is answered twice; and one that is `truncated`
+by its last byte leaves a device of HCP, HCP2 or Mentor II waiting, which takes the first byte of the next request for
+it and answers NAK, to a request that went to somebody else.
 """
 
 from __future__ import annotations
@@ -23,6 +26,8 @@ if TYPE_CHECKING:
 
 FORGED = b"\x06\x15\x04"
 """Bytes that are a whole reply by themselves: ACK, NAK, EOT."""
+NO_NOISE = bytes(byte | parity for byte in FORGED + b"\x08" for parity in (0x00, 0x80))
+"""These, and BS, which is a whole request to a Mentor II; also as a line of 7 bits with parity carries them."""
 
 HEARING = ("dead", "drop", "deaf", "restart", "flapping", "nak", "late")
 SPEAKING = (
@@ -60,9 +65,9 @@ class Faults:
     duplicate: float = 0.0
     """A second device with the same address answers too, after a delay of its own."""
     leading: float = 0.0
-    """A few noise bytes before it (a driver switched on): never one of `FORGED`."""
+    """A few noise bytes before it (a driver switched on): never one of `NO_NOISE`."""
     trailing: float = 0.0
-    """A few noise bytes glued to its end: never one of `FORGED`."""
+    """A few noise bytes glued to its end: never one of `NO_NOISE`."""
     forged: float = 0.0
     """A stray ACK, NAK or EOT in front of it."""
     babble: float = 0.0
@@ -208,12 +213,12 @@ def distort(faults: Faults, said: Said, device: Device | None, tau: float, chanc
 
 
 def noise(chance: Chance, longest: int) -> bytes:
-    """One to `longest` bytes as a disturbed line makes them: all zeros, all ones, or anything but `FORGED`."""
+    """One to `longest` bytes as a disturbed line makes them: all zeros, all ones, or anything but `NO_NOISE`."""
     kind = chance.randrange(0, 4)
     count = chance.randrange(1, longest + 1)
     if kind < 2:
         return (b"\x00", b"\xff")[kind] * count
-    return bytes(chance.getrandbits(8) for _ in range(count)).translate(None, FORGED) or b"\xff"
+    return bytes(chance.getrandbits(8) for _ in range(count)).translate(None, NO_NOISE) or b"\xff"
 
 
 def flipped(data: bytes, chance: Chance, count: int) -> bytes:

@@ -34,6 +34,10 @@ class Oracle:
     def read(self, element: int) -> int:
         return oracle_value(self.node, element, self.writes[element], self.modulus)
 
+    def elsewhere(self) -> int:
+        """A value of another node: what a reply carries that answers for somebody else."""
+        return oracle_value(self.node + 1, 0, 0, self.modulus)
+
     def write(self, element: int, value: float, slack: int = 64) -> None:
         """Counts it. The writer is to send `oracle_value(node, element, n)` with n within `slack` of the count."""
         count = self.writes[element]

@@ -6,10 +6,12 @@ from random import Random
 
 import pytest
 
+from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay
 from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.faults import BEYOND, FORGED, HEARING, NAMES, SPEAKING, WITHIN, Faults, noise
 from busmaster.emulator.line import Line
+from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
 from tests.emulator.lines import TAU, arrivals, ask, hexed, line_of
 
@@ -164,6 +166,27 @@ def test_a_wrong_element_with_a_right_checksum() -> None:
     assert heard("wrong=1", request=WRITE) == b"\x06"  # an ACK names nobody
 
 
+@pytest.mark.parametrize(
+    ("protocol", "modulus", "request_", "value"),
+    [
+        ("hcp", 10**12, "04 31 31 02 30 31 05", slice(3, -2)),
+        ("hcp2", 10**12, "07 30 31 02 30 31 05 07", slice(3, -2)),
+        ("mentor", 10**4, "04 30 30 31 31 30 31 31 37 05", slice(5, -2)),
+        ("msc", 2**31, "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74", slice(-6, -2)),
+        ("dc104", 2**16, "02 AA 01 AB", slice(2, -1)),
+    ],
+)
+def test_a_reply_for_somebody_else_carries_somebody_elses_value(
+    protocol: str, modulus: int, request_: str, value: slice
+) -> None:
+    """Else a reader that does not look at the echo would not be caught."""
+    address = 0 if protocol == "dc104" else 1
+    right, wrong = (make_device(protocol, address, oracle=Oracle(address, modulus)) for _ in range(2))
+    wrong.faults.wrong = 1.0
+    answers = [bytes.fromhex(ask(line_of(device), request_)) for device in (right, wrong)]
+    assert answers[0][value] != answers[1][value]
+
+
 def test_a_duplicate_address_collides_or_answers_too() -> None:
     heard_twice = collided = 0
     for seed in range(20):
@@ -189,6 +212,7 @@ def test_noise_is_never_a_reply_by_itself() -> None:
         burst = noise(chance, 8)
         assert 1 <= len(burst) <= 8
         assert not set(burst) & set(FORGED)
+        assert not {byte & 0x7F for byte in burst} & {*FORGED, 0x08}, "nor to a Mentor II, whose characters have 7 bits"
 
 
 def test_a_forged_reply() -> None:

@@ -121,7 +121,8 @@ class Dc104Drive(Device):
         if reply[0] != STX:
             return reply
         other = chance.randrange(0, LAST_PARAMETER)
-        return packet(other + (other >= reply[1]), int.from_bytes(reply[2:4], "big"))
+        value = int.from_bytes(reply[2:4], "big") if self.oracle is None else self.oracle.elsewhere()
+        return packet(other + (other >= reply[1]), value)
 
 
 def packet(parameter: int, value: int) -> bytes:

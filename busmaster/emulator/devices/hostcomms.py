@@ -230,7 +230,8 @@ class HostCommsDevice(Device):
             return reply
         element = int(reply[1:3], self.framing.base)
         other = chance.randrange(1, self.framing.last_element)
-        return telegram(self.framing, other + (other >= element), reply[3:-2])
+        text = reply[3:-2] if self.oracle is None else number_text(self.oracle.elsewhere())
+        return telegram(self.framing, other + (other >= element), text)
 
 
 @lru_cache(maxsize=4096)

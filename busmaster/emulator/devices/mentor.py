@@ -282,7 +282,8 @@ class MentorDrive(Device):
             return reply
         parameter = int(reply[1:5].translate(SEVEN_BITS))
         other = chance.randrange(0, 9999)
-        summed = b"%04d" % (other + (other >= parameter)) + reply[5:-1].translate(SEVEN_BITS)
+        data = reply[5:-2].translate(SEVEN_BITS) if self.oracle is None else b"%+05d" % self.oracle.elsewhere()
+        summed = b"%04d" % (other + (other >= parameter)) + data + b"\x03"
         disguised = b"\x02" + summed + bytes((bcc(summed),))
         return disguised.translate(EVEN_PARITY) if reply[0] != STX else disguised
 

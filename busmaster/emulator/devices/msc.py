@@ -316,7 +316,10 @@ class MscController(Device):
         if reply[0] != STX:
             return reply
         other = chance.randrange(UNITS.start, UNITS.stop - 1)
-        return packet(other + (other >= self.address), reply[HEADER:-2])
+        body = reply[HEADER:-2]
+        if self.oracle is not None and body.startswith(b"DREAD,"):
+            body = body[:-VALUE] + self.oracle.elsewhere().to_bytes(VALUE, "big")
+        return packet(other + (other >= self.address), body)
 
 
 def packet(unit: int, body: bytes) -> bytes:
