@@ -1,0 +1,322 @@
+"""One line under attack, in virtual time: what is asked of it, what goes wrong on it, how it heals.
+
+A hunt is one seed of one protocol and one mix of faults. Clients read, write and go away; poll groups poll; devices die
+and the port is lost. At the end all faults heal and progress must resume; then the bus is closed with requests in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from itertools import count
+from random import Random
+from typing import Any
+
+from busmaster.arbiter.events import Completed, Event, LatenessRaised, LineState, NodeChanged, Polled
+from busmaster.arbiter.health import Health, NodeRecord
+from busmaster.arbiter.schedule import Poll, line_time, set_members
+from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.emulator.device import Delay
+from busmaster.emulator.faults import Faults
+from busmaster.emulator.line import Echo
+from busmaster.emulator.world import World
+from busmaster.exchange import Command
+from tests.campaigns.judge import Asked, BrokenRuleError, Judge, Totals
+from tests.campaigns.kinds import KINDS, elements_of
+from tests.campaigns.mixes import MIXES, PROMPT, Mix
+from tests.campaigns.witness import Ledger, WatchedLine
+
+LONGEST = 1800.0
+"""Virtual seconds after which the faults heal, however few transactions there were."""
+RECOVERY = 240.0
+"""Likewise in which everything must go well again (R11: probes are up to 36 s apart, and paid for)."""
+PAUSE = 0.05
+"""Seconds after which a client whose request failed at once asks again."""
+PERIODS = (0.1, 0.25, 0.5, 1.0)
+
+
+class Hunt:
+    """One seed of one protocol and mix: `run` it once. `record` gets the transcript, line by line."""
+
+    def __init__(self, protocol: str, mix: str, seed: int, record: Callable[[str], None] | None = None) -> None:
+        self.kind = KINDS[protocol]
+        self.mix: Mix = MIXES[mix]
+        self.name = f"{protocol}/{mix}/{seed}"
+        self.random = Random(self.name)
+        self._record = record
+        chance = self.random
+        ledger = Ledger(self.kind.modulus, self.kind.step)
+        addresses = chance.sample(self.kind.addresses, min(len(self.kind.addresses), chance.randrange(1, 7)))
+        self.devices = [self.kind.device(ledger, address) for address in addresses]
+        chunked = self.mix.chunks
+        self.line = WatchedLine(
+            ledger,
+            self.kind.profile.line,
+            self.devices,
+            chance=Random(f"{self.name} line"),
+            echo=self.mix.echo or (Echo() if chance.random() < 0.1 else None),
+            chunk=chance.randrange(1, 4) if chunked else 0,
+            latency=0.0 if "doubled" in self.mix.device else chance.choice((0.0, 0.0, 0.004)),
+            repeats=self.kind.profile.listen is not None,
+            paced=chunked or chance.random() < 0.8,
+        )
+        self.world = World(
+            self.line, on_event=self._on_event, record=record, jitter=Random(f"{self.name} probes").random
+        )
+        ledger.now = lambda: self.world.now
+        self.judge = Judge(self.kind, self.mix, ledger, self.line, self.devices, self.world.arbiter)
+        self.ledger = ledger
+        self.nodes = [self.world.node(self.kind.profile, address) for address in addresses]
+        broadcast = self.kind.profile.broadcast
+        self.everybody = None if broadcast is None else self.world.node(self.kind.profile, broadcast)
+        self.reads = [*self.kind.reads, *(self.kind.runs if self.mix.runs else ())]
+        self.open: dict[Transaction, None] = {}
+        self.polls: list[Poll] = []
+        self._names = count(1)
+        self._healed = False
+        self._dead: set[int] = set()
+
+    @property
+    def totals(self) -> Totals:
+        return self.judge.totals
+
+    def run(self, transactions: int) -> Totals:
+        """Until about so many were on the wire; then heal, recover and close. A broken rule ends it at once."""
+        totals, world = self.totals, self.world
+        try:
+            self._break()
+            while totals.transactions < transactions and world.now < LONGEST:
+                world.run(world.now + 1.0)
+            self._heal()
+            self._close()
+            self.judge.check_all_ended(len(self.open))
+        except BrokenRuleError as broken:
+            self.note(f"BROKEN: {broken}")
+        self.judge.sum_up(world.now)
+        return totals
+
+    def note(self, what: str) -> None:
+        if self._record is not None:
+            self._record(f"{self.world.now:.6f} {what}")
+
+    # the three acts
+
+    def _break(self) -> None:
+        mix, lateness = self.mix, self.kind.lateness
+        slow = Delay(*PROMPT, stragglers=mix.slow, straggle=(mix.span[0] * lateness, mix.span[1] * lateness))
+        for device in self.devices:
+            device.delay = slow
+            self.kind.slow_down(device, slow)
+            device.faults = mix.faults(mix.device, lateness)
+        self.line.faults = mix.faults(mix.line, lateness)
+        for _ in range(self.random.randrange(1, 4)):
+            self._add_poll()
+        for client in range(self.random.randrange(1, 6)):
+            self.world.at(self.random.uniform(0.0, 1.0), partial(self._ask, client))
+        self._again(20.0, self._change_polls)
+        if mix.reconnects:
+            self._again(mix.reconnects, self._lose_the_port)
+        if mix.deaths:
+            self._again(mix.deaths, self._kill)
+
+    def _heal(self) -> None:
+        """R11, R13: whatever happened, everything goes well again within a bound."""
+        world = self.world
+        self.note("all faults heal")
+        self._healed = True
+        self.line.faults = Faults()
+        self.line.restore(world.now)
+        prompt = Delay(*PROMPT)
+        for device in self.devices:
+            device.faults = Faults()
+            device.delay = prompt
+            self.kind.slow_down(device, prompt)
+        if self.line.echo is not None:
+            self.line.echo = Echo()
+        world.plug()
+        for poll in self.polls[1:]:
+            world.arbiter.remove_poll(poll, world.now)
+        self.polls = self.polls[:1]
+        begun = world.now
+        if not world.run_until(self._all_well, RECOVERY):
+            states = ", ".join(f"{node.label} {node.health.value}" for node in self.nodes)
+            self.judge.problem(f"no progress {RECOVERY:g} s after all faults had healed: {states}")
+        self.totals.recovery = world.now - begun
+        cycles = self.polls[0].cycles
+        world.run_until(lambda: self.polls[0].cycles >= cycles + 2 and not self.polls[0].running, 60.0)
+        for read in self.polls[0].results:
+            if read.error is not None:
+                self.judge.problem(f"not well again: {read.error!r}")
+
+    def _all_well(self) -> bool:
+        return not self.open and all(node.health is Health.UP for node in self.nodes)
+
+    def _close(self) -> None:
+        """R8: requests are in it, and each ends."""
+        world = self.world
+        for node in self.nodes:
+            for priority in Priority:
+                self._submit(node, self.random.choice(self.reads), Asked(), priority)
+        world.run(world.now + self.random.uniform(0.0, 0.1))
+        world.arbiter.close(world.now)
+        world.run(world.now + 10.0)
+        if world.arbiter.state is not LineState.OFFLINE:
+            self.judge.problem(f"R8: closed, and the line is still {world.arbiter.state.name}")
+
+    # clients
+
+    def _ask(self, client: int) -> None:
+        """One request of a client, who asks the next one when it has ended."""
+        if self._healed:
+            return
+        chance = self.random
+        node = chance.choice(self.nodes)
+        asked = Asked(client)
+        options: dict[str, Any] = {}
+        if chance.random() < 0.25:
+            command, node = self._write(node, asked, options)
+        else:
+            command = chance.choice(self.reads)
+        if chance.random() < 0.1:
+            options["start_by"] = self.world.now + chance.uniform(0.0, 0.5)
+        if chance.random() < 0.1:
+            options["retries"] = 0 if command.writes and not command.idempotent else chance.randrange(0, 4)
+        priority = chance.choices(tuple(Priority), (1, 7, 1, 1))[0]
+        transaction = self._submit(node, command, asked, priority, **options)
+        if chance.random() < self.mix.cancel:
+            self.world.at(
+                self.world.now + chance.expovariate(1 / self.kind.lateness), partial(self._leave, transaction)
+            )
+
+    def _write(self, node: NodeRecord, asked: Asked, options: dict[str, Any]) -> tuple[Command[Any], NodeRecord]:
+        chance = self.random
+        number = self.ledger.number()
+        repeat = chance.random() < 0.3
+        command = self.kind.write(chance, number, repeat)
+        options["idempotent"] = repeat
+        if self.everybody is not None and chance.random() < 0.1:
+            node = self.everybody
+        asked.written = self.ledger.sending(
+            number, None if node is self.everybody else node.address, elements_of(command)
+        )
+        return command, node
+
+    def _submit(
+        self, node: NodeRecord, command: Command[Any], asked: Asked, priority: Priority, **options: Any
+    ) -> Transaction:
+        asked.elements = elements_of(command)
+        asked.urgent_ahead = self.world.arbiter.dispatcher.backlog.waiting(Priority.URGENT)
+        transaction = Transaction(node, command, priority=priority, waiter=asked, **options)
+        self.open[transaction] = None
+        if self._record is not None:
+            self.note(f"asked: {node.label}: {command} ({priority.name})")
+        self.world.arbiter.submit(transaction, self.world.now)
+        return transaction
+
+    def _leave(self, transaction: Transaction) -> None:
+        if transaction in self.open:
+            del self.open[transaction]
+            self.note(f"cancelled: {transaction.node.label}: {transaction.command}")
+            self.judge.left(transaction)
+            self.world.arbiter.cancel(transaction, self.world.now)
+            self._ask(transaction.waiter.client)
+
+    # what the master says
+
+    def _on_event(self, event: Event) -> None:
+        match event:
+            case Completed(transaction):
+                self._completed(transaction)
+            case Polled(poll):
+                self.judge.polled(poll)
+            case NodeChanged():
+                self.judge.changed(event)
+            case LatenessRaised():
+                self.totals.raised += 1
+
+    def _completed(self, transaction: Transaction) -> None:
+        self.judge.ended(transaction)
+        if transaction.probe:
+            return
+        if transaction not in self.open:
+            self.judge.problem(f"R8: {transaction.command} ended twice, or for a caller who had gone")
+            return
+        del self.open[transaction]
+        client = transaction.waiter.client
+        if client < 0:
+            return
+        if transaction.attempts:
+            self._ask(client)
+        else:
+            self.world.at(self.world.now + PAUSE, partial(self._ask, client))
+
+    # what happens to it
+
+    def _again(self, mean: float, action: Callable[[], None]) -> None:
+        """Now and then, until the faults heal."""
+
+        def act() -> None:
+            if not self._healed:
+                action()
+                self.world.at(self.world.now + self.random.expovariate(1 / mean), act)
+
+        self.world.at(self.world.now + self.random.expovariate(1 / mean), act)
+
+    def _add_poll(self) -> None:
+        """Its first group reads one element of each node: answers that could be taken for each other's."""
+        chance, world = self.random, self.world
+        reads = [chance.choice(self.reads)] * len(self.nodes)
+        nodes = self.nodes
+        if self.polls:
+            reads = chance.choices(self.reads, k=chance.randrange(1, 7))
+            nodes = chance.choices(self.nodes, k=len(reads))
+        members = [
+            Transaction(node, read, waiter=Asked(elements=elements_of(read)))
+            for node, read in zip(nodes, reads, strict=True)
+        ]
+        tau = self.kind.profile.line.byte_time
+        cost = sum(line_time(member.command.open(1, member.node.timings), tau) for member in members)
+        period = max(chance.choice(PERIODS), 2 * cost)
+        poll = Poll(f"group {next(self._names)}", period, cost=cost)
+        set_members(poll, members, chance.choice((Priority.POLL, Priority.POLL, Priority.BACKGROUND)))
+        self.polls.append(poll)
+        world.arbiter.add_poll(poll, world.now)
+
+    def _change_polls(self) -> None:
+        poll = self.random.choice(self.polls)
+        if poll is not self.polls[0]:
+            self.note(f"removed: {poll.name}")
+            self.polls.remove(poll)
+            self.world.arbiter.remove_poll(poll, self.world.now)
+            self._add_poll()
+        elif not poll.running:
+            self.note(f"demanded: {poll.name}")
+            self.judge.demanded(poll)
+            self.world.arbiter.demand(poll, self.world.now)
+
+    def _lose_the_port(self) -> None:
+        world = self.world
+        world.unplug()
+        world.at(world.now, self._check_nothing_is_open)
+        world.at(world.now + self.random.uniform(0.001, 1.0), world.plug)
+
+    def _check_nothing_is_open(self) -> None:
+        """R13: whatever waited has failed."""
+        if self.open:
+            self.judge.problem(f"R13: {len(self.open)} requests are still open on a port that is gone")
+
+    def _kill(self) -> None:
+        """A device falls silent, or its wire breaks, for a while."""
+        device = self.random.choice(self.devices)
+        self.note(f"dies: {device!r}")
+        if self.random.random() < 0.5:
+            device.faults.dead = 1.0
+        else:
+            self.line.cut(self.world.now, device)
+        self.world.at(self.world.now + self.random.uniform(0.2, 10.0), self._revive)
+
+    def _revive(self) -> None:
+        self.note("all revive")
+        self.line.restore(self.world.now)
+        for device in self.devices:
+            device.faults.dead = 0.0

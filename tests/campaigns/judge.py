@@ -1,0 +1,298 @@
+"""Holds what the master says against what truly happened, and every rule that can be checked cheaply, on every step.
+
+A wrong outcome is a value, or the acknowledgement of a write, that is not this attempt's. It is *unseen* if damage on
+the line made it, which the telegram's own checksum does not show (or which hit a telegram that has none: an ACK, a NAK,
+an EOT, a read of HCP or Mentor II); else it is *confused*: the master took one exchange's bytes for another's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.events import NodeChanged
+from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
+from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.emulator.device import Device
+from busmaster.emulator.devices.msc import AUTO_START, RAM_NOT_RELIABLE, RUNNING, SYSTEM_RESET, MscController
+from busmaster.errors import BacklogFull, NotStarted, Refused
+from busmaster.exchange import Command
+from busmaster.protocols import msc
+from tests.campaigns.kinds import Kind, echoed, elements_of
+from tests.campaigns.mixes import Mix
+from tests.campaigns.witness import RECENT, ROUNDING, Ledger, WatchedLine, Written
+
+STATES = (RUNNING | AUTO_START, SYSTEM_RESET | RAM_NOT_RELIABLE)
+"""What an emulated MSC's status word can be."""
+
+
+@dataclass(slots=True)
+class Asked:
+    """What is known of a transaction beside itself."""
+
+    client: int = -1
+    elements: tuple[int, ...] = ()
+    written: Written | None = None
+    urgent_ahead: int = 0
+
+
+@dataclass
+class Totals:
+    """Of one hunt, or of many. `transactions` were on the wire; those `turned_away` ended without it."""
+
+    hunts: int = 0
+    transactions: int = 0
+    values: int = 0
+    writes: int = 0
+    failed: int = 0
+    cancelled: int = 0
+    turned_away: int = 0
+    confused: int = 0
+    unseen: int = 0
+    """Wrong values and acknowledgements that the documents' checksums let through."""
+    unseen_writes: int = 0
+    """Writes of something that nobody had sent, likewise."""
+    unasked: int = 0
+    """What devices said because damage had made them: see `Ledger.unasked`."""
+    lost: int = 0
+    attempts: int = 0
+    bad_attempts: int = 0
+    strays: int = 0
+    raised: int = 0
+    seconds: float = 0.0
+    recovery: float = 0.0
+    """The longest time, in seconds, that it took until everything went well again after the faults had healed."""
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def wrong(self) -> int:
+        return self.confused + self.unseen
+
+    def add(self, other: Totals) -> None:
+        for name, value in vars(other).items():
+            if name == "recovery":
+                self.recovery = max(self.recovery, value)
+            else:
+                setattr(self, name, getattr(self, name) + value)
+
+
+class BrokenRuleError(AssertionError):
+    """A promise was not kept."""
+
+
+class Judge:
+    """Of one hunt. What it finds is in `totals`; a rule that was broken is raised too."""
+
+    def __init__(
+        self, kind: Kind, mix: Mix, ledger: Ledger, line: WatchedLine, devices: Sequence[Device], arbiter: Arbiter
+    ) -> None:
+        self.kind = kind
+        self.mix = mix
+        self.ledger = ledger
+        self.line = line
+        self.devices = {device.address: device for device in devices}
+        self.arbiter = arbiter
+        self.totals = Totals(hunts=1)
+        self._left: list[tuple[Transaction, int]] = []
+        self._demanded: set[Poll] = set()
+        self._timing = kind.profile.timings
+        self._window = max(self._timing.read.window, self._timing.write.window)
+        ledger.problem = self.problem
+        line.on_request = self.request_leaves
+
+    @property
+    def now(self) -> float:
+        return self.ledger.now()
+
+    def problem(self, what: str) -> None:
+        """A rule was broken: that ends the hunt."""
+        found = f"{self.now:.6f} {what}"
+        self.totals.problems.append(found)
+        raise BrokenRuleError(found)
+
+    # the line
+
+    def request_leaves(self, now: float) -> None:
+        """R1, R3: whatever was caused before is over. An MSC repeats its packets by itself."""
+        last = self.ledger.last
+        if self.mix.beyond or self.line.repeats or self.ledger.broken():
+            return
+        if last.start > now + ROUNDING:
+            self.problem(f"R3: a request leaves while a reply is still to come, at {last.start:.6f}")
+        elif last.end > now + ROUNDING:
+            self.problem(f"R1: a request leaves into a reply that lasts until {last.end:.6f}")
+
+    # transactions
+
+    def ended(self, transaction: Transaction) -> None:
+        """With its value or its error."""
+        totals = self.totals
+        asked: Asked = transaction.waiter or Asked(elements=elements_of(transaction.command))
+        if transaction.phase is not Phase.ENDED:
+            self.problem(f"R8: {transaction.command} was reported while {transaction.phase.value}")
+        if not transaction.attempts:
+            totals.turned_away += 1
+            if transaction.error is None or (asked.written is not None and asked.written.taken):
+                self.problem(f"{transaction.command} was carried out without having been sent")
+            return
+        totals.transactions += 1
+        if transaction.attempts == 1:
+            self._check_wait(transaction, asked)
+        if transaction.writes:
+            self._check_write(transaction, asked)
+        elif transaction.error is None:
+            self._check_value(transaction, asked)
+        else:
+            totals.failed += 1
+            self._check_error(transaction)
+
+    def _check_value(self, transaction: Transaction, asked: Asked) -> None:
+        self.totals.values += 1
+        value = transaction.value
+        address = transaction.node.address
+        if asked.elements:
+            values = value if type(value) is tuple else (value,)
+            right = len(values) == len(asked.elements) and all(
+                self._is_right(number, address, element, transaction.started)
+                for number, element in zip(values, asked.elements, strict=True)
+            )
+        else:
+            right = self._is_state(transaction.command, value, address)
+        if not right:
+            self._wrong(transaction, f"{transaction.node.label}: {transaction.command} brought {value}")
+        self._check_times(transaction)
+
+    def _is_right(self, number: float, address: int, element: int, started: float) -> bool:
+        answer = self.ledger.said_for(int(number))
+        return answer is not None and answer[:2] == (address, element) and answer.asked >= started
+
+    def _is_state(self, command: Command[Any], value: Any, address: int) -> bool:
+        device = self.devices[address]
+        assert isinstance(device, MscController)
+        if isinstance(command, msc.ReadFlag):
+            return bool(value == (command.flag in device.flags))
+        return int(value) in STATES
+
+    def _check_times(self, transaction: Transaction) -> None:
+        """R2: a value's first byte came within the window, all of it within the bound of a leg."""
+        if self.line.repeats or self.line.echo is not None:
+            return
+        spoken = next(self.line.during(transaction.started, transaction.last_byte))
+        due = spoken.asked_until + self._window + self.line.latency + ROUNDING
+        if transaction.first_byte > due:
+            self.problem(f"R2: {transaction.command} accepted {transaction.first_byte - due:.6f} s after its window")
+
+    def _check_write(self, transaction: Transaction, asked: Asked) -> None:
+        written, error = asked.written, transaction.error
+        if error is None:
+            self.totals.writes += 1
+        else:
+            self.totals.failed += 1
+            self._check_error(transaction)
+        if transaction.node.address == self.kind.profile.broadcast or written is None:
+            return
+        what = f"{transaction.node.label}: {transaction.command}"
+        if error is None and written.taken_at < transaction.started:
+            self._wrong(transaction, f"{what} was acknowledged, but not taken")
+        elif not transaction.idempotent:
+            sent_again = transaction.attempts - transaction.refusals
+            if sent_again > 1:
+                self.problem(f"R7: {what} was sent {transaction.attempts} times unasked")
+            if written.taken > 1 or (written.taken and type(error) is Refused and len(written.elements) == 1):
+                what += f" was taken {written.taken} times and ended with {error!r}"
+                self._count_wrong(not self.ledger.damaged(transaction.queued, transaction.ended_at), what)
+
+    def _check_error(self, transaction: Transaction) -> None:
+        error = transaction.error
+        if isinstance(error, NotStarted | BacklogFull):
+            self.problem(f"{transaction.command} was on the wire and ended with {error!r}")
+        elif isinstance(error, Refused) and not self.mix.refuses and not self.mix.beyond:
+            begin, end = transaction.started - RECENT, transaction.ended_at
+            self._count_wrong(not self.ledger.damaged(begin, end), f"{error}: nobody did")
+
+    def _wrong(self, transaction: Transaction, what: str) -> None:
+        ledger, begin, end = self.ledger, transaction.started, transaction.ended_at
+        confused = ledger.straggler_in(begin, end) or not ledger.damaged(begin, end)
+        if not transaction.writes and transaction.error is None:
+            heard = b" ".join(bytes(spoken.heard) for spoken in self.line.during(begin, end))
+            confused = confused or not echoed(transaction.command, transaction.node.address, heard)
+        self._count_wrong(confused, what)
+
+    def _count_wrong(self, confused: bool, what: str) -> None:
+        if not confused or (self.ledger.broken() and not self.mix.beyond):
+            self.totals.unseen += 1
+            return
+        self.totals.confused += 1
+        if not self.mix.beyond:
+            self.problem(f"WRONG: {what}")
+
+    def _check_wait(self, transaction: Transaction, asked: Asked) -> None:
+        """R9: an urgent read waits for the exchange on the wire and for what is ahead in its class."""
+        ahead = transaction.exchanges_ahead
+        if transaction.priority is Priority.URGENT and not transaction.writes and ahead > 1 + asked.urgent_ahead:
+            self.problem(f"R9: {ahead} exchanges went before an urgent one")
+        if transaction.started > transaction.start_by + ROUNDING:
+            self.problem(f"R12: {transaction.command} was sent after its time")
+
+    # callers who go away, polls, nodes
+
+    def left(self, transaction: Transaction) -> None:
+        """Its caller went away: it is not sent (again) from now on (R6)."""
+        self.totals.cancelled += 1
+        self._left.append((transaction, transaction.attempts))
+        if len(self._left) > 500:
+            self.check_those_who_left()
+
+    def check_those_who_left(self) -> None:
+        for transaction, attempts in self._left:
+            if transaction.attempts != attempts:
+                self.problem(f"R6: {transaction.command} was sent again for nobody")
+        self._left = [entry for entry in self._left if entry[0].phase is not Phase.ENDED]
+
+    def demanded(self, poll: Poll) -> None:
+        self._demanded.add(poll)
+
+    def polled(self, poll: Poll) -> None:
+        for transaction in poll.results:
+            self.ended(transaction)
+        if poll in self._demanded:
+            self._demanded.discard(poll)
+            return
+        places = (poll.due - poll.base) / poll.period
+        if abs(places - round(places)) * poll.period > ROUNDING:
+            self.problem(f"R10: {poll.name} was due at {poll.due:.6f}, off its grid")
+        if poll.started < poll.due - ROUNDING and any(t.attempts for t in poll.results):
+            self.problem(f"R10: {poll.name} started before it was due")
+        if poll.remaining:
+            self.problem(f"R10: {poll.name} was reported with {poll.remaining} reads to come")
+
+    def changed(self, change: NodeChanged) -> None:
+        known, failures = change.before is not Health.UNKNOWN, change.node.failures
+        if change.after is Health.DOWN and known and failures < DOWN_AFTER_FAILURES:
+            self.problem(f"R11: {change.node.label} is down after {failures} failures")
+
+    # at the end
+
+    def check_all_ended(self, open_transactions: int) -> None:
+        """Nothing is left anywhere."""
+        self.check_those_who_left()
+        dispatcher = self.arbiter.dispatcher
+        if open_transactions:
+            self.totals.lost += open_transactions
+            self.problem(f"R8: {open_transactions} transactions never ended")
+        if len(dispatcher.backlog) or list(dispatcher.busy_with()):
+            self.problem("R8: something is left in the backlog")
+
+    def sum_up(self, seconds: float) -> None:
+        dispatcher, totals = self.arbiter.dispatcher, self.totals
+        totals.unseen_writes += self.ledger.unseen_writes
+        totals.unasked += self.ledger.unasked
+        totals.seconds += seconds
+        totals.strays += self.arbiter.statistics(self.now).stray_bytes
+        for node in dispatcher.nodes:
+            counters = node.counters
+            totals.attempts += counters.attempts
+            totals.bad_attempts += counters.no_reply + counters.garbled

@@ -1,0 +1,154 @@
+"""The five protocols as a campaign sees them: what devices there are, what to ask them, and what an answer shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from random import Random
+from typing import Any
+
+from busmaster.emulator.build import make_device
+from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.devices.dc104 import Dc104Drive
+from busmaster.emulator.devices.msc import MscController
+from busmaster.exchange import Command
+from busmaster.profile import Profile
+from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from tests.campaigns.witness import Ledger, Witness
+
+SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))
+MSC_STEP = 4
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One protocol. Its few elements are asked of all nodes alike, so that answers can be taken for each other's."""
+
+    name: str
+    profile: Profile
+    addresses: Sequence[int]
+    modulus: int
+    step: int
+    reads: Sequence[Command[Any]]
+    write: Callable[[Random, int, bool], Command[Any]]
+    """Of a number; the bool says whether it may be repeated, where the command can say so."""
+    runs: Sequence[Command[Any]] = ()
+    """Reads of several legs whose later legs carry no address."""
+
+    @property
+    def lateness(self) -> float:
+        """Of the leg that has the shortest."""
+        timings = self.profile.timings
+        return min(timings.read.lateness, timings.write.lateness, timings.packet.lateness)
+
+    def device(self, ledger: Ledger, address: int) -> Device:
+        device = make_device(self.name, address, oracle=Witness(ledger, address))
+        if isinstance(device, MscController):
+            device.flags |= {flag for flag in range(64) if (flag + address) % 2}
+        return device
+
+    def slow_down(self, device: Device, delay: Delay) -> None:
+        """How long whatever follows a first answer takes: MSC's packet, DC104's EEPROM."""
+        if isinstance(device, MscController):
+            device.packet_delay = delay
+        elif isinstance(device, Dc104Drive):
+            device.eeprom = delay
+
+
+def elements_of(command: Command[Any]) -> tuple[int, ...]:
+    """What a command reads or writes, as the devices number it. Empty for what the ledger knows nothing of."""
+    match command:
+        case hcp.Read(element) | hcp2.Read(element):
+            return (element,)
+        case hcp.Write(element, values) | hcp2.Write(element, values):
+            return tuple(range(element, element + len(values)))
+        case mentor.Read(menu, number) | mentor.Write(menu, number):
+            return (menu * 100 + number,)
+        case mentor.ReadRun(menu, number, count, step):
+            return tuple(menu * 100 + number + step * place for place in range(count))
+        case msc.DataRead(address) | msc.DataWrite(address):
+            return (address,)
+        case msc.BlockRead(address) | msc.BlockWrite(address):
+            return tuple(address + MSC_STEP * place for place in range(msc.BLOCK))
+        case dc104.Read(parameter) | dc104.Write(parameter):
+            return (parameter,)
+    return ()
+
+
+def echoed(command: Command[Any], address: int, heard: bytes) -> bool:
+    """Whether what the host heard holds the telegram's echo of the command: the least that a value needs."""
+    match command:
+        case hcp.Read(element):
+            return b"\x02%02d" % element in heard
+        case hcp2.Read(element):
+            return b"\x02%02X" % element in heard
+        case mentor.Read(menu, number) | mentor.ReadRun(menu, number):
+            return b"\x02%02d%02d" % (menu, number) in heard.translate(SEVEN_BITS)
+        case dc104.Read(parameter):
+            return bytes((0x02, parameter)) in heard
+        case _:
+            name = _NAMES.get(type(command))
+            return name is None or (bytes((0x02, address)) in heard and name in heard)
+
+
+_NAMES: dict[type, bytes] = {
+    msc.DataRead: b"DREAD,",
+    msc.BlockRead: b"BREAD,",
+    msc.ReadFlag: b"RFLAG,",
+    msc.ReadFlags: b"RFLAGS,",
+    msc.ReadStatus: b"RQSTAT,",
+}
+
+
+def _comms(write: type[hcp.Write] | type[hcp2.Write]) -> Callable[[Random, int, bool], Command[Any]]:
+    def make(chance: Random, number: int, repeat: bool) -> Command[Any]:
+        return write(chance.randrange(1, 6), (number,) * chance.choice((1, 1, 1, 3)), idempotent=repeat)
+
+    return make
+
+
+def _mentor_write(chance: Random, number: int, repeat: bool) -> Command[Any]:
+    if chance.random() < 0.2:
+        return mentor.Write(15, 60, number, wide=True, idempotent=repeat)
+    return mentor.Write(1, chance.randrange(17, 21), number, idempotent=repeat)
+
+
+def _msc_write(chance: Random, number: int, repeat: bool) -> Command[Any]:
+    if chance.random() < 0.05:
+        return msc.BlockWrite(2008, (number,) * msc.BLOCK)
+    return msc.DataWrite(2008 + MSC_STEP * chance.randrange(0, 6), number)
+
+
+def _dc104_write(chance: Random, number: int, repeat: bool) -> Command[Any]:
+    return dc104.Write(chance.randrange(1, 6), number)
+
+
+_MSC_READS: list[Command[Any]] = [msc.DataRead(2008 + MSC_STEP * place) for place in range(6)]
+_COMMS = (1, 2, 3, 4, 5, 99)
+KINDS = {
+    kind.name: kind
+    for kind in (
+        Kind("hcp", hcp.PROFILE, range(16), 10**9, 7_654_321, [hcp.Read(e) for e in _COMMS], _comms(hcp.Write)),
+        Kind("hcp2", hcp2.PROFILE, range(256), 10**9, 7_654_321, [hcp2.Read(e) for e in _COMMS], _comms(hcp2.Write)),
+        Kind(
+            "msc",
+            msc.PROFILE,
+            range(1, 16),
+            2**31,
+            7_654_321,
+            [*_MSC_READS, *_MSC_READS, msc.BlockRead(2008), msc.ReadFlag(5), msc.ReadFlag(6), msc.ReadStatus()],
+            _msc_write,
+        ),
+        Kind(
+            "mentor",
+            mentor.PROFILE,
+            range(1, 100),
+            10**4,
+            3_719,
+            [*(mentor.Read(1, number) for number in range(17, 22)), mentor.Read(15, 60)],
+            _mentor_write,
+            [mentor.ReadRun(1, 17, 4), mentor.ReadRun(1, 20, 3, -1), mentor.ReadRun(1, 17, 2, 0)],
+        ),
+        Kind("dc104", dc104.PROFILE, [0], 2**16, 25_717, [dc104.Read(p) for p in (1, 2, 3, 6, 21)], _dc104_write),
+    )
+}

@@ -1,0 +1,108 @@
+"""What goes wrong in a campaign: mixes of faults, inside R3's assumption and beyond it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from busmaster.emulator.faults import BEYOND as BEYOND_FAULTS
+from busmaster.emulator.faults import Faults
+from busmaster.emulator.line import Echo
+
+PROMPT = (0.0005, 0.005)
+"""Seconds after which a device usually answers."""
+
+
+@dataclass(frozen=True)
+class Mix:
+    """`device` faults strike what devices hear and say, `line` faults every frame, the host's too.
+
+    `slow` is the share of replies that take from `span[0]` to `span[1]` of the lateness of their protocol. `cancel` is
+    the share of requests whose caller goes away; `reconnects` and `deaths` are mean seconds between losses of the port
+    and of a device (0: never). `chunks`: bytes reach the host as they come, a few at a time. `overdue`: the mix is
+    beyond R3's assumption for what its faults do not say.
+    """
+
+    name: str
+    says: str
+    device: Mapping[str, float] = field(default_factory=dict)
+    line: Mapping[str, float] = field(default_factory=dict)
+    slow: float = 0.0
+    span: tuple[float, float] = (0.3, 0.97)
+    echo: Echo | None = None
+    cancel: float = 0.1
+    reconnects: float = 0.0
+    deaths: float = 0.0
+    chunks: bool = False
+    runs: bool = False
+    overdue: bool = False
+
+    @property
+    def beyond(self) -> bool:
+        return self.overdue or bool(BEYOND_FAULTS & {*self.device, *self.line})
+
+    @property
+    def refuses(self) -> bool:
+        return "nak" in {*self.device, *self.line}
+
+    def faults(self, rates: Mapping[str, float], lateness: float) -> Faults:
+        """`late` stays within the lateness, together with the prompt delay it is added to."""
+        faults = Faults()
+        for name, rate in rates.items():
+            setattr(faults, name, rate)
+        faults.late_by = 0.97 * lateness - PROMPT[1]
+        assert not (self.slow and faults.late), "together they would be later than the lateness"
+        return faults
+
+
+EVERYTHING = {
+    **dict.fromkeys(("lost", "late", "flip", "truncated", "doubled", "leading", "trailing", "wrong", "deaf"), 0.03),
+    **dict.fromkeys(("split", "nak"), 0.03),
+    **dict.fromkeys(("babble", "drop"), 0.01),
+    **dict.fromkeys(("flapping", "restart"), 0.002),
+    "away_for": 2.0,
+}
+WITHIN = (
+    Mix("calm", "nothing is wrong", runs=True),
+    Mix("bytewise", "replies reach the host in pieces", {"split": 0.5}, chunks=True, runs=True),
+    Mix("lost", "requests and replies are lost", {"lost": 0.1, "deaf": 0.1}, runs=True),
+    Mix("late", "replies begin up to the lateness", {"lost": 0.02}, slow=0.3, runs=True),
+    Mix("cancelled", "callers go away, replies are late", slow=0.3, cancel=0.6, runs=True),
+    Mix(
+        "garbled",
+        "bits flip and frames are cut",
+        {"flip": 0.05, "truncated": 0.05},
+        {"flip": 0.02, "lost": 0.02},
+    ),
+    Mix(
+        "glued",
+        "replies come doubled, in noise",
+        {"doubled": 0.1, "leading": 0.05, "trailing": 0.05},
+    ),
+    Mix("glued-bytewise", "likewise, in pieces", {"doubled": 0.1, "leading": 0.05, "trailing": 0.1}, chunks=True),
+    Mix("noise", "bursts of noise, alone or into frames", {"babble": 0.05}, {"babble": 0.02}, slow=0.05),
+    Mix("wrong", "replies for another element or unit", {"wrong": 0.1, "late": 0.1}, runs=True),
+    Mix("refusals", "devices refuse unheeded", {"nak": 0.1, "late": 0.1}, runs=True),
+    Mix("echo", "an adapter echoes, late and damaged at times", {"flip": 0.02, "late": 0.1}, echo=Echo(0.001, 0.02)),
+    Mix(
+        "deaths",
+        "devices die, come and go, forget",
+        {"flapping": 0.01, "restart": 0.01, "late": 0.05, "away_for": 3.0},
+        deaths=5.0,
+        runs=True,
+    ),
+    Mix("reconnects", "the port is lost and found", {"lost": 0.02}, slow=0.2, reconnects=2.0, runs=True),
+    Mix("everything", "all of it", EVERYTHING, {"flip": 0.01, "lost": 0.01}, reconnects=20.0, deaths=20.0),
+)
+BEYOND = (
+    Mix("repeated", "a second reply, up to 300 ms after the first", {"repeated": 0.05}),
+    Mix("overdue", "replies begin after up to three times the lateness", slow=0.05, span=(1.0, 3.0), overdue=True),
+    Mix("forged", "a stray ACK, NAK or EOT before a reply", {"forged": 0.05}),
+    Mix("duplicate", "two devices answer to one address", {"duplicate": 0.05}),
+    Mix("double flips", "the same bit flipped in two bytes of a reply", {"unseen": 0.05}),
+    Mix("double flips both ways", "or of a request", line={"unseen": 0.05}),
+    Mix("heard twice", "a request is heard twice, and answered twice", line={"doubled": 0.05}, overdue=True),
+    Mix("cut", "requests are cut", line={"truncated": 0.05}, overdue=True),
+    Mix("runs", "short commands, damaged requests", line={"flip": 0.05, "lost": 0.05}, runs=True, overdue=True),
+)
+MIXES = {mix.name: mix for mix in (*WITHIN, *BEYOND)}

@@ -1,0 +1,230 @@
+"""What truly happened on an emulated line, against which a campaign holds what the master says happened.
+
+Every value that a device sends is a number used once, and so is every value that is written: whichever comes to a
+caller, the ledger knows who said it, to what, and when. A value is right only if the node and the element that were
+asked said it after this very attempt had begun; a stale one is recognised although node and element are right.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from math import inf
+from typing import Any, NamedTuple
+
+from busmaster.emulator.device import Device
+from busmaster.emulator.line import Line, Talk
+from busmaster.emulator.oracle import Oracle
+
+REMEMBERED = 2048
+"""Answers and writes that are kept: far more than can still be on their way, and fewer than the narrowest protocol has
+values."""
+HEARD = 4096
+ROUNDING = 1e-7
+RECENT = 2.0
+"""Seconds for which a frame that was damaged may still be in somebody's way."""
+
+
+class Answer(NamedTuple):
+    """A value was said for `element` of the device `node`, which heard the request at `asked`."""
+
+    node: int
+    element: int
+    asked: float
+
+
+class Frame(NamedTuple):
+    """What a device said, whatever became of it on the line: caused by what it heard at `cause`."""
+
+    cause: float
+    start: float
+    end: float
+
+
+NOTHING = Frame(-inf, -inf, -inf)
+
+
+@dataclass(slots=True)
+class Written:
+    """A number that was sent to be written. `node` None: to all."""
+
+    node: int | None
+    elements: tuple[int, ...]
+    order: int
+    taken: int = 0
+    taken_at: float = -inf
+
+
+@dataclass(slots=True)
+class Spoken:
+    """What passed in one exchange: `heard` is what the host heard since its request, which takes until `asked_until`
+    by the baud rate, be the line paced or not."""
+
+    asked_at: float
+    asked_until: float
+    heard: bytearray = field(default_factory=bytearray)
+
+
+@dataclass
+class Ledger:
+    """Of one line. `step`, prime to `modulus`, keeps numbers that were given out one after the other far apart, so
+    that a damaged one does not look like its neighbour."""
+
+    modulus: int
+    step: int
+    now: Callable[[], float] = lambda: 0.0
+    problem: Callable[[str], None] = field(default=lambda what: None)
+    unseen_writes: int = 0
+    """Writes that were taken though nobody had sent them: damage that the request's checksum does not show."""
+    unasked: int = 0
+    """What devices said that nobody had asked, because of damage: one that misses the end of a request takes the
+    beginning of the next one for it. Then R3's assumption does not hold for a while."""
+    last: Frame = NOTHING
+    """The latest of all that devices who were asked are going to say."""
+    _given: int = 0
+    _answers: dict[int, Answer] = field(default_factory=dict)
+    _written: dict[int, Written] = field(default_factory=dict)
+    _old: deque[int] = field(default_factory=deque)
+    _frames: deque[Frame] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _damage: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _unasked_at: float = -inf
+    _orders: dict[int, int] = field(default_factory=dict)
+
+    def number(self) -> int:
+        """One that was not used for long."""
+        self._given += 1
+        number = self._given * self.step % self.modulus
+        self._old.append(number)
+        if len(self._old) > REMEMBERED:
+            old = self._old.popleft()
+            self._answers.pop(old, None)
+            self._written.pop(old, None)
+        return number
+
+    def said_for(self, number: int) -> Answer | None:
+        return self._answers.get(number)
+
+    def answer(self, node: int, element: int) -> int:
+        number = self.number()
+        self._answers[number] = Answer(node, element, self.now())
+        return number
+
+    def sending(self, number: int, node: int | None, elements: tuple[int, ...]) -> Written:
+        """It is going to be written. Must be told in the order in which the writes are submitted."""
+        written = self._written[number] = Written(node, elements, self._given)
+        return written
+
+    def take(self, node: int, element: int, number: int) -> None:
+        """A device stores a number."""
+        now = self.now()
+        written = self._written.get(number)
+        if written is None or written.node not in (None, node) or element not in written.elements:
+            if self.damaged(now - RECENT, now):
+                self.unseen_writes += 1
+            else:
+                self.problem(f"device {node} took {number} for {element}, which nobody sent it")
+            return
+        if element != written.elements[0]:
+            return
+        written.taken += 1
+        written.taken_at = now
+        if written.node is not None:
+            if written.order < self._orders.get(node, 0):
+                self.problem(f"R7: device {node} took the write of {number} after a later one")
+            self._orders[node] = written.order
+
+    def said(self, start: float, end: float, asked: bool) -> None:
+        """A device is going to say something; `asked`: the last request was for it."""
+        now = self.now()
+        frame = Frame(now, start, end)
+        self._frames.append(frame)
+        if asked:
+            self.last = max(self.last, frame, key=lambda one: one.end)
+        elif self.damaged(now - RECENT, now):
+            self.unasked += 1
+            self._unasked_at = now
+        else:
+            self.problem("a device spoke that was not asked")
+
+    def spoiled(self, start: float, end: float) -> None:
+        """What passed then is not what was said."""
+        self._damage.append((start, end))
+
+    def damaged(self, begin: float, end: float) -> bool:
+        """Something that passed in that time was not what was said."""
+        return any(start < end and begin < stop for start, stop in self._damage)
+
+    def broken(self) -> bool:
+        """A device spoke unasked a short while ago."""
+        return self.now() - self._unasked_at < RECENT
+
+    def straggler_in(self, begin: float, end: float) -> bool:
+        """Something that was caused before `begin` was still being said in that time."""
+        return any(frame.cause < begin < frame.end - ROUNDING and frame.start < end for frame in self._frames)
+
+
+class Witness(Oracle):
+    """The memory of one device: it keeps no values, the ledger does."""
+
+    def __init__(self, ledger: Ledger, node: int) -> None:
+        super().__init__(node, ledger.modulus)
+        self.ledger = ledger
+
+    def read(self, element: int) -> int:
+        return self.ledger.answer(self.node, element)
+
+    def write(self, element: int, value: float, slack: int = 0) -> None:
+        self.ledger.take(self.node, element, round(value))
+
+
+class WatchedLine(Line):
+    """A line whose ledger learns what is said on it, what of that is damaged, and what the host hears.
+
+    `repeats`: its devices speak by themselves until they are acknowledged (MSC).
+    """
+
+    def __init__(self, ledger: Ledger, *args: Any, repeats: bool = False, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.ledger = ledger
+        self.repeats = repeats
+        self.on_request: Callable[[float], None] = lambda now: None
+        self._request = b""
+        self._exchanges: deque[Spoken] = deque([Spoken(-inf, -inf)], maxlen=REMEMBERED)
+
+    def send(self, data: bytes, now: float) -> None:
+        if len(data) > 1:
+            self.on_request(now)
+            self._request = data
+            self._exchanges.append(Spoken(now, now))
+        super().send(data, now)
+        self._exchanges[-1].asked_until = now + len(data) * self.settings.byte_time
+
+    def receive(self, now: float) -> bytes:
+        data = super().receive(now)
+        if data and len(self._exchanges[-1].heard) < HEARD:
+            self._exchanges[-1].heard += data
+        return data
+
+    def during(self, begin: float, end: float) -> Iterator[Spoken]:
+        """What was said in that time, the latest first."""
+        for spoken in reversed(self._exchanges):
+            if spoken.asked_at < begin:
+                return
+            if spoken.asked_at < end:
+                yield spoken
+
+    def _say(self, talker: Device | None, start: float, data: bytes) -> None:
+        if talker is not None:
+            asked = self.repeats or self._request.startswith(talker.routes)
+            self.ledger.said(start, start + len(data) * self.tau, asked)
+        super()._say(talker, start, data)
+
+    def _join(self, talk: Talk) -> None:
+        if not talk.clean:
+            self.ledger.spoiled(talk.start, talk.end)
+        super()._join(talk)
+
+    def _collide(self, talk: Talk, other: Talk) -> None:
+        super()._collide(talk, other)
+        self.ledger.spoiled(talk.start, talk.end)
