@@ -36,6 +36,7 @@ from busmaster.handles import (
     MscController,
 )
 from busmaster.node import Node
+from busmaster.planning import GroupPlan, Plan, PlannedGroup, PlannedNode
 from busmaster.points import Point
 from busmaster.polling import GroupStatistics, PollGroup, Quality, Sample, Snapshot, Stream
 from busmaster.profile import LineSettings, Profile
@@ -58,6 +59,7 @@ __all__ = [
     "Dc104Drive",
     "Endpoint",
     "GarbledReply",
+    "GroupPlan",
     "GroupStatistics",
     "Hcp2Controller",
     "HcpController",
@@ -82,6 +84,9 @@ __all__ = [
     "NodeDown",
     "NodeStatistics",
     "NotStarted",
+    "Plan",
+    "PlannedGroup",
+    "PlannedNode",
     "Point",
     "PollGroup",
     "Priority",
