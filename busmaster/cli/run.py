@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 
-import anyio
 import click
 
 from busmaster.cli.arguments import View, viewed
 from busmaster.cli.capturing import capture_option, capturing
+from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import file_argument, load, other_port, port_option
 from busmaster.cli.output import note
 from busmaster.cli.watching import Watch, follow, shown_on_screen
 from busmaster.config import ConfiguredLine
 from busmaster.outputs.base import OutputStatistics
+
+SWITCH_INTERVAL = 0.0005
+"""Seconds for which an output's thread may keep the interpreter from the loop that owns the line; else it is 5 ms."""
 
 
 @click.command(short_help="Poll what a file says, with its outputs.")
@@ -28,13 +32,14 @@ def command(path: str, port: str | None, capture: str | None, view: View) -> int
     standard error ends it: of groups, of nodes, and of what each output has written and dropped. An output that is
     slow or down never holds up the line.
     """
+    sys.setswitchinterval(SWITCH_INTERVAL)
     file = load(path)
     endpoint = other_port(file, port)
     where = endpoint or file.port
     protocols = {node.protocol for node in file.nodes.values()}
     only = protocols.pop() if len(protocols) == 1 else ""
     with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
-        return anyio.run(run, ConfiguredLine(file, port=endpoint, tap=recorder), view)
+        return until_ended(run, ConfiguredLine(file, port=endpoint, tap=recorder), view)
 
 
 async def run(line: ConfiguredLine, view: View) -> int:

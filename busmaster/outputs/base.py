@@ -34,6 +34,8 @@ BATCH = 2_000
 """Values that are written at once."""
 FIRST_RETRY, LAST_RETRY = 0.5, 10.0
 """Seconds from a failure to the next try: doubled each time."""
+CLOCK_WAS_SET = 0.005
+"""Seconds by which two clocks do not differ by themselves between two looks at them."""
 ERROR_NUMBER = re.compile(r"^\[Errno -?\d+\] ")
 
 
@@ -115,6 +117,7 @@ class Output(ABC):
         self._waiting: deque[Item] = deque()
         self._stop = threading.Event()
         self._retry = FIRST_RETRY
+        self._offset = 0.0
         self._thread = threading.Thread(target=self._run, name=f"busmaster {kind}", daemon=True)
 
     # on the loop that owns the line
@@ -178,8 +181,14 @@ class Output(ABC):
             self._say(f"{self.kind} is down: {text}")
 
     def wall_clock(self) -> Callable[[float], float]:
-        """From the bus's time to seconds since 1970, by the machine's clock as it goes now."""
+        """From the bus's time to seconds since 1970, by the machine's clock.
+
+        What is sent twice has the same time twice, unless that clock was set meanwhile.
+        """
         offset = time.time() - self._clock()
+        if abs(offset - self._offset) > CLOCK_WAS_SET:
+            self._offset = offset
+        offset = self._offset
         return lambda moment: round(moment + offset, 6)
 
     def _run(self) -> None:

@@ -20,7 +20,8 @@ import json
 import logging
 import ssl
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -39,8 +40,11 @@ from busmaster.polling import Snapshot
 if TYPE_CHECKING:
     from aiomqtt import Client, Message
 
-AT_ONCE = 500
-"""Values on their way to the broker, not yet acknowledged."""
+AT_ONCE = 100
+"""Messages on their way to the broker, not yet acknowledged."""
+PIECE = 10
+BREATH = 0.002
+"""Seconds for which the interpreter is let go of after so many messages: when a broker returns, thousands may wait."""
 TIMEOUT = 5.0
 """Seconds in which a broker must answer."""
 KEEP_ALIVE = 15
@@ -105,7 +109,7 @@ class MqttOutput(Output):
                 stopped = self._stop.is_set()
                 await self._send(client, list(self._changes()))
                 while self._fill():
-                    await self._send(client, [message for item in self._held for message in self._messages(item)])
+                    await self._send(client, (message for item in self._held for message in self._messages(item)))
                     self.written += sum(map(size_of, self._held))
                     self._held.clear()
                 await anyio.sleep(0 if stopped else TICK)
@@ -126,23 +130,29 @@ class MqttOutput(Output):
             will=aiomqtt.Will(self._topic("status"), "offline", qos=1, retain=True),
             keepalive=KEEP_ALIVE,
             timeout=TIMEOUT,
+            max_inflight_messages=AT_ONCE,
             logger=self._quiet,
         )
         client.pending_calls_threshold = AT_ONCE
         return client
 
-    async def _send(self, client: Client, messages: list[Outgoing]) -> None:
+    async def _send(self, client: Client, messages: Iterable[Outgoing]) -> None:
         """In order, and acknowledged at QoS 1. Raises what went wrong first."""
-        results = await asyncio.gather(
-            *(
-                client.publish(topic, payload, qos=self._settings.qos, retain=retain)
-                for topic, payload, retain in messages
-            ),
-            return_exceptions=True,
-        )
-        for result in results:
-            if isinstance(result, BaseException):
-                raise result
+        under_way: deque[asyncio.Task[None]] = deque()
+        try:
+            for number, (topic, payload, retain) in enumerate(messages, 1):
+                work = client.publish(topic, payload, qos=self._settings.qos, retain=retain)
+                under_way.append(asyncio.ensure_future(work))
+                if number % PIECE == 0:
+                    await anyio.sleep(BREATH)
+                if len(under_way) == AT_ONCE:
+                    await under_way.popleft()
+            while under_way:
+                await under_way.popleft()
+        finally:
+            for task in under_way:
+                task.cancel()
+            await asyncio.gather(*under_way, return_exceptions=True)
 
     def _fill(self) -> bool:
         """What was not acknowledged comes first."""
