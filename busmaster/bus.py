@@ -18,7 +18,7 @@ from busmaster.arbiter.events import Event, LineState, NodeChanged, Strayed
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
-from busmaster.errors import InvalidCommand
+from busmaster.errors import BusClosed, InvalidCommand
 from busmaster.exchange import Timings
 from busmaster.logbook import Logbook
 from busmaster.merging import Merge
@@ -76,12 +76,14 @@ class Bus:
         self._tasks: set[asyncio.Task[None]] = set()
         self._connection: Connection | None = None
         self.running = False
+        self._closed = False
 
     # opening and closing
 
     async def __aenter__(self) -> Bus:
         if self.running:
             raise InvalidCommand("this bus is open already")
+        self._check_not_closed()
         self.pump.bind(asyncio.get_running_loop())
         self._arbiter.reset_statistics(self.now())
         connection = Connection(self.endpoint, self.pump, jitter=self._random)
@@ -100,22 +102,31 @@ class Bus:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Waiting callers get BusClosed at once; the exchange on the wire may end, within its own window."""
+        self._closed = True
+        for group in list(self._groups):
+            group.close()
+        self._arbiter.close(self.now())
+        self.pump.turn()
+        with anyio.CancelScope(shield=True):  # Task.cancel() comes through all the same
+            try:
+                await self.pump.run_out()
+            finally:
+                await self._let_go()
+
+    async def _let_go(self) -> None:
+        """Nothing is on the wire, or nobody waits for its end."""
         assert self._connection is not None
-        with anyio.CancelScope(shield=True):
-            for group in list(self._groups):
-                group.close()
-            self._arbiter.close(self.now())
-            self.pump.turn()
-            await self.pump.run_out()
-            self.running = False
+        self.running = False
+        try:
             await self._connection.close()
+        finally:
             self.pump.turn()
             self.pump.stop()
             for stream in list(self._streams):
                 stream.close()
             for task in self._tasks:
                 task.cancel()
-            await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*self._tasks, return_exceptions=True)
 
     # nodes and groups
 
@@ -126,7 +137,7 @@ class Bus:
         other timings or retries than it was first asked with."""
         known = self._nodes.get((profile.name, address))
         if known is not None:
-            if timings not in (None, known.record.timings) or retries not in (None, known.record.retries):
+            if timings not in (None, known.timings) or retries not in (None, known.record.retries):
                 raise InvalidCommand(f"{known.label} is in use with other timings or retries")
             if profile.merge is not None:
                 known.record.profile = profile
@@ -165,6 +176,7 @@ class Bus:
         """
         if any(group.name == name for group in self._groups):
             raise InvalidCommand(f"there is a poll group {name!r} already")
+        self._check_not_closed()
         for other in self._groups:
             other.weigh()
         group = PollGroup(self, name, period, points, phase=phase, priority=priority, merge=merge)
@@ -204,8 +216,9 @@ class Bus:
         self._touched[write.touches] = when
 
     def touched_at(self, point: Point[Any]) -> float:
-        """When the last write to the point, or to all of its node, ended; -inf if none has."""
-        return max(self._touched.get(point, -inf), self._touched.get(point.node, -inf)) if self._touched else -inf
+        """When the last write to the point's quantity, or to all of its node, ended; -inf if none has."""
+        touched = self._touched
+        return max(touched.get(point.quantity, -inf), touched.get(point.node, -inf)) if touched else -inf
 
     # looking
 
@@ -264,9 +277,14 @@ class Bus:
 
     def events(self) -> Stream[Event]:
         """What happens to the line and its nodes, from now on (NodeChanged, LineChanged, ...)."""
+        self._check_not_closed()
         return Stream(self._streams, EVENT_BUFFER)
 
     # inside
+
+    def _check_not_closed(self) -> None:
+        if self._closed:
+            raise BusClosed("the bus was closed", hint="make a new Bus: one is opened and closed once")
 
     def _check_framing(self, profile: Profile) -> None:
         settings = self.endpoint.settings

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import Priority, Timeline, Transaction
-from busmaster.errors import BusClosed, BusError, InvalidCommand
+from busmaster.errors import BusClosed, BusError, InvalidCommand, Refused
 from busmaster.exchange import Command
 from busmaster.planning import PlannedNode
 from busmaster.profile import Profile
@@ -30,6 +30,8 @@ class Node:
     def __init__(self, bus: Bus, record: NodeRecord) -> None:
         self.bus = bus
         self.record = record
+        self.timings = record.timings
+        """As they were asked for: its record's lateness may have been raised since."""
         self.kinds: dict[type, Command[Any]] = {}
         """Of each kind of command that was asked of it, the first: the worst case reckons with them."""
         self.returning = asyncio.Lock()
@@ -87,7 +89,7 @@ class Node:
         """Run one command and return its value.
 
         `priority` defaults to COMMAND. `start_within` (seconds) fails the request with NotStarted if it could not be
-        sent by then. `retries` (0 or more) overrides the node's; writes are not retried unless the command or
+        sent by then. `retries` (0 to 100) overrides the node's; writes are not retried unless the command or
         `idempotent` says that they may be repeated (R7). `touches` names the point that a write changes: samples
         older than the write are marked stale; without it, all of the node's.
 
@@ -142,7 +144,7 @@ class Node:
             idempotent=idempotent,
             probe=probe,
         )
-        transaction.touches = self if touches is None else touches
+        transaction.touches = self if touches is None else touches.quantity
         self.kinds.setdefault(type(command), command)
         return transaction, self.bus.pump.transact(transaction)
 
@@ -153,15 +155,18 @@ class Node:
             self.bus.touched(transaction, self.bus.now())
 
     async def probe(self) -> bool:
-        """Ask the node's cheapest read now, once; True if it answered (a refusal is an answer)."""
+        """Ask the node's cheapest read now, once; True if it answered (a refusal is an answer), False if not, or if
+        it could not be asked."""
         transaction, future = self._start(self.profile.probe, None, None, 0, None, probe=True)
         try:
             await future
         except asyncio.CancelledError:
             self._give_up(transaction)
             raise
+        except Refused:
+            return True
         except BusError:
-            return self.health is Health.UP
+            return False
         return True
 
     def suspend(self, for_: float) -> None:

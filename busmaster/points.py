@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from busmaster.errors import InvalidCommand
+from busmaster.errors import GarbledReply, InvalidCommand
 from busmaster.exchange import Command
 
 if TYPE_CHECKING:
@@ -38,6 +38,23 @@ class Point(Generic[T]):
         return f"{self.node.address}/{self.item}"
 
     @property
+    def quantity(self) -> tuple[Node, Command[Any]]:
+        """What it reads, by whatever name: a write to one point makes every point of its quantity stale."""
+        return self.node, self.command
+
+    def value_of(self, raw: Any) -> T:
+        """The value that stands for what its command returned. Raises GarbledReply for what means nothing."""
+        if self.decode is None:
+            value: T = raw
+            return value
+        try:
+            return self.decode(raw)
+        except Exception as bad:  # a decoder may be the application's own
+            raise GarbledReply(
+                f"{raw!r} is no value of {self.item}: {bad}", node=self.node.label, command=str(self.command)
+            ) from bad
+
+    @property
     def writable(self) -> bool:
         return self.encode is not None
 
@@ -55,8 +72,9 @@ class Point(Generic[T]):
             if sample is not None and sample.error is None and sample.age(self.node.bus.now()) <= max_age:
                 value: T = sample.value
                 return value
-        raw = await self.node.request(self.command, priority=priority, start_within=start_within, retries=retries)
-        return self.decode(raw) if self.decode else raw
+        return self.value_of(
+            await self.node.request(self.command, priority=priority, start_within=start_within, retries=retries)
+        )
 
     async def write(
         self,

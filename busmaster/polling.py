@@ -174,13 +174,10 @@ class PollGroup:
             quality = Quality.LATE if transaction.late else Quality.GOOD
             if transaction.started < self._bus.touched_at(point):
                 quality = Quality.STALE
-            value = transaction.value if place is None else transaction.value[place]
-            if point.decode is not None:
-                try:
-                    value = point.decode(value)
-                except (ValueError, ArithmeticError) as bad:
-                    error = GarbledReply(f"{value!r} is no value of {point.item}: {bad}", node=point.node.label)
-                    value, quality = None, Quality.BAD
+            try:
+                value = point.value_of(transaction.value if place is None else transaction.value[place])
+            except GarbledReply as bad:
+                error, quality = bad, Quality.BAD
         self._tally.samples[quality] += 1
         timeline = transaction.timeline()
         return Sample(value, error, self._poll.due, timeline.started, transaction.ended_at, quality, timeline)

@@ -158,7 +158,8 @@ class Stream(Generic[T]):
         while not self._items:
             if self._closed:
                 raise StopAsyncIteration
-            self._arrived = anyio.Event()
+            if self._arrived.is_set():
+                self._arrived = anyio.Event()
             await self._arrived.wait()
         return self._items.popleft()
 

@@ -12,9 +12,10 @@ from busmaster.bus import Bus
 from busmaster.emulator.device import Delay
 from busmaster.emulator.devices.mentor import MentorDrive
 from busmaster.emulator.devices.msc import MscController as EmulatedMsc
-from busmaster.errors import NoReply, Refused
+from busmaster.errors import GarbledReply, NoReply, Refused
 from busmaster.handles import Hcp2Controller, MscController
 from busmaster.handles import MentorDrive as MentorHandle
+from busmaster.points import Point
 from busmaster.polling import Quality
 from busmaster.profile import LineSettings
 from busmaster.protocols import hcp2, mentor
@@ -336,3 +337,65 @@ def test_runs_of_parameters_are_chained_only_by_those_who_opt_in() -> None:
         assert other.merged[0].saved > 0
 
     on_a_bus(story, MentorDrive(11), settings=mentor.PROFILE.line)
+
+
+# points of one quantity, made by several hands
+
+
+def test_a_write_makes_the_same_quantity_stale_by_whatever_name_it_is_polled() -> None:
+    async def story(bus: Bus) -> None:
+        drive = MentorHandle(bus, 11)
+        polled = [drive.point("1.17"), drive.point("01.17"), drive.point("1.17:hires")]
+        other = drive.point("1.18")
+        group = bus.poll_group("g", period=5.0, points=[*polled, other])
+        await cycles(group, 1)
+        await drive.point("1.17:wide").write(7)
+        assert [bus.latest(point) for point in polled] == [None] * 3
+        assert bus.latest(other) is not None
+
+    on_a_bus(story, MentorDrive(11), settings=mentor.PROFILE.line)
+
+
+def test_two_handles_that_scale_a_parameter_differently_have_different_points() -> None:
+    async def story(bus: Bus) -> None:
+        raw, scaled = MentorHandle(bus, 11), MentorHandle(bus, 11, decimals={"1.17": 1})
+        await raw.write("1.17", 476)
+        items = ("1.17", "1.17:2")
+        points = [handle.point(item) for item in items for handle in (raw, scaled)]
+        group = bus.poll_group("g", period=1.0, points=points)
+        snapshot = (await cycles(group, 1))[0]
+        assert [snapshot[point].value for point in points[:2]] == [476, 47.6]
+        assert [snapshot[point].value[0] for point in points[2:]] == [476, 47.6]
+        assert await scaled.point("1.17").read(max_age=1.0) == 47.6
+        assert MentorHandle(bus, 11, decimals={"1.17": 1}).point("1.17") == points[1]
+
+    on_a_bus(story, MentorDrive(11), settings=mentor.PROFILE.line)
+
+
+# values that mean nothing
+
+
+def test_a_value_that_cannot_be_decoded_is_an_error_of_its_point_alone() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        good = axis.point("7")
+        bad = Point(axis.node, "colour", hcp2.Read(7), decode={1.0: "red"}.__getitem__)
+        group = bus.poll_group("g", period=0.1, points=[good, bad])
+        snapshot = (await cycles(group, 2))[-1]
+        assert snapshot[good].value == 0.0
+        assert (snapshot[bad].value, snapshot[bad].quality) == (None, Quality.BAD)
+        assert isinstance(snapshot[bad].error, GarbledReply)
+        assert bus.statistics().losses == 0
+        with pytest.raises(GarbledReply, match="colour"):
+            await bad.read()
+
+    on_a_bus(story)
+
+
+def test_two_tasks_may_share_a_stream() -> None:
+    async def story(bus: Bus) -> None:
+        stream = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")]).subscribe()
+        first, second = await asyncio.gather(anext(stream), anext(stream))
+        assert {first.cycle, second.cycle} == {1, 2}
+
+    on_a_bus(story)

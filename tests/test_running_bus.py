@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator
+from dataclasses import replace
 
 import pytest
 
@@ -14,7 +15,7 @@ from busmaster.arbiter.schedule import line_time
 from busmaster.bus import Bus
 from busmaster.emulator.device import Delay
 from busmaster.emulator.devices.mint import MintController
-from busmaster.errors import BusError, NodeDown, NoReply
+from busmaster.errors import BusError, InvalidCommand, NodeDown, NoReply
 from busmaster.handles import Hcp2Controller
 from busmaster.node import Node, Priority
 from busmaster.polling import PollGroup
@@ -192,5 +193,34 @@ def test_what_a_cycle_takes_is_a_guess_until_it_is_measured() -> None:
         read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
         assert guessed == pytest.approx(line_time(read, bus.byte_time))
         assert group.poll.cost == pytest.approx(0.002 + (8 + 6) * bus.byte_time, abs=0.0005)
+
+    on_a_bus(story)
+
+
+def test_a_refused_probe_of_a_suspect_is_an_answer_and_a_request_that_was_not_sent_is_none() -> None:
+    async def story(bus: Bus) -> None:
+        node = Hcp2Controller(bus, 1).node
+        await node.request(hcp2.Read(1))
+        assert await node.probe()
+        node.suspend(10.0)
+        assert not await node.probe()
+        node.suspend(0.0)
+        node.record.health = Health.SUSPECT
+        node.record.profile = replace(hcp2.PROFILE, probe=hcp2.Read(105))
+        node.record.failures = 1
+        node.record.failed_at = bus.now()
+        assert await node.probe()
+
+    on_a_bus(story, MintController(1, axes=0, refuse_reserved=True))
+
+
+def test_a_second_handle_with_the_same_timings_is_welcome_after_lateness_was_raised() -> None:
+    async def story(bus: Bus) -> None:
+        timings = hcp2.PROFILE.timings.with_window(0.12)
+        first = Hcp2Controller(bus, 1, timings=timings)
+        first.node.record.timings = timings.with_lateness(0.3)
+        assert Hcp2Controller(bus, 1, timings=timings).node is first.node
+        with pytest.raises(InvalidCommand, match="other timings"):
+            Hcp2Controller(bus, 1, timings=hcp2.PROFILE.timings)
 
     on_a_bus(story)

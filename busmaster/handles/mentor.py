@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command, Timings
@@ -18,6 +19,8 @@ from busmaster.protocols.mentor import Read, ReadRun, Write, parse_parameter
 if TYPE_CHECKING:
     from busmaster.bus import Bus
     from busmaster.node import Node, Priority
+
+T = TypeVar("T")
 
 _BEYOND_ANY_FORM = 1e9
 FORM = "a parameter such as 1.17, 15.60:wide, 1.17:hires, or 1.17:20 for a run of 20"
@@ -82,10 +85,11 @@ class MentorDrive(Handle):
             """In the unit in which it is written: without decimals, high resolution counts in tenths."""
             return from_line(number * 10 if high_resolution and decimals is None else number, decimals)
 
-        return Point(self.node, item, read, decode=decode, encode=encode)
+        return ScaledPoint(self.node, item, read, decode=decode, encode=encode, decimals=(decimals,))
 
     def _run_point(self, item: str, run: ReadRun) -> Point[tuple[float, ...]]:
-        return Point(self.node, item, run, decode=lambda sent: self._values(run, sent))
+        decimals = tuple(self._decimals.get(parameter) for parameter in _parameters(run))
+        return ScaledPoint(self.node, item, run, decode=lambda sent: self._values(run, sent), decimals=decimals)
 
     async def read(
         self,
@@ -180,8 +184,19 @@ class MentorDrive(Handle):
         return Write(menu, number, to_line(value, decimals), wide, high_resolution, idempotent)
 
     def _values(self, run: ReadRun, sent: Sequence[int]) -> tuple[float, ...]:
-        parameters = [(run.menu, run.number + i) for i in range(run.count)]
+        parameters = _parameters(run)
         return tuple(from_line(n, self._decimals.get(parameter)) for n, parameter in zip(sent, parameters, strict=True))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScaledPoint(Point[T]):
+    """Points of one parameter are equal only if the handles that made them scale it alike."""
+
+    decimals: tuple[int | None, ...]
+
+
+def _parameters(run: ReadRun) -> list[tuple[int, int]]:
+    return [(run.menu, run.number + i) for i in range(run.count)]
 
 
 def to_line(value: float, decimals: int | None) -> int:

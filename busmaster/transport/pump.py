@@ -107,6 +107,7 @@ class Pump(asyncio.Protocol):
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
+        self._loop = None
 
     # what asyncio calls
 
