@@ -463,25 +463,6 @@ def test_a_refused_point_is_refused_and_its_node_lives() -> None:
     assert record.health is UP
 
 
-def test_r11_whoever_looks_at_the_statistics_does_not_shorten_the_pauses_that_pay_for_probes() -> None:
-    tokens = []
-    for looks in (0, 40):
-        bench = Bench()
-        node = bench.node()
-        bench.ask(node)
-        bench.hear(FIVE, after=0.004)
-        budget = bench.arbiter.dispatcher._budget
-        budget.tokens, budget.probe = 0.0, 0.150
-        for _ in range(looks):
-            bench.wait(0.05)
-            bench.arbiter.statistics(bench.now)
-        bench.to(3.1)
-        bench.ask(node)
-        tokens.append(budget.tokens)
-    assert tokens[0] == pytest.approx(tokens[1])
-    assert tokens[0] > 0.4
-
-
 def test_r11_polls_that_wait_already_do_not_go_before_the_hook_of_a_node_that_returns() -> None:
     bench = Bench()
     node, other = bench.node(1), bench.node(2)

@@ -376,3 +376,22 @@ def test_a_timeline_that_spans_a_reset_of_the_statistics_counts_on() -> None:
     assert timeline.exchanges_ahead == 1
     assert timeline.settling_ahead == pytest.approx(0.050, abs=0.002)
     assert bench.arbiter.statistics(bench.now).exchanges == 1
+
+
+def test_r11_whoever_looks_at_the_statistics_does_not_shorten_the_pauses_that_pay_for_probes() -> None:
+    tokens = []
+    for looks in (0, 40):
+        bench = Bench()
+        node = bench.node()
+        bench.ask(node)
+        bench.hear(FIVE, after=0.004)
+        budget = bench.arbiter.dispatcher._budget
+        budget.tokens, budget.probe = 0.0, 0.150
+        for _ in range(looks):
+            bench.wait(0.05)
+            bench.arbiter.statistics(bench.now)
+        bench.to(3.1)
+        bench.ask(node)
+        tokens.append(budget.tokens)
+    assert tokens[0] == pytest.approx(tokens[1])
+    assert tokens[0] > 0.4
