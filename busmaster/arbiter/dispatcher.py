@@ -11,7 +11,7 @@ import heapq
 from collections import deque
 from collections.abc import Callable, Iterable
 from itertools import count
-from math import inf
+from math import inf, nextafter
 from typing import Any
 
 from busmaster.arbiter import health
@@ -222,7 +222,7 @@ class Dispatcher:
                 self.backlog.discard(transaction, Phase.PARKED)
             if transaction.phase is Phase.PARKED:
                 self._end(transaction, now, _not_started(transaction, now))
-        self._deadlines.expiry = heap[0][0] + 1e-9 if heap else inf
+        self._deadlines.expiry = nextafter(heap[0][0], inf) if heap else inf
 
     # polls
 
@@ -393,7 +393,7 @@ class Dispatcher:
             self._expiries = heap = [entry for entry in heap if entry[2].phase is not Phase.ENDED]
             heapq.heapify(heap)
         heapq.heappush(heap, (transaction.start_by, next(self._order), transaction))
-        self._deadlines.expiry = heap[0][0] + 1e-9
+        self._deadlines.expiry = nextafter(heap[0][0], inf)
 
     def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:
         """Exactly once (R8). A write that was on the wire before something else ended it may have been carried out."""

@@ -38,7 +38,7 @@ class Polled:
 
 @dataclass(frozen=True, slots=True)
 class NodeChanged:
-    """A node's health changed. `returning`: its polls wait until `Arbiter.release_node` (its hook runs first)."""
+    """A node's health changed. `returning`: its polls wait until `Dispatcher.release_node` (its hook runs first)."""
 
     node: NodeRecord
     before: Health

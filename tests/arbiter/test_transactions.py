@@ -395,3 +395,13 @@ def test_r11_whoever_looks_at_the_statistics_does_not_shorten_the_pauses_that_pa
         tokens.append(budget.tokens)
     assert tokens[0] == pytest.approx(tokens[1])
     assert tokens[0] > 0.4
+
+
+def test_r12_a_time_to_start_passes_even_on_a_clock_that_is_months_old() -> None:
+    """There a nanosecond is less than the clock can tell: the deadline must lie behind the moment all the same."""
+    bench = Bench()
+    bench.to(3e7)
+    node = bench.node()
+    bench.ask(node)
+    waiting = bench.ask(node, start_by=bench.now + 0.010)
+    assert bench.arbiter.poll_timeout() > waiting.start_by
