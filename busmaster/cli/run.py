@@ -32,12 +32,14 @@ def command(path: str, port: str | None, capture: str | None, view: View) -> int
     standard error ends it: of groups, of nodes, and of what each output has written and dropped. An output that is
     slow or down never holds up the line.
     """
-    sys.setswitchinterval(SWITCH_INTERVAL)
     file = load(path)
     endpoint = other_port(file, port)
     where = endpoint or file.port
     protocols = {node.protocol for node in file.nodes.values()}
     only = protocols.pop() if len(protocols) == 1 else ""
+    usual = sys.getswitchinterval()
+    click.get_current_context().call_on_close(lambda: sys.setswitchinterval(usual))
+    sys.setswitchinterval(SWITCH_INTERVAL)
     with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
         return until_ended(run, ConfiguredLine(file, port=endpoint, tap=recorder), view)
 
