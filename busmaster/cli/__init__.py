@@ -6,7 +6,7 @@ import importlib.util
 import sys
 from collections.abc import Sequence
 
-WRONG_USAGE = 2
+WRONG_USAGE, INTERRUPTED = 2, 130
 NEEDED = ("click", "rich", "msgspec")
 
 
@@ -20,6 +20,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return WRONG_USAGE
-    from busmaster.cli.app import run
-
+    try:
+        from busmaster.cli.app import run
+    except KeyboardInterrupt:  # importing takes a moment; from then on `run` hears it
+        return INTERRUPTED
     return run(arguments)

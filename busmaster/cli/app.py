@@ -7,9 +7,7 @@ import importlib.metadata
 import importlib.util
 import logging
 import os
-import signal
 import sys
-import threading
 import warnings
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -17,6 +15,7 @@ from typing import Any, TextIO
 
 import click
 
+from busmaster.cli.ending import Ending
 from busmaster.errors import BusError, InvalidCommand, NoReply
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
@@ -89,9 +88,10 @@ def cli() -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """The exit status: 0 all good, 1 an error from the line, 2 wrong usage, 130 after Ctrl-C. Never raises."""
     listen_quietly()
-    end_in_order()
+    print_somewhere()
     try:
-        result = cli.main(args=arguments, prog_name="busmaster", standalone_mode=False)
+        with Ending() as ending:
+            result = cli.main(args=arguments, prog_name="busmaster", standalone_mode=False, obj=ending)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message(), err=True)
         return WRONG_USAGE
@@ -101,13 +101,16 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return complain(error.format_message(), WRONG_USAGE)
     except (click.Abort, KeyboardInterrupt):
         return INTERRUPTED
+    except (OSError, SystemExit) as error:  # outside a command: --help prints before one is invoked
+        return status_of(error)
     return result if isinstance(result, int) else OK
 
 
-def end_in_order() -> None:
-    """SIGTERM unwinds as Ctrl-C does, so that ports, links and files are given back; the exit status is the usual."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+def print_somewhere() -> None:
+    """Whoever closed standard output or standard error wants to hear nothing there: print would use the other."""
+    if sys.stdout is None or sys.stderr is None:
+        nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  it stays open as long as the process
+        sys.stdout, sys.stderr = sys.stdout or nowhere, sys.stderr or nowhere
 
 
 def listen_quietly() -> None:
@@ -132,9 +135,10 @@ def show_warning(
 
 
 def usage_text(error: click.UsageError) -> str:
-    text = error.format_message().rstrip(".")
+    """What is wrong, and what was meant, or else where to look."""
+    text = error.format_message().rstrip(".").replace(". Did you mean", ": did you mean")
     text = text[:1].lower() + text[1:]
-    return f"{text}; see {error.ctx.command_path} --help" if error.ctx else text
+    return text if error.ctx is None or text.endswith("?") else f"{text}; see {error.ctx.command_path} --help"
 
 
 def complain(text: str, status: int) -> int:
@@ -159,6 +163,8 @@ def status_of(error: BaseException) -> int:
         case BusError():
             return complain(bus_error_text(error), FAILED)
         case OSError():
+            if not can_flush():
+                forget_standard_output()
             what = error.strerror or str(error)
             return complain(f"{error.filename}: {what}" if error.filename else what, FAILED)
         case _:
@@ -184,6 +190,14 @@ def only_one(error: BaseException) -> BaseException:
         interrupts = error.subgroup(KeyboardInterrupt)
         error = (interrupts or error).exceptions[0]
     return error
+
+
+def can_flush() -> bool:
+    try:
+        sys.stdout.flush()
+    except OSError:
+        return False
+    return True
 
 
 def forget_standard_output() -> None:

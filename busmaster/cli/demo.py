@@ -14,6 +14,7 @@ import click
 from busmaster.bus import Bus
 from busmaster.cli.arguments import View, plain_option, seconds_option
 from busmaster.cli.demo_line import CONTROLLERS, DRIVES, SETTINGS
+from busmaster.cli.ending import until_ended
 from busmaster.cli.watching import Watch, follow
 from busmaster.errors import BusError
 from busmaster.handles.hcp2 import Hcp2Controller
@@ -36,7 +37,7 @@ def command(seconds: float | None, plain: bool) -> int:
     one of them loses its wire for some seconds. Nothing is connected or listened to. Ctrl-C ends it.
     """
     with emulated_line() as path:
-        return anyio.run(demo, path, View(seconds=seconds, plain=plain))
+        return until_ended(demo, path, View(seconds=seconds, plain=plain))
 
 
 @contextmanager

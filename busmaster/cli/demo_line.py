@@ -6,6 +6,7 @@ One of them loses its wire for a few seconds now and then. Prints the terminal's
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import select
@@ -64,4 +65,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(BrokenPipeError):  # who started this has ended already
+        main()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import anyio
 import click
 
 from busmaster.cli.arguments import (
@@ -18,6 +17,7 @@ from busmaster.cli.arguments import (
     parsed,
 )
 from busmaster.cli.capturing import capture_option, capturing
+from busmaster.cli.ending import until_ended
 from busmaster.cli.examination import Patient, examine
 from busmaster.cli.output import emit_all, note
 from busmaster.handles import HANDLES
@@ -66,7 +66,7 @@ def command(
 
     name = patient.endpoint.name
     with capturing(capture, port=name, protocol=protocol or "", echo=patient.endpoint.echo) as recorder:
-        anyio.run(examine, patient, tell, recorder)
+        until_ended(examine, patient, tell, recorder)
     if wrong:
         note(f"{name}: {wrong} thing{'' if wrong == 1 else 's'} to mend")
         return FAILED

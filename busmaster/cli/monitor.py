@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any
 
-import anyio
 import click
 
 from busmaster.capture.decode import DEFAULT_GAP, Decoder
@@ -19,6 +18,7 @@ from busmaster.capture.pcapng import Direction
 from busmaster.capture.recorder import Recorder
 from busmaster.cli.arguments import Connection, protocol_option
 from busmaster.cli.capturing import capture_option, capturing
+from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit
 from busmaster.errors import BusError, LineDown
 from busmaster.handles import HANDLES
@@ -42,7 +42,7 @@ def command(port: str, protocol: str, baud: int | None, as_json: bool, capture: 
     names = element_names(protocol)
     write = json_text if as_json else plain_text
     with capturing(capture, port=endpoint.name, protocol=protocol) as recorder:
-        anyio.run(listen, endpoint, Decoder(dialect(protocol)), lambda frame: emit(write(frame, names)), recorder)
+        until_ended(listen, endpoint, Decoder(dialect(protocol)), lambda frame: emit(write(frame, names)), recorder)
 
 
 class Listener(asyncio.Protocol):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import anyio
 import click
 
 from busmaster.cli.arguments import (
@@ -15,6 +14,7 @@ from busmaster.cli.arguments import (
     parse_seconds,
     viewed,
 )
+from busmaster.cli.ending import until_ended
 from busmaster.cli.watching import Watch, follow
 
 
@@ -34,7 +34,7 @@ def command(
     On a terminal a live table; else, or with --plain, a line a value: seconds since the start, NODE/ITEM and the
     value, or `-` and what went wrong. A summary on standard error ends it.
     """
-    return anyio.run(poll, connection, connection.addresses(nodes), items, period, view)
+    return until_ended(poll, connection, connection.addresses(nodes), items, period, view)
 
 
 async def poll(

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import anyio
 import click
 
 from busmaster.cli.arguments import Connection, connected, is_run, json_option, node_option, run_names
+from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit, emit_all, json_line, json_value, value_text
 from busmaster.errors import Refused
 from busmaster.handles import Handle, MentorDrive, MscController
@@ -25,7 +25,7 @@ def command(connection: Connection, node: int | None, items: tuple[str, ...], ch
     """Read each ITEM of one node on PORT and print `ITEM VALUE`, a line each; for a run a line a value."""
     if chain and connection.protocol != "mentor":
         raise click.UsageError("--chain is mentor's alone")
-    anyio.run(read, connection, connection.one_address(node), items, chain, as_json)
+    until_ended(read, connection, connection.one_address(node), items, chain, as_json)
 
 
 async def read(connection: Connection, address: int, items: tuple[str, ...], chain: bool, as_json: bool) -> None:

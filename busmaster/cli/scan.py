@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import anyio
 import click
 
 from busmaster.cli.arguments import Connection, connected, json_option, nodes_option
+from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit, json_line, json_value, value_text
 from busmaster.cli.progress import Bar
 from busmaster.errors import GarbledReply, NodeDown, NoReply, Refused
@@ -23,7 +23,7 @@ def command(connection: Connection, nodes: tuple[int, ...] | None, as_json: bool
     """
     if nodes is None and connection.profile.addressed:
         nodes = tuple(connection.profile.addresses)
-    anyio.run(scan, connection, connection.addresses(nodes), as_json)
+    until_ended(scan, connection, connection.addresses(nodes), as_json)
 
 
 async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-import anyio
 import click
 
 from busmaster.cli.arguments import (
@@ -18,6 +17,7 @@ from busmaster.cli.arguments import (
     parsed,
     run_names,
 )
+from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit, json_line, value_text
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command
@@ -45,7 +45,7 @@ def command(
     fails ends it, with those before it written.
     """
     pairs = [parsed(parse_assignment, text) for text in assignments]
-    anyio.run(write, connection, connection.one_address(node), pairs, verify, as_json)
+    until_ended(write, connection, connection.one_address(node), pairs, verify, as_json)
 
 
 async def write(

@@ -1,0 +1,93 @@
+"""How a command ends that is told to: Ctrl-C or SIGTERM unwind it, so that ports, links and files are given back."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import threading
+import time
+from collections.abc import Awaitable, Callable
+from types import TracebackType
+from typing import Any, NoReturn, TypeVar
+
+import anyio
+import click
+
+T = TypeVar("T")
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+PATIENCE = 2.0
+"""Seconds in which the same wish said again is not heard."""
+
+
+class Ending:
+    """The first signal cancels what `run` runs, or unwinds whatever the thread does.
+
+    Terminals, shells and supervisors often send a second one at once: it must not break the unwinding. One that comes
+    PATIENCE later ends the process where it stands.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+        """The signal that was heard; 0 before."""
+        self._since = 0.0
+        self._running = False
+        self._cancel: Callable[[], object] | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Ending:
+        if threading.current_thread() is threading.main_thread():
+            for number in SIGNALS:
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    self._before[number] = signal.signal(number, self._heard)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """What still comes while a process that was told to end shuts down is not heard."""
+        for number, handler in self._before.items():
+            signal.signal(number, signal.SIG_IGN if self.number else handler)
+
+    def _heard(self, number: int, _frame: object) -> None:
+        now = time.monotonic()
+        if self.number:
+            if now >= self._since + PATIENCE:
+                os._exit(128 + number)
+            return
+        self.number, self._since = number, now
+        if not self._running:
+            self._unwind()
+        if self._cancel is not None:
+            self._cancel()
+
+    def _unwind(self) -> NoReturn:
+        raise KeyboardInterrupt if self.number == signal.SIGINT else SystemExit(128 + self.number)
+
+    def run(self, function: Callable[..., Awaitable[T]], *arguments: Any) -> T:
+        """As anyio.run. Raises KeyboardInterrupt or SystemExit if it was cancelled by a signal."""
+
+        async def cancellable() -> T:
+            loop, task = asyncio.get_running_loop(), asyncio.current_task()
+            assert task is not None
+            self._cancel = lambda: loop.call_soon_threadsafe(task.cancel)
+            try:
+                if self.number:
+                    raise asyncio.CancelledError
+                return await function(*arguments)
+            finally:
+                self._cancel = None
+
+        self._running = True
+        try:
+            return anyio.run(cancellable)
+        finally:
+            self._running = False
+            if self.number:
+                self._unwind()
+
+
+def until_ended(function: Callable[..., Awaitable[T]], *arguments: Any) -> T:
+    """Run it in an event loop, to be ended by the signals of the command that runs."""
+    ending = click.get_current_context().find_object(Ending)
+    return anyio.run(function, *arguments) if ending is None else ending.run(function, *arguments)
