@@ -57,7 +57,7 @@ class Fan:
         with anyio.CancelScope(shield=True):
             if self._tasks:
                 *feeding, watching = self._tasks
-                await asyncio.gather(*feeding)
+                await asyncio.gather(*feeding, return_exceptions=True)
                 watching.cancel()
                 await asyncio.gather(watching, return_exceptions=True)
             await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in self._outputs))

@@ -33,7 +33,7 @@ from busmaster.bus import Bus
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.outputs.base import TICK, Item, Output, check_extra, reason, size_of
 from busmaster.outputs.settings import MqttSettings
-from busmaster.outputs.values import cycle_fields, sample_fields
+from busmaster.outputs.values import cycle_fields, json_line, sample_fields
 from busmaster.points import Point
 from busmaster.polling import Snapshot
 
@@ -166,15 +166,15 @@ class MqttOutput(Output):
         time_of = self.wall_clock()
         settings = self._settings
         if not isinstance(item, Snapshot):
-            fields = {"time": time_of(item.time), "node": item.node or None, "text": item.text}
-            yield Outgoing(self._topic("events"), json.dumps(fields))
+            payload = json_line(time=time_of(item.time), node=item.node or None, text=item.text)
+            yield Outgoing(self._topic("events"), payload)
         elif settings.messages == "cycle":
-            payload = json.dumps(cycle_fields(item, time_of))
+            payload = json_line(**cycle_fields(item, time_of))
             yield Outgoing(self._topic("cycles", item.group), payload, settings.retain)
         else:
             for point, sample in item.samples.items():
-                fields = {"time": time_of(sample.finished), "unit": point.unit, **sample_fields(sample)}
-                yield Outgoing(self._topic("values", topic_part(point.key)), json.dumps(fields), settings.retain)
+                payload = json_line(time=time_of(sample.finished), unit=point.unit, **sample_fields(sample))
+                yield Outgoing(self._topic("values", topic_part(point.key)), payload, settings.retain)
 
     def _changes(self) -> Iterator[Outgoing]:
         """What is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
@@ -184,7 +184,7 @@ class MqttOutput(Output):
         for topic, (name, state) in now.items():
             if self._published.get(topic) != state:
                 self._published[topic] = state
-                payload = json.dumps({"time": round(time.time(), 3), name: state})
+                payload = json_line(**{"time": round(time.time(), 3), name: state})
                 yield Outgoing(self._topic(topic), payload, True)
 
     def _topic(self, *parts: str) -> str:
@@ -233,7 +233,7 @@ class MqttOutput(Output):
 
     async def _answer(self, client: Client, name: str, refusal: str) -> None:
         fields = {"ok": False, "error": refusal} if refusal else {"ok": True}
-        await self._send(client, [Outgoing(self._topic("result", name), json.dumps(fields))])
+        await self._send(client, [Outgoing(self._topic("result", name), json_line(**fields))])
 
 
 def command_value(payload: object) -> Any:

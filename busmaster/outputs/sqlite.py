@@ -148,4 +148,6 @@ def number_of(database: sqlite3.Connection, point: Point[Any]) -> int:
 def column(value: Any) -> Any:
     """SQLite holds numbers and texts; several values are JSON."""
     plain = json_value(value)
-    return json.dumps(plain) if isinstance(plain, list) else plain
+    if isinstance(plain, list):
+        return json.dumps(plain)
+    return plain if plain is None or isinstance(plain, int | float | str) else str(plain)

@@ -79,7 +79,8 @@ def json_value(value: Any) -> Any:
 
 
 def json_line(**fields: Any) -> str:
-    return json.dumps(fields, ensure_ascii=False)
+    """What JSON has no word for is written as text."""
+    return json.dumps(fields, ensure_ascii=False, default=str)
 
 
 def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[str, Any]:

@@ -15,8 +15,14 @@ from busmaster.errors import NoReply
 from busmaster.outputs import sqlite
 from busmaster.outputs.base import Happening
 from busmaster.outputs.settings import SqliteSettings
-from busmaster.outputs.sqlite import DAY, SqliteOutput
+from busmaster.outputs.sqlite import DAY, SqliteOutput, column
+from busmaster.protocols.msc import ProgramStatus
 from tests.outputs.cycles import cycle, settled, until
+
+
+def test_a_column_holds_whatever_a_value_is() -> None:
+    values = (None, 1, 1.5, "text", True, float("nan"), ProgramStatus(65), frozenset({2, 1}), {"a": 1})
+    assert [column(value) for value in values] == [None, 1, 1.5, "text", 1, None, 65, "[1, 2]", "{'a': 1}"]
 
 
 @contextmanager
