@@ -10,8 +10,7 @@ from typing import Any, TypeVar
 import click
 
 from busmaster.bus import Bus
-from busmaster.capture.recorder import Recorder
-from busmaster.cli.output import note
+from busmaster.cli.capturing import capture_option, capturing
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Timings
 from busmaster.handles import HANDLES, Handle, MscController
@@ -26,6 +25,36 @@ T = TypeVar("T")
 
 HIGHEST_ADDRESS = 255
 HIGHEST_PORT = 65535
+LONGEST_WINDOW = 60.0
+"""Seconds. Lateness moves with it, and a line is first listened to for that long."""
+
+WHAT_ITEMS_ARE = """\b
+ITEM, by protocol:
+  hcp        a comms element, 1 to 99
+  hcp2       an element, 1 to 255, or its name: axis0.position (to axis7;
+             position velocity mode axis_error demand encoder idle
+             following_error), inputs outputs adc0 (to adc7) error error_line
+             error_axis running line_number firmware
+  microflex  an element, or its name: position demand_position
+             following_error axis_error drive_error command_word status_word
+             speed_reference speed_demand speed_measured speed_error
+             torque_reference torque_demand current current_u current_v
+             bus_voltage drive_overload motor_overload hall_state
+             absolute_encoder phase_search_status inputs outputs analog_input
+             firmware temperature
+  msc        2008 (a data address), 2008:32 (32 values from there on), flag:5,
+             flags, status
+  mentor     1.17 (menu and parameter), 15.60:wide, 1.17:hires, 1.17:20 (20
+             parameters from there on)
+  dc104      a parameter, 1 to 255
+"""
+"""For the help of commands that take some."""
+
+
+class Whole(click.IntRange):
+    """Says "is not a valid whole number" of what is none."""
+
+    name = "whole number"
 
 
 def option_type(parse: Callable[[str], T]) -> Callable[[str], T]:
@@ -64,9 +93,12 @@ def parse_seconds(text: str) -> float:
     return seconds
 
 
-def parse_milliseconds(text: str) -> float:
-    """Milliseconds above 0, in seconds. Raises InvalidCommand."""
-    return parse_seconds(text) / 1000
+def parse_window(text: str) -> float:
+    """A reply window in milliseconds, in seconds. Raises InvalidCommand for one that nobody would wait for."""
+    seconds = parse_seconds(text) / 1000
+    if seconds > LONGEST_WINDOW:
+        raise InvalidCommand(f"a reply window is at most {LONGEST_WINDOW * 1000:.0f} ms, not {text}")
+    return seconds
 
 
 def parse_items(text: str) -> tuple[str, ...]:
@@ -173,14 +205,11 @@ class Connection:
     def open_bus(self) -> Bus:
         """The bus on it, which `async with` opens. Raises InvalidCommand for a PORT that is none.
 
-        With --capture it is recorded until the command ends.
+        With --capture it is recorded until the command ends. Raises UsageError if that file cannot be written.
         """
         where = self.endpoint()
-        if self.capture is None:
-            return Bus(where)
-        recorder = Recorder(self.capture, port=where.name, protocol=self.protocol, echo=where.echo)
-        click.get_current_context().call_on_close(lambda: end_capture(recorder))
-        return Bus(where, tap=recorder)
+        recording = capturing(self.capture, port=where.name, protocol=self.protocol, echo=where.echo)
+        return Bus(where, tap=click.get_current_context().with_resource(recording))
 
     def open_handle(self, bus: Bus, address: int) -> Handle:
         """A handle on the bus, which need not be open. Raises InvalidCommand."""
@@ -211,15 +240,6 @@ class View:
     plain: bool = False
     read_only: bool = False
     """No key of the screen writes."""
-
-
-def end_capture(recorder: Recorder) -> None:
-    """Wait for the disk, and say so if not all is there."""
-    recorder.close()
-    if recorder.error is not None:
-        note(f"the capture is not whole: {recorder.error.strerror or recorder.error}")
-    elif recorder.dropped:
-        note(f"the capture is not whole: {recorder.dropped} events were dropped")
 
 
 def line_settings(profile: Profile, baud: int | None) -> LineSettings:
@@ -283,17 +303,15 @@ def connected(command: F) -> F:
     options = (
         click.argument("port"),
         protocol_option,
-        click.option("--baud", type=click.IntRange(min=1), metavar="N", help="Baud rate; the protocol's by default."),
+        click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default."),
         click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire)."),
         click.option(
-            "--timeout", type=option_type(parse_milliseconds), metavar="MS", help="The reply window, in milliseconds."
+            "--timeout", type=option_type(parse_window), metavar="MS", help="The reply window, in milliseconds."
         ),
-        click.option("--retries", type=click.IntRange(min=0), metavar="N", help="How often a read is tried again."),
+        click.option("--retries", type=Whole(min=0), metavar="N", help="How often a read is tried again."),
+        capture_option,
         click.option(
-            "--capture", type=click.Path(dir_okay=False), metavar="FILE", help="Record the line for Wireshark (pcapng)."
-        ),
-        click.option(
-            "--address-step", type=click.IntRange(min=1), metavar="N", help="msc: addresses from one value to the next."
+            "--address-step", type=Whole(min=1), metavar="N", help="msc: addresses from one value to the next."
         ),
     )
     for option in reversed(options):
@@ -314,7 +332,7 @@ def viewed(command: F) -> F:
     return gathered  # type: ignore[return-value]  # likewise
 
 
-node_option = click.option("--node", type=click.IntRange(0, HIGHEST_ADDRESS), metavar="N", help="The node's address.")
+node_option = click.option("--node", type=Whole(0, HIGHEST_ADDRESS), metavar="N", help="The node's address.")
 nodes_option = click.option(
     "--nodes", type=option_type(parse_nodes), metavar="N-M,K", help="Node addresses, like 1-8,255."
 )

@@ -9,11 +9,12 @@ import click
 
 from busmaster.cli.arguments import (
     Connection,
+    Whole,
     checked,
     nodes_option,
     only_address,
     option_type,
-    parse_milliseconds,
+    parse_window,
     parsed,
 )
 from busmaster.cli.capturing import capture_option, capturing
@@ -36,11 +37,9 @@ USUAL = LineSettings(9600)
 @click.argument("port")
 @click.option("--protocol", type=click.Choice(list(HANDLES)), metavar="P", help=f"One of {', '.join(HANDLES)}.")
 @nodes_option
-@click.option("--baud", type=click.IntRange(min=1), metavar="N", help="Baud rate; the protocol's by default.")
+@click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
 @click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire).")
-@click.option(
-    "--timeout", type=option_type(parse_milliseconds), metavar="MS", help="The reply window, in milliseconds."
-)
+@click.option("--timeout", type=option_type(parse_window), metavar="MS", help="The reply window, in milliseconds.")
 @capture_option
 def command(
     port: str,

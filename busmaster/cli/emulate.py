@@ -9,6 +9,7 @@ import threading
 import click
 
 from busmaster.cli.arguments import (
+    Whole,
     line_settings,
     nodes_option,
     option_type,
@@ -22,7 +23,7 @@ from busmaster.cli.output import emit
 from busmaster.config import ConfiguredLine, LineFile, emulated_line
 from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay
-from busmaster.emulator.faults import Faults
+from busmaster.emulator.faults import NAMES, Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, serve_pty, serve_tcp
 from busmaster.errors import LineDown
@@ -41,7 +42,7 @@ from busmaster.transport.tcp import TcpPort
     "--pty", is_flag=False, flag_value="", metavar="[LINK]", help="A pseudo-terminal (the default), and a link to it."
 )
 @click.option("--tcp", type=option_type(parse_host_port), metavar="HOST:PORT", help="A TCP port; 0 picks a free one.")
-@click.option("--baud", type=click.IntRange(min=1), metavar="N", help="Baud rate; the protocol's by default.")
+@click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
 @click.option("--paced", is_flag=True, help="Bytes take their time on the wire.")
 @click.option(
     "--reply-delay",
@@ -54,7 +55,7 @@ from busmaster.transport.tcp import TcpPort
     "faults",
     multiple=True,
     metavar="NAME=VALUE",
-    help="What goes wrong with every drive, like lost=0.1. Again for more.",
+    help=f"What goes wrong with every drive, like lost=0.1. Again for more. One of {' '.join(NAMES)}.",
 )
 @click.option("--seed", type=int, metavar="N", help="Of all that is random; the file's or 1 by default.")
 @seconds_option

@@ -148,14 +148,13 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     byte_time = (profile.line if settings is None else settings).byte_time
     prober = Prober(wire, profile, timings, byte_time, echo=heard.startswith(HARMLESS))
     records = await ask_all(patient, prober)
-    if any(record.answers for record in records):
+    if any(record.lives for record in records):
         for finding in diagnosis.nodes(records, timings.read):
             tell(finding)
-        return
-    tell(diagnosis.nobody(patient.crowd(patient.addresses), profile, settings))
-    for finding in diagnosis.nodes([record for record in records if record.lives], timings.read):
-        tell(finding)
-    await try_settings(patient, wire, prober, tell)
+    else:
+        tell(diagnosis.nobody(patient.crowd(patient.addresses), profile, settings))
+    if not any(record.answers for record in records):
+        await try_settings(patient, wire, prober, tell)
 
 
 async def ask_all(patient: Patient, prober: Prober) -> list[Record]:

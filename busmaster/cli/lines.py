@@ -17,7 +17,12 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def file_argument(required: bool = True) -> Callable[[F], F]:
     """LINE.toml, as `path`. A file that is not there is wrong usage."""
-    return click.argument("path", required=required, type=click.Path(exists=True, dir_okay=False), metavar="LINE.toml")
+    return click.argument(
+        "path",
+        required=required,
+        type=click.Path(exists=True, dir_okay=False),
+        metavar="LINE.toml" if required else "[LINE.toml]",
+    )
 
 
 port_option = click.option("--port", metavar="PORT", help="Use this port in place of the file's.")

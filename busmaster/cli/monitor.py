@@ -16,7 +16,7 @@ from busmaster.capture.dialects import dialect
 from busmaster.capture.frames import Frame, Kind
 from busmaster.capture.pcapng import Direction
 from busmaster.capture.recorder import Recorder
-from busmaster.cli.arguments import Connection, protocol_option
+from busmaster.cli.arguments import Connection, Whole, protocol_option
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit
@@ -29,7 +29,7 @@ ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 @click.command(short_help="Listen only; decode what passes.")
 @click.argument("port")
 @protocol_option
-@click.option("--baud", type=click.IntRange(min=1), metavar="N", help="Baud rate; the protocol's by default.")
+@click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
 @capture_option
 def command(port: str, protocol: str, baud: int | None, as_json: bool, capture: str | None) -> None:

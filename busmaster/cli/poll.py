@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from busmaster.cli.arguments import (
+    WHAT_ITEMS_ARE,
     Connection,
     View,
     connected,
@@ -18,7 +19,7 @@ from busmaster.cli.ending import until_ended
 from busmaster.cli.watching import Watch, follow
 
 
-@click.command(short_help="Read values of several nodes once a period.")
+@click.command(short_help="Read values of several nodes once a period.", epilog=WHAT_ITEMS_ARE)
 @connected
 @nodes_option
 @click.option("--items", required=True, type=option_type(parse_items), metavar="ITEM,ITEM...", help="What to read.")

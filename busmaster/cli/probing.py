@@ -28,6 +28,8 @@ QUIET = 0.02
 """Seconds of silence, at least, after which nothing more is expected."""
 BABBLE = 1.0
 """Seconds after which a line that does not fall silent is left alone."""
+MUCH = 16384
+"""Bytes after which it is as well: more than comes in that time at any usual rate."""
 
 
 class Wire(asyncio.Protocol):
@@ -84,11 +86,14 @@ class Wire(asyncio.Protocol):
         return self._chunks.popleft()
 
     async def hear_all(self, within: float, quiet: float = QUIET) -> bytes:
-        """What begins to come `within` so many seconds, up to a silence of `quiet` seconds, or BABBLE seconds of it."""
+        """What begins to come `within` so many seconds, up to a silence of `quiet` seconds.
+
+        Of what does not fall silent, BABBLE seconds or MUCH.
+        """
         heard = b""
         until = self.clock() + within
         end = until + BABBLE
-        while (chunk := await self.hear(min(until, end))) is not None:
+        while len(heard) < MUCH and (chunk := await self.hear(min(until, end))) is not None:
             heard += chunk[1]
             until = chunk[0] + quiet
         return heard

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from busmaster.cli.arguments import Connection, connected, is_run, json_option, node_option, run_names
+from busmaster.cli.arguments import WHAT_ITEMS_ARE, Connection, connected, is_run, json_option, node_option, run_names
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit, emit_all, json_line, json_value, value_text
 from busmaster.errors import Refused
@@ -15,7 +15,7 @@ from busmaster.handles import Handle, MentorDrive, MscController
 from busmaster.points import Point
 
 
-@click.command(short_help="Read values of one node.")
+@click.command(short_help="Read values of one node.", epilog=WHAT_ITEMS_ARE)
 @connected
 @node_option
 @click.argument("items", nargs=-1, required=True, metavar="ITEM...")

@@ -21,24 +21,29 @@ def command(connection: Connection, nodes: tuple[int, ...] | None, as_json: bool
 
     All addresses of the protocol are asked unless --nodes names some.
     """
-    if nodes is None and connection.profile.addressed:
-        nodes = tuple(connection.profile.addresses)
+    profile = connection.profile
+    if nodes is None and profile.addressed:
+        nodes = tuple(profile.addresses)
+    if nodes is not None and profile.broadcast in nodes:
+        raise click.UsageError(
+            f"{profile.name}: address {profile.broadcast} is for writes to all: nobody answers there"
+        )
     until_ended(scan, connection, connection.addresses(nodes), as_json)
 
 
 async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool) -> None:
     bus = connection.open_bus()
-    handles = [connection.open_handle(bus, address) for address in addresses]
+    nodes = [bus.node(connection.profile, address, timings=connection.timings) for address in addresses]
     async with bus:
-        with Bar("scanning", len(handles)) as bar:
-            for handle in handles:
-                answer = await ask(handle.node)
+        with Bar("scanning", len(nodes)) as bar:
+            for node in nodes:
+                answer = await ask(node)
                 if answer is not None:
                     value, outcome = answer
-                    number = connection.node_number(handle.node.address)
+                    number = connection.node_number(node.address)
                     found = json_line(node=number, value=json_value(value), answer=outcome)
                     with bar.aside():
-                        emit(found if as_json else f"{handle.node.address} {outcome}")
+                        emit(found if as_json else f"{node.address} {outcome}")
                 bar.advance()
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from busmaster.cli.arguments import (
+    WHAT_ITEMS_ARE,
     Connection,
     connected,
     is_decimal,
@@ -30,7 +31,7 @@ from busmaster.protocols.comms import telegrams
 Write = Callable[[], Awaitable[None]]
 
 
-@click.command(short_help="Write values of one node.")
+@click.command(short_help="Write values of one node.", epilog=WHAT_ITEMS_ARE)
 @connected
 @node_option
 @click.argument("assignments", nargs=-1, required=True, metavar="ITEM=VALUE[,VALUE...]...")

@@ -17,7 +17,8 @@ from busmaster.points import Point
 class Scale:
     """What a number on the line means: value = number / 10**decimals x factor + offset.
 
-    Reckoned in whole numbers and divided once, so that 3 x 0.1 is 0.3. `whole`: the line carries whole numbers, to
+    Reckoned in whole numbers and divided once, so that 3 x 0.1 is 0.3; of a number with decimals 15 digits are kept, so
+    that 14.2953 x 0.001 is 0.0142953. `whole`: the line carries whole numbers, to
     which a written value is rounded, half away from zero.
     """
 
@@ -43,8 +44,10 @@ class Scale:
         plus = self.offset.numerator * self.factor.denominator
 
         def read(number: Any) -> Any:
-            if type(number) is int or type(number) is float:
+            if type(number) is int:
                 return (number * times + plus) / below
+            if type(number) is float:
+                return float(f"{(number * times + plus) / below:.15g}")
             return tuple(map(read, number)) if type(number) is tuple else number
 
         return read

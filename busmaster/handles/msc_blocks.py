@@ -29,7 +29,7 @@ def place(address: int, index: int, step: int | None) -> int:
     if step is None:
         raise InvalidCommand(
             f"while the address step is unknown, {BLOCK} values at most can be read, and one or {BLOCK} written: "
-            "give address_step or call find_address_step"
+            "give address_step (--address-step), or call find_address_step"
         )
     return DataRead(address + index * step).address
 

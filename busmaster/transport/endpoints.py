@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import difflib
+import re
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Protocol
 from urllib.parse import parse_qsl, urlsplit
@@ -12,6 +13,8 @@ from busmaster.errors import InvalidCommand
 from busmaster.profile import LineSettings
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
+
+HOST_PORT = re.compile(r"[\w.-]+:\d+")
 
 
 class Endpoint(Protocol):
@@ -69,6 +72,8 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
     """
     if "://" not in url:
         path, _, query = url.partition("?")
+        if HOST_PORT.fullmatch(path):
+            raise InvalidCommand(f"{path!r} is no device path; a TCP port is written socket://{path}")
         return _serial_port(path, _options(query, SERIAL_OPTIONS), defaults)
     scheme, _, rest = url.partition("://")
     if scheme == "rfc2217":

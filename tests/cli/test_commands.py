@@ -10,6 +10,7 @@ import pytest
 
 from busmaster.capture.pcapng import Direction, read_packets
 from busmaster.emulator.serve import TcpServer
+from busmaster.handles import HANDLES, Hcp2Controller, MicroFlexDrive
 from tests.cli.conftest import Command, serve
 
 HCP2 = ("--protocol", "hcp2")
@@ -102,6 +103,11 @@ def test_a_bad_assignment_is_status_2_and_nothing_is_sent(busmaster: Command, as
         (("read", "PORT", *HCP2, "--node", "1", "1", "--chain"), "--chain is mentor's alone"),
         (("read", "PORT?baud=3", *HCP2, "--node", "1", "1"), "did you mean 'baudrate'?"),
         (("read", "rfc2217://host:1", *HCP2, "--node", "1", "1"), "use socket://host:1"),
+        (("read", "host:5020", *HCP2, "--node", "1", "1"), "a TCP port is written socket://host:5020"),
+        (("read", "PORT", *HCP2, "--node", "one", "1"), "'one' is not a valid whole number"),
+        (("read", "PORT", *HCP2, "--node", "1", "1", "--timeout", "9e9"), "at most 60000 ms"),
+        (("read", "PORT", "--protcol", "hcp2", "1"), "no such option '--protcol': did you mean '--protocol'?\n"),
+        (("scan", "PORT", "--protocol", "mentor", "--nodes", "1,0"), "address 0 is for writes to all"),
         (("poll", "PORT", *HCP2, "--nodes", "8-1", "--items", "1", "--period", "1"), "upwards: 1-8"),
         (("poll", "PORT", *HCP2, "--nodes", "1;2", "--items", "1", "--period", "1"), "like 1-8,255"),
         (("poll", "PORT", *HCP2, "--nodes", "1", "--items", ",", "--period", "1"), "at least one item"),
@@ -129,6 +135,18 @@ def test_help_and_version_go_to_standard_output(busmaster: Command) -> None:
         assert (outcome.status, outcome.err) == (0, "")
         assert "busmaster" in outcome.out
     assert busmaster().status == 2
+
+
+@pytest.mark.parametrize("command", ["read", "write", "poll"])
+def test_help_names_the_items_of_every_protocol(busmaster: Command, command: str) -> None:
+    listed = {line.split()[0] for line in busmaster(command, "--help").out.partition("ITEM, by")[2].splitlines()[1:]}
+    assert listed >= set(HANDLES)
+
+
+def test_help_names_every_element_of_the_maps(busmaster: Command) -> None:
+    words = set(busmaster("read", "--help").out.replace(":", " ").split())
+    assert words >= set(MicroFlexDrive.elements)
+    assert words >= {name.rpartition(".")[2].rstrip("1234567") for name in Hcp2Controller.elements} - {"adc"}
 
 
 def test_a_port_that_is_not_there_is_status_1(busmaster: Command, tmp_path: Path) -> None:
@@ -178,6 +196,13 @@ def test_scan_prints_a_line_for_each_node_that_answers(busmaster: Command, contr
     assert json.loads(found.out) == {"node": 7, "value": 0, "answer": "read element 1: 0"}
 
 
+def test_a_scan_of_all_addresses_warns_of_none_of_them(busmaster: Command) -> None:
+    with serve("mentor", 3) as server:
+        found = busmaster("scan", server.path, "--protocol", "mentor", "--nodes", "2-3", "--timeout", "30")
+    assert (found.status, found.err) == (0, "")
+    assert [line.split()[0] for line in found.lines] == ["3"]
+
+
 def test_any_command_can_be_captured(busmaster: Command, controllers: TcpServer, tmp_path: Path) -> None:
     file = tmp_path / "line.pcapng"
     read = busmaster("read", controllers.path, *HCP2, "--node", "8", "1", "2", "--capture", str(file))
@@ -188,8 +213,8 @@ def test_any_command_can_be_captured(busmaster: Command, controllers: TcpServer,
     assert packets[0].frame == bytes.fromhex("07 30 38 02 30 31 05 0E")
 
     outcome = busmaster("read", controllers.path, *HCP2, "--node", "8", "1", "--capture", str(tmp_path / "no" / "dir"))
-    assert (outcome.status, outcome.out) == (1, "")
-    assert outcome.err.endswith("No such file or directory\n")
+    assert (outcome.status, outcome.out) == (2, "")
+    assert "No such file or directory" in outcome.err
 
 
 def test_words_are_printed_with_the_names_of_their_bits(busmaster: Command) -> None:

@@ -6,11 +6,14 @@ number, and is deaf while it is another than its own.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
+import socket
 import subprocess
 import sys
 import termios
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -214,6 +217,23 @@ def test_a_named_node_that_is_not_there_is_named_and_the_others_are_measured() -
     findings = examined(line_of("hcp2", [hcp2(5)]), (5, 9))
     assert findings.wrong == {"node 9"}
     assert findings.on("node 9").what == "does not answer"
+
+
+def test_a_port_that_floods_is_examined_all_the_same(busmaster: Command) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=flood, args=(server,), daemon=True)
+        thread.start()
+        done = busmaster("doctor", f"socket://127.0.0.1:{server.getsockname()[1]}")
+    assert done.status == 1
+    assert "bytes came unasked" in done.out
+
+
+def flood(server: socket.socket) -> None:
+    """The first client, until it goes away."""
+    client, _ = server.accept()
+    with client, contextlib.suppress(OSError):
+        while True:
+            client.sendall(bytes(65536))
 
 
 def test_where_nobody_answers_that_is_one_finding() -> None:

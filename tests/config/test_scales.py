@@ -20,6 +20,8 @@ def test_a_scaled_value_is_the_decimal_that_a_person_would_write() -> None:
     assert Scale.of(0.001).reader()(12345) == 12.345
     assert Scale.of(decimals=1).reader()(-476) == -47.6
     assert Scale.of(0.1, -40).reader()(655) == 25.5
+    assert Scale.of(0.001).reader()(14.2953) == 0.0142953
+    assert Scale.of(0.06).reader()(70.2514) == 4.215084
 
 
 @given(st.integers(-(2**31), 2**31 - 1), factors, offsets, st.integers(0, 4))
