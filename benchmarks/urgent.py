@@ -53,8 +53,8 @@ async def _measure(master: ModbusMaster, line: FarEnd, options: Options, table: 
     alive, dead = Tally(), Tally()
     pollers = [asyncio.create_task(_poll(master, unit, alive)) for unit in range(1, UNITS + 1)]
     await asyncio.sleep(0.3)
-    writes = options.pick(400, 20)
-    seconds = options.pick(30.0, 0.5)
+    writes = options.pick(300, 20)
+    seconds = options.pick(20.0, 0.5)
     await _write(master, writes, seconds, alive)
     waits = list(master.waits) if isinstance(master, Busmaster) else []
     await asyncio.to_thread(line.kill, DEAD)
