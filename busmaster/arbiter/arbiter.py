@@ -361,7 +361,7 @@ class Arbiter:
         elif not error.whole:
             self._strays.blame(now)
         free = self._say(error.send, now) if error.send else now
-        self._end_exchange()
+        self._end_exchange(failed=True)
         self.dispatcher.attempt_failed(transaction, no_reply, what, now)
         if error.whole:
             self._release_at(free + self._leg.timing.turnaround, now)
@@ -387,7 +387,9 @@ class Arbiter:
         self._leg.end = now + len(send) * self.byte_time
         return self._leg.end
 
-    def _end_exchange(self) -> None:
+    def _end_exchange(self, failed: bool = False) -> None:
+        if failed and self._exchange is not None:
+            self._leg.give_up(self._exchange.later)
         self._transaction = None
         self._exchange = None
         self._counters.exchanges += 1
@@ -436,6 +438,7 @@ class Arbiter:
         """Bytes that nobody asked for."""
         strays = self._strays
         strays.note(data, now, self._leg.quiet())
+        self._leg.strayed(now)
         if self.state is LineState.OFFLINE:
             return
         self._settle(now)
@@ -484,7 +487,7 @@ class Arbiter:
         self._strays.answered()
         self._strays.silent()
         if transaction is not None:
-            self._end_exchange()
+            self._end_exchange(failed=True)
             self.dispatcher.cut_off(transaction, self._offline(), now)
 
     def _enter(self, state: LineState, now: float) -> None:

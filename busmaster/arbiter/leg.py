@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import inf
 
 from busmaster.arbiter.strays import QUIET
+from busmaster.exchange import Leg as LaterLeg
 from busmaster.exchange import ReplyTiming
 
 TAINT_SHARE = 0.9
@@ -14,7 +16,7 @@ TAINT_SHARE = 0.9
 class Leg:
     """The leg on the wire, or the last one. `latency`: how long received bytes may lie in an adapter, in seconds."""
 
-    __slots__ = ("_limit", "_taint_until", "begun", "end", "latency", "timing")
+    __slots__ = ("_follows", "_limit", "_taint_until", "begun", "end", "latency", "timing")
 
     def __init__(self, timing: ReplyTiming, latency: float) -> None:
         self.timing = timing
@@ -22,6 +24,7 @@ class Leg:
         self.end = -inf
         """When the last byte sent is on the wire."""
         self.latency = latency
+        self._follows: ReplyTiming | None = None
         self._limit = inf
         self._taint_until = -inf
 
@@ -29,6 +32,7 @@ class Leg:
         """The host says something that takes `said` seconds; the longest reply takes `longest`. When it must begin."""
         self.timing = timing
         self.begun = False
+        self._follows = None
         self.end = end = now + said
         due = end + timing.window + self.latency
         self._limit = due + longest + timing.byte_gap
@@ -58,6 +62,16 @@ class Leg:
     def quiet(self) -> float:
         """The silence, in seconds, after which nothing more of a frame can come."""
         return max(QUIET, self.timing.byte_gap)
+
+    def give_up(self, later: Sequence[LaterLeg]) -> None:
+        """Its reply may still come; then its node goes on by itself with those of the `later` legs that need no word
+        from the host (MSC: the packet after its ACK)."""
+        self._follows = later[0].timing if later and not later[0].sent else None
+
+    def strayed(self, now: float) -> None:
+        """Something came: perhaps the reply that was given up, and its next leg begins here."""
+        if self._follows is not None:
+            self.timing, self.end, self._follows = self._follows, now, None
 
     def past(self) -> float:
         """From then on, no reply to it can begin (R3)."""

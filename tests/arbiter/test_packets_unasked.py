@@ -6,7 +6,7 @@ import pytest
 
 from busmaster.arbiter.events import LineState
 from busmaster.arbiter.transaction import Priority
-from busmaster.errors import GarbledReply, Refused
+from busmaster.errors import GarbledReply, NoReply, Refused
 from busmaster.protocols import msc
 from tests.arbiter.bench import Bench
 
@@ -136,3 +136,36 @@ def test_r3_on_a_noisy_line_nothing_is_sent_not_even_an_ack() -> None:
     line.sent()
     line.hear(REPLY_1234)
     assert line.sent() == ACK
+
+
+def test_r3_a_late_ack_is_followed_by_its_packet_and_both_are_waited_for() -> None:
+    """Each leg begins within its own lateness, so the packet may begin one lateness after the latest ACK."""
+    line = bench()
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    read = line.ask(node, msc.DataRead(2008), retries=0)
+    line.ask(node, msc.DataRead(2012))
+    line.sent()
+    line.wait(0.9)
+    assert isinstance(read.error, NoReply)
+    line.hear(ACK)
+    line.wait(0.95)
+    assert line.sent() == ""
+    line.hear(REPLY_1234)
+    assert line.sent() == ACK, "it is ACKed and dropped"
+    assert line.until_sent() >= 1.0
+
+
+def test_r3_an_ack_that_lies_behind_a_lost_port_is_followed_by_its_packet_too() -> None:
+    line = bench()
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    line.ask(node, msc.DataRead(2008))
+    line.sent()
+    line.arbiter.line_down("unplugged", line.now)
+    line.wait(0.1)
+    line.arbiter.line_up(line.now)
+    line.ask(node, msc.DataRead(2012))
+    line.hear(ACK, after=0.7)
+    line.wait(0.95)
+    assert line.sent() == ""
