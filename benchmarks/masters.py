@@ -27,6 +27,8 @@ from busmaster.transport.tcp import TcpPort
 
 REPLY_DEADLINE = 1.0
 """Seconds. Long: a machine that is busy with something else must not end a benchmark."""
+PATIENCE = 50
+"""Attempts at the first read, while the responder's process may still be starting."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Ours:
         self.bus = Bus(endpoint)
         await self.bus.__aenter__()
         for ask in self._asks:
-            await self.bus.node(self._profile, ask.address).request(ask.command)
+            await self.bus.node(self._profile, ask.address).request(ask.command, retries=PATIENCE)
 
     async def run(self, transactions: int) -> int:
         share, left = divmod(transactions, self._callers)
