@@ -209,16 +209,14 @@ class Arbiter:
     # outputs, pumped in this order
 
     def poll_transmit(self) -> bytes | None:
-        data = self._out
-        if not data:
-            return None
-        self._out = b""
-        return data
+        data, self._out = self._out, b""
+        return data or None
 
     def poll_event(self) -> Event | None:
         return self._events.popleft() if self._events else None
 
     def poll_timeout(self) -> float:
+        self._counters.tally()  # the owner asks this last: the next request has left
         return self._deadlines.earliest()
 
     def reset_statistics(self, now: float) -> None:
@@ -231,11 +229,11 @@ class Arbiter:
 
     # one exchange
 
-    def _advance(self, now: float) -> None:
-        """The line is free: start the next transaction, if one waits."""
+    def _advance(self, now: float) -> bool:
+        """The line is free: start the next transaction. False if none waits."""
         if now < self._quarantine:
             self._settle(now)
-            return
+            return True
         while (transaction := self.dispatcher.next(now)) is not None:
             node = transaction.node
             try:
@@ -245,15 +243,17 @@ class Arbiter:
             else:
                 break
         else:
-            return
+            return False
         self.dispatcher.started(transaction, now)
         self._transaction = transaction
         self._exchange = exchange
         self._strayed_within = False
-        self._enter(LineState.EXCHANGE, now)
+        if self.state is not LineState.EXCHANGE:
+            self._enter(LineState.EXCHANGE, now)
         self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, now)
         if not exchange.answered:
             self._deadlines.line = self._leg.end + exchange.timing.turnaround
+        return True
 
     def _begin_leg(self, timing: ReplyTiming, longest: int, send: bytes, now: float) -> None:
         """Say `send`; its reply must begin within the window, and end within the bound of R2."""
@@ -403,10 +403,9 @@ class Arbiter:
         elif free > now:
             self._enter(LineState.HOLDOFF, now)
             self._deadlines.line = free
-        else:
+        elif not self._advance(now):
             self._enter(LineState.READY, now)
             self._deadlines.line = inf
-            self._advance(now)
 
     def _settle(self, now: float) -> None:
         """Discard until it has been silent long enough and nothing can come any more (R3)."""

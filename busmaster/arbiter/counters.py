@@ -117,6 +117,7 @@ class LineCounters:
     __slots__ = (
         "_before",
         "_entered",
+        "_noted",
         "_spent",
         "cancelled",
         "collisions",
@@ -137,6 +138,7 @@ class LineCounters:
         """Ever, as `settling` is: what a request waited for is counted across a reset."""
         self._entered = since
         self._spent = [0.0] * len(LineState)
+        self._noted: list[tuple[Histogram, float]] = []
         self.reset(LineState.OFFLINE, since)
 
     def reset(self, state: LineState, since: float) -> None:
@@ -145,6 +147,15 @@ class LineCounters:
         self.tainted = self.collisions = self.settles = self.noisy = self.losses = 0
         self._before = (self.exchanges, self._times(state, since))
         self.waits = (Histogram(), Histogram(), Histogram(), Histogram())
+
+    def note(self, histogram: Histogram, seconds: float) -> None:
+        """To be recorded by `tally`, and not between a reply and the next request."""
+        self._noted.append((histogram, seconds))
+
+    def tally(self) -> None:
+        for histogram, seconds in self._noted:
+            histogram.record(seconds)
+        self._noted.clear()
 
     def spend(self, state: LineState, now: float) -> float:
         """The time since the last call went by in this state; returns it."""
@@ -165,6 +176,7 @@ class LineCounters:
 
     def snapshot(self, state: LineState, now: float, backlog: int) -> LineStatistics:
         """Changes nothing: whoever looks does not cut the pauses, from which probes are paid, into pieces."""
+        self.tally()
         first, second, third, fourth = self.waits
         exchanges, times = self._before
         spent = [time - before for time, before in zip(self._times(state, now), times, strict=True)]

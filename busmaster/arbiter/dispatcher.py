@@ -124,7 +124,7 @@ class Dispatcher:
         """Its next attempt goes out now."""
         counters = self.counters
         if transaction.attempts == 0:
-            counters.waits[transaction.priority].record(now - transaction.queued)
+            counters.note(counters.waits[transaction.priority], now - transaction.queued)
             self._count_ahead(transaction)
             poll = transaction.poll
             if poll is not None and poll.started == -inf:
@@ -143,7 +143,7 @@ class Dispatcher:
         node = transaction.node
         counters = node.counters
         counters.ok += 1
-        counters.latency.record(now - transaction.started)
+        self.counters.note(counters.latency, now - transaction.started)
         if transaction.late:
             counters.late += 1
         node.last_reply = now

@@ -133,13 +133,11 @@ class _Link(asyncio.Protocol):
         self._name = name
         self._protocol = protocol
         self._closing = closing
+        self.data_received = protocol.data_received  # type: ignore[method-assign]  # no step more on the hot path
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast("asyncio.Transport", transport)  # uvloop's are none by inheritance
         self._protocol.connection_made(transport)
-
-    def data_received(self, data: bytes) -> None:
-        self._protocol.data_received(data)
 
     def pause_writing(self) -> None:
         self._protocol.pause_writing()
