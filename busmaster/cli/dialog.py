@@ -40,7 +40,7 @@ class AskValue(ModalScreen[str | None]):
         if event.value.strip():
             self.value = event.value.strip()
             event.input.remove()
-            self.query_one(Label).update(f"write {self.asked} = {self.value} {self.unit}?  y or n")
+            self.query_one(Label).update(f"write {self.asked} = {f'{self.value} {self.unit}'.rstrip()}?  y or n")
 
     def action_agree(self) -> None:
         if self.value is not None:
