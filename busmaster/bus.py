@@ -49,6 +49,10 @@ class Bus:
     ) -> None:
         if capacity < 1:
             raise InvalidCommand(f"a bus needs room for at least one request, not {capacity}")
+        if isinstance(endpoint, str):
+            raise InvalidCommand(
+                f"a bus needs an endpoint, not text: Bus(endpoint({endpoint!r})), or SerialPort, TcpPort"
+            )
         self.endpoint = endpoint
         self._random = random.Random(seed)
         self._logbook = Logbook(endpoint.name)
@@ -135,6 +139,7 @@ class Bus:
     ) -> Node:
         """The node at this address. Raises InvalidCommand for an address that the protocol does not have, and for
         other timings or retries than it was first asked with."""
+        profile.check_address(address)
         known = self._nodes.get((profile.name, address))
         if known is not None:
             if timings not in (None, known.timings) or retries not in (None, known.record.retries):

@@ -135,6 +135,8 @@ class Node:
             )
         if not self.bus.running:
             raise BusClosed("the bus is not open", node=self.label, command=str(command))
+        if not hasattr(command, "open"):
+            raise InvalidCommand(f"{self.label}: {command!r} is no command; read it through a handle, or its point")
         transaction = Transaction(
             self.record,
             command,

@@ -22,8 +22,9 @@ class LineSettings:
     stopbits: float = 1
 
     def __post_init__(self) -> None:
-        if self.baudrate <= 0:
-            raise InvalidCommand(f"baudrate must be above 0, not {self.baudrate}")
+        rate: object = self.baudrate
+        if not isinstance(rate, int) or rate <= 0:
+            raise InvalidCommand(f"baudrate must be a whole number above 0, not {rate!r}")
         if self.bytesize not in (5, 6, 7, 8) or self.parity not in tuple("NEOMS") or self.stopbits not in (1, 1.5, 2):
             raise InvalidCommand(
                 f"no such framing: {self.bytesize}{self.parity}{self.stopbits:g}; use for example 8N1 or 7E1"

@@ -41,8 +41,9 @@ class TcpPort:
     def __post_init__(self) -> None:
         if not self.host:
             raise InvalidCommand("a TCP port needs a host name or address")
-        if not 1 <= self.port <= 65535:
-            raise InvalidCommand(f"a TCP port number is 1 to 65535, not {self.port}")
+        number: object = self.port
+        if not isinstance(number, int) or not 1 <= number <= 65535:
+            raise InvalidCommand(f"a TCP port number is 1 to 65535, not {number!r}")
         if not (math.isfinite(self.receive_latency) and self.receive_latency >= 0):
             raise InvalidCommand(f"receive_latency must be at least 0 s, not {self.receive_latency}")
         if self.paced and self.baudrate is None:
