@@ -1,15 +1,21 @@
-"""Submit, cancel, advance, deliver, garble, lose the port, close: in any order, the promises hold (R1, R3, R6, R8)."""
+"""Submit, poll, cancel, advance, deliver, garble, lose the port, close: in any order, the promises hold.
+
+R1, R3, R6, R8, R10, R11; with and without an echo.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
+from typing import ClassVar
 
 import hypothesis.strategies as st
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, LineState
+from busmaster.arbiter.events import Completed, LineState, NodeChanged, Polled
+from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
+from busmaster.arbiter.schedule import Poll, set_members
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.errors import BusError
 from busmaster.protocols import hcp2
@@ -17,6 +23,9 @@ from busmaster.wire.checks import xor
 from tests.arbiter.bench import TAU
 
 LATENESS = 0.150
+ROUNDING = 1e-9
+MOST_STEPS = 1000
+"""Of one `advance`."""
 
 
 def reply(element: int, value: int) -> bytes:
@@ -25,32 +34,38 @@ def reply(element: int, value: int) -> bytes:
 
 
 class AnyOrder(RuleBasedStateMachine):
-    """The test plays owner and node; `asked` is the request on the wire that may still be answered."""
+    """The test plays owner and nodes; `asked` is the request on the wire that may still be answered."""
+
+    echo: ClassVar[bool] = False
 
     def __init__(self) -> None:
         super().__init__()
         self.now = 0.0
-        self.arbiter = Arbiter(TAU, capacity=20)
-        self.nodes = [self.arbiter.add_node(hcp2.PROFILE, address, 0.0) for address in (1, 2)]
+        self.arbiter = Arbiter(TAU, capacity=20, echo=self.echo)
+        self.nodes = [self.arbiter.add_node(hcp2.PROFILE, address, 0.0) for address in (1, 2, 3)]
         self.submitted: list[Transaction] = []
+        self.polls: list[Poll] = []
         self.cancelled: set[int] = set()
         self.ended: Counter[int] = Counter()
+        self.cycles: Counter[str] = Counter()
         self.asked: bytes | None = None
-        self.asked_until = -1.0
-        self.right: dict[int, int] = {}
-        self.value = 0
-        self.closed = False
+        self.asked_at = self.asked_until = -1.0
+        self.answers: dict[int, tuple[int, int, float]] = {}
+        """Who was asked for what, and when, of each value: they are used once."""
+        self.spoil_echo = False
 
     @initialize()
     def open_the_port(self) -> None:
         self.arbiter.line_up(self.now)
         self.pump()
 
-    @rule(node=st.integers(0, 1), element=st.integers(1, 99), priority=st.sampled_from(Priority))
+    # the owner
+
+    @rule(node=st.integers(0, 2), element=st.integers(1, 9), priority=st.sampled_from(Priority))
     def read(self, node: int, element: int, priority: Priority) -> None:
         self.submit(Transaction(self.nodes[node], hcp2.Read(element), priority=priority))
 
-    @rule(node=st.integers(0, 1), repeat=st.booleans(), priority=st.sampled_from(Priority))
+    @rule(node=st.integers(0, 2), repeat=st.booleans(), priority=st.sampled_from(Priority))
     def write(self, node: int, repeat: bool, priority: Priority) -> None:
         self.submit(Transaction(self.nodes[node], hcp2.Write(1, (5,), idempotent=repeat), priority=priority))
 
@@ -67,14 +82,61 @@ class AnyOrder(RuleBasedStateMachine):
         self.arbiter.cancel(transaction, self.now)
         self.pump()
 
+    @precondition(lambda self: len(self.polls) < 4)
+    @rule(period=st.sampled_from([0.05, 0.2, 1.0]), reads=st.lists(st.tuples(st.integers(0, 2), st.integers(1, 9))))
+    def add_poll(self, period: float, reads: list[tuple[int, int]]) -> None:
+        poll = Poll(f"group {len(self.polls)}", period)
+        members = reads or [(0, 1), (1, 1), (2, 1)]
+        set_members(poll, [Transaction(self.nodes[node], hcp2.Read(element)) for node, element in members])
+        self.polls.append(poll)
+        self.arbiter.add_poll(poll, self.now)
+        self.pump()
+
+    @precondition(lambda self: self.polls)
+    @rule(which=st.integers(0, 3))
+    def demand_a_poll(self, which: int) -> None:
+        self.arbiter.demand(self.polls[which % len(self.polls)], self.now)
+        self.pump()
+
+    @precondition(lambda self: self.polls)
+    @rule(which=st.integers(0, 3))
+    def remove_a_poll(self, which: int) -> None:
+        self.arbiter.remove_poll(self.polls[which % len(self.polls)], self.now)
+        self.pump()
+
     @rule(seconds=st.floats(0.0001, 0.3))
     def advance(self, seconds: float) -> None:
         end = self.now + seconds
-        while (due := self.arbiter.poll_timeout()) <= end:
+        for _ in range(MOST_STEPS):
+            if (due := self.arbiter.poll_timeout()) > end:
+                break
             self.now = max(self.now, due)
             self.arbiter.handle_timeout(self.now)
             self.pump()
-        self.now = end
+        else:
+            raise AssertionError("it asks to be called again and again")
+        self.now = max(self.now, end)
+
+    @rule()
+    def nobody_answers_for_long(self) -> None:
+        """Whoever is asked goes down, and is probed."""
+        self.advance(3.0)
+
+    @rule()
+    def lose_the_port_and_find_it_again(self) -> None:
+        self.arbiter.line_down("unplugged", self.now)
+        self.pump()
+        assert all(t.phase is Phase.ENDED for t in self.submitted), "R13"
+        self.arbiter.line_up(self.now)
+        self.pump()
+
+    @precondition(lambda self: len(self.submitted) > 8)
+    @rule()
+    def close(self) -> None:
+        self.arbiter.close(self.now)
+        self.pump()
+
+    # the nodes, and the line
 
     @precondition(lambda self: self.asked is not None and self.now < self.asked_until)
     @rule()
@@ -83,10 +145,22 @@ class AnyOrder(RuleBasedStateMachine):
         assert self.asked is not None
         request, self.asked = self.asked, None
         if request[6] == 0x05:
-            self.value += 1
-            self.deliver(reply(int(request[4:6], 16), self.value))
+            element, value = int(request[4:6], 16), len(self.answers) + 1
+            self.answers[value] = (int(request[1:3], 16), element, self.asked_at)
+            self.deliver(reply(element, value))
         else:
             self.deliver(b"\x06")
+
+    @rule(times=st.integers(2, 12))
+    def answer_at_once_for_a_while(self, times: int) -> None:
+        """A healthy line: else no node would ever stay up."""
+        for _ in range(times):
+            if self.asked is not None and self.now < self.asked_until:
+                self.advance(0.002)
+                if self.asked is not None:
+                    self.answer()
+            else:
+                self.advance(0.05)
 
     @precondition(lambda self: self.asked is not None and self.now < self.asked_until)
     @rule(cut=st.integers(1, 6))
@@ -98,19 +172,12 @@ class AnyOrder(RuleBasedStateMachine):
     def garble(self, noise: bytes) -> None:
         self.deliver(noise)
 
+    @precondition(lambda self: self.echo)
     @rule()
-    def lose_the_port_and_find_it_again(self) -> None:
-        self.arbiter.line_down("unplugged", self.now)
-        self.pump()
-        self.arbiter.line_up(self.now)
-        self.pump()
+    def the_next_echo_is_damaged(self) -> None:
+        self.spoil_echo = True
 
-    @precondition(lambda self: len(self.submitted) > 8)
-    @rule()
-    def close(self) -> None:
-        self.closed = True
-        self.arbiter.close(self.now)
-        self.pump()
+    # what comes of it
 
     def submit(self, transaction: Transaction) -> None:
         self.submitted.append(transaction)
@@ -124,22 +191,48 @@ class AnyOrder(RuleBasedStateMachine):
     def pump(self) -> None:
         data = self.arbiter.poll_transmit()
         if data is not None:
-            assert self.asked is None or self.now >= self.asked_until, "R3: a reply could still have come"
+            assert self.asked is None or self.now >= self.asked_until - ROUNDING, "R3: a reply could still have come"
             assert self.arbiter.state is LineState.EXCHANGE
             self.asked = data
+            self.asked_at = self.now
             self.asked_until = self.now + len(data) * TAU + LATENESS
         while (event := self.arbiter.poll_event()) is not None:
-            if isinstance(event, Completed) and not event.transaction.probe:
-                self.check(event.transaction)
+            match event:
+                case Completed(transaction):
+                    self.check(transaction)
+                case Polled(poll):
+                    self.check_cycle(poll)
+                case NodeChanged(node, Health.UP | Health.SUSPECT, Health.DOWN):
+                    assert node.failures >= DOWN_AFTER_FAILURES, "R11"
+        if data is not None and self.echo:
+            self.hear_the_echo(data)
+
+    def hear_the_echo(self, data: bytes) -> None:
+        self.now += len(data) * TAU
+        spoilt, self.spoil_echo = self.spoil_echo, False
+        self.deliver(bytes([data[0] ^ 1]) + data[1:] if spoilt else data)
 
     def check(self, transaction: Transaction) -> None:
-        self.ended[id(transaction)] += 1
-        assert id(transaction) not in self.cancelled, "R6: its caller has gone"
+        if not transaction.probe:
+            self.ended[id(transaction)] += 1
+            assert id(transaction) not in self.cancelled, "R6: its caller has gone"
+        self.check_outcome(transaction)
+
+    def check_outcome(self, transaction: Transaction) -> None:
+        assert transaction.phase is Phase.ENDED
         if transaction.error is not None:
             assert isinstance(transaction.error, BusError)
             assert str(transaction.error).startswith("node ")
         elif not transaction.writes:
-            assert transaction.value == self.value, "the value of an earlier request"
+            assert isinstance(transaction.command, hcp2.Read)
+            mine = (transaction.node.address, transaction.command.element, transaction.started)
+            assert self.answers[int(transaction.value)] == mine, "the value of another request"
+
+    def check_cycle(self, poll: Poll) -> None:
+        self.cycles[poll.name] += 1
+        assert self.cycles[poll.name] <= poll.cycles, "R10: a cycle was reported twice"
+        for transaction in poll.results:
+            self.check_outcome(transaction)
 
     @invariant()
     def each_transaction_ends_at_most_once(self) -> None:
@@ -158,7 +251,16 @@ class AnyOrder(RuleBasedStateMachine):
             assert transaction.phase is Phase.ENDED
             assert self.ended[id(transaction)] == (id(transaction) not in self.cancelled)
         assert not any(node.writes for node in self.nodes)
+        assert self.arbiter.state is LineState.OFFLINE
+
+
+class AnyOrderWithEcho(AnyOrder):
+    """The port hears what it says, as it leaves."""
+
+    echo = True
 
 
 TestAnyOrder = AnyOrder.TestCase
 TestAnyOrder.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+TestAnyOrderWithEcho = AnyOrderWithEcho.TestCase
+TestAnyOrderWithEcho.settings = settings(max_examples=40, stateful_step_count=40, deadline=None)
