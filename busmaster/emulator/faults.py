@@ -213,12 +213,14 @@ def distort(faults: Faults, said: Said, device: Device | None, tau: float, chanc
 
 
 def noise(chance: Chance, longest: int) -> bytes:
-    """One to `longest` bytes as a disturbed line makes them: all zeros, all ones, or anything but `NO_NOISE`."""
+    """One to `longest` bytes as a disturbed line makes them: all zeros, all ones, or anything but `NO_NOISE`, now and
+    then behind an STX, as if it were a telegram."""
     kind = chance.randrange(0, 4)
     count = chance.randrange(1, longest + 1)
     if kind < 2:
         return (b"\x00", b"\xff")[kind] * count
-    return bytes(chance.getrandbits(8) for _ in range(count)).translate(None, NO_NOISE) or b"\xff"
+    burst = bytes(chance.getrandbits(8) for _ in range(count)).translate(None, NO_NOISE) or b"\xff"
+    return burst if kind == 2 else (b"\x02" + burst)[:longest]
 
 
 def flipped(data: bytes, chance: Chance, count: int) -> bytes:

@@ -45,7 +45,7 @@ class Hunt:
         self.random = Random(self.name)
         self._record = record
         chance = self.random
-        ledger = Ledger(self.kind.modulus, self.kind.step)
+        ledger = Ledger(self.kind.modulus, self.kind.step, gaps=self.mix.gaps)
         addresses = chance.sample(self.kind.addresses, min(len(self.kind.addresses), chance.randrange(1, 7)))
         self.devices = [self.kind.device(ledger, address) for address in addresses]
         chunked = self.mix.chunks
@@ -56,15 +56,16 @@ class Hunt:
             chance=Random(f"{self.name} line"),
             echo=self.mix.echo or (Echo() if chance.random() < 0.1 else None),
             chunk=chance.randrange(1, 4) if chunked else 0,
-            latency=0.0 if "doubled" in self.mix.device else chance.choice((0.0, 0.0, 0.004)),
+            latency=chance.choice((0.0, 0.0, 0.004)) if self.mix.latency is None else self.mix.latency,
             repeats=self.kind.profile.listen is not None,
             paced=chunked or chance.random() < 0.8,
         )
+        self.line.record = record
         self.world = World(
             self.line, on_event=self._on_event, record=record, jitter=Random(f"{self.name} probes").random
         )
         ledger.now = lambda: self.world.now
-        self.judge = Judge(self.kind, self.mix, ledger, self.line, self.devices, self.world.arbiter)
+        self.judge = Judge(self.kind, self.mix, ledger, self.line, self.world.arbiter)
         self.ledger = ledger
         self.nodes = [self.world.node(self.kind.profile, address) for address in addresses]
         broadcast = self.kind.profile.broadcast

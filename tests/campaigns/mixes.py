@@ -34,6 +34,7 @@ class Mix:
     reconnects: float = 0.0
     deaths: float = 0.0
     chunks: bool = False
+    latency: float | None = None
     runs: bool = False
     overdue: bool = False
 
@@ -44,6 +45,11 @@ class Mix:
     @property
     def refuses(self) -> bool:
         return "nak" in {*self.device, *self.line}
+
+    @property
+    def gaps(self) -> bool:
+        """Devices are away for a while, and miss what passes."""
+        return bool(self.deaths) or not {"flapping", "restart"}.isdisjoint(self.device)
 
     def faults(self, rates: Mapping[str, float], lateness: float) -> Faults:
         """`late` stays within the lateness, together with the prompt delay it is added to."""
@@ -78,9 +84,16 @@ WITHIN = (
         "glued",
         "replies come doubled, in noise",
         {"doubled": 0.1, "leading": 0.05, "trailing": 0.05},
+        latency=0.0,
     ),
-    Mix("glued-bytewise", "likewise, in pieces", {"doubled": 0.1, "leading": 0.05, "trailing": 0.1}, chunks=True),
-    Mix("noise", "bursts of noise, alone or into frames", {"babble": 0.05}, {"babble": 0.02}, slow=0.05),
+    Mix(
+        "glued-bytewise",
+        "likewise, in pieces",
+        {"doubled": 0.1, "leading": 0.05, "trailing": 0.1},
+        latency=0.0,
+        chunks=True,
+    ),
+    Mix("noise", "bursts of noise, alone or into frames", {"babble": 0.05, "late": 0.05}, {"babble": 0.02}),
     Mix("wrong", "replies for another element or unit", {"wrong": 0.1, "late": 0.1}, runs=True),
     Mix("refusals", "devices refuse unheeded", {"nak": 0.1, "late": 0.1}, runs=True),
     Mix("echo", "an adapter echoes, late and damaged at times", {"flip": 0.02, "late": 0.1}, echo=Echo(0.001, 0.02)),
@@ -89,10 +102,9 @@ WITHIN = (
         "devices die, come and go, forget",
         {"flapping": 0.01, "restart": 0.01, "late": 0.05, "away_for": 3.0},
         deaths=5.0,
-        runs=True,
     ),
     Mix("reconnects", "the port is lost and found", {"lost": 0.02}, slow=0.2, reconnects=2.0, runs=True),
-    Mix("everything", "all of it", EVERYTHING, {"flip": 0.01, "lost": 0.01}, reconnects=20.0, deaths=20.0),
+    Mix("everything", "all of it", EVERYTHING, {"flip": 0.01, "lost": 0.01}, latency=0.0, reconnects=20.0, deaths=20.0),
 )
 BEYOND = (
     Mix("repeated", "a second reply, up to 300 ms after the first", {"repeated": 0.05}),
@@ -102,7 +114,9 @@ BEYOND = (
     Mix("double flips", "the same bit flipped in two bytes of a reply", {"unseen": 0.05}),
     Mix("double flips both ways", "or of a request", line={"unseen": 0.05}),
     Mix("heard twice", "a request is heard twice, and answered twice", line={"doubled": 0.05}, overdue=True),
+    Mix("glued, delayed", "doubled replies that lie in an adapter", {"doubled": 0.1}, latency=0.004, overdue=True),
     Mix("cut", "requests are cut", line={"truncated": 0.05}, overdue=True),
     Mix("runs", "short commands, damaged requests", line={"flip": 0.05, "lost": 0.05}, runs=True, overdue=True),
+    Mix("runs, deaths", "short commands, drives that hear nothing for a while", deaths=3.0, runs=True, overdue=True),
 )
 MIXES = {mix.name: mix for mix in (*WITHIN, *BEYOND)}

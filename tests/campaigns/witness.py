@@ -77,9 +77,12 @@ class Ledger:
     problem: Callable[[str], None] = field(default=lambda what: None)
     unseen_writes: int = 0
     """Writes that were taken though nobody had sent them: damage that the request's checksum does not show."""
+    gaps: bool = False
+    """Devices miss what passes for a while: that is damage too."""
     unasked: int = 0
-    """What devices said that nobody had asked, because of damage: one that misses the end of a request takes the
-    beginning of the next one for it. Then R3's assumption does not hold for a while."""
+    """What devices said that nobody had asked, because of damage: one that missed the end of a request takes the
+    beginning of the next one for it; a Mentor II that missed the request to another takes that one's ACK for its own
+    short command. Then R3's assumption does not hold for a while."""
     last: Frame = NOTHING
     """The latest of all that devices who were asked are going to say."""
     _given: int = 0
@@ -141,7 +144,7 @@ class Ledger:
         self._frames.append(frame)
         if asked:
             self.last = max(self.last, frame, key=lambda one: one.end)
-        elif self.damaged(now - RECENT, now):
+        elif self.gaps or self.damaged(now - RECENT, now):
             self.unasked += 1
             self._unasked_at = now
         else:
@@ -153,7 +156,7 @@ class Ledger:
 
     def damaged(self, begin: float, end: float) -> bool:
         """Something that passed in that time was not what was said."""
-        return any(start < end and begin < stop for start, stop in self._damage)
+        return any(start <= end and begin < stop for start, stop in self._damage)
 
     def broken(self) -> bool:
         """A device spoke unasked a short while ago."""
@@ -188,6 +191,8 @@ class WatchedLine(Line):
         super().__init__(*args, **options)
         self.ledger = ledger
         self.repeats = repeats
+        self.record: Callable[[str], None] | None = None
+        """Is told what devices say, and what becomes of it."""
         self.on_request: Callable[[float], None] = lambda now: None
         self._request = b""
         self._exchanges: deque[Spoken] = deque([Spoken(-inf, -inf)], maxlen=REMEMBERED)
@@ -217,14 +222,23 @@ class WatchedLine(Line):
     def _say(self, talker: Device | None, start: float, data: bytes) -> None:
         if talker is not None:
             asked = self.repeats or self._request.startswith(talker.routes)
-            self.ledger.said(start, start + len(data) * self.tau, asked)
+            end = start + len(data) * self.tau
+            if self.record is not None:
+                self.record(f"{self.ledger.now():.6f} {talker!r} says {data.hex(' ')} from {start:.6f} to {end:.6f}")
+            self.ledger.said(start, end, asked)
         super()._say(talker, start, data)
 
     def _join(self, talk: Talk) -> None:
         if not talk.clean:
-            self.ledger.spoiled(talk.start, talk.end)
+            self._spoiled(talk, f"passes as {talk.data.hex(' ')}")
         super()._join(talk)
 
     def _collide(self, talk: Talk, other: Talk) -> None:
         super()._collide(talk, other)
+        self._spoiled(talk, "collides with another")
+
+    def _spoiled(self, talk: Talk, what: str) -> None:
         self.ledger.spoiled(talk.start, talk.end)
+        if self.record is not None:
+            who = "the host's" if talk.talker is None else f"{talk.talker!r}'s"
+            self.record(f"{self.ledger.now():.6f} {who} talk from {talk.start:.6f} to {talk.end:.6f} {what}")

@@ -1,0 +1,108 @@
+"""A fixed set of hunts for wrong values; `python -m tests.campaigns` goes on from there."""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.campaigns.hunt import Hunt
+from tests.campaigns.judge import Totals
+from tests.campaigns.kinds import KINDS
+from tests.campaigns.mixes import BEYOND, WITHIN
+
+EACH = 700
+"""Transactions of one hunt."""
+EVERY_PROTOCOL = pytest.mark.parametrize("protocol", list(KINDS))
+
+
+def check(totals: Totals, hunt: Hunt) -> None:
+    again = f"python -m tests.campaigns --each {EACH} --replay '{hunt.name}'"
+    assert not totals.problems, f"{totals.problems[0]}\nits transcript: {again}"
+
+
+@EVERY_PROTOCOL
+@pytest.mark.parametrize("mix", [mix.name for mix in WITHIN])
+def test_r1_to_r13_inside_the_assumption_nothing_is_wrong_or_lost_and_everything_heals(protocol: str, mix: str) -> None:
+    hunt = Hunt(protocol, mix, 1)
+    totals = hunt.run(EACH)
+    check(totals, hunt)
+    assert totals.confused == totals.lost == 0
+    assert totals.transactions >= EACH
+
+
+@EVERY_PROTOCOL
+def test_what_the_faults_do_shows(protocol: str) -> None:
+    """Else the hunts would prove nothing."""
+    found = {}
+    for mix in WITHIN:
+        found[mix.name] = Hunt(protocol, mix.name, 2).run(300)
+    calm = found.pop("calm")
+    assert calm.bad_attempts == calm.strays == calm.unseen == 0
+    del found["bytewise"]
+    quiet = [name for name, totals in found.items() if totals.bad_attempts + totals.strays < 10]
+    assert quiet == ["refusals"] or not quiet
+    assert found["cancelled"].cancelled > found["late"].cancelled
+
+
+@EVERY_PROTOCOL
+def test_beyond_the_assumption_the_oracle_sees_what_is_wrong(protocol: str) -> None:
+    def wrong(mix: str) -> Totals:
+        total = Totals()
+        for seed in range(1, 4):
+            total.add(Hunt(protocol, mix, seed).run(1000))
+        assert not total.problems
+        return total
+
+    assert wrong("overdue").confused > 0
+    assert wrong("double flips").unseen > 0
+
+
+@pytest.mark.parametrize("mix", [mix.name for mix in BEYOND])
+def test_beyond_the_assumption_too_everything_ends_and_heals(mix: str) -> None:
+    for protocol in KINDS:
+        hunt = Hunt(protocol, mix, 1)
+        check(hunt.run(150), hunt)
+
+
+def transcript(protocol: str, mix: str, seed: int) -> list[str]:
+    lines: list[str] = []
+    Hunt(protocol, mix, seed, lines.append).run(200)
+    return lines
+
+
+@EVERY_PROTOCOL
+def test_the_same_seed_gives_the_same_transcript_and_another_another(protocol: str) -> None:
+    first = transcript(protocol, "everything", 1)
+    assert len(first) > 600
+    assert transcript(protocol, "everything", 1) == first
+    assert transcript(protocol, "everything", 2) != first
+
+
+def test_the_same_seed_gives_the_same_transcript_byte_for_byte_in_any_process() -> None:
+    """Whatever the seed of the hashes is: no set and no address of an object may decide anything."""
+    command = [sys.executable, "-m", "tests.campaigns", "--each", "200", "--replay", "msc/everything/1"]
+    root = Path(__file__).parents[2]
+    digests = set()
+    for seed in ("0", "1", "2"):
+        ran = subprocess.run(command, cwd=root, env={"PYTHONHASHSEED": seed}, capture_output=True, check=True)
+        digests.add(hashlib.sha256(ran.stdout).hexdigest())
+    here = "".join(f"{line}\n" for line in transcript("msc", "everything", 1))
+    assert digests == {hashlib.sha256(here.encode()).hexdigest()}
+
+
+def test_nothing_grows_without_bound() -> None:
+    """What is remembered is full after some thousand transactions; then twice as many leave no more objects."""
+
+    def objects(transactions: int) -> int:
+        hunt = Hunt("hcp2", "everything", 3)
+        hunt.run(transactions)
+        gc.collect()
+        assert not hunt.totals.problems
+        return len(gc.get_objects())
+
+    assert objects(12_000) < objects(6000) + 300

@@ -1,0 +1,106 @@
+"""A campaign that finds nothing is worth what it would have found: bugs are planted in the master, and caught."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.leg import Leg
+from busmaster.arbiter.transaction import Transaction
+from busmaster.exchange import FrameError
+from busmaster.protocols import dc104, msc_exchange
+from busmaster.wire import readers
+from tests.campaigns.hunt import Hunt
+from tests.campaigns.judge import Judge, Totals
+from tests.campaigns.kinds import KINDS
+
+SEEDS = range(1, 21)
+EACH = 2000
+"""Transactions of a hunt. Most are broken off long before."""
+EVERY_PROTOCOL = pytest.mark.parametrize("protocol", list(KINDS))
+
+
+def caught(protocol: str, mix: str) -> Totals:
+    """What the first hunt found that found a wrong value."""
+    for seed in SEEDS:
+        totals = Hunt(protocol, mix, seed).run(EACH)
+        if totals.confused:
+            return totals
+    pytest.fail(f"{len(SEEDS)} hunts found no wrong value")
+
+
+@pytest.fixture(autouse=True)
+def wrong_values_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """R1 and R3 are checked at each request too: that would end the hunt before harm is done."""
+    monkeypatch.setattr(Judge, "request_leaves", lambda judge, now: None)
+
+
+def excusing(feed: Callable[..., Any]) -> Callable[..., Any]:
+    """A reader's function, for which a wrong echo is as good as a bad checksum."""
+
+    def read(*arguments: Any) -> Any:
+        try:
+            return feed(*arguments)
+        except FrameError as error:
+            error.whole = error.whole or error.what.startswith("wrong echo")
+            raise
+
+    return read
+
+
+@EVERY_PROTOCOL
+def test_a_lateness_of_zero_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Leg, "past", lambda leg: leg.end)
+    assert "WRONG" in caught(protocol, "late").problems[0]
+
+
+@pytest.mark.parametrize("protocol", ["hcp", "hcp2", "mentor", "dc104"])
+def test_a_wrong_echo_that_does_not_settle_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(readers, "find_etx", excusing(readers.find_etx))
+    monkeypatch.setattr(dc104.Reading, "feed", excusing(dc104.Reading.feed))
+    assert "WRONG" in caught(protocol, "noise").problems[0]
+
+
+@EVERY_PROTOCOL
+def test_a_cancellation_that_clears_the_exchange_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    right = Arbiter.cancel
+
+    def cancel(arbiter: Arbiter, transaction: Transaction, now: float) -> None:
+        right(arbiter, transaction, now)
+        if arbiter._transaction is transaction:
+            arbiter._end_exchange()
+            arbiter.dispatcher._end(transaction, now)
+            arbiter._release_at(now, now)
+
+    monkeypatch.setattr(Arbiter, "cancel", cancel)
+    assert "WRONG" in caught(protocol, "cancelled").problems[0]
+
+
+@EVERY_PROTOCOL
+def test_an_echo_that_is_not_looked_at_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The element check removed; for an MSC, that of unit and name."""
+    right, read = readers.find_etx, dc104.Reading.feed
+
+    def find_etx(buffer: bytes, header: bytes, *others: Any) -> int:
+        return right(buffer, buffer[: len(header)], *others) if len(buffer) >= len(header) else 0
+
+    def feed(reading: dc104.Reading, data: bytes) -> Any:
+        reading._parameter = (reading._buffer + data + b"\0\0")[1]
+        return read(reading, data)
+
+    monkeypatch.setattr(readers, "find_etx", find_etx)
+    monkeypatch.setattr(dc104.Reading, "feed", feed)
+    monkeypatch.setattr(msc_exchange.Reply, "echoed_by", lambda reply, whole: len(whole) == reply.size)
+    assert "WRONG" in caught(protocol, "wrong").problems[0]
+
+
+@pytest.mark.parametrize("protocol", ["hcp", "hcp2", "mentor", "dc104"])
+def test_without_r3_a_request_that_leaves_too_early_is_caught_before_it_does_harm(
+    protocol: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
+    monkeypatch.setattr(Leg, "past", lambda leg: leg.end)
+    assert "R3" in Hunt(protocol, "late", 1).run(EACH).problems[0]
