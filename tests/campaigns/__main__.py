@@ -11,6 +11,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import nullcontext
 from itertools import count
 from multiprocessing import Pool
 
@@ -24,17 +25,10 @@ EACH = 5000
 Pair = tuple[str, str]
 Found = Mapping[Pair, Totals]
 COLUMNS = (
-    "transactions",
-    "values",
-    "writes",
-    "failed",
-    "cancelled",
-    "confused",
-    "unseen",
-    "unasked",
-    "hours",
-    "longest",
+    *("transactions", "values", "writes", "failed", "cancelled"),
+    *("confused", "unseen", "unseen_writes", "unasked", "seconds", "recovery"),
 )
+"""Those of `Totals` that are shown for each protocol and mix."""
 
 
 def main() -> int:
@@ -45,10 +39,10 @@ def main() -> int:
     pairs = [(protocol, mix) for protocol in arguments.protocol for mix in arguments.mix]
     found: defaultdict[Pair, Totals] = defaultdict(Totals)
     begun, done = time.perf_counter(), 0
-    with Pool(arguments.jobs) as pool:
+    with Pool(arguments.jobs) if arguments.jobs > 1 else nullcontext() as pool:
         for seed in count(arguments.seed):
             hunts = [(protocol, mix, seed, arguments.each) for protocol, mix in pairs]
-            for (protocol, mix), totals in pool.imap_unordered(_hunt, hunts):
+            for (protocol, mix), totals in map(_hunt, hunts) if pool is None else pool.imap_unordered(_hunt, hunts):
                 found[protocol, mix].add(totals)
                 done += totals.transactions
                 if totals.problems:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.campaigns.__main__ import main
 from tests.campaigns.hunt import Hunt
 from tests.campaigns.judge import Totals
 from tests.campaigns.kinds import KINDS
@@ -106,3 +107,25 @@ def test_nothing_grows_without_bound() -> None:
         return len(gc.get_objects())
 
     assert objects(12_000) < objects(6000) + 300
+
+
+def test_the_command_adds_up_and_says_how_to_replay(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Here of a bug that was planted."""
+    monkeypatch.setattr("busmaster.arbiter.leg.Leg.past", lambda leg: leg.end)
+    arguments = ["campaigns", "--transactions", "100", "--each", "100", "--protocol", "hcp2", "--seed", "3"]
+    monkeypatch.setattr(sys, "argv", [*arguments, "--mix", "late", "--mix", "calm"])
+    assert main() == 1
+    said = capfd.readouterr().out
+    assert "python -m tests.campaigns --replay 'hcp2/late/3' --each 100" in said
+    assert "R3: a request leaves while a reply is still to come" in said
+    assert "1 rules broken" in said
+    monkeypatch.setattr(sys, "argv", [*arguments, "--beyond", "--mix", "overdue"])
+    main()
+    assert "| replies begin after up to three times the lateness |" in capfd.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["campaigns", "--replay", "hcp2/late/3", "--each", "100"])
+    assert main() == 1
+    *transcript, last = capfd.readouterr().out.splitlines()
+    assert "BROKEN: " in last
+    assert len(transcript) > 10
