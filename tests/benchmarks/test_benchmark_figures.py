@@ -99,7 +99,7 @@ def test_late_replies_and_cancelled_callers_give_no_wrong_value_in_virtual_time(
 
 
 def test_a_simulation_counts_each_transaction_once() -> None:
-    simulation = Simulation(Faults(lost=0.02, flip=0.02), 300)
+    simulation = Simulation(Faults(lost=0.02, flip=0.02), 5.0)
     simulation.run()
     assert simulation.wrong == 0
     assert simulation.done == simulation.right + simulation.failed >= 300
