@@ -168,7 +168,12 @@ def note_success(node: NodeRecord, now: float) -> None:
 
 
 def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> None:
-    """A transaction failed without a valid reply. The caller reports the change of health."""
+    """A transaction failed without a valid reply. The caller reports the change of health.
+
+    A broadcast fails for what its echo was: that says nothing of a node, and there is none to be probed.
+    """
+    if node.address == node.profile.broadcast:
+        return
     node.failures += 1
     node.failed_at = now
     node.replies = 0

@@ -21,7 +21,7 @@ from busmaster.arbiter.health import (
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Priority
 from busmaster.errors import NodeDown, NoReply, Refused, WriteUnconfirmed
-from busmaster.protocols import hcp2
+from busmaster.protocols import hcp2, mentor
 from tests.arbiter.bench import FIVE, NAK, READ_1_OF_NODE_1, WRITE_5, Bench
 
 UNKNOWN, UP, SUSPECT, DOWN = Health
@@ -131,6 +131,20 @@ def test_r7_a_suspect_that_fails_gets_no_retries_and_one_that_answered_does() ->
             bench.sent()
         attempts.append(read.attempts)
     assert attempts == [3, 1, 1, 3]
+
+
+def test_r11_broadcasts_that_fail_are_no_dead_node_and_the_dead_are_probed_all_the_same() -> None:
+    bench = Bench(echo=True)
+    everybody, drive = bench.node(0, mentor.PROFILE), bench.node(12, mentor.PROFILE)
+    for node in (everybody, drive):
+        write = bench.ask(node, mentor.Write(1, 17, 0), retries=0)
+        bench.sent()
+        bench.hear("FF")
+        assert isinstance(write.error, WriteUnconfirmed)
+        bench.wait(0.5)
+    assert (drive.health, everybody.health) == (DOWN, UNKNOWN)
+    bench.wait(60.0)
+    assert drive.counters.probes > 2
 
 
 # probes
