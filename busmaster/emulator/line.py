@@ -197,7 +197,9 @@ class Line:
             chunk = talk.chunk or self.chunk
             if self.prompt:
                 chunk = min(chunk or self._piece, self._piece) if talk.given else 1
-            if chunk and talk.wave is None and self._heard_at_once(talk):
+            if talk.wave is not None:
+                end = min(end, self._next_byte(talk.wave, talk.given))
+            elif chunk and self._heard_at_once(talk):
                 end = min(end, talk.start + (talk.given + chunk) * self.tau)
             if self._pending and self._pending[0][0] < talk.end - self._rounding:
                 end = min(end, self._pending[0][0])
@@ -328,6 +330,11 @@ class Line:
 
     def _host_hears(self, wave: Wave, until: float) -> bytes:
         return bytes(byte for _, byte in wave.heard(None, until, echo=self.echo is not None))
+
+    def _next_byte(self, wave: Wave, given: int) -> float:
+        """When the host has heard the next byte of several talkers, whom it hears one byte at a time."""
+        begins = [start for start, _ in wave.heard(None, echo=self.echo is not None)]
+        return begins[given] + self.tau if given < len(begins) else NEVER
 
     def _arrive(self, data: bytes, when: float) -> None:
         arrivals = self._arrivals

@@ -200,6 +200,18 @@ def test_what_had_arrived_before_a_collision_stays_as_it_was() -> None:
     assert len(rest.split()) == 2  # what came while it talked it did not hear
 
 
+@pytest.mark.parametrize("prompt", [False, True])
+def test_what_is_heard_of_a_collision_reaches_the_host_as_it_comes(prompt: bool) -> None:
+    """However long the other talker goes on."""
+    line = line_of(mint())
+    line.prompt = prompt
+    line.send(READ_2, 0.0)
+    start = 8 * TAU + 0.002
+    line.receive(start + 2 * TAU)
+    line.send(b"\x00", start + 2.5 * TAU)
+    assert [when for when, _ in arrivals(line, 1.0)] == pytest.approx([start + 5 * TAU, start + 6 * TAU])
+
+
 def test_a_request_that_collides_with_a_straggler_is_lost_and_not_misheard() -> None:
     line = line_of(mint(2, delay=0.05), mint(3))
     line.send(READ_2, 0.0)

@@ -167,7 +167,8 @@ def test_numbers_are_written_short(number: float, text: bytes) -> None:
 @given(st.floats(-1e9, 1e9))
 @settings(max_examples=200)
 def test_a_number_written_and_read_again_is_the_same_to_four_decimals(number: float) -> None:
-    assert list(numbers(number_text(number))) == pytest.approx([number], abs=0.00005001)
+    """Half of the fifth decimal, and what floats of that size cannot tell apart."""
+    assert list(numbers(number_text(number))) == pytest.approx([number], abs=0.0000502)
     assert numbers(number_text(number, fixed_decimals=True)) == numbers(number_text(number))
 
 
