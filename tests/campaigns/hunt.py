@@ -138,19 +138,18 @@ class Hunt:
         for poll in self.polls[1:]:
             world.arbiter.remove_poll(poll, world.now)
         self.polls = self.polls[:1]
-        begun = world.now
-        if not world.run_until(self._all_well, RECOVERY):
+        begun, cycles = world.now, self.polls[0].cycles
+        if not world.run_until(lambda: self._all_well(cycles), RECOVERY):
             states = ", ".join(f"{node.label} {node.health.value}" for node in self.nodes)
-            self.judge.problem(f"no progress {RECOVERY:g} s after all faults had healed: {states}")
+            errors = [read.error for read in self.polls[0].results if read.error is not None]
+            self.judge.problem(f"no progress {RECOVERY:g} s after all faults had healed: {states}; {errors}")
         self.totals.recovery = world.now - begun
-        cycles = self.polls[0].cycles
-        world.run_until(lambda: self.polls[0].cycles >= cycles + 2 and not self.polls[0].running, 60.0)
-        for read in self.polls[0].results:
-            if read.error is not None:
-                self.judge.problem(f"not well again: {read.error!r}")
 
-    def _all_well(self) -> bool:
-        return not self.open and all(node.health is Health.UP for node in self.nodes)
+    def _all_well(self, cycles: int) -> bool:
+        """No request of before is open, all nodes are up, and a later cycle of the first poll than that was good."""
+        poll = self.polls[0]
+        polled = poll.cycles > cycles + 1 and not poll.running and all(read.error is None for read in poll.results)
+        return polled and not self.open and all(node.health is Health.UP for node in self.nodes)
 
     def _close(self) -> None:
         """R8: requests are in it, and each ends."""

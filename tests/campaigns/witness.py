@@ -123,7 +123,7 @@ class Ledger:
         now = self.now()
         written = self._written.get(number)
         if written is None or written.node not in (None, node) or element not in written.elements:
-            if self.damaged(now - RECENT, now):
+            if self.gaps or self.damaged(now - RECENT, now):
                 self.unseen_writes += 1
             else:
                 self.problem(f"device {node} took {number} for {element}, which nobody sent it")
