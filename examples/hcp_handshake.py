@@ -20,7 +20,7 @@ from busmaster.emulator.devices.mint import MintController, command_handshake
 from busmaster.emulator.line import Line
 
 MOVE_ABSOLUTE = 1
-ATTEMPTS = 20
+ATTEMPTS = 100
 
 
 async def give_command(controller: HcpController, command: int, speed: float, target: float) -> None:
