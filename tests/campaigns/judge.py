@@ -111,13 +111,14 @@ class Judge:
     # the line
 
     def request_leaves(self, now: float) -> None:
-        """R1, R3: whatever was caused before is over. An MSC repeats its packets by itself."""
+        """R1, R3: whatever was caused before is over. An MSC repeats its packets by itself. A reply that noise cut
+        into may look as if it had ended, with a bad checksum."""
         last = self.ledger.last
         if self.mix.beyond or self.line.repeats or self.ledger.broken():
             return
         if last.start > now + ROUNDING:
             self.problem(f"R3: a request leaves while a reply is still to come, at {last.start:.6f}")
-        elif last.end > now + ROUNDING:
+        if last.end > now + ROUNDING and not self.ledger.damaged(last.start, now):
             self.problem(f"R1: a request leaves into a reply that lasts until {last.end:.6f}")
 
     # transactions
@@ -202,9 +203,10 @@ class Judge:
         error = transaction.error
         if isinstance(error, NotStarted | BacklogFull):
             self.problem(f"{transaction.command} was on the wire and ended with {error!r}")
-        elif isinstance(error, Refused) and not self.mix.refuses and not self.mix.beyond:
-            begin, end = transaction.started - RECENT, transaction.ended_at
-            self._count_wrong(not self.ledger.damaged(begin, end), f"{error}: nobody did")
+            return
+        refused = isinstance(error, Refused) and not self.mix.refuses and not self.mix.beyond
+        if refused and not self.ledger.damaged(transaction.started - RECENT, transaction.ended_at):
+            self._count_wrong(True, f"{error}: nobody did")
 
     def _wrong(self, transaction: Transaction, what: str) -> None:
         ledger, begin, end = self.ledger, transaction.started, transaction.ended_at

@@ -151,7 +151,7 @@ class Ledger:
             self.problem("a device spoke that was not asked")
 
     def spoiled(self, start: float, end: float) -> None:
-        """What passed then is not what was said."""
+        """What passed then does not hold what was said."""
         self._damage.append((start, end))
 
     def damaged(self, begin: float, end: float) -> bool:
@@ -194,7 +194,7 @@ class WatchedLine(Line):
         self.record: Callable[[str], None] | None = None
         """Is told what devices say, and what becomes of it."""
         self.on_request: Callable[[float], None] = lambda now: None
-        self._request = b""
+        self._request = self._said = b""
         self._exchanges: deque[Spoken] = deque([Spoken(-inf, -inf)], maxlen=REMEMBERED)
 
     def send(self, data: bytes, now: float) -> None:
@@ -226,10 +226,11 @@ class WatchedLine(Line):
             if self.record is not None:
                 self.record(f"{self.ledger.now():.6f} {talker!r} says {data.hex(' ')} from {start:.6f} to {end:.6f}")
             self.ledger.said(start, end, asked)
+        self._said = data
         super()._say(talker, start, data)
 
     def _join(self, talk: Talk) -> None:
-        if not talk.clean:
+        if not talk.clean and self._said not in talk.data:
             self._spoiled(talk, f"passes as {talk.data.hex(' ')}")
         super()._join(talk)
 
