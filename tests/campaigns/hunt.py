@@ -75,7 +75,6 @@ class Hunt:
         self.polls: list[Poll] = []
         self._names = count(1)
         self._healed = False
-        self._dead: set[int] = set()
 
     @property
     def totals(self) -> Totals:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from random import Random
 from typing import Any
 
@@ -18,6 +18,8 @@ from tests.campaigns.witness import Ledger, Witness
 
 SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))
 MSC_STEP = 4
+EEPROM = 1.9
+"""How much longer than a slow read a slow write of DC104 takes, whose lateness is three times as long."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Kind:
         if isinstance(device, MscController):
             device.packet_delay = delay
         elif isinstance(device, Dc104Drive):
-            device.eeprom = delay
+            device.eeprom = replace(delay, straggle=(EEPROM * delay.straggle[0], EEPROM * delay.straggle[1]))
 
 
 def elements_of(command: Command[Any]) -> tuple[int, ...]:
