@@ -67,7 +67,7 @@ async def _measure(
     table.row(name, delay * 1000, timings["ours"].wrong, limit, rate, share, bare_share, of_bare)
     outcome.wrong += timings["ours"].wrong
     outcome.series[f"{name}, {delay * 1000:g} ms"] = {"ours": share, "bare": bare_share}
-    if delay == CLAIMED_REPLY_TIME and profile is hcp2.PROFILE:
+    if delay == CLAIMED_REPLY_TIME:
         if baudrate == min(BAUDRATES):
             outcome.claims.append(Claim(f"% of the wire's limit, {name}", share, OF_THE_WIRE, at_most=False))
         else:

@@ -229,8 +229,8 @@ class Arbiter:
 
     # one exchange
 
-    def _advance(self, now: float) -> bool:
-        """The line is free: start the next transaction. False if none waits."""
+    def _advance(self, now: float, free: float = -inf) -> bool:
+        """Start the next transaction, right behind our own last byte, which is out at `free`. False if none waits."""
         if now < self._quarantine:
             self._settle(now)
             return True
@@ -250,7 +250,7 @@ class Arbiter:
         self._strayed_within = False
         if self.state is not LineState.EXCHANGE:
             self._enter(LineState.EXCHANGE, now)
-        self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, now)
+        self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, max(now, free))
         if not exchange.answered:
             self._deadlines.line = self._leg.end + exchange.timing.turnaround
         return True
@@ -346,7 +346,7 @@ class Arbiter:
             self._settle(now)
             return
         self._strays.answered()
-        self._release_at(free + self._leg.timing.turnaround if answered else now, now)
+        self._release(free, self._leg.timing.turnaround if answered else 0.0, now)
 
     def _attempt_failed(self, error: FrameError, now: float, no_reply: bool = False) -> None:
         transaction = self._transaction
@@ -364,7 +364,7 @@ class Arbiter:
         self._end_exchange(failed=True)
         self.dispatcher.attempt_failed(transaction, no_reply, what, now)
         if error.whole:
-            self._release_at(free + self._leg.timing.turnaround, now)
+            self._release(free, self._leg.timing.turnaround, now)
         else:
             self._settle(now)
 
@@ -376,7 +376,7 @@ class Arbiter:
         self._end_exchange()
         self.dispatcher.refused(transaction, refusal, now)
         if transaction.writes:
-            self._release_at(now + self._leg.timing.turnaround, now)
+            self._release(now, self._leg.timing.turnaround, now)
         else:
             self._settle(now)
 
@@ -396,16 +396,14 @@ class Arbiter:
 
     # the line between exchanges
 
-    def _release_at(self, free: float, now: float) -> None:
-        """The outcome was certain: the next exchange may start at `free`."""
+    def _release(self, free: float, hold: float, now: float) -> None:
+        """The outcome was certain: the next request may follow `hold` seconds behind our own last byte."""
         if self._closed:
             self._go_offline(now)
-        elif free > now:
-            self._enter(LineState.HOLDOFF, now)
-            self._deadlines.line = free
-        elif not self._advance(now):
-            self._enter(LineState.READY, now)
-            self._deadlines.line = inf
+        elif hold or not self._advance(now, free):
+            held = free + hold > now
+            self._enter(LineState.HOLDOFF if held else LineState.READY, now)
+            self._deadlines.line = free + hold if held else inf
 
     def _settle(self, now: float) -> None:
         """Discard until it has been silent long enough and nothing can come any more (R3)."""

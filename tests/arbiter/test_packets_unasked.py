@@ -22,7 +22,7 @@ def bench() -> Bench:
     return made
 
 
-def test_ack_then_packet_then_the_hosts_ack() -> None:
+def test_ack_then_packet_then_the_hosts_ack_with_the_next_request_right_behind_it() -> None:
     line = bench()
     node = line.node(1, msc.PROFILE)
     line.wait(1.0)
@@ -31,12 +31,26 @@ def test_ack_then_packet_then_the_hosts_ack() -> None:
     assert line.sent() == READ_2008
     line.hear(ACK, after=0.03)
     line.hear(REPLY_1234, after=0.1)
-    assert (read.value, line.sent()) == (1234, ACK)
-    assert line.arbiter.state is LineState.HOLDOFF
-    assert line.until_sent() == pytest.approx(10 / 9600)
-    assert line.sent() == READ_2008
+    assert (read.value, line.sent()) == (1234, f"{ACK} {READ_2008}")
     line.hear(ACK + REPLY_1234, after=0.05)
-    assert following.value == 1234
+    assert (following.value, line.sent()) == (1234, ACK)
+    assert line.arbiter.state is LineState.HOLDOFF, "nothing follows, but the ACK is not out yet"
+
+
+def test_the_window_of_a_request_behind_the_hosts_ack_starts_at_the_end_of_both() -> None:
+    line = bench()
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    line.ask(node, msc.DataRead(2008))
+    following = line.ask(node, msc.DataRead(2012), retries=0)
+    line.sent()
+    line.hear(ACK + REPLY_1234, after=0.05)
+    said = len(bytes.fromhex(line.sent())) * 10 / 9600
+    window = msc.PROFILE.timings.read.window
+    line.wait(said + window - 0.001)
+    assert following.error is None
+    line.wait(0.002)
+    assert isinstance(following.error, NoReply)
 
 
 def test_a_bad_packet_is_naked_and_comes_again() -> None:
@@ -75,9 +89,7 @@ def test_r9_with_an_urgent_request_waiting_a_bad_packet_is_acked_away() -> None:
     line.sent()
     line.hear(ACK + BAD_REPLY, after=0.05)
     assert isinstance(read.error, GarbledReply)
-    assert line.sent() == ACK
-    line.until_sent()
-    line.sent()
+    assert line.sent().startswith(f"{ACK} 02 01 00 07"), "the urgent request is right behind the ACK"
     assert urgent.attempts == 1
 
 

@@ -73,7 +73,7 @@ def test_a_cancellation_that_clears_the_exchange_is_caught(protocol: str, monkey
         if arbiter._transaction is transaction:
             arbiter._end_exchange()
             arbiter.dispatcher._end(transaction, now)
-            arbiter._release_at(now, now)
+            arbiter._release(now, 0.0, now)
 
     monkeypatch.setattr(Arbiter, "cancel", cancel)
     assert "WRONG" in caught(protocol, "cancelled").problems[0]
