@@ -16,7 +16,9 @@ pauses for a byte gap, and speaks only then. So it never talks into a packet, an
 of one for an ACK.
 
 A reply names its command but no data address. So a packet that comes before the request's ACK is never a reply:
-it answers something older; it is ACKed and dropped, and the ACK still awaited.
+it answers something older; it is ACKed and dropped, and the ACK still awaited. If that packet is said twice, the
+host's ACK runs into the second one's STX, and unit 6 follows: the byte of an ACK. So behind a dropped packet an ACK
+counts only with a pause (for a write) or a packet (for a read) right behind it.
 """
 
 from __future__ import annotations
@@ -147,6 +149,8 @@ class PacketExchange(Generic[T]):
             return MORE
         if self._lost:
             return self._swallow()
+        if self._acked and self._reply is None:
+            raise FrameError("an ACK within other bytes, behind a packet that answers something else")
         if not self._acked:
             if buffer[0] == ACK[0]:
                 del buffer[0]
@@ -161,14 +165,16 @@ class PacketExchange(Generic[T]):
             return MORE
         return self._take(bytes(buffer[:size]))
 
-    def expired(self, started: bool, /) -> Expect:
+    def expired(self, started: bool, /) -> Expect | Done[T]:
         arrived = len(self._buffer)
         if not self._acked and not arrived:
             raise no_reply()
+        if self._acked and self._reply is None:
+            return Done(self._decode(b""))
         what = f"the packet was cut short after {arrived} bytes"
         if self._lost:
             what = f"{arrived} bytes that are no packet, the first of them {self._buffer[0]:02x}"
-        if not self._acked:
+        if not self._acked or (self._lost and self._stale):
             raise FrameError(what, send=ACK)
         if not arrived:
             raise FrameError("no packet followed the ACK", send=ACK)
@@ -183,9 +189,11 @@ class PacketExchange(Generic[T]):
         return self._failure
 
     def _accepted(self) -> Step[T]:
-        if self._reply is None:
+        if self._reply is None and not self._stale:
             return Done(self._decode(b""), rest=bytes(self._buffer))
         self._acked = True
+        if self._reply is None:
+            return self.feed(b"")  # anything behind it?
         return Expect(self._packet_timing, self.later[0].sizes)
 
     def _resend(self) -> Expect:

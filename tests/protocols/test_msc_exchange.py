@@ -168,10 +168,43 @@ def test_a_packet_before_the_ack_is_acked_dropped_and_the_ack_awaited() -> None:
     assert exchange.feed(packet(1, b"DREAD,\0\0\0\7")) == Done(7, send=ACK)
 
 
-def test_an_ack_glued_to_a_stale_packet_is_the_requests() -> None:
+def test_an_ack_glued_to_a_stale_packet_is_the_requests_once_the_line_pauses() -> None:
     exchange = writing()
     assert says(exchange.feed(STALE + ACK)) == ACK
-    assert exchange.feed(b"") == Done(None)
+    assert exchange.feed(b"") is MORE
+    assert exchange.expired(False) == Done(None)
+
+
+def test_a_writes_ack_behind_a_stale_packet_counts_once_the_line_pauses() -> None:
+    exchange = writing()
+    assert says(exchange.feed(STALE)) == ACK
+    assert exchange.feed(ACK) is MORE
+    assert exchange.expired(True) == Done(None)
+
+
+TWICE = packet(6, b"RFLAG,\0\1")
+"""Said twice at once, the host's ACK destroys the second one's STX. Unit 6 remains, and looks like an ACK."""
+
+
+@pytest.mark.parametrize("chunk", [1, 4, 99])
+def test_a_stale_packet_said_twice_is_no_writes_ack(chunk: int) -> None:
+    exchange = writing()
+    assert says(exchange.feed(TWICE)) == ACK
+    rest = TWICE[1:]
+    with pytest.raises(FrameError, match="within other bytes") as error:
+        for start in range(0, len(rest), chunk):
+            exchange.feed(rest[start : start + chunk])
+    assert error.value.send == b"", "nobody talks into a packet"
+
+
+def test_a_stale_packet_said_twice_is_no_reads_ack_and_the_reply_is_not_asked_for_again() -> None:
+    """A NAK would make its device send it once more, and it may be of the unit and the command that were asked."""
+    exchange = reading()
+    assert says(exchange.feed(TWICE)) == ACK
+    assert says(exchange.feed(TWICE[1:2])) == b""
+    assert exchange.feed(TWICE[2:]) is MORE
+    with pytest.raises(FrameError, match="no packet"):
+        exchange.expired(True)
 
 
 def test_six_stale_packets_are_dropped_and_the_seventh_ends_the_attempt() -> None:
