@@ -26,7 +26,6 @@ from busmaster.handles import Dc104Drive, Handle, MentorDrive, MscController
 from busmaster.handles.comms import CommsHandle
 from busmaster.handles.msc_blocks import writes
 from busmaster.points import Point
-from busmaster.protocols.comms import telegrams
 
 Write = Callable[[], Awaitable[None]]
 
@@ -74,11 +73,8 @@ def prepare(handle: Handle, item: str, values: tuple[float, ...], verify: bool) 
 
 def comms_write(handle: CommsHandle, item: str, values: tuple[float, ...], verify: bool) -> Write:
     """Consecutive elements, in as many telegrams as it takes."""
-    writable(handle.point(item))
     element = int(item) if is_decimal(item) else item
-    number = element if isinstance(element, int) else handle.elements[element].number
-    for offset, part in telegrams(values):
-        handle.write_command(number + offset, part)
+    handle.writes(element, values)
     return lambda: handle.write(element, *values, verify=verify)
 
 

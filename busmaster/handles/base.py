@@ -39,8 +39,15 @@ class Handle:
         return f"<{type(self).__name__} {self.node.label}>"
 
 
+def item_text(item: str) -> str:
+    """The item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
+    if not isinstance(item, str):
+        raise InvalidCommand(f"an item is text, such as {str(item)!r}, not {item!r}")
+    return item
+
+
 def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
     """The error for an item that does not exist: what would do, and the nearest name."""
-    near = difflib.get_close_matches(item, list(known), n=1)
+    near = difflib.get_close_matches(str(item), list(known), n=1)
     guess = f"; did you mean {near[0]!r}?" if near else ""
     return InvalidCommand(f"no such item {item!r}: use {form}{guess}")

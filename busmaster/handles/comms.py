@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, overload
 
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command
-from busmaster.handles.base import Handle, unknown_item
+from busmaster.handles.base import Handle, item_text, unknown_item
 from busmaster.points import Point
 from busmaster.protocols import hcp, hcp2
 from busmaster.protocols.comms import is_read_back, telegrams
@@ -35,7 +35,7 @@ class CommsHandle(Handle):
 
     def point(self, item: str) -> Point[Any]:
         """An element by its number, decimal, or by its name."""
-        if item.isascii() and item.isdigit():
+        if item_text(item).isascii() and item.isdigit():
             return self.element(int(item))
         return self.named(self._lookup(item))
 
@@ -92,15 +92,26 @@ class CommsHandle(Handle):
 
         Raises InvalidCommand before anything is sent for a value that cannot be sent, or a read-only name.
         """
-        number = element if isinstance(element, int) else self._writable(element)
-        commands = [self.write_command(number + offset, part, idempotent) for offset, part in telegrams(values)]
-        if not commands:
-            raise InvalidCommand(f"{self.node.label}: there is no value to write")
+        commands = self.writes(element, values, idempotent)
         for command in commands:
             await self.node.request(command, priority=priority, start_within=start_within)
         if verify:
-            for offset, value in enumerate(values):
-                await self._verify(number + offset, value, priority)
+            for number, value in enumerate(values, commands[0].element):
+                await self._verify(number, value, priority)
+
+    def writes(
+        self, element: int | str, values: Sequence[float], idempotent: bool = False
+    ) -> list[hcp.Write | hcp2.Write]:
+        """What `write` sends. Raises InvalidCommand for a value that cannot be sent; and where the map has names, for a
+        name that it calls read-only, or that another value of the list would go to."""
+        number = element if isinstance(element, int) else self._lookup(element).number
+        if not isinstance(element, int):
+            for known in self.elements.values():
+                if known.number in range(number, number + max(1, len(values))) and not known.writable:
+                    raise InvalidCommand(f"{self.node.label}: {known.name} is read-only")
+        if not values:
+            raise InvalidCommand(f"{self.node.label}: there is no value to write")
+        return [self.write_command(number + offset, part, idempotent) for offset, part in telegrams(values)]
 
     async def _verify(self, number: int, written: float, priority: Priority | None) -> None:
         command = self.read_command(number)
@@ -117,12 +128,6 @@ class CommsHandle(Handle):
         if element is None:
             raise unknown_item(name, self.elements, self.form)
         return element
-
-    def _writable(self, name: str) -> int:
-        element = self._lookup(name)
-        if not element.writable:
-            raise InvalidCommand(f"{self.node.label}: {name} is read-only")
-        return element.number
 
 
 class HasElements(typing.Protocol):

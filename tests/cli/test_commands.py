@@ -224,5 +224,7 @@ def test_words_are_printed_with_the_names_of_their_bits(busmaster: Command) -> N
         assert (
             busmaster("read", server.path, *microflex, "status_word").out == "status_word 192 HARDWARE_ENABLE|ENABLED\n"
         )
+        refused = busmaster("write", server.path, *microflex, "speed_reference=10,20")
+        assert (refused.status, refused.out) == (2, "")
         read = busmaster("read", server.path, *microflex, "status_word", "--json")
         assert json.loads(read.out) == {"node": 7, "item": "status_word", "value": 192}

@@ -303,5 +303,12 @@ async def test_read_only_names_are_refused_before_anything_is_sent(drive: MicroF
     assert line.asked == []
 
 
+@pytest.mark.asyncio
+async def test_no_value_of_a_list_may_go_to_a_read_only_name(drive: MicroFlexDrive, line: Drive) -> None:
+    with pytest.raises(InvalidCommand, match="speed_demand is read-only"):
+        await drive.write("speed_reference", 10, 20)
+    assert line.asked == []
+
+
 def test_the_errors_of_these_tests_are_bus_errors() -> None:
     assert issubclass(VerifyFailed, BusError)
