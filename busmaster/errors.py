@@ -134,7 +134,7 @@ class LineNoisy(BusError):
 class LineDown(BusError, ConnectionError):
     """The port is gone or not yet open. It is opened again by itself."""
 
-    hint = "check the port or adapter; the bus reconnects by itself"
+    hint = "check the port or adapter; while a bus is open it opens a lost port again by itself"
 
 
 class BusClosed(BusError):

@@ -29,8 +29,8 @@ class Point(Generic[T]):
     item: str
     command: Command[Any]
     unit: str = field(default="", compare=False)
-    decode: Callable[[Any], T] | None = field(default=None, compare=False)
-    encode: Callable[[T], Command[None]] | None = field(default=None, compare=False)
+    decode: Callable[[Any], T] | None = field(default=None, compare=False, repr=False)
+    encode: Callable[[T], Command[None]] | None = field(default=None, compare=False, repr=False)
 
     @property
     def key(self) -> str:

@@ -357,7 +357,7 @@ class Arbiter:
             if what == NO_REPLY:
                 what = f"no reply within {self._leg.timing.window * 1000:g} ms"
             if self._echo.owed:
-                what += ", and no echo of the request, though the port says echo"
+                what += ", and no echo of the request: if the adapter has none, leave echo out"
         elif not error.whole:
             self._strays.blame(now)
         free = self._say(error.send, now) if error.send else now
@@ -463,7 +463,8 @@ class Arbiter:
             self._events.append(Strayed(data, collision=True))
             self._strays.last_byte = now
             if self.state is LineState.EXCHANGE:
-                self._attempt_failed(FrameError("the echo differs from what was sent: a collision"), now)
+                what = "the echo differs from what was sent: a collision, or an adapter without echo"
+                self._attempt_failed(FrameError(what), now)
             else:
                 self._settle(now)
             return b""

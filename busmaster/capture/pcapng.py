@@ -165,6 +165,8 @@ def _blocks(file: BinaryIO) -> Iterator[tuple[int, bytes, str]]:
             raise CaptureError("the file is cut in mid-block")
         first = False
         yield kind, rest[:-4], order
+    if first:
+        raise CaptureError("the file is empty")
 
 
 def _padded(data: bytes) -> bytes:

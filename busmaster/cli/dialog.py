@@ -10,6 +10,9 @@ from textual.containers import Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Input, Label
 
+from busmaster.cli.arguments import parse_value
+from busmaster.errors import InvalidCommand
+
 
 class AskValue(ModalScreen[str | None]):
     """Asks for a value of `name`, then whether to write it. Its result is the value, or None for no."""
@@ -37,10 +40,16 @@ class AskValue(ModalScreen[str | None]):
             yield Input(placeholder="value")
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        if event.value.strip():
-            self.value = event.value.strip()
-            event.input.remove()
-            self.query_one(Label).update(f"write {self.asked} = {f'{self.value} {self.unit}'.rstrip()}?  y or n")
+        if not event.value.strip():
+            return
+        try:
+            parse_value(event.value)
+        except InvalidCommand as error:
+            self.query_one(Label).update(f"write {self.asked}: {error}  (Enter; Esc leaves it)")
+            return
+        self.value = event.value.strip()
+        event.input.remove()
+        self.query_one(Label).update(f"write {self.asked} = {f'{self.value} {self.unit}'.rstrip()}?  y or n")
 
     def action_agree(self) -> None:
         if self.value is not None:

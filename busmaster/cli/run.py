@@ -50,6 +50,8 @@ async def run(line: ConfiguredLine, view: View) -> int:
         async with line:
             entered = True
             watch = Watch(line.bus, line.file.title, view)
+            if not line.groups:
+                note("nothing is polled: the file has no [groups.NAME]")
             for group in line.groups.values():
                 watch.add(group)
             line.outputs.tell = partial(tell, watch)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from busmaster.errors import VerifyFailed
 from busmaster.exchange import Command, Timings
-from busmaster.handles.base import Handle, unknown_item
+from busmaster.handles.base import Handle, item_text, unknown_item
 from busmaster.points import Point
 from busmaster.profile import Profile
 from busmaster.protocols import dc104
@@ -46,7 +46,7 @@ class Dc104Drive(Handle):
 
     def point(self, item: str) -> Point[int]:
         """A parameter by its number, decimal."""
-        if not (item.isascii() and item.isdigit()):
+        if not (item_text(item).isascii() and item.isdigit()):
             raise unknown_item(item, (), f"a parameter number, {self._minimum} to {self._maximum}")
         return self.parameter(int(item))
 

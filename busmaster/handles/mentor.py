@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command, Timings
-from busmaster.handles.base import Handle, unknown_item
+from busmaster.handles.base import Handle, item_text, unknown_item
 from busmaster.points import Point
 from busmaster.profile import Profile
 from busmaster.protocols import mentor
@@ -64,7 +64,7 @@ class MentorDrive(Handle):
     def point(self, item: str) -> Point[Any]:
         """A parameter ("1.17"), one written as a wide integer ("15.60:wide") or in high resolution ("1.17:hires"), or
         a run, always read in one exchange ("1.17:20")."""
-        text, colon, kind = item.partition(":")
+        text, colon, kind = item_text(item).partition(":")
         try:
             menu, number = parse_parameter(text)
         except InvalidCommand:

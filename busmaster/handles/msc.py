@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from busmaster.errors import InvalidCommand, Refused, VerifyFailed
 from busmaster.exchange import Command, Timings
-from busmaster.handles.base import Handle, unknown_item
+from busmaster.handles.base import Handle, item_text, unknown_item
 from busmaster.handles.msc_blocks import Count, Part, Progress, Run, place, reads, reads_back, writes
 from busmaster.node import Node, Priority
 from busmaster.points import Point
@@ -83,7 +83,7 @@ class MscController(Handle):
 
     def point(self, item: str) -> Point[Any]:
         """A value ("2008" or a symbol), a run of values ("2008:32"), "flag:5", "flags" or "status"."""
-        if item == "status":
+        if item_text(item) == "status":
             return Point(self.node, item, ReadStatus())
         if item == "flags":
             return Point(self.node, item, ReadFlags())

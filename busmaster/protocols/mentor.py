@@ -54,9 +54,12 @@ def with_parity(starts: bytes) -> bytes:
 
 def parse_parameter(text: str) -> tuple[int, int]:
     """Menu and number of "1.17" or "01.17". Raises InvalidCommand for anything else."""
-    match = _PARAMETER.fullmatch(text)
+    try:
+        match = _PARAMETER.fullmatch(text)
+    except TypeError:  # a number, of which 1.10 would be 1.1
+        match = None
     if match is None:
-        raise InvalidCommand(f"{text!r} is not a parameter: write menu and number as in 1.17")
+        raise InvalidCommand(f"{text!r} is not a parameter: write menu and number as text, as in '1.17'")
     return int(match[1]), int(match[2])
 
 

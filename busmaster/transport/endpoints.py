@@ -70,6 +70,8 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
     `defaults` fills the line settings that a serial port's URL leaves open; behind a TCP port they are the server's.
     Raises InvalidCommand, naming the nearest option, for anything that it does not understand.
     """
+    if not isinstance(url, str):
+        raise InvalidCommand(f"a port is named by text, such as '/dev/ttyUSB0?baudrate=57600', not {url!r}")
     if "://" not in url:
         path, _, query = url.partition("?")
         if HOST_PORT.fullmatch(path):

@@ -137,7 +137,14 @@ async def test_a_value_is_written_once_it_was_asked_whether_it_is_meant() -> Non
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize(
-    "keys", [("w", "5", "enter", "n"), ("w", "5", "escape"), ("w", "5", "enter", "escape"), ("w", "5")]
+    "keys",
+    [
+        ("w", "5", "enter", "n"),
+        ("w", "5", "escape"),
+        ("w", "5", "enter", "escape"),
+        ("w", "5"),
+        ("w", *"abc", "enter", "y"),
+    ],
 )
 async def test_a_value_that_was_not_confirmed_is_not_written(keys: tuple[str, ...]) -> None:
     assert await pressed(*keys, row=OUTPUTS) == []

@@ -42,3 +42,6 @@ def test_a_file_that_is_no_capture_is_wrong_usage(tmp_path: Path, capsys: pytest
     assert main(["replay", str(other)]) == 2
     assert "not a pcapng file" in capsys.readouterr().err
     assert main(["replay", str(tmp_path / "nowhere")]) == 2
+    other.write_text("")
+    assert main(["replay", str(other)]) == 2
+    assert "the file is empty" in capsys.readouterr().err

@@ -75,8 +75,9 @@ async def test_a_value_that_does_not_fit_is_refused_before_anything_is_sent(
     for parameter, value in (("2.10", 1.5), ("2.10", 10000), ("1.17", 1000.0), ("1.17", float("nan")), ("1.17", 1e300)):
         with pytest.raises(InvalidCommand):
             await drive.write(parameter, value)
-    with pytest.raises(InvalidCommand):
-        await drive.write("117", 1)
+    for wrong in ("117", 1.17, None):
+        with pytest.raises(InvalidCommand, match="as text"):
+            await drive.write(wrong, 1)  # type: ignore[arg-type]
     assert line.asked == []
 
 

@@ -85,3 +85,8 @@ def test_the_protocol_fills_in_what_the_url_leaves_open() -> None:
 def test_what_is_not_understood_is_named_with_what_would_do(url: str, says: str) -> None:
     with pytest.raises(InvalidCommand, match=says):
         endpoint(url)
+
+
+def test_a_port_is_named_by_text() -> None:
+    with pytest.raises(InvalidCommand, match="a port is named by text"):
+        endpoint(None)  # type: ignore[arg-type]
