@@ -29,6 +29,11 @@ def writing() -> PacketExchange[None]:
     return DataWrite(2008, 1234).open(1, TIMINGS)
 
 
+def feed_in_chunks(exchange: PacketExchange[None], data: bytes, chunk: int) -> None:
+    for start in range(0, len(data), chunk):
+        exchange.feed(data[start : start + chunk])
+
+
 def says(step: object) -> bytes:
     assert isinstance(step, Expect)
     return step.send
@@ -190,10 +195,8 @@ TWICE = packet(6, b"RFLAG,\0\1")
 def test_a_stale_packet_said_twice_is_no_writes_ack(chunk: int) -> None:
     exchange = writing()
     assert says(exchange.feed(TWICE)) == ACK
-    rest = TWICE[1:]
     with pytest.raises(FrameError, match="within other bytes") as error:
-        for start in range(0, len(rest), chunk):
-            exchange.feed(rest[start : start + chunk])
+        feed_in_chunks(exchange, TWICE[1:], chunk)
     assert error.value.send == b"", "nobody talks into a packet"
 
 
