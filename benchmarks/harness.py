@@ -118,6 +118,10 @@ class Timings:
         """The median of the ratios of the rounds, each with the other's round beside it."""
         return median(a / b for a, b in zip(self.taken, other.taken, strict=True))
 
+    def cpu_ratio(self, other: Timings) -> float:
+        """Likewise of the processor time."""
+        return median(a / b for a, b in zip(self.cpu, other.cpu, strict=True))
+
 
 async def alternate(
     runs: Mapping[str, Callable[[int], Awaitable[int]]], transactions: int, rounds: int
