@@ -188,9 +188,9 @@ async def test_a_name_that_is_read_only_is_refused_and_its_number_is_sent(line: 
 async def test_an_item_that_is_a_number_is_named_as_such(line: CommsArray) -> None:
     controller = Hcp2Controller(line.bus, 5)
     with pytest.raises(InvalidCommand, match=r"an item is text, such as '1', not 1"):
-        controller.point(1)  # type: ignore[arg-type]
+        controller.point(1)  # type: ignore[arg-type]  # a caller without a type checker
     with pytest.raises(InvalidCommand, match="no such item"):
-        await controller.read(1.0)  # type: ignore[arg-type]
+        await controller.read(1.0)  # type: ignore[arg-type]  # likewise
     assert line.asked == []
 
 

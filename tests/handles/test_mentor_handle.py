@@ -77,7 +77,7 @@ async def test_a_value_that_does_not_fit_is_refused_before_anything_is_sent(
             await drive.write(parameter, value)
     for wrong in ("117", 1.17, None):
         with pytest.raises(InvalidCommand, match="as text"):
-            await drive.write(wrong, 1)  # type: ignore[arg-type]
+            await drive.write(wrong, 1)  # type: ignore[arg-type]  # a caller without a type checker
     assert line.asked == []
 
 

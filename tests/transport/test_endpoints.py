@@ -89,4 +89,4 @@ def test_what_is_not_understood_is_named_with_what_would_do(url: str, says: str)
 
 def test_a_port_is_named_by_text() -> None:
     with pytest.raises(InvalidCommand, match="a port is named by text"):
-        endpoint(None)  # type: ignore[arg-type]
+        endpoint(None)  # type: ignore[arg-type]  # a caller without a type checker
