@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from itertools import count
 from math import inf, nextafter
 from typing import Any
@@ -441,10 +441,6 @@ class Dispatcher:
                 self.backlog.push_front(writes[0])
         elif transaction in writes:
             writes.remove(transaction)
-
-    def busy_with(self) -> Iterable[Transaction]:
-        """Whatever has not ended: for close and for tests."""
-        return [w for n in self.nodes for w in n.writes]
 
 
 def _error(kind: type[BusError], what: str, transaction: Transaction) -> BusError:

@@ -63,6 +63,13 @@ def test_run_prints_a_line_a_value_and_a_summary_of_groups_nodes_and_outputs(
     assert found == 4
 
 
+def test_run_says_that_a_file_without_groups_polls_nothing(busmaster: Command, line: Path) -> None:
+    line.write_text(line.read_text().partition("[groups")[0])
+    ran = busmaster("run", str(line), "--seconds", "0.1", "--plain")
+    assert (ran.status, ran.out) == (0, "")
+    assert "nothing is polled: the file has no [groups.NAME]" in ran.err
+
+
 def test_run_as_json_is_a_line_a_cycle_under_the_files_names(busmaster: Command, line: Path) -> None:
     ran = busmaster("run", str(line), "--seconds", "0.4", "--json")
     cycles = [cycle for cycle in map(json.loads, ran.lines) if cycle["group"] == "fast"]
