@@ -1,8 +1,8 @@
 """The emulated Modbus line, served on a pty from a process of its own, with its faults set from here.
 
 `python -m benchmarks.far_end` is told what to serve in a line of JSON, and prints the path. Each further line there is
-an order: {"unit": 3, "dead": true} takes a unit off the line, {"delay": {...}} changes every unit's reply time, and
-{"log": true} asks for what passed on the line since the last time: (seconds, "host" or "line", bytes, seconds taken).
+an order: {"unit": 3, "dead": true} takes a unit off the line, {"log": true} asks for what passed on the line since the
+last time: (seconds, "host" or "line", bytes, seconds taken).
 """
 
 from __future__ import annotations
@@ -94,10 +94,6 @@ class FarEnd:
         """Take a unit off the line, or bring it back."""
         self._ask({"unit": unit, "dead": dead})
 
-    def setdelay_of(self, **delay: Any) -> None:
-        """Of every unit: `busmaster.emulator.device.Delay`."""
-        self._ask({"delay": delay})
-
     def log(self) -> list[tuple[float, str, int, float]]:
         """What passed since the last time."""
         return [(start, who, length, taken) for start, who, length, taken in self._ask({"log": True})]
@@ -119,9 +115,6 @@ def _obey(order: dict[str, Any], line: Line, now: float) -> Any:
             line.cut(now, unit)
         else:
             line.restore(now)
-    if "delay" in order:
-        for device in line.devices:
-            device.delay = delay_of(order["delay"])
     if "log" in order:
         log, line.log = line.log, []
         return log
