@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from functools import reduce
-from operator import xor as _xor
-
 FIRST_PRINTABLE = 0x20
 
 
 def xor(data: bytes) -> int:
     """HCP, HCP2: exclusive-or of all bytes. Half of all frames get a control character, so never search for it."""
-    return reduce(_xor, data, 0)
+    check = 0
+    for byte in data:
+        check ^= byte
+    return check
 
 
 def bcc(data: bytes) -> int:
     """Mentor II: exclusive-or of all bytes, plus 32 where that would be a control character."""
-    check = reduce(_xor, data, 0)
+    check = xor(data)
     return check if check >= FIRST_PRINTABLE else check + FIRST_PRINTABLE
 
 
