@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from busmaster.arbiter.counters import LineStatistics, NodeStatistics, Quantiles
-from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, LineState, NodeChanged
+from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, NodeChanged
 from busmaster.arbiter.health import Health
+from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Timeline
 from busmaster.bus import Bus
 from busmaster.errors import (

@@ -14,9 +14,10 @@ import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineStatistics
-from busmaster.arbiter.events import Event, LineState, NodeChanged, Strayed
+from busmaster.arbiter.events import Event, NodeChanged, Strayed
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.errors import BusClosed, InvalidCommand
 from busmaster.exchange import Timings

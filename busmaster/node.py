@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health, NodeRecord
-from busmaster.arbiter.transaction import Priority, Timeline, Transaction
+from busmaster.arbiter.transaction import COMMAND, Priority, Timeline, Transaction
 from busmaster.errors import BusClosed, BusError, InvalidCommand, Refused
 from busmaster.exchange import Command
 from busmaster.planning import PlannedNode
@@ -125,30 +125,31 @@ class Node:
         probe: bool = False,
         touches: Point[Any] | None = None,
     ) -> tuple[Transaction, asyncio.Future[Any]]:
+        record = self.record
+        profile = record.profile
         if retries is not None and not 0 <= retries <= 100:
             raise InvalidCommand(f"{self.label}: retries must be 0 to 100, not {retries}")
         if start_within is not None and not 0 <= start_within < inf:
             raise InvalidCommand(f"{self.label}: start_within is a time of 0 s or more, not {start_within!r}")
-        if self.address == self.profile.broadcast and not command.writes:
-            raise InvalidCommand(
-                f"{self.profile.name}: address {self.address} is for writes to all; nobody answers a read"
-            )
-        if not self.bus.running:
+        if record.address == profile.broadcast and not command.writes:
+            raise InvalidCommand(f"{profile.name}: address {self.address} is for writes to all; nobody answers a read")
+        bus = self.bus
+        if not bus.running:
             raise BusClosed("the bus is not open", node=self.label, command=str(command))
         if not hasattr(command, "open"):
             raise InvalidCommand(f"{self.label}: {command!r} is no command; read it through a handle, or its point")
         transaction = Transaction(
-            self.record,
+            record,
             command,
-            priority=Priority.COMMAND if priority is None else priority,
-            start_by=inf if start_within is None else self.bus.now() + start_within,
+            priority=COMMAND if priority is None else priority,
+            start_by=inf if start_within is None else bus.now() + start_within,
             retries=retries,
             idempotent=idempotent,
             probe=probe,
         )
         transaction.touches = self if touches is None else touches.quantity
         self.kinds.setdefault(type(command), command)
-        return transaction, self.bus.pump.transact(transaction)
+        return transaction, bus.pump.transact(transaction)
 
     def _give_up(self, transaction: Transaction) -> None:
         """Nobody waits for it any more. A write that is on the wire now is over before anything else can be read."""

@@ -8,6 +8,7 @@ from functools import partial
 from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.schedule import Poll, line_time, set_members
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import BusClosed, GarbledReply, InvalidCommand, Refused
@@ -132,7 +133,7 @@ class PollGroup:
 
     def reset_statistics(self) -> None:
         """Start its counts again; cycles keep their numbers."""
-        self._poll.jitter.clear()
+        self._poll.jitter = Histogram()
         self._tally = Tally(self._poll)
 
     def planned(self) -> PlannedGroup:

@@ -40,16 +40,11 @@ from busmaster.arbiter.counters import LineCounters, LineStatistics
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.echo import Echo
-from busmaster.arbiter.events import (
-    Event,
-    LineChange,
-    LineChanged,
-    LineState,
-    Strayed,
-)
+from busmaster.arbiter.events import Event, LineChange, LineChanged, Strayed
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
 from busmaster.arbiter.strays import QUIET, Strays
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import BusClosed, BusError, LineDown, LineNoisy, Refused
@@ -74,7 +69,7 @@ class Arbiter:
         jitter: Callable[[], float] = lambda: 0.5,
     ) -> None:
         self.byte_time = byte_time
-        self.state = LineState.OFFLINE
+        self.state = OFFLINE
         self.noisy = False
         self._echo = Echo(echo)
         self._paced = False
@@ -115,10 +110,13 @@ class Arbiter:
         self._quarantine = max(self._quarantine, self._up_at + node.lateness + self._leg.latency)
         return node
 
-    def submit(self, transaction: Transaction, now: float) -> None:
-        self.dispatcher.submit(transaction, now)
-        if self.state is LineState.READY:
+    def submit(self, transaction: Transaction, now: float) -> bool:
+        """False if it waits and nothing else has changed: then there is nothing to pump."""
+        waits = self.dispatcher.submit(transaction, now)
+        if self.state is READY:
             self._advance(now)
+            return True
+        return not waits or transaction.writes or transaction.start_by < inf
 
     def cancel(self, transaction: Transaction, now: float) -> None:
         """Synchronous; never touches the line (R6)."""
@@ -134,7 +132,7 @@ class Arbiter:
     def demand(self, poll: Poll, now: float) -> None:
         """One cycle now, off the grid."""
         self.dispatcher.demand(poll, now)
-        if self.state is LineState.READY:
+        if self.state is READY:
             self._advance(now)
 
     def close(self, now: float) -> None:
@@ -146,7 +144,7 @@ class Arbiter:
         for poll in list(self.dispatcher.schedule.polls):
             self.dispatcher.remove_poll(poll, now)
         self.dispatcher.fail_all(now)
-        if self.state is not LineState.EXCHANGE:
+        if self.state is not EXCHANGE:
             self._go_offline(now)
 
     # inputs
@@ -156,7 +154,7 @@ class Arbiter:
 
         `paced`: bytes leave at the baud rate, so that an earlier reply cannot be one (R4).
         """
-        if self.state is not LineState.OFFLINE or self._closed:
+        if self.state is not OFFLINE or self._closed:
             return
         self._paced = paced
         self.dispatcher.fault = None
@@ -168,7 +166,7 @@ class Arbiter:
 
     def line_down(self, cause: str, now: float) -> None:
         """The port is gone: everything fails at once (R13)."""
-        if self.state is LineState.OFFLINE:
+        if self.state is OFFLINE:
             return
         self._counters.losses += 1
         self._cause = cause
@@ -183,7 +181,7 @@ class Arbiter:
             data = self._strip_echo(data, now)
             if not data:
                 return
-        if self.state is LineState.EXCHANGE:
+        if self.state is EXCHANGE:
             self._read(data, now)
         else:
             self._stray(data, now)
@@ -199,11 +197,11 @@ class Arbiter:
             self._enter(self.state, now)
             self.dispatcher.probe(now)
         if now >= deadlines.line and not unread:
-            if self.state is LineState.EXCHANGE:
+            if self.state is EXCHANGE:
                 self._take(None, now)
             else:
                 self._free(now)
-        elif self.state is LineState.READY:
+        elif self.state is READY:
             self._advance(now)
 
     # outputs, pumped in this order
@@ -216,7 +214,6 @@ class Arbiter:
         return self._events.popleft() if self._events else None
 
     def poll_timeout(self) -> float:
-        self._counters.tally()  # the owner asks this last: the next request has left
         return self._deadlines.earliest()
 
     def reset_statistics(self, now: float) -> None:
@@ -248,8 +245,8 @@ class Arbiter:
         self._transaction = transaction
         self._exchange = exchange
         self._strayed_within = False
-        if self.state is not LineState.EXCHANGE:
-            self._enter(LineState.EXCHANGE, now)
+        if self.state is not EXCHANGE:
+            self._enter(EXCHANGE, now)
         self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, max(now, free))
         if not exchange.answered:
             self._deadlines.line = self._leg.end + exchange.timing.turnaround
@@ -262,8 +259,9 @@ class Arbiter:
         self._deadlines.line = self._leg.begin(timing, said, longest * byte_time, now)
         if send:
             self._out += send
-            self._echo.sent(send)
-            if self._paced and not self._echo.declared:
+            if self._echo.declared:
+                self._echo.sent(send)
+            elif self._paced:
                 self._leg.taint(said, now)
 
     def _read(self, data: bytes, now: float) -> None:
@@ -402,7 +400,7 @@ class Arbiter:
             self._go_offline(now)
         elif hold or not self._advance(now, free):
             held = free + hold > now
-            self._enter(LineState.HOLDOFF if held else LineState.READY, now)
+            self._enter(HOLDOFF if held else READY, now)
             self._deadlines.line = free + hold if held else inf
 
     def _settle(self, now: float) -> None:
@@ -410,16 +408,16 @@ class Arbiter:
         if self._closed:
             self._go_offline(now)
             return
-        if self.state is not LineState.SETTLING:
+        if self.state is not SETTLING:
             self._counters.settles += 1
-            self._enter(LineState.SETTLING, now)
+            self._enter(SETTLING, now)
         self._echo.forget()
         silent = self._strays.last_byte + self._leg.quiet()
         self._deadlines.line = max(self._leg.past(), silent, self._quarantine, now)
 
     def _free(self, now: float) -> None:
         """A holdoff or a settle is over."""
-        if self.state is LineState.SETTLING:
+        if self.state is SETTLING:
             self._strays.silent()
             if self._answer_stray(self._strays.reply_to_silence(), now):
                 return
@@ -427,7 +425,7 @@ class Arbiter:
                 self.noisy = False
                 self.dispatcher.fault = None
                 self._events.append(LineChanged(LineChange.QUIET))
-        self._enter(LineState.READY, now)
+        self._enter(READY, now)
         self._deadlines.line = inf
         self._advance(now)
 
@@ -436,7 +434,7 @@ class Arbiter:
         strays = self._strays
         strays.note(data, now, self._leg.quiet())
         self._leg.strayed(now)
-        if self.state is LineState.OFFLINE:
+        if self.state is OFFLINE:
             return
         self._settle(now)
         if not self.noisy:
@@ -462,13 +460,13 @@ class Arbiter:
             self._counters.collisions += 1
             self._events.append(Strayed(data, collision=True))
             self._strays.last_byte = now
-            if self.state is LineState.EXCHANGE:
+            if self.state is EXCHANGE:
                 what = "the echo differs from what was sent: a collision, or an adapter without echo"
                 self._attempt_failed(FrameError(what), now)
             else:
                 self._settle(now)
             return b""
-        if not self._echo.owed and self.state is LineState.EXCHANGE and not self._leg.begun:
+        if not self._echo.owed and self.state is EXCHANGE and not self._leg.begun:
             due = self._leg.echoed(now)
             answered = self._exchange is not None and self._exchange.answered
             self._deadlines.line = due if answered else now + self._leg.timing.turnaround
@@ -477,7 +475,7 @@ class Arbiter:
     def _go_offline(self, now: float) -> None:
         """Whatever is on the wire is cut off."""
         transaction = self._transaction
-        self._enter(LineState.OFFLINE, now)
+        self._enter(OFFLINE, now)
         self.noisy = False
         self._deadlines.line = inf
         self._out = b"" if transaction is not None else self._out
@@ -490,7 +488,7 @@ class Arbiter:
 
     def _enter(self, state: LineState, now: float) -> None:
         spent = self._counters.spend(self.state, now)
-        if self.state is LineState.READY:
+        if self.state is READY:
             self.dispatcher.idle(spent)
         self.state = state
 

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from itertools import count
 
-from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.arbiter.transaction import BACKGROUND, POLL, QUEUED, Phase, Priority, Transaction
 
 SHARE = 7
 """Consecutive exchanges of higher classes after which a waiting lower class gets one slot."""
@@ -35,7 +35,7 @@ class _Fifo:
     def pop(self) -> Transaction:
         while True:
             transaction = self._entries.popleft()
-            if transaction.phase is Phase.QUEUED:
+            if transaction.phase is QUEUED:
                 self.live -= 1
                 return transaction
 
@@ -49,7 +49,7 @@ class _Fifo:
         self.live -= 1
 
     def __iter__(self) -> Iterator[Transaction]:
-        return (t for t in self._entries if t.phase is Phase.QUEUED)
+        return (t for t in self._entries if t.phase is QUEUED)
 
 
 class _EarliestDeadlineFirst:
@@ -74,14 +74,14 @@ class _EarliestDeadlineFirst:
     def pop(self) -> Transaction:
         while True:
             transaction = heapq.heappop(self._entries)[2]
-            if transaction.phase is Phase.QUEUED:
+            if transaction.phase is QUEUED:
                 self.live -= 1
                 return transaction
 
     def discard(self) -> None:
         self.live -= 1
         if len(self._entries) > 2 * self.live + SLACK:
-            self._entries = [entry for entry in self._entries if entry[2].phase is Phase.QUEUED]
+            self._entries = [entry for entry in self._entries if entry[2].phase is QUEUED]
             heapq.heapify(self._entries)
 
     def remove(self, transaction: Transaction) -> None:
@@ -90,7 +90,7 @@ class _EarliestDeadlineFirst:
         self.live -= 1
 
     def __iter__(self) -> Iterator[Transaction]:
-        return (t for _, _, t in sorted(self._entries, key=lambda e: e[:2]) if t.phase is Phase.QUEUED)
+        return (t for _, _, t in sorted(self._entries, key=lambda e: e[:2]) if t.phase is QUEUED)
 
 
 class Backlog:
@@ -101,7 +101,7 @@ class Backlog:
     def __init__(self) -> None:
         self._queues = (_Fifo(), _Fifo(), _EarliestDeadlineFirst(), _EarliestDeadlineFirst())
         self._streak = 0
-        self._rotated = Priority.BACKGROUND
+        self._rotated = BACKGROUND
 
     def __len__(self) -> int:
         urgent, command, poll, background = self._queues
@@ -112,12 +112,12 @@ class Backlog:
 
     def push(self, transaction: Transaction) -> None:
         """At the back of its class (of its deadline, in POLL and BACKGROUND)."""
-        transaction.phase = Phase.QUEUED
+        transaction.phase = QUEUED
         self._queues[transaction.priority].push(transaction)
 
     def push_front(self, transaction: Transaction) -> None:
         """At the front of its class: for a write whose turn had come while an earlier one was not over."""
-        transaction.phase = Phase.QUEUED
+        transaction.phase = QUEUED
         self._queues[transaction.priority].push_front(transaction)
 
     def discard(self, transaction: Transaction, phase: Phase) -> None:
@@ -160,10 +160,10 @@ class Backlog:
         """POLL and BACKGROUND in turn, if both wait."""
         self._streak = 0
         _, _, poll, background = self._queues
-        if poll.live and (self._rotated is Priority.BACKGROUND or not background.live):
-            self._rotated = Priority.POLL
+        if poll.live and (self._rotated is BACKGROUND or not background.live):
+            self._rotated = POLL
             return poll.pop()
-        self._rotated = Priority.BACKGROUND
+        self._rotated = BACKGROUND
         return background.pop()
 
     def drain(self) -> list[Transaction]:

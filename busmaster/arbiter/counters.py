@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from busmaster.arbiter.events import LineState
 from busmaster.arbiter.histogram import Histogram
+from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, SETTLING, LineState
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,6 @@ class LineCounters:
     __slots__ = (
         "_before",
         "_entered",
-        "_noted",
         "_spent",
         "cancelled",
         "collisions",
@@ -127,6 +126,7 @@ class LineCounters:
         "noise_bytes",
         "noisy",
         "settles",
+        "settling",
         "since",
         "stray_bytes",
         "tainted",
@@ -135,11 +135,12 @@ class LineCounters:
 
     def __init__(self, since: float) -> None:
         self.exchanges = 0
-        """Ever, as `settling` is: what a request waited for is counted across a reset."""
+        """Ever: what a request waited for is counted across a reset."""
         self._entered = since
         self._spent = [0.0] * len(LineState)
-        self._noted: list[tuple[Histogram, float]] = []
-        self.reset(LineState.OFFLINE, since)
+        self.settling = 0.0
+        """Seconds, ever."""
+        self.reset(OFFLINE, since)
 
     def reset(self, state: LineState, since: float) -> None:
         self.since = since
@@ -148,25 +149,13 @@ class LineCounters:
         self._before = (self.exchanges, self._times(state, since))
         self.waits = (Histogram(), Histogram(), Histogram(), Histogram())
 
-    def note(self, histogram: Histogram, seconds: float) -> None:
-        """To be recorded by `tally`, and not between a reply and the next request."""
-        self._noted.append((histogram, seconds))
-
-    def tally(self) -> None:
-        for histogram, seconds in self._noted:
-            histogram.record(seconds)
-        self._noted.clear()
-
     def spend(self, state: LineState, now: float) -> float:
         """The time since the last call went by in this state; returns it."""
         spent = now - self._entered
         self._spent[state] += spent
+        self.settling = self._spent[SETTLING]
         self._entered = now
         return spent
-
-    @property
-    def settling(self) -> float:
-        return self._spent[LineState.SETTLING]
 
     def _times(self, state: LineState, now: float) -> list[float]:
         """Seconds ever spent in each state, up to now."""
@@ -176,7 +165,6 @@ class LineCounters:
 
     def snapshot(self, state: LineState, now: float, backlog: int) -> LineStatistics:
         """Changes nothing: whoever looks does not cut the pauses, from which probes are paid, into pieces."""
-        self.tally()
         first, second, third, fourth = self.waits
         exchanges, times = self._before
         spent = [time - before for time, before in zip(self._times(state, now), times, strict=True)]
@@ -190,8 +178,8 @@ class LineCounters:
             self.tainted,
             self.collisions,
             self.settles,
-            spent[LineState.SETTLING],
-            spent[LineState.EXCHANGE] + spent[LineState.HOLDOFF],
+            spent[SETTLING],
+            spent[EXCHANGE] + spent[HOLDOFF],
             self.noisy,
             self.losses,
             backlog,

@@ -19,9 +19,9 @@ from busmaster.arbiter.backlog import Backlog
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.events import Completed, Event, NodeChanged, Polled
-from busmaster.arbiter.health import Health, NodeRecord, ProbeBudget
+from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord, ProbeBudget
 from busmaster.arbiter.schedule import Poll, Schedule, begin_cycle
-from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
 from busmaster.errors import (
     BacklogFull,
     BusError,
@@ -67,22 +67,24 @@ class Dispatcher:
 
     # requests
 
-    def submit(self, transaction: Transaction, now: float) -> None:
-        """Queue it, or end it at once with the reason why not."""
+    def submit(self, transaction: Transaction, now: float) -> bool:
+        """Queue it, or end it at once with the reason why not: then False."""
         node = transaction.node
         transaction.queued = now
         self._waits(transaction)
         if self.fault is not None:
             self._end(transaction, now, _named(self.fault(), transaction))
-            return
-        if transaction.writes and transaction.priority is Priority.URGENT:
+            return False
+        if transaction.writes and transaction.priority is URGENT:
             self._supersede(node, now)
-        waiting = max(self.backlog.waiting(transaction.priority), len(node.writes) if transaction.writes else 0)
+        waiting = self.backlog.waiting(transaction.priority)
+        if transaction.writes:
+            waiting = max(waiting, len(node.writes))
         if waiting >= self._capacity:
             self._end(transaction, now, _error(BacklogFull, f"{waiting} requests are waiting already", transaction))
-            return
+            return False
         if not self._may_ask(transaction, now):
-            return
+            return False
         if transaction.writes:
             node.writes.append(transaction)
         if transaction.deadline == inf:
@@ -90,16 +92,17 @@ class Dispatcher:
         if transaction.start_by < inf:
             self._expect_start(transaction)
         self.backlog.push(transaction)
+        return True
 
     def cancel(self, transaction: Transaction, now: float) -> None:
         """Its caller has gone: never sent if still queued, unheard if on the wire (R6)."""
-        if not transaction.heard or transaction.phase in (Phase.ENDED, Phase.IDLE):
+        if not transaction.heard or transaction.phase in (ENDED, IDLE):
             return
         transaction.heard = False
         self.counters.cancelled += 1
-        if transaction.phase is Phase.QUEUED:
-            self.backlog.discard(transaction, Phase.PARKED)
-        if transaction.phase is Phase.PARKED:
+        if transaction.phase is QUEUED:
+            self.backlog.discard(transaction, PARKED)
+        if transaction.phase is PARKED:
             self._budget.refund(transaction.paid)
             self._end(transaction, now)
 
@@ -111,27 +114,27 @@ class Dispatcher:
                 self._end(transaction, now, _not_started(transaction, now))
             elif transaction.writes and node.writes[0] is not transaction:
                 self._park(transaction)
-            elif (node.health is not Health.DOWN and not node.holds and node.suspended_until <= now) or self._may_ask(
+            elif (node.health is not DOWN and not node.holds and node.suspended_until <= now) or self._may_ask(
                 transaction, now
             ):
                 return transaction
         return None
 
     def urgent_waits(self) -> bool:
-        return self.backlog.waiting(Priority.URGENT) > 0
+        return self.backlog.waiting(URGENT) > 0
 
     def started(self, transaction: Transaction, now: float) -> None:
         """Its next attempt goes out now."""
         counters = self.counters
         if transaction.attempts == 0:
-            counters.note(counters.waits[transaction.priority], now - transaction.queued)
+            counters.waits[transaction.priority].record(now - transaction.queued)
             self._count_ahead(transaction)
             poll = transaction.poll
             if poll is not None and poll.started == -inf:
                 poll.started = now
                 poll.jitter.record(now - poll.due)
         transaction.node.counters.attempts += 1
-        transaction.phase = Phase.ON_WIRE
+        transaction.phase = ON_WIRE
         transaction.attempts += 1
         transaction.started = now
         transaction.first_byte = -inf
@@ -143,11 +146,11 @@ class Dispatcher:
         node = transaction.node
         counters = node.counters
         counters.ok += 1
-        self.counters.note(counters.latency, now - transaction.started)
+        counters.latency.record(now - transaction.started)
         if transaction.late:
             counters.late += 1
         node.last_reply = now
-        if node.failures or node.health is not Health.UP:
+        if node.failures or node.health is not UP:
             self._heard(node, now)
         if transaction.paid:
             self._budget.refund(transaction.paid - (now - transaction.started))
@@ -183,7 +186,7 @@ class Dispatcher:
             self._requeue(transaction, now)
             return
         node.last_reply = now
-        if node.failures or node.health is not Health.UP:
+        if node.failures or node.health is not UP:
             self._heard(node, now)
         transaction.refused_cycles += 1
         if transaction.refused_cycles > 1:
@@ -205,22 +208,22 @@ class Dispatcher:
         fault = self.fault
         assert fault is not None
         for node in self.nodes:
-            for write in [w for w in node.writes if w.phase is Phase.PARKED]:
+            for write in [w for w in node.writes if w.phase is PARKED]:
                 self._end(write, now, _named(fault(), write))
         for transaction in self.backlog.drain():
-            transaction.phase = Phase.PARKED
+            transaction.phase = PARKED
             self._end(transaction, now, _named(fault(), transaction))
 
     def expire(self, now: float) -> None:
         """Fail what should have started by now (R12)."""
         heap = self._expiries
-        while heap and (heap[0][0] < now or heap[0][2].phase is Phase.ENDED):
+        while heap and (heap[0][0] < now or heap[0][2].phase is ENDED):
             transaction = heapq.heappop(heap)[2]
             if transaction.attempts:
                 continue
-            if transaction.phase is Phase.QUEUED:
-                self.backlog.discard(transaction, Phase.PARKED)
-            if transaction.phase is Phase.PARKED:
+            if transaction.phase is QUEUED:
+                self.backlog.discard(transaction, PARKED)
+            if transaction.phase is PARKED:
                 self._end(transaction, now, _not_started(transaction, now))
         self._deadlines.expiry = nextafter(heap[0][0], inf) if heap else inf
 
@@ -262,7 +265,7 @@ class Dispatcher:
             return _named(self.fault(), transaction)
         if now < node.suspended_until:
             return _error(NodeDown, SUSPENDED, transaction)
-        if node.health is Health.DOWN:
+        if node.health is DOWN:
             return _error(NodeDown, "down: it is probed, its polls wait", transaction)
         if node.holds:
             return _error(NodeDown, "back, and its on_return hook is still running", transaction)
@@ -289,13 +292,13 @@ class Dispatcher:
         if self._probe is not None:
             self._deadlines.health = inf
             return
-        down = [node for node in self.nodes if node.health is Health.DOWN]
+        down = [node for node in self.nodes if node.health is DOWN]
         self._budget.probe = max((node.lateness for node in down), default=0.0)
         self._deadlines.health = min((max(node.probe_at, node.suspended_until) for node in down), default=inf)
 
     def probe(self, now: float) -> None:
         """Ask the dead node whose turn it is, if the budget allows."""
-        ready = [n for n in self.nodes if n.health is Health.DOWN and max(n.probe_at, n.suspended_until) <= now]
+        ready = [n for n in self.nodes if n.health is DOWN and max(n.probe_at, n.suspended_until) <= now]
         if self._probe is not None or not ready or self.fault is not None:
             self._deadlines.health = inf if self._probe is not None else now + health.LONGEST_BUDGET_WAIT
             if not ready:
@@ -306,7 +309,7 @@ class Dispatcher:
         if not self._budget.take(cost, now):
             self._deadlines.health = now + self._budget.wait_for(cost, now)
             return
-        probe = Transaction(node, node.profile.probe, priority=Priority.BACKGROUND, retries=0, probe=True)
+        probe = Transaction(node, node.profile.probe, priority=BACKGROUND, retries=0, probe=True)
         probe.paid = cost
         probe.queued = now
         self._waits(probe)
@@ -324,7 +327,7 @@ class Dispatcher:
             error = self._reason_to_park(transaction, now)
         elif now < node.suspended_until:
             error = _error(NodeDown, SUSPENDED, transaction)
-        elif node.health is Health.DOWN and not (transaction.paid or transaction.probe):
+        elif node.health is DOWN and not (transaction.paid or transaction.probe):
             if self._budget.take(node.lateness, now):
                 transaction.paid = node.lateness
                 transaction.retries = 0
@@ -338,16 +341,16 @@ class Dispatcher:
         before = node.health
         flaps = health.flaps(node, now)
         health.note_success(node, now)
-        if before is Health.DOWN and not flaps:
+        if before is DOWN and not flaps:
             self._budget.node_returned(now)
             for other in self.nodes:
-                if other.health is Health.DOWN:
+                if other.health is DOWN:
                     other.probe_at = min(other.probe_at, now)
         self._report(node, before)
 
     def _report(self, node: NodeRecord, before: Health) -> None:
         if node.health is not before:
-            returning = before is Health.DOWN and node.has_hook
+            returning = before is DOWN and node.has_hook
             node.holds += returning
             self.events.append(NodeChanged(node, before, node.health, returning))
         self.plan_probes()
@@ -357,9 +360,9 @@ class Dispatcher:
     def _worth_a_retry(self, transaction: Transaction) -> bool:
         """Not while its node fails; nor may the polls of nodes that were never heard hold up the start of a line."""
         node = transaction.node
-        if node.health is Health.UNKNOWN:
+        if node.health is UNKNOWN:
             return transaction.poll is None
-        return not node.failures and node.health is not Health.DOWN
+        return not node.failures and node.health is not DOWN
 
     def _wanted(self, transaction: Transaction) -> bool:
         return transaction.heard and not transaction.superseded and self.fault is None
@@ -372,25 +375,25 @@ class Dispatcher:
 
     def _park(self, write: Transaction) -> None:
         """An earlier write to its node is not over: it waits, and lends that one its class (R7)."""
-        write.phase = Phase.PARKED
+        write.phase = PARKED
         first = write.node.writes[0]
-        if first.priority > write.priority and first.phase is Phase.QUEUED:
+        if first.priority > write.priority and first.phase is QUEUED:
             self.backlog.promote(first, write.priority)
 
     def _supersede(self, node: NodeRecord, now: float) -> None:
         """An urgent write overtakes: what it overtakes is never sent after it, nor if it cannot be sent itself (R7)."""
         for write in list(node.writes):
-            if write.phase is Phase.ON_WIRE:
+            if write.phase is ON_WIRE:
                 write.superseded = True
-            elif write.priority > Priority.URGENT:
-                if write.phase is Phase.QUEUED:
-                    self.backlog.discard(write, Phase.PARKED)
+            elif write.priority > URGENT:
+                if write.phase is QUEUED:
+                    self.backlog.discard(write, PARKED)
                 self._end(write, now, _error(Superseded, "overtaken by an urgent write to the same node", write))
 
     def _expect_start(self, transaction: Transaction) -> None:
         heap = self._expiries
         if len(heap) > 2 * len(self.backlog) + EXPIRY_SLACK:
-            self._expiries = heap = [entry for entry in heap if entry[2].phase is not Phase.ENDED]
+            self._expiries = heap = [entry for entry in heap if entry[2].phase is not ENDED]
             heapq.heapify(heap)
         heapq.heappush(heap, (transaction.start_by, next(self._order), transaction))
         self._deadlines.expiry = nextafter(heap[0][0], inf)
@@ -401,7 +404,7 @@ class Dispatcher:
             error = _error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
         if not transaction.attempts:
             self._count_ahead(transaction)
-        transaction.phase = Phase.ENDED
+        transaction.phase = ENDED
         transaction.ended_at = now
         transaction.error = error
         if error is not None:
@@ -437,7 +440,7 @@ class Dispatcher:
         writes = transaction.node.writes
         if writes and writes[0] is transaction:
             writes.popleft()
-            if writes and writes[0].phase is Phase.PARKED:
+            if writes and writes[0].phase is PARKED:
                 self.backlog.push_front(writes[0])
         elif transaction in writes:
             writes.remove(transaction)

@@ -12,16 +12,6 @@ if TYPE_CHECKING:
     from busmaster.arbiter.transaction import Transaction
 
 
-class LineState(enum.IntEnum):
-    """Of the one line; the table on top of arbiter.py says what leads where."""
-
-    OFFLINE = 0
-    READY = 1
-    HOLDOFF = 2
-    EXCHANGE = 3
-    SETTLING = 4
-
-
 @dataclass(slots=True)
 class Completed:
     """A caller's transaction has ended: its `value` or its `error` is set."""

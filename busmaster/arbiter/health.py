@@ -41,6 +41,9 @@ class Health(enum.Enum):
     DOWN = "down"
 
 
+UNKNOWN, UP, SUSPECT, DOWN = Health
+
+
 class NodeRecord:
     """What the arbiter knows of one node. Changed by the arbiter alone."""
 
@@ -74,7 +77,7 @@ class NodeRecord:
         self.label = profile.label(address)
         self.timings = timings
         self.retries = retries
-        self.health = Health.UNKNOWN
+        self.health = UNKNOWN
         self.failures = 0
         """Transactions in a row that failed without a valid reply."""
         self.failed_at = -inf
@@ -157,14 +160,14 @@ def flaps(node: NodeRecord, now: float) -> bool:
 def note_success(node: NodeRecord, now: float) -> None:
     """A reply came. The caller reports the change of health."""
     node.failures = 0
-    if node.health is Health.SUSPECT:
+    if node.health is SUSPECT:
         node.replies += 1
         if node.replies < UP_AFTER_REPLIES or now - node.failed_at < UP_AFTER_CALM:
             return
     else:
         node.up_since = now
         node.probe_at = inf
-    node.health = Health.UP
+    node.health = UP
 
 
 def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> None:
@@ -177,18 +180,18 @@ def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> N
     node.failures += 1
     node.failed_at = now
     node.replies = 0
-    if node.health is Health.DOWN:
+    if node.health is DOWN:
         if now >= node.probe_at:
             _probe_later(node, min(2 * node.probe_delay, LONGEST_PROBE_DELAY), now, jitter)
         return
-    never_heard = node.health is Health.UNKNOWN
+    never_heard = node.health is UNKNOWN
     silent = now - node.last_reply >= DOWN_AFTER_SILENCE
     if never_heard or (node.failures >= DOWN_AFTER_FAILURES and silent):
         again = min(2 * node.probe_delay, LONGEST_PROBE_DELAY)
-        node.health = Health.DOWN
+        node.health = DOWN
         _probe_later(node, again if flaps(node, now) else FIRST_PROBE_DELAY, now, jitter)
     else:
-        node.health = Health.SUSPECT
+        node.health = SUSPECT
 
 
 def _probe_later(node: NodeRecord, delay: float, now: float, jitter: Callable[[], float]) -> None:

@@ -9,7 +9,7 @@ from math import ceil, floor, inf
 from typing import Any
 
 from busmaster.arbiter.histogram import Histogram
-from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.arbiter.transaction import BACKGROUND, POLL, Priority, Transaction
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Exchange
 
@@ -82,7 +82,7 @@ class Poll:
         self.patience = min(period, LONGEST_PATIENCE)
         self.phase = phase
         self.cost = cost
-        self.priority = Priority.POLL
+        self.priority = POLL
         self.results: Sequence[Transaction] = ()
         self.fresh: Sequence[Transaction] | None = None
         self.waiter: Any = None
@@ -203,11 +203,11 @@ def begin_cycle(poll: Poll, now: float) -> list[Transaction]:
         transaction.reset()
         transaction.queued = now
         transaction.deadline = deadline
-        transaction.priority = poll.priority if transaction.node.last_reply > -inf else Priority.BACKGROUND
+        transaction.priority = poll.priority if transaction.node.last_reply > -inf else BACKGROUND
     return list(poll.results)
 
 
-def set_members(poll: Poll, members: Iterable[Transaction], priority: Priority = Priority.POLL) -> None:
+def set_members(poll: Poll, members: Iterable[Transaction], priority: Priority = POLL) -> None:
     """Give a poll its transactions, from its next cycle on."""
     fresh = tuple(members)
     for transaction in fresh:

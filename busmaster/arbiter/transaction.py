@@ -23,6 +23,9 @@ class Priority(enum.IntEnum):
     BACKGROUND = 3
 
 
+URGENT, COMMAND, POLL, BACKGROUND = Priority
+
+
 class Phase(enum.Enum):
     """Where a transaction is. A write is PARKED while an earlier write to its node is not over (R7)."""
 
@@ -31,6 +34,9 @@ class Phase(enum.Enum):
     PARKED = "parked"
     ON_WIRE = "on wire"
     ENDED = "ended"
+
+
+IDLE, QUEUED, PARKED, ON_WIRE, ENDED = Phase
 
 
 class Timeline(NamedTuple):
@@ -90,7 +96,7 @@ class Transaction:
         node: NodeRecord,
         command: Command[Any],
         *,
-        priority: Priority = Priority.COMMAND,
+        priority: Priority = COMMAND,
         start_by: float = inf,
         retries: int | None = None,
         idempotent: bool | None = None,
@@ -119,7 +125,7 @@ class Transaction:
 
     def reset(self) -> None:
         """Fresh for its (next) run: a poll's transaction lives as long as the poll."""
-        self.phase = Phase.IDLE
+        self.phase = IDLE
         self.attempts = 0
         self.retried = 0
         self.refusals = 0

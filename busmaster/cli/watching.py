@@ -12,7 +12,7 @@ from typing import Any
 
 import anyio
 
-from busmaster.arbiter.events import LineState
+from busmaster.arbiter.state import LineState
 from busmaster.bus import Bus
 from busmaster.cli.app import OK
 from busmaster.cli.arguments import View, parse_value

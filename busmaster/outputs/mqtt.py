@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import anyio
 from anyio.abc import TaskGroup
 
-from busmaster.arbiter.events import LineState
+from busmaster.arbiter.state import LineState
 from busmaster.bus import Bus
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.outputs.base import TICK, Item, Output, check_extra, reason, size_of

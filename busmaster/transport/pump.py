@@ -17,8 +17,9 @@ from typing import Any, Protocol, cast
 import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, Event, LineState, Polled
+from busmaster.arbiter.events import Completed, Event, Polled
 from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import LineDown
 from busmaster.transport.clock import clock_of
@@ -68,9 +69,14 @@ class Pump(asyncio.Protocol):
 
     # what the bus calls
 
-    def submit(self, transaction: Transaction) -> None:
-        self.arbiter.submit(transaction, self.clock())
-        self.turn()
+    def transact(self, transaction: Transaction) -> asyncio.Future[Any]:
+        """Submit it; the future gets its value or its error."""
+        assert self._loop is not None
+        future: asyncio.Future[Any] = self._loop.create_future()
+        transaction.waiter = future
+        if self.arbiter.submit(transaction, self.clock()):
+            self.turn()
+        return future
 
     def cancel(self, transaction: Transaction) -> None:
         self.arbiter.cancel(transaction, self.clock())
@@ -160,14 +166,6 @@ class Pump(asyncio.Protocol):
         now = self.clock()
         self.arbiter.handle_timeout(now, unread=self._input is not None and self._input())
         self.turn()
-
-    def transact(self, transaction: Transaction) -> asyncio.Future[Any]:
-        """Submit it; the future gets its value or its error."""
-        assert self._loop is not None
-        future: asyncio.Future[Any] = self._loop.create_future()
-        transaction.waiter = future
-        self.submit(transaction)
-        return future
 
 
 def input_of(transport: asyncio.BaseTransport) -> Callable[[], bool] | None:

@@ -13,9 +13,10 @@ from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, LineState, NodeChanged, Polled
+from busmaster.arbiter.events import Completed, NodeChanged, Polled
 from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
 from busmaster.arbiter.schedule import Poll, set_members
+from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.errors import BusError
 from busmaster.protocols import hcp2

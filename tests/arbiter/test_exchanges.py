@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from busmaster.arbiter.events import LineState
+from busmaster.arbiter.state import LineState
 from busmaster.errors import GarbledReply, NoReply, WriteUnconfirmed
 from busmaster.exchange import Exchange, Timings
 from busmaster.protocols import hcp2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from busmaster.arbiter.events import LineState
+from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority
 from busmaster.errors import GarbledReply, NoReply, Refused
 from busmaster.protocols import msc

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, LineState, Strayed
+from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, Strayed
+from busmaster.arbiter.state import LineState
 from busmaster.errors import GarbledReply, LineNoisy, Refused
 from busmaster.exchange import ReplyTiming, Timings
 from busmaster.protocols import hcp2, mentor

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from busmaster.arbiter.events import LineState
 from busmaster.arbiter.health import Health
+from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Priority
 from busmaster.errors import (
     BacklogFull,

@@ -12,9 +12,10 @@ from itertools import count
 from random import Random
 from typing import Any
 
-from busmaster.arbiter.events import Completed, Event, LatenessRaised, LineState, NodeChanged, Polled
+from busmaster.arbiter.events import Completed, Event, LatenessRaised, NodeChanged, Polled
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import Poll, line_time, set_members
+from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults

@@ -12,7 +12,8 @@ from itertools import count
 import pytest
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, LineState
+from busmaster.arbiter.events import Completed
+from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import BusError
 from busmaster.protocols import hcp2
