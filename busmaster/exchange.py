@@ -125,13 +125,13 @@ class Expect:
 class Done(Generic[T_co]):
     """The reply is complete.
 
-    `send` is the host's closing ACK (MSC): the line is free when it has left. `rest` is what came after the reply:
-    those bytes are strays and the line settles.
+    `rest` is what came after the reply: those bytes are strays and the line settles. `send` is the host's closing ACK
+    (MSC): the line is free when it has left.
     """
 
     value: T_co
-    send: bytes = b""
     rest: bytes = b""
+    send: bytes = b""
 
 
 Step: TypeAlias = Need | Expect | Done[T_co]

@@ -181,10 +181,11 @@ class Arbiter:
             data = self._strip_echo(data, now)
             if not data:
                 return
-        if self.state is EXCHANGE:
-            self._read(data, now)
-        else:
+        if self.state is not EXCHANGE:
             self._stray(data, now)
+        elif self._leg.begun or (data := self._begin_reply(data, now)):
+            self._strays.last_byte = now
+            self._take(data, now)
 
     def handle_timeout(self, now: float, *, unread: bool = False) -> None:
         """`unread`: bytes have come that were not handed over yet, so the silence of the line is not known."""
@@ -211,6 +212,8 @@ class Arbiter:
         return data or None
 
     def poll_event(self) -> Event | None:
+        if self.dispatcher.unnoted:
+            self.dispatcher.note_successes()
         return self._events.popleft() if self._events else None
 
     def poll_timeout(self) -> float:
@@ -247,7 +250,7 @@ class Arbiter:
         self._strayed_within = False
         if self.state is not EXCHANGE:
             self._enter(EXCHANGE, now)
-        self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, max(now, free))
+        self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, free if free > now else now)
         if not exchange.answered:
             self._deadlines.line = self._leg.end + exchange.timing.turnaround
         return True
@@ -263,12 +266,6 @@ class Arbiter:
                 self._echo.sent(send)
             elif self._paced:
                 self._leg.taint(said, now)
-
-    def _read(self, data: bytes, now: float) -> None:
-        """Bytes while an exchange is on the wire."""
-        if self._leg.begun or (data := self._begin_reply(data, now)):
-            self._strays.last_byte = now
-            self._take(data, now)
 
     def _begin_reply(self, data: bytes, now: float) -> bytes:
         """The first bytes of a leg: returns those that may be its reply."""
@@ -333,7 +330,6 @@ class Arbiter:
         """A value: the line is free when the closing ACK has left and the node has let go of the line."""
         transaction = self._transaction
         assert transaction is not None
-        transaction.last_byte = now
         answered = self._exchange is not None and self._exchange.answered
         free = self._say(step.send, now) if step.send else now
         self._end_exchange()

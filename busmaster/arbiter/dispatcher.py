@@ -51,6 +51,8 @@ class Dispatcher:
         self, deadlines: Deadlines, counters: LineCounters, now: float, capacity: int, jitter: Callable[[], float]
     ) -> None:
         self.events: deque[Event] = deque()
+        self.unnoted: deque[Transaction] = deque()
+        """Those that have succeeded, until `note_successes`."""
         self.backlog = Backlog()
         self.schedule = Schedule()
         self.nodes: list[NodeRecord] = []
@@ -143,6 +145,21 @@ class Dispatcher:
     # what came of an attempt
 
     def succeeded(self, transaction: Transaction, value: Any, now: float) -> None:
+        """Noted at once where it bears on what goes next; else with the events, when the next request has left."""
+        node = transaction.node
+        transaction.value = value
+        transaction.last_byte = now
+        if transaction.writes or transaction.paid or transaction.probe or node.failures or node.health is not UP:
+            self._note_success(transaction, now)
+        else:
+            self.unnoted.append(transaction)
+
+    def note_successes(self) -> None:
+        while self.unnoted:
+            transaction = self.unnoted.popleft()
+            self._note_success(transaction, transaction.last_byte)
+
+    def _note_success(self, transaction: Transaction, now: float) -> None:
         node = transaction.node
         counters = node.counters
         counters.ok += 1
@@ -154,7 +171,6 @@ class Dispatcher:
             self._heard(node, now)
         if transaction.paid:
             self._budget.refund(transaction.paid - (now - transaction.started))
-        transaction.value = value
         transaction.refused_cycles = 0
         self._end(transaction, now)
 
@@ -400,8 +416,10 @@ class Dispatcher:
 
     def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:
         """Exactly once (R8). A write that was on the wire before something else ended it may have been carried out."""
-        if transaction.writes and transaction.attempts and error is not None and not isinstance(error, TELLING):
-            error = _error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
+        if transaction.writes:
+            if transaction.attempts and error is not None and not isinstance(error, TELLING):
+                error = _error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
+            self._next_write(transaction)
         if not transaction.attempts:
             self._count_ahead(transaction)
         transaction.phase = ENDED
@@ -409,8 +427,6 @@ class Dispatcher:
         transaction.error = error
         if error is not None:
             transaction.node.counters.failed += 1
-        if transaction.writes:
-            self._next_write(transaction)
         if transaction is self._probe:
             self._probe = None
             self.plan_probes()

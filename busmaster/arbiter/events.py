@@ -1,4 +1,7 @@
-"""What the arbiter tells its owner, in the order in which it happened."""
+"""What the arbiter tells its owner, in the order in which it happened.
+
+Of what happens in one call, the successes may come last: they are noted when the next request has left.
+"""
 
 from __future__ import annotations
 

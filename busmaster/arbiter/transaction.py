@@ -95,14 +95,14 @@ class Transaction:
         self,
         node: NodeRecord,
         command: Command[Any],
-        *,
         priority: Priority = COMMAND,
         start_by: float = inf,
         retries: int | None = None,
         idempotent: bool | None = None,
+        probe: bool = False,
+        *,
         waiter: Any = None,
         poll: Poll | None = None,
-        probe: bool = False,
     ) -> None:
         self.node = node
         self.command = command

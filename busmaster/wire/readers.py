@@ -24,6 +24,7 @@ ACK = b"\x06"
 BEL = b"\x07"
 NAK = b"\x15"
 
+_STX = STX[0]
 _PRINTABLE = bytes(range(0x20, 0x7F))
 _ENVELOPE = len(STX + ETX) + 1
 _REFUSALS: Mapping[int, type[Refused]] = {NAK[0]: Refused}
@@ -96,7 +97,8 @@ class TelegramReader(SingleLeg, Generic[T]):
     starts: ClassVar[bytes] = STX + NAK
 
     def __init__(self, request: bytes, echo: bytes, timing: ReplyTiming) -> None:
-        super().__init__(request, timing)
+        self.request = request
+        self.timing = timing
         self._header = STX + echo
         self._buffer = b""
 
@@ -107,13 +109,13 @@ class TelegramReader(SingleLeg, Generic[T]):
         buffer = self._buffer = self._buffer + data if self._buffer else data
         if not buffer:
             return MORE
-        if buffer[0] != STX[0]:
+        if buffer[0] != _STX:
             self.reject(buffer[0])
         header = self._header
         etx = find_etx(buffer, header, self.longest, self.check)
         if not etx:
             return MORE
-        return Done(self.parse(buffer[len(header) : etx]), rest=buffer[etx + 2 :])
+        return Done(self.parse(buffer[len(header) : etx]), buffer[etx + 2 :])
 
     def expired(self, started: bool) -> NoReturn:
         raise FrameError(f"reply cut short after {len(self._buffer)} bytes") if started else no_reply()

@@ -62,6 +62,7 @@ class Desk:
                 transaction.node.health = Health.UP
                 transaction.node.failures = 0
         self.start()
+        self.dispatcher.note_successes()
 
     def run_out(self) -> None:
         while self.on_wire is not None:

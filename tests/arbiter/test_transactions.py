@@ -6,7 +6,7 @@ import pytest
 
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.state import LineState
-from busmaster.arbiter.transaction import Phase, Priority
+from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.errors import (
     BacklogFull,
     BusClosed,
@@ -405,3 +405,49 @@ def test_r12_a_time_to_start_passes_even_on_a_clock_that_is_months_old() -> None
     bench.ask(node)
     waiting = bench.ask(node, start_by=bench.now + 0.010)
     assert bench.arbiter.poll_timeout() > waiting.start_by
+
+
+def heard_but_not_yet_told(bench: Bench) -> tuple[Transaction, Transaction]:
+    """Two reads of a node that is UP: the first one's reply has come, and nobody has asked for events since."""
+    node = bench.node()
+    bench.ask(node)
+    bench.hear(FIVE, after=0.004)
+    first, second = bench.ask(node), bench.ask(node)
+    bench.sent()
+    bench.to(bench.now + 0.004)
+    bench.arbiter.data_received(bytes.fromhex(FIVE), bench.now)
+    assert bench.sent() == READ_1_OF_NODE_1
+    assert second.phase is Phase.ON_WIRE
+    return first, second
+
+
+def test_r8_the_next_request_leaves_before_a_success_is_noted_and_what_is_noted_is_of_its_own_time() -> None:
+    bench = Bench()
+    first, _ = heard_but_not_yet_told(bench)
+    assert first.node.counters.ok == 1
+    came = bench.now
+    bench.now += 0.001
+    bench.listen()
+    assert (first.value, first.ended_at, first.node.last_reply) == (5.0, came, came)
+    assert first.node.counters.ok == 2
+    assert bench.ended(first) == 1
+    bench.listen()
+    assert bench.ended(first) == 1
+
+
+def test_r6_r8_a_caller_that_goes_before_it_is_told_is_not_told() -> None:
+    bench = Bench()
+    first, second = heard_but_not_yet_told(bench)
+    bench.arbiter.cancel(first, bench.now)
+    bench.hear(SEVEN, after=0.004)
+    assert (bench.ended(first), bench.ended(second)) == (0, 1)
+    assert (first.phase, first.node.counters.unheard) == (Phase.ENDED, 1)
+
+
+def test_r13_a_line_that_is_lost_before_a_success_is_told_takes_nothing_back() -> None:
+    bench = Bench()
+    first, second = heard_but_not_yet_told(bench)
+    bench.arbiter.line_down("unplugged", bench.now)
+    bench.listen()
+    assert (first.value, first.error, bench.ended(first)) == (5.0, None, 1)
+    assert isinstance(second.error, LineDown)
