@@ -119,6 +119,12 @@ def test_peers_that_are_not_installed_are_named_and_left_out(monkeypatch: pytest
 
 def test_a_ratio_is_the_median_of_the_ratios_of_neighbouring_rounds() -> None:
     assert Timings([1.0, 2.0, 30.0]).ratio(Timings([1.0, 1.0, 10.0])) == 2.0
+    assert Timings([], [1.0, 2.0, 30.0]).cpu_ratio(Timings([], [1.0, 1.0, 10.0])) == 2.0
+
+
+def test_which_rounds_were_calm_is_for_the_other_to_say() -> None:
+    ours, bare = Timings([], [9.0, 5.0, 1.0, 7.0, 2.0]), Timings([], [3.0, 1.0, 9.0, 2.0, 8.0])
+    assert ours.cpu_in_calm(bare) == 6.0
 
 
 def test_a_claim_says_whether_it_is_met() -> None:
