@@ -189,6 +189,8 @@ class Watch:
 
     def summarise(self) -> None:
         """On standard error: cycles, missed, achieved period, utilisation; a line for each node."""
+        if self.bus.state is LineState.SETTLING and not self.bus.statistics().exchanges:
+            note("nothing was asked yet: a line just opened rests until replies to an earlier master are past")
         for group in map(self._group, self.groups):
             text = f"{group.name}: {group.cycles} cycles, {group.missed} missed"
             if group.achieved is not None and group.p99 is not None:
