@@ -149,30 +149,26 @@ class Dispatcher:
         node = transaction.node
         transaction.value = value
         transaction.last_byte = now
+        self.unnoted.append(transaction)
         if transaction.writes or transaction.paid or transaction.probe or node.failures or node.health is not UP:
-            self._note_success(transaction, now)
-        else:
-            self.unnoted.append(transaction)
+            self.note_successes()
 
     def note_successes(self) -> None:
         while self.unnoted:
             transaction = self.unnoted.popleft()
-            self._note_success(transaction, transaction.last_byte)
-
-    def _note_success(self, transaction: Transaction, now: float) -> None:
-        node = transaction.node
-        counters = node.counters
-        counters.ok += 1
-        counters.latency.record(now - transaction.started)
-        if transaction.late:
-            counters.late += 1
-        node.last_reply = now
-        if node.failures or node.health is not UP:
-            self._heard(node, now)
-        if transaction.paid:
-            self._budget.refund(transaction.paid - (now - transaction.started))
-        transaction.refused_cycles = 0
-        self._end(transaction, now)
+            node, now = transaction.node, transaction.last_byte
+            counters = node.counters
+            counters.ok += 1
+            counters.latency.record(now - transaction.started)
+            if transaction.late:
+                counters.late += 1
+            node.last_reply = now
+            if node.failures or node.health is not UP:
+                self._heard(node, now)
+            if transaction.paid:
+                self._budget.refund(transaction.paid - (now - transaction.started))
+            transaction.refused_cycles = 0
+            self._end(transaction, now)
 
     def attempt_failed(self, transaction: Transaction, no_reply: bool, what: str, now: float) -> None:
         node = transaction.node
