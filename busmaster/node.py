@@ -136,14 +136,15 @@ class Node:
         bus = self.bus
         if not bus.running:
             raise BusClosed("the bus is not open", node=self.label, command=str(command))
-        if not hasattr(command, "open"):
-            raise InvalidCommand(f"{self.label}: {command!r} is no command; read it through a handle, or its point")
+        if type(command) not in self.kinds:
+            if not hasattr(command, "open"):
+                raise InvalidCommand(f"{self.label}: {command!r} is no command; read it through a handle, or its point")
+            self.kinds[type(command)] = command
         if priority is None:
             priority = COMMAND
         start_by = inf if start_within is None else bus.now() + start_within
         transaction = Transaction(record, command, priority, start_by, retries, idempotent, probe)
         transaction.touches = self if touches is None else touches.quantity
-        self.kinds.setdefault(type(command), command)
         return transaction, bus.pump.transact(transaction)
 
     def _give_up(self, transaction: Transaction) -> None:

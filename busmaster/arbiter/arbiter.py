@@ -272,7 +272,8 @@ class Arbiter:
         transaction, exchange = self._transaction, self._exchange
         assert transaction is not None
         assert exchange is not None
-        if self._leg.tainted(now):
+        leg = self._leg
+        if now < leg.taint_until:
             self._counters.tainted += 1
             self._strays.last_byte = now
             self._attempt_failed(FrameError("bytes came before the request was out"), now)
@@ -288,10 +289,10 @@ class Arbiter:
             if not kept:
                 return b""
             data = kept
-        self._leg.begun = True
+        leg.begun = True
         if transaction.first_byte == -inf:
             transaction.first_byte = now
-        if self._leg.late(now):
+        if now > leg.late_after:
             transaction.late = True
         return data
 

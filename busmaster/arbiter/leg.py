@@ -16,7 +16,7 @@ TAINT_SHARE = 0.9
 class Leg:
     """The leg on the wire, or the last one. `latency`: how long received bytes may lie in an adapter, in seconds."""
 
-    __slots__ = ("_follows", "_limit", "_taint_until", "begun", "end", "latency", "timing")
+    __slots__ = ("_follows", "_limit", "begun", "end", "late_after", "latency", "taint_until", "timing")
 
     def __init__(self, timing: ReplyTiming, latency: float) -> None:
         self.timing = timing
@@ -26,7 +26,10 @@ class Leg:
         self.latency = latency
         self._follows: ReplyTiming | None = None
         self._limit = inf
-        self._taint_until = -inf
+        self.taint_until = -inf
+        """What comes before cannot be its reply."""
+        self.late_after = -inf
+        """A reply that begins then is late, and counts all the same."""
 
     def begin(self, timing: ReplyTiming, said: float, longest: float, now: float) -> float:
         """The host says something that takes `said` seconds; the longest reply takes `longest`. When it must begin."""
@@ -34,19 +37,15 @@ class Leg:
         self.begun = False
         self._follows = None
         self.end = end = now + said
-        due = end + timing.window + self.latency
+        latency = self.latency
+        self.late_after = end + timing.nominal + latency
+        due = end + timing.window + latency
         self._limit = due + longest + timing.byte_gap
         return due
 
     def taint(self, said: float, now: float) -> None:
         """On a paced line: bytes that come before most of the request is out cannot be its reply."""
-        self._taint_until = now + TAINT_SHARE * said
-
-    def tainted(self, now: float) -> bool:
-        return now < self._taint_until
-
-    def late(self, now: float) -> bool:
-        return now > self.end + self.timing.nominal + self.latency
+        self.taint_until = now + TAINT_SHARE * said
 
     def gap_over(self, now: float) -> float:
         """When the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
@@ -56,6 +55,7 @@ class Leg:
     def echoed(self, now: float) -> float:
         """The last byte of its echo came: its times start here. When its reply must begin."""
         self._limit += now - self.end
+        self.late_after += now - self.end
         self.end = now
         return now + self.timing.window + self.latency
 
