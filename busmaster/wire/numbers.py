@@ -10,6 +10,7 @@ from typing import SupportsFloat
 
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import FrameError
+from busmaster.wire.characters import made_of
 
 LONGEST_NUMBER = 20
 """Characters of one value. A controller returns no more, so a longer one could never be read back."""
@@ -18,7 +19,7 @@ LONGEST_LIST = 60
 
 _FOURTH_DECIMAL = Decimal("0.0001")
 _TOO_BIG = 10**LONGEST_NUMBER
-_NUMBER_CHARACTERS = b"0123456789+-.eE "
+_NUMBER_CHARACTERS = made_of(b"0123456789+-.eE ")
 
 
 def format_number(value: SupportsFloat) -> str:
@@ -62,7 +63,7 @@ def parse_number(field: bytes) -> float:
 
     Spaces around it are dropped. Raises FrameError for anything else, such as "nan", "1_0" or an empty field.
     """
-    if not field.translate(None, _NUMBER_CHARACTERS):
+    if field.translate(_NUMBER_CHARACTERS) == field:
         try:
             value = float(field)
         except ValueError:

@@ -12,6 +12,7 @@ from typing import ClassVar, Generic, NoReturn, TypeVar
 
 from busmaster.errors import Refused
 from busmaster.exchange import MORE, Done, Expect, FrameError, Leg, Need, ReplyTiming, Sizes, no_reply
+from busmaster.wire.characters import made_of
 from busmaster.wire.checks import xor
 
 T = TypeVar("T")
@@ -25,7 +26,7 @@ BEL = b"\x07"
 NAK = b"\x15"
 
 _STX = STX[0]
-_PRINTABLE = bytes(range(0x20, 0x7F))
+_PRINTABLE = made_of(bytes(range(0x20, 0x7F)))
 _ENVELOPE = len(STX + ETX) + 1
 _REFUSALS: Mapping[int, type[Refused]] = {NAK[0]: Refused}
 
@@ -43,7 +44,7 @@ def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes]
         raise FrameError(f"wrong echo: {buffer[:start].hex(' ')} in place of {header.hex(' ')}")
     etx = buffer.find(ETX, start, start + longest + 1)
     field = buffer[start : etx if etx > 0 else start + longest + 1]
-    if field.translate(None, _PRINTABLE):
+    if field.translate(_PRINTABLE) != field:
         raise FrameError("a control character within the data")
     if etx < 0:
         if len(field) > longest:

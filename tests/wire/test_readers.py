@@ -79,6 +79,7 @@ def test_a_bad_checksum_is_a_whole_frame_unless_something_follows() -> None:
         (b"\x0202", "wrong echo"),
         (b"\x021", "wrong echo"),
         (b"\x0201\x04", "control character"),
+        (b"\x0201\0", "control character"),
         (b"\x02011\x02", "control character"),
         (b"\x0201\xb1", "control character"),
         (b"\x0201" + b"1" * 21, "more than 20"),
