@@ -72,7 +72,7 @@ async def _idle(loop: str, kind: Kind, options: Options, outcome: Outcome) -> No
         outcome.claims.append(Claim("time a transaction on a pty, over bare asyncio.Protocol", ours.ratio(bare), 1.3))
         outcome.claims.append(Claim("CPU a transaction on a pty, us", ours.cpu_each * 1e6, CPU_US))
         calm = ours.cpu_in_calm(bare) * 1e6
-        text = "the same, of the quarter of the rounds in which bare asyncio.Protocol took least"
+        text = "CPU a transaction on a pty, us, in the quarter of the rounds in which bare asyncio.Protocol took least"
         outcome.claims.append(Claim(text, calm, CPU_US))
         text = "CPU a transaction on a pty, over bare asyncio.Protocol"
         outcome.claims.append(Claim(text, ours.cpu_ratio(bare), CPU_US / BARE_CPU_US))

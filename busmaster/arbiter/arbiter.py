@@ -84,7 +84,6 @@ class Arbiter:
         # the exchange on the wire
         self._transaction: Transaction | None = None
         self._exchange: Exchange[Any] | None = None
-        self._answered = True
         self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency)
         self._strayed_within = False
         # the line
@@ -252,8 +251,7 @@ class Arbiter:
         if self.state is not EXCHANGE:
             self._enter(EXCHANGE, now)
         self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, free if free > now else now)
-        self._answered = exchange.answered
-        if not self._answered:
+        if not exchange.answered:
             self._deadlines.line = self._leg.end + exchange.timing.turnaround
         return True
 
@@ -271,19 +269,20 @@ class Arbiter:
 
     def _begin_reply(self, data: bytes, now: float) -> bytes:
         """The first bytes of a leg: returns those that may be its reply."""
-        transaction, leg = self._transaction, self._leg
+        transaction, exchange, leg = self._transaction, self._exchange, self._leg
         assert transaction is not None
+        assert exchange is not None
         if now < leg.taint_until:
             self._counters.tainted += 1
             self._strays.last_byte = now
             self._attempt_failed(FrameError("bytes came before the request was out"), now)
             return b""
-        if not self._answered:
+        if not exchange.answered:
             self._strays.note(data, now, self._leg.quiet())
             self._strayed_within = True
             return b""
-        if transaction.node.profile.noise_tolerant and self._exchange is not None:
-            kept = data.lstrip(bytes(set(data) - set(self._exchange.starts)))
+        if transaction.node.profile.noise_tolerant:
+            kept = data.lstrip(bytes(set(data) - set(exchange.starts)))
             self._counters.noise_bytes += len(data) - len(kept)
             self._strays.last_byte = now
             if not kept:
@@ -331,7 +330,7 @@ class Arbiter:
         """A value: the line is free when the closing ACK has left and the node has let go of the line."""
         transaction = self._transaction
         assert transaction is not None
-        answered = self._answered
+        answered = self._exchange is not None and self._exchange.answered
         free = self._say(step.send, now) if step.send else now
         self._end_exchange()
         self.dispatcher.succeeded(transaction, step.value, now)
@@ -465,7 +464,8 @@ class Arbiter:
             return b""
         if not self._echo.owed and self.state is EXCHANGE and not self._leg.begun:
             due = self._leg.echoed(now)
-            self._deadlines.line = due if self._answered else now + self._leg.timing.turnaround
+            answered = self._exchange is not None and self._exchange.answered
+            self._deadlines.line = due if answered else now + self._leg.timing.turnaround
         return rest
 
     def _go_offline(self, now: float) -> None:

@@ -117,7 +117,6 @@ class LineCounters:
     __slots__ = (
         "_before",
         "_entered",
-        "_spent",
         "cancelled",
         "collisions",
         "completed",
@@ -126,8 +125,8 @@ class LineCounters:
         "noise_bytes",
         "noisy",
         "settles",
-        "settling",
         "since",
+        "spent",
         "stray_bytes",
         "tainted",
         "waits",
@@ -137,9 +136,8 @@ class LineCounters:
         self.exchanges = 0
         """Ever: what a request waited for is counted across a reset."""
         self._entered = since
-        self._spent = [0.0] * len(LineState)
-        self.settling = 0.0
-        """Seconds, ever."""
+        self.spent = [0.0] * len(LineState)
+        """Seconds in each state, ever, up to the last change."""
         self.reset(OFFLINE, since)
 
     def reset(self, state: LineState, since: float) -> None:
@@ -152,14 +150,13 @@ class LineCounters:
     def spend(self, state: LineState, now: float) -> float:
         """The time since the last call went by in this state; returns it."""
         spent = now - self._entered
-        self._spent[state] += spent
-        self.settling = self._spent[SETTLING]
+        self.spent[state] += spent
         self._entered = now
         return spent
 
     def _times(self, state: LineState, now: float) -> list[float]:
         """Seconds ever spent in each state, up to now."""
-        times = self._spent.copy()
+        times = self.spent.copy()
         times[state] += now - self._entered
         return times
 

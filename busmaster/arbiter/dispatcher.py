@@ -21,6 +21,7 @@ from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.events import Completed, Event, NodeChanged, Polled
 from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord, ProbeBudget
 from busmaster.arbiter.schedule import Poll, Schedule, begin_cycle
+from busmaster.arbiter.state import SETTLING
 from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
 from busmaster.errors import (
     BacklogFull,
@@ -146,11 +147,10 @@ class Dispatcher:
 
     def succeeded(self, transaction: Transaction, value: Any, now: float) -> None:
         """Noted at once where it bears on what goes next; else with the events, when the next request has left."""
-        node = transaction.node
         transaction.value = value
         transaction.last_byte = now
         self.unnoted.append(transaction)
-        if transaction.writes or transaction.paid or transaction.probe or node.failures or node.health is not UP:
+        if transaction.writes or transaction.node.health is not UP:
             self.note_successes()
 
     def note_successes(self) -> None:
@@ -163,7 +163,7 @@ class Dispatcher:
             if transaction.late:
                 counters.late += 1
             node.last_reply = now
-            if node.failures or node.health is not UP:
+            if node.health is not UP:
                 self._heard(node, now)
             if transaction.paid:
                 self._budget.refund(transaction.paid - (now - transaction.started))
@@ -198,7 +198,7 @@ class Dispatcher:
             self._requeue(transaction, now)
             return
         node.last_reply = now
-        if node.failures or node.health is not UP:
+        if node.health is not UP:
             self._heard(node, now)
         transaction.refused_cycles += 1
         if transaction.refused_cycles > 1:
@@ -441,12 +441,12 @@ class Dispatcher:
     def _waits(self, transaction: Transaction) -> None:
         """What the line has counted so far is not what it waits for."""
         transaction.exchanges_ahead = self.counters.exchanges
-        transaction.settling_ahead = self.counters.settling
+        transaction.settling_ahead = self.counters.spent[SETTLING]
 
     def _count_ahead(self, transaction: Transaction) -> None:
         """It has waited: until now it held what `_waits` noted."""
         transaction.exchanges_ahead = self.counters.exchanges - transaction.exchanges_ahead
-        transaction.settling_ahead = self.counters.settling - transaction.settling_ahead
+        transaction.settling_ahead = self.counters.spent[SETTLING] - transaction.settling_ahead
 
     def _next_write(self, transaction: Transaction) -> None:
         writes = transaction.node.writes

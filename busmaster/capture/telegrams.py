@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from busmaster.capture.frames import UNASKED, Frame, Kind
 from busmaster.capture.pcapng import Direction
+from busmaster.wire.characters import made_of
 from busmaster.wire.checks import bcc, xor
 
 STX, ETX, EOT, ENQ, ACK, BEL, BS, NAK = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x15
@@ -130,12 +131,12 @@ class CommsDialect:
 
 
 def number(field: bytes, base: int, digits: bytes) -> int | None:
-    """The number that these characters spell, or None if one is none of `digits`."""
-    return None if field.translate(None, digits) else int(field, base)
+    """The number that these characters spell, or None if one is none of `digits` (a table of `made_of`)."""
+    return int(field, base) if field.translate(digits) == field else None
 
 
-_DECIMAL = b"0123456789"
-_HEXADECIMAL = _DECIMAL + b"ABCDEF"
+_DECIMAL = made_of(b"0123456789")
+_HEXADECIMAL = made_of(b"0123456789ABCDEF")
 
 
 class HcpDialect(CommsDialect):
@@ -289,7 +290,7 @@ class MentorDialect:
 
 
 def _parameter(digits: bytes) -> str:
-    if digits.translate(None, _DECIMAL):
+    if digits.translate(_DECIMAL) != digits:
         return repr(characters(digits))
     return f"{characters(digits[:2])}.{characters(digits[2:])}"
 

@@ -189,8 +189,9 @@ class Watch:
 
     def summarise(self) -> None:
         """On standard error: cycles, missed, achieved period, utilisation; a line for each node."""
-        if self.bus.state is LineState.SETTLING and not self.bus.statistics().exchanges:
-            note("nothing was asked yet: a line just opened rests until replies to an earlier master are past")
+        counts = self.bus.statistics()
+        if self.bus.state is LineState.SETTLING and not (counts.exchanges or counts.stray_bytes):
+            note("nothing was asked: a new line rests until replies to an earlier master are past; let it run longer")
         for group in map(self._group, self.groups):
             text = f"{group.name}: {group.cycles} cycles, {group.missed} missed"
             if group.achieved is not None and group.p99 is not None:

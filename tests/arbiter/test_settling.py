@@ -255,3 +255,12 @@ def test_a_broadcast_whose_echo_never_came_leaves_nothing_to_be_taken_for_a_coll
         bench.wait(1.0)
         bench.sent()
     assert bench.arbiter._echo.owed == b""
+
+
+def test_r2_a_reply_is_late_by_the_time_from_the_end_of_its_echo() -> None:
+    bench = Bench(echo=True)
+    prompt = bench.ask(bench.node())
+    request = bench.sent()
+    bench.hear(request, after=0.030)
+    bench.hear("02 30 31 35 03 37", after=0.049)
+    assert (prompt.value, prompt.late) == (5.0, False)

@@ -451,3 +451,28 @@ def test_r13_a_line_that_is_lost_before_a_success_is_told_takes_nothing_back() -
     bench.listen()
     assert (first.value, first.error, bench.ended(first)) == (5.0, None, 1)
     assert isinstance(second.error, LineDown)
+
+
+def test_r11_a_success_that_changes_a_nodes_health_is_noted_before_the_next_request() -> None:
+    bench = Bench()
+    node = bench.node()
+    first = bench.ask(node)
+    bench.to(bench.now + 0.004)
+    bench.arbiter.data_received(bytes.fromhex(FIVE), bench.now)
+    assert (node.health, node.counters.ok, first.phase) == (Health.UP, 1, Phase.ENDED)
+
+
+def test_submitting_says_whether_there_is_something_to_pump() -> None:
+    """An owner that is told False neither sends, nor tells, nor sets its timer anew."""
+    bench = Bench(capacity=4)
+    node = bench.node()
+
+    def submit(**how: float) -> bool:
+        return bench.arbiter.submit(Transaction(node, hcp2.Read(1), **how), bench.now)  # type: ignore[arg-type]  # start_by
+
+    assert submit(), "it is to be sent"
+    assert not submit(), "it waits"
+    assert submit(start_by=bench.now + 0.010), "its time to start is a deadline"
+    assert bench.arbiter.submit(Transaction(node, write(5)), bench.now), "a write may overtake others"
+    assert not submit()
+    assert submit(), "the backlog is full: it has ended"

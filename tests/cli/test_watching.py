@@ -12,8 +12,11 @@ from busmaster.bus import Bus
 from busmaster.cli.arguments import View
 from busmaster.cli.messages import Action, Frame
 from busmaster.cli.watching import Watch, count_cycles
+from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer
 from busmaster.handles import Hcp2Controller
+from busmaster.protocols import hcp2
+from busmaster.transport.memory import MemoryPort
 from busmaster.transport.tcp import TcpPort
 
 
@@ -117,3 +120,17 @@ async def test_a_node_is_suspended_and_goes_on_with_the_same_key(controllers: Tc
         await watch.act(Action("suspend", "node 7"))
         frame = await seen(watch, lambda frame: not frame.rows[0].error)
         assert frame.events[-1].endswith("node 7 goes on")
+
+
+@pytest.mark.asyncio
+async def test_a_watch_that_ends_too_early_says_why_nothing_was_asked_but_not_of_a_noisy_line(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    line = Line(hcp2.PROFILE.line, [])
+    async with Bus(MemoryPort(line)) as bus:
+        watch = Watch(bus, "test", View())
+        watch.summarise()
+        assert "nothing was asked: a new line rests" in capfd.readouterr().err
+        bus.pump.data_received(b"?")
+        watch.summarise()
+        assert "nothing was asked" not in capfd.readouterr().err
