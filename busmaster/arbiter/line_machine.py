@@ -258,7 +258,7 @@ class LineMachine:
         if now < leg.taint_until:
             self._counters.tainted += 1
             self._strays.last_byte = now
-            self._attempt_failed(FrameError("bytes came before the request was out"), now)
+            self._attempt_failed(FrameError("bytes came before the request was out", heard=data), now)
             return b""
         if not exchange.answered:
             self._strays.note(data, now, self._leg.quiet())
@@ -345,9 +345,8 @@ class LineMachine:
                 what = f"no reply within {leg.timing.window * 1000:g} ms"
             if self._echo.owed:
                 what += ", and no echo of the request: if the adapter has none, leave echo out"
-        elif not error.whole:
+        elif error.heard:
             strays.blame(now)
-        if error.heard:
             strays.run[:] = error.heard
         spared = error.whole and not self._in_step.debts
         self._trust.owe(self._wire, heard=not no_reply, whole=error.whole)
