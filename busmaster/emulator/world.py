@@ -91,7 +91,7 @@ class World:
         if not self.plugged:
             self.plugged = True
             self.line.receive(self.now)
-            self.arbiter.line_up(self.now, paced=self.line.tau > 0)
+            self.arbiter.line_up(self.now, paced=self.line.paced)
 
     def unplug(self, cause: str = "unplugged") -> None:
         """The port is gone, and what the line has for the host is lost until it is back."""
