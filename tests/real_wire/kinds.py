@@ -1,4 +1,4 @@
-"""The five protocols as they are tried on real ports: equal reads, one kind of write, values that tell who said them."""
+"""The five protocols as they are tried on real ports: equal reads, one kind of write, values that tell their node."""
 
 from __future__ import annotations
 
