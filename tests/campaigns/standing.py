@@ -144,9 +144,7 @@ class StandingWorld(World):
     def _time_out(self) -> None:
         arbiter: Any = self.arbiter
         if hasattr(arbiter, "line_due") and self.plugged and arbiter.line_due(self.now):
-            unsent = self.line.unsent(self.now)
-            if unsent:
-                arbiter.unsent(unsent, self.now)
+            arbiter.unsent(self.line.unsent(self.now), self.now)
         arbiter.handle_timeout(self.now, unread=bool(self._unread))
         self._pump()
 
