@@ -102,6 +102,8 @@ class Hunt:
             behind_network = own.random() < 0.5
         if mix.edges is not None and mix.latency is None:
             latency = own.choice((0.0, 0.016))
+        if mix.edges is not None and latency:
+            chunk = 1  # no byte is held for longer than that, whatever follows it
         if mix.doubled or mix.stands is not None:  # where talkers collide, a line soon falls into step again
             paced = own.random() < 1 / 3
         if mix.stands is not None:
