@@ -22,7 +22,8 @@ from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Priority
 from busmaster.errors import NodeDown, NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols import hcp2, mentor
-from tests.arbiter.bench import FIVE, NAK, READ_1_OF_NODE_1, WRITE_5, Bench
+from busmaster.protocols.comms import CHECKED
+from tests.arbiter.bench import FIVE, NAK, READ_1_OF_NODE_1, WRITE_5, Bench, request_of
 
 UNKNOWN, UP, SUSPECT, DOWN = Health
 PROBE_COST = 0.150
@@ -150,16 +151,43 @@ def test_r11_broadcasts_that_fail_are_no_dead_node_and_the_dead_are_probed_all_t
 # probes
 
 
-def test_r11_probes_are_the_cheapest_read_at_delays_that_double_up_to_thirty_seconds() -> None:
+class Sparing(ProbeBudget):
+    """Pays for any probe that is due, and never has line time saved up: as on a line that is always busy."""
+
+    def take(self, cost: float, now: float) -> bool:
+        return True
+
+    def idle(self, seconds: float) -> None:
+        self.tokens = 0.0
+
+
+def test_r11_probes_are_cheap_reads_at_delays_that_double_up_to_thirty_seconds() -> None:
     bench = Bench()
     record = dead(bench)
-    delays = []
+    bench.arbiter.dispatcher.probes.budget = Sparing(bench.now)
+    delays, probes = [], []
     for _ in range(9):
         delays.append(record.probe_delay)
-        bench.until_sent(limit=40.0)
-        assert bench.sent() == READ_1_OF_NODE_1
+        waited = bench.until_sent(limit=40.0)
+        assert waited + 0.2 == pytest.approx(record.probe_delay, abs=0.11), "from the end of the one before"
+        probes.append(bench.sent())
         bench.wait(0.2)
     assert delays == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0, 30.0]
+    assert probes[-3:] == [READ_1_OF_NODE_1] * 3, "its cheapest read"
+
+
+def test_r15_probes_that_follow_one_another_never_ask_for_what_is_owed() -> None:
+    """The reply to the one before may still come, and would be taken for its own."""
+    bench = Bench()
+    dead(bench)
+    asked = [READ_1_OF_NODE_1]
+    while bench.now < 7.0:
+        bench.until_sent()
+        asked.append(bench.sent())
+        bench.wait(0.2)
+    assert len(asked) > 5
+    assert len(set(asked)) == len(asked)
+    assert set(asked) <= {request_of(element) for element in CHECKED}
 
 
 @pytest.mark.parametrize("drawn", [0.0, 0.25, 1.0])
@@ -204,8 +232,7 @@ def test_r11_when_one_node_returns_the_others_are_probed_at_once() -> None:
     bench.sent()
     second.probe_at = bench.now + 25.0
     bench.until_sent()
-    bench.sent()
-    bench.hear(FIVE, after=0.004)
+    bench.answer()
     assert first.health is UP
     assert bench.until_sent() < 0.01
     assert second.counters.probes == 1
@@ -218,11 +245,12 @@ def test_r11_a_flapping_node_that_returns_tells_nothing_about_the_others() -> No
     bench.ask(other, retries=0)
     bench.wait(0.2)
     bench.sent()
-    other.probe_at = bench.now + 25.0
+    other.probe_at = due = bench.now + 25.0
     bench.until_sent()
-    bench.sent()
-    bench.hear(FIVE, after=0.004)
-    bench.wait(1.0)
+    bench.answer()
+    bench.arbiter.dispatcher.probes.budget.tokens = 0.2
+    bench.wait(0.5)
+    assert other.probe_at == due
     assert flapping.health is UP
     assert other.counters.probes == 0
 
@@ -275,20 +303,20 @@ def test_r11_a_probe_that_is_answered_costs_what_it_took() -> None:
     dead(bench)
     bench.until_sent()
     before = bench.arbiter.dispatcher.probes.budget.tokens
-    bench.hear(FIVE, after=0.004)
+    bench.answer()
     assert bench.arbiter.dispatcher.probes.budget.tokens == pytest.approx(before + PROBE_COST - 0.004, abs=0.002)
 
 
 def test_r11_a_request_to_a_dead_node_is_tried_once_while_the_budget_allows_and_then_fails_at_once() -> None:
     bench = Bench()
     record = dead(bench)
-    record.probe_at = inf
+    record.probe_at = record.probed_at = inf
     attempts = []
     for _ in range(6):
         read = bench.ask(record)
         attempts.append(read.attempts)
         if read.error is None:
-            bench.wait(0.2)
+            bench.wait(0.4)
             assert isinstance(read.error, NoReply)
         else:
             assert isinstance(read.error, NodeDown)
@@ -300,8 +328,7 @@ def test_r11_an_owner_may_probe_at_any_time() -> None:
     record = dead(bench)
     bench.arbiter.dispatcher.probes.budget.tokens = 0.0
     probe = bench.ask(record, record.profile.probe, probe=True)
-    bench.sent()
-    bench.hear(FIVE, after=0.004)
+    bench.answer()
     assert probe.value == 5.0
     assert record.health is UP
 
@@ -309,7 +336,7 @@ def test_r11_an_owner_may_probe_at_any_time() -> None:
 def test_r11_the_polls_of_a_dead_node_are_parked() -> None:
     bench = Bench()
     record = dead(bench)
-    record.probe_at = inf
+    record.probe_at = record.probed_at = inf
     poll = bench.poll(record, 0.1, 1, 2)
     bench.wait(0.35)
     assert bench.sent() == ""
@@ -343,8 +370,7 @@ def test_r11_polls_of_a_node_never_heard_are_not_retried() -> None:
 
 def returned(bench: Bench, record: NodeRecord) -> None:
     bench.until_sent(limit=40.0)
-    bench.sent()
-    bench.hear(FIVE, after=0.004)
+    bench.answer()
     assert record.health is UP
 
 
@@ -400,10 +426,9 @@ def test_r11_only_a_return_runs_the_hook_not_a_suspicion_that_passes() -> None:
     record.has_hook = True
     bench.ask(record, retries=0)
     bench.wait(6.0)
+    bench.sent()
     for _ in range(3):
-        bench.ask(record)
-        bench.sent()
-        bench.hear(FIVE, after=0.004)
+        bench.served(bench.ask(record))
     assert changes(bench) == [UP, SUSPECT, UP]
     assert not any(e.returning for e in bench.events if isinstance(e, NodeChanged))
     assert not record.holds
