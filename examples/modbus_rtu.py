@@ -105,7 +105,9 @@ class Conversation(Generic[T]):
         if buffer.startswith(self._refusal):
             return self._refused(buffer)
         if not buffer.startswith(header) and not header.startswith(buffer):
-            raise FrameError(f"wrong echo: {buffer[: len(header)].hex(' ')} in place of {header.hex(' ')}", heard=buffer)
+            raise FrameError(
+                f"wrong echo: {buffer[: len(header)].hex(' ')} in place of {header.hex(' ')}", heard=buffer
+            )
         if len(buffer) < size:
             return MORE
         if with_crc(buffer[: size - 2]) != buffer[:size]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import Completed, Event, Polled
-from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import Poll, set_members
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.exchange import Command, Timings
@@ -149,3 +149,22 @@ class Bench:
     def ended(self, transaction: Transaction) -> int:
         """How often it was reported as completed."""
         return sum(isinstance(e, Completed) and e.transaction is transaction for e in self.events)
+
+
+def heard(bench: Bench) -> NodeRecord:
+    """A node that is UP."""
+    record = bench.node()
+    bench.ask(record)
+    bench.sent()
+    bench.hear(FIVE, after=0.004)
+    return record
+
+
+def dead(bench: Bench) -> NodeRecord:
+    """A node that was never heard, and did not answer."""
+    record = bench.node()
+    bench.ask(record, retries=0)
+    bench.wait(0.2)
+    bench.sent()
+    assert record.health is Health.DOWN
+    return record
