@@ -89,6 +89,7 @@ class Choice:
         if chosen is first:
             self._gone_before = 0
             self._silent_checks.clear()
+            self._check = None
         if isinstance(chosen, float):
             self._dispatcher.backlog.restore(transaction)
         else:
