@@ -137,7 +137,9 @@ class Verdict:
     falsely_confirmed: list[str] = field(default_factory=list)
     failed: int = 0
     back: list[float] = field(default_factory=list)
-    """From the end of each standstill of up to a second to the first good value of every node."""
+    """From the end of each standstill of up to a second until every node had given a good value."""
+    back_later: list[float] = field(default_factory=list)
+    """Likewise of longer ones."""
 
     @property
     def longest_back(self) -> float:
@@ -180,6 +182,8 @@ def trial(protocol: str, port: str, what: str, standstills: int, longest: float 
             known = len(master.lines)
             end()
             verdict.standstills.append((begun, time.monotonic()))
+            for address in KINDS[protocol].addresses:
+                master.wait_for(1, f"value {address} ", known)
             master.wait_for(chance.randrange(*BETWEEN), "value", known)
     judge(protocol, verdict, [*master.lines, *(slaves.lines if slaves is not None else ())])
     return verdict
@@ -239,11 +243,9 @@ def judge(protocol: str, verdict: Verdict, lines: list[str]) -> None:
 def _note_returns(protocol: str, verdict: Verdict, good: dict[int, list[float]]) -> None:
     last = max((moments[-1] for moments in good.values()), default=-math.inf)
     for begun, ended in verdict.standstills:
-        if ended - begun > 1.0:
-            continue
         back = 0.0
         for address in KINDS[protocol].addresses:
             moments = good.get(address, [])
             place = bisect_left(moments, ended)
             back = max(back, (moments[place] if place < len(moments) else last) - ended)
-        verdict.back.append(back)
+        (verdict.back if ended - begun <= 1.0 else verdict.back_later).append(back)
