@@ -21,9 +21,9 @@ from typing import NamedTuple
 from tests.real_wire.kinds import KINDS
 
 ROOT = Path(__file__).parents[2]
-SETTLED = 100
+SETTLED = 60
 """Values before the first standstill."""
-BETWEEN = (40, 120)
+BETWEEN = (20, 80)
 """Values from one standstill's end to the next."""
 PATIENCE = 30.0
 """Seconds in which they must have come."""
