@@ -102,7 +102,8 @@ class Process:
                 if seen >= count:
                     return
                 if not self._more.wait(max(0.0, limit - time.monotonic())):
-                    raise AssertionError(f"only {seen} of {count} {what}s came within {PATIENCE:g} s")
+                    recent = " | ".join(line.strip() for line in self.lines[-3:])
+                    raise AssertionError(f"only {seen} of {count} {what.strip()}s came within {PATIENCE:g} s: {recent}")
 
     def end(self) -> None:
         """Its input ends; then it does."""
