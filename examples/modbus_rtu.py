@@ -8,7 +8,8 @@ device for the emulated line. `busmaster.testing.check_protocol` proves it (test
              unit 10 first first count count bytes data... crc   answered by unit 10 first first count count crc crc
     refused                                                      answered by unit function+80 code crc crc
 
-Numbers are big-endian, the CRC is not. A reply does not say which register was read: exactly what busmaster is for.
+Numbers are big-endian, the CRC is not. A reply does not say which register was read, only how many: exactly what
+busmaster is for.
 """
 
 from __future__ import annotations
@@ -69,6 +70,7 @@ class Conversation(Generic[T]):
         "_refusal",
         "_size",
         "answered",
+        "answers",
         "request",
         "sizes",
         "starts",
@@ -84,6 +86,7 @@ class Conversation(Generic[T]):
         self.request = with_crc(body)
         self.timing = timing
         self.answered = body[0] != BROADCAST
+        self.answers = (header,) if self.answered else ()
         self.starts = header[:1]
         self._header = header
         self._refusal = bytes((body[0], body[1] | REFUSED))
@@ -92,13 +95,19 @@ class Conversation(Generic[T]):
         self._decode = decode
         self._buffer = b""
 
+    @property
+    def owed(self) -> Sequence[bytes]:
+        return self.answers
+
     def feed(self, data: bytes) -> Step[T]:
         buffer = self._buffer = self._buffer + data
         header, size = self._header, self._size
         if buffer.startswith(self._refusal):
             return self._refused(buffer)
         if not buffer.startswith(header) and not header.startswith(buffer):
-            raise FrameError(f"wrong echo: {buffer[: len(header)].hex(' ')} in place of {header.hex(' ')}")
+            raise FrameError(
+                f"wrong echo: {buffer[: len(header)].hex(' ')} in place of {header.hex(' ')}", heard=buffer
+            )
         if len(buffer) < size:
             return MORE
         if with_crc(buffer[: size - 2]) != buffer[:size]:
@@ -195,6 +204,7 @@ PROFILE = Profile(
     line=LineSettings(19200, parity="E"),
     timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.2, lateness=0.4, byte_gap=0.02, turnaround=SILENCE)),
     probe=ReadRegisters(0),
+    checks=tuple(ReadRegisters(0, count) for count in range(1, 5)),
     broadcast=BROADCAST,
 )
 

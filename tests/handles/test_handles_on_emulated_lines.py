@@ -31,6 +31,7 @@ from busmaster.emulator.devices.hostcomms import HCP
 from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.line import Line
 from busmaster.handles.base import Handle
+from busmaster.protocols import msc as msc_commands
 from busmaster.protocols.msc import ProgramStatus
 from busmaster.testing.virtual_time import run_in_virtual_time
 
@@ -87,7 +88,8 @@ async def test_msc_gives_up_after_six_bad_packets_and_leaves_the_line_free() -> 
             await MscController(bus, 3, retries=0).read(2008)
         failed = bus.now()
         assert await MscController(bus, 4).read(2008) == 44
-        assert bus.now() - failed < 0.05
+        silence = msc_commands.PROFILE.timings.packet.byte_gap + msc_commands.PROFILE.line.byte_time
+        assert bus.now() - failed < silence + 0.05, "no lateness: the packet had begun"
         assert device.retransmitted == 5
         assert not device.unacknowledged
         assert await MscController(bus, 3).read(2008) == 0
