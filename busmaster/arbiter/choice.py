@@ -7,7 +7,8 @@ line is in step. An urgent write is never held back; its answer may then be doub
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from math import inf
 from typing import Any, TypeAlias
 
 from busmaster.arbiter.dispatcher import Dispatcher
@@ -30,7 +31,9 @@ class Choice:
         self._dispatcher = dispatcher
         self._in_step = in_step
         self._gone_before = 0
-        self._check_asked: Transaction | None = None
+        self._check: Transaction | None = None
+        self._silent_checks: set[NodeRecord] = set()
+        """The nodes that did not answer a check since something is held back."""
 
     def next(self, now: float, silent: float) -> Chosen | float | None:
         """The transaction to be sent now, with its exchange. None if none waits; a time if none may go before it.
@@ -58,7 +61,9 @@ class Choice:
         while (transaction := dispatcher.next(now)) is not None:
             node = transaction.node
             try:
-                return transaction, transaction.command.open(node.address, node.timings)
+                exchange = transaction.command.open(node.address, node.timings)
+                if exchange.answers is not None:  # a protocol may lack it: found out here, it fails this one alone
+                    return transaction, exchange
             except Exception as bug:
                 dispatcher.unsendable(transaction, bug, now)
         return None
@@ -76,14 +81,15 @@ class Choice:
             chosen = self._instead_of(first, now)
         elif in_step.alike >= LONGEST_ALIKE:
             chosen = self._another(first, now, lambda other: other == answers) or first
-            if chosen is first and (check := self._check(now, lambda other: other == answers)) is not None:
+            if chosen is first and (check := self._ask_check(now, lambda other: other == answers)) is not None:
                 chosen = check
             in_step.alike = 0
-        elif in_step.doubts and answers == in_step.last:
+        elif in_step.doubts(now) and answers == in_step.last:
             chosen = self._another(first, now, lambda other: other == answers) or first
         if chosen is first:
             self._gone_before = 0
-            self._check_asked = None
+            self._silent_checks.clear()
+            self._check = None
         if isinstance(chosen, float):
             self._dispatcher.backlog.restore(transaction)
         else:
@@ -96,24 +102,26 @@ class Choice:
 
     def _instead_of(self, first: Chosen, now: float) -> Chosen | float:
         """What goes in place of one whose answer could be one that is owed."""
-        in_step = self._in_step
+        in_step, answers = self._in_step, first[1].answers
         if first[0].probe and (other := self._other_probe(first[0])) is not None:
             return other
-        if self._gone_before < MOST_BEFORE and not self._check_failed():
-            other = self._another(first, now, in_step.clashes) or self._check(now, in_step.clashes)
-            if other is not None:
-                self._gone_before += 1
-                return other
-            over = in_step.over(first[1].answers)
+        if self._gone_before >= MOST_BEFORE:
+            return first
+        other = self._another(first, now, in_step.clashes)
+        if other is None:
+            ends = in_step.ends(answers)
+            if ends < inf:
+                return ends
+            other = self._ask_check(now, in_step.clashes, in_step.owing(answers))
+        if other is not None:
+            self._gone_before += 1
+            return other
+        if not self._silent_checks:
+            over = in_step.over(answers)
             if now < over:
                 return over
-            in_step.forgive(first[1].answers)
+            in_step.forgive(answers)
         return first
-
-    def _check_failed(self) -> bool:
-        """The last check brought nothing: another would cost as much again."""
-        check = self._check_asked
-        return check is not None and check.error is not None and not isinstance(check.error, Refused)
 
     def _other_probe(self, probe: Transaction) -> Chosen | None:
         """The same dead node asked for something that is not owed."""
@@ -146,14 +154,21 @@ class Choice:
         transaction = self._dispatcher.backlog.pick(first[0].priority, suits)
         return None if transaction is None else (transaction, opened[0])
 
-    def _check(self, now: float, unfit: Callable[[Sequence[bytes]], bool]) -> Chosen | None:
-        """A read of some node, of one that answers if there is any, whose answer is fit to prove something."""
-        for node in self._those_who_answer(now):
+    def _ask_check(
+        self, now: float, unfit: Callable[[Sequence[bytes]], bool], owing: Iterable[NodeRecord] = ()
+    ) -> Chosen | None:
+        """A read whose answer is fit to prove something: of a node that owes, if it answers; else of one that does."""
+        check = self._check
+        if check is not None and check.error is not None and not isinstance(check.error, Refused):
+            self._silent_checks.add(check.node)
+        for node in (*(node for node in owing if node.health is UP), *self._those_who_answer(now)):
+            if node in self._silent_checks:
+                continue
             for command in checks_of(node):
                 exchange = command.open(node.address, node.timings)
                 if not unfit(exchange.answers):
-                    self._check_asked = self._dispatcher.check(node, command, now)
-                    return self._check_asked, exchange
+                    self._check = self._dispatcher.check(node, command, now)
+                    return self._check, exchange
         return None
 
     def _those_who_answer(self, now: float) -> Iterator[NodeRecord]:

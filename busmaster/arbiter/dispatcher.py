@@ -181,21 +181,26 @@ class Dispatcher:
             transaction.refused_cycles = 0
             self._end(transaction, now)
 
-    def attempt_failed(self, transaction: Transaction, no_reply: bool, what: str, now: float) -> None:
+    def attempt_failed(
+        self, transaction: Transaction, no_reply: bool, what: str, now: float, doubted: bool = False
+    ) -> None:
+        """`doubted`: an answer came and was not believed, which says nothing of the node (R15)."""
         node = transaction.node
         transaction.unsure = True
         if no_reply:
             node.counters.no_reply += 1
         else:
             node.counters.garbled += 1
-        if transaction.retried < transaction.retries and self._worth_a_retry(transaction) and self._wanted(transaction):
+        worth = doubted or self._worth_a_retry(transaction)
+        if transaction.retried < transaction.retries and worth and self._wanted(transaction):
             transaction.retried += 1
             node.counters.retries += 1
             self._requeue(transaction, now)
             return
-        before = node.health
-        health.note_failure(node, now, self._jitter)
-        self._report(node, before)
+        if not (doubted or transaction.check):
+            before = node.health
+            health.note_failure(node, now, self._jitter)
+            self._report(node, before)
         kind: type[BusError] = NoReply if no_reply else GarbledReply
         if transaction.writes:
             kind = WriteUnconfirmed
@@ -211,13 +216,18 @@ class Dispatcher:
         error.__cause__ = bug
         self._end(transaction, now, error)
 
-    def refused(self, transaction: Transaction, refusal: Refused, now: float) -> None:
-        """A NAK or EOT: asked once more where that can tell something new, then final (R7)."""
+    def refused(self, transaction: Transaction, refusal: Refused, certain: bool, now: float) -> None:
+        """A NAK or EOT: asked once more where that can tell something new, then final (R7).
+
+        Not `certain`: it may be an earlier request's (R15). A read is asked once more; a write was perhaps carried out.
+        """
         node = transaction.node
         node.counters.refused += 1
         if not transaction.writes:
             node.note_refused(transaction.command)
-        if refusal.confirm and not transaction.refusals and self._wanted(transaction):
+        transaction.unsure = transaction.unsure or not certain
+        again = refusal.confirm if certain else not transaction.writes or transaction.idempotent
+        if again and not transaction.refusals and not transaction.probe and self._wanted(transaction):
             transaction.refusals += 1
             self._requeue(transaction, now)
             return

@@ -36,6 +36,8 @@ CALM_LATENESS = 3600.0
 """Seconds of prompt replies after which a lateness that was raised comes down again."""
 MOST_ANSWERED = 3
 """Commands that are remembered of a node because it has answered them."""
+SLOWER, SLOWER_BY = 1.25, 0.001
+"""A reply is later than its node usually is if it takes so many times its slowest one, and so many seconds."""
 SLOWEST_DECAY = 0.002
 """By how much of the difference a node's slowest reply is forgotten with each one that is faster."""
 
@@ -131,10 +133,17 @@ class NodeRecord:
         if len(self.answered) < MOST_ANSWERED and answers not in self.answered and not command.writes:
             self.answered[answers] = command
 
+    def latest(self, unknown: float) -> float:
+        """Seconds to the first byte of its replies that are no later than usual; `unknown` if none was timed."""
+        return SLOWER * self.slowest + SLOWER_BY if self.slowest else unknown
+
     def note_refused(self, command: Command[Any]) -> None:
-        """It has refused this read: it is no check."""
+        """It has refused this read: it is no check, unless it has refused them all. Then one of them may have been
+        refused by mistake."""
         if command in self.profile.checks:
             self.refused.add(command)
+        if len(self.refused) >= len(self.profile.checks):
+            self.refused.clear()
         self.answered = {key: read for key, read in self.answered.items() if read != command}
 
     def raise_lateness(self, lateness: float, now: float) -> None:
@@ -247,4 +256,5 @@ def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> N
 
 def _probe_later(node: NodeRecord, delay: float, now: float, jitter: Callable[[], float]) -> None:
     node.probe_delay = delay
+    node.probed_at = now
     node.probe_at = now + delay * (1 + PROBE_JITTER * (2 * jitter() - 1))

@@ -9,8 +9,9 @@ came in place of a whole reply leaves one with the key ANY_BYTE: its tail, a lon
 A debt is paid
 - by its own reply, heard while nothing was asked or in place of another;
 - by a right answer of the same node to something else: a node answers in the order in which it was asked;
-- once its lateness is over, by a right answer of any node to something else: a channel keeps the order. In case that
-  one did not, an answer like the owed one is doubted for three times its lateness;
+- once its lateness is over, and where its node has been silent since, by a right answer of any node to something else:
+  a channel keeps the order. It stays for as long as its node could still take: what was held up together is let go
+  together, and the slower node answers last. Then an answer like it is doubted for three times its lateness;
 - by LAPSE seconds.
 
 What nobody owed and yet came, though it looks like a reply, was said twice. Then answers like those heard lately are
@@ -20,13 +21,11 @@ doubted for a while, and neighbours that could be confused are not asked one aft
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.health import UP, NodeRecord
 
 ANY_BYTE = b""
 """The key of a debt that any lone byte could pay."""
@@ -53,6 +52,10 @@ class Debt:
     asked: float
     over: float
     """From then on, it is later than its node's lateness allows."""
+    silent: bool = False
+    """Its node was asked again, and was silent."""
+    until: float = inf
+    """It is owed until then: a right answer of another node was heard."""
 
 
 class InStep:
@@ -76,15 +79,22 @@ class InStep:
 
     # what is owed
 
-    def owe(self, keys: Iterable[bytes], node: NodeRecord | None, asked: float, over: float) -> None:
-        """Replies that begin with these keys were not heard."""
+    def owe(
+        self, keys: Iterable[bytes], node: NodeRecord | None, asked: float, over: float, silent: bool = False
+    ) -> None:
+        """Replies that begin with these keys were not heard. `silent`: nor was anything else of that node."""
+        if silent:
+            for debt in self.debts:
+                debt.silent = debt.silent or debt.node is node
         self.debts += [Debt(key, node, asked, over) for key in keys]
         del self.debts[:-MOST_DEBTS]
         self.alert = True
 
     def lapse(self, now: float) -> None:
         """Forget what has been owed for too long, and stop being careful where nothing is left to be careful of."""
-        self.debts = [debt for debt in self.debts if now - debt.asked <= LAPSE]
+        gone = [debt for debt in self.debts if debt.until <= now]
+        self._doubted += [(debt.key, debt.until + DOUBTED_LATENESSES * (debt.over - debt.asked)) for debt in gone]
+        self.debts = [debt for debt in self.debts if now < min(debt.until, debt.asked + LAPSE)]
         self._doubted = [entry for entry in self._doubted if entry[1] > now]
         self.alert = bool(self.debts or self._doubted or self._doubt_until > now)
 
@@ -94,10 +104,20 @@ class InStep:
 
     def over(self, answers: Sequence[bytes]) -> float:
         """When all that is owed and could look so is later than its node's lateness allows."""
-        return max((debt.over for debt in self.debts if _could_be(debt, answers)), default=-inf)
+        return max((min(debt.over, debt.until) for debt in self.debts if _could_be(debt, answers)), default=-inf)
+
+    def owing(self, answers: Sequence[bytes]) -> Iterator[NodeRecord]:
+        """The nodes that owe what could look so, and have not been silent since."""
+        return (d.node for d in self.debts if d.node is not None and not d.silent and _could_be(d, answers))
+
+    def ends(self, answers: Sequence[bytes]) -> float:
+        """When all of what is owed and could look so is owed no more, by what was heard of others; inf if not known."""
+        return max((debt.until for debt in self.debts if _could_be(debt, answers)), default=-inf)
 
     def forgive(self, answers: Sequence[bytes]) -> None:
-        """There is no unlike exchange to ask: R3's assumption must do."""
+        """There is no unlike exchange to ask: R3's assumption must do, and doubt."""
+        forgiven = [debt for debt in self.debts if _could_be(debt, answers)]
+        self._doubted += [(debt.key, debt.asked + LAPSE) for debt in forgiven]
         self.debts = [debt for debt in self.debts if not _could_be(debt, answers)]
 
     def doubtful_answer(self, answers: Sequence[bytes]) -> None:
@@ -107,39 +127,43 @@ class InStep:
                 del self.debts[place]
                 return
 
-    def answered(self, node: NodeRecord, asked: float, now: float) -> None:
-        """A right answer came that could be nobody else's, to what `node` was asked at `asked`."""
-        if not self.debts:
-            return
-        kept: list[Debt] = []
+    def answered(self, node: NodeRecord, asked: float, now: float, patience: float) -> None:
+        """A right answer came that could be nobody else's, to what `node` was asked at `asked`.
+
+        `patience` is how long a reply is taken to need, in seconds, of a node whose replies were never timed.
+        """
+        self.debts = [debt for debt in self.debts if debt.node is not node]
         for debt in self.debts:
-            if debt.node is node:
-                continue
-            if debt.over > asked:
-                kept.append(debt)
-            elif debt.key:
-                self._doubted.append((debt.key, now + DOUBTED_LATENESSES * (debt.over - debt.asked)))
-        self.debts = kept
+            if debt.over <= asked and debt.until == inf and _is_silent(debt):
+                debt.until = now + (0.0 if debt.node is None else debt.node.latest(patience))
 
     def heard(self, run: bytes, now: float) -> NodeRecord | None:
-        """All that came while nothing was asked, or in place of a reply, up to a silence. Returns who owed it.
+        """Take all that came up to a silence, unasked or in place of a reply. Returns who owed it, if that is known.
 
-        A lone byte pays only if it is all that came. What nobody owed, though it is like the last answers, was said
-        twice.
+        Lone bytes pay only if nothing else came. What nobody owed, though it is like the last answers, was said twice.
+        What is not explained so may be a part of something: another part may come.
         """
-        for place, debt in enumerate(self.debts):
-            if _is(run, debt.key):
-                del self.debts[place]
-                self._share(debt)
-                return debt.node
-        for place, (key, until) in enumerate(self._doubted):
-            if until > now and _is(run, key):
-                del self._doubted[place]
-                return None
-        if any(_is(run, key) for key in (*self.last, *self.before)):
-            self._doubt_until = now + DOUBT_PERIOD
-            self.alert = True
-        return None
+        payers = [debt for debt in self.debts if _is(run, debt.key)]
+        explained = bool(payers)
+        place = 0
+        for debt in payers:
+            place = run.find(debt.key, place) + len(debt.key)
+            if place < len(debt.key):
+                break
+            self.debts.remove(debt)
+            self._share(debt)
+        for entry in self._doubted:
+            if not explained and entry[1] > now and _is(run, entry[0]):
+                self._doubted.remove(entry)
+                explained = True
+                break
+        if not explained:
+            if any(_is(run, key) for key in (*self.last, *self.before)):
+                self._doubt_until = now + DOUBT_PERIOD
+                self.alert = True
+            else:
+                self.owe((ANY_BYTE,), None, now, now)
+        return payers[0].node if payers else None
 
     # how far an answer can be trusted
 
@@ -148,17 +172,15 @@ class InStep:
         if now < self._doubt_until:
             self._said.append((answers, now))
 
-    @property
-    def doubts(self) -> bool:
+    def doubts(self, now: float) -> bool:
         """Something was said twice lately."""
-        return self._doubt_until > -inf
+        return now < self._doubt_until
 
     def is_doubtful(self, answers: Sequence[bytes], now: float) -> bool:
         """An answer like this may be one that was overtaken, or one that is said twice."""
         if any(until > now and key in answers for key, until in self._doubted):
             return True
         if now >= self._doubt_until:
-            self._doubt_until = -inf
             return False
         for said, when in reversed(self._said):
             if now - when > SAID_MEMORY:
@@ -179,6 +201,11 @@ def _could_be(debt: Debt, answers: Sequence[bytes]) -> bool:
     return debt.key in answers if debt.key else any(len(key) == 1 for key in answers)
 
 
+def _is_silent(debt: Debt) -> bool:
+    """Its node does not answer, as far as is known: another's answer must do. One that does is asked itself."""
+    return debt.silent or debt.node is None or debt.node.health is not UP
+
+
 def _is(run: bytes, key: bytes) -> bool:
-    """These bytes are the reply of that key: it begins with it, or is it, where that is one byte."""
-    return run == key if len(key) == 1 else bool(key) and run.startswith(key)
+    """These bytes are replies of that key: they begin with it, or are nothing else, where it is one byte."""
+    return run == key * len(run) if len(key) == 1 else bool(key) and run.startswith(key)

@@ -37,7 +37,7 @@ business.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
 from typing import Any, cast
 
@@ -164,13 +164,15 @@ class LineMachine:
 
     def transmitted(self, now: float) -> None:
         """The port has taken only now what `poll_transmit` gave: whoever held the process up meanwhile."""
+        said_at = self._wire.output.said_at
         late = self._wire.output.taken(now)
         if late:
             self._deadlines.line += late
             if self.state is SETTLING:
                 self._silent_at += late
-            if late > LOOK_SLACK and self._wire.transaction is not None:
-                self._wire.transaction.started += late
+            transaction = self._wire.transaction
+            if late > LOOK_SLACK and transaction is not None and transaction.started == said_at:
+                transaction.started = now
 
     def line_due(self, now: float) -> bool:
         """A deadline of the line falls due: `unsent` is to be told first, where it is known."""
@@ -273,8 +275,6 @@ class LineMachine:
             data = kept
         leg.begun = True
         leg.begun_at = now
-        if leg.end > now:  # an unpaced port: what was answered has left
-            leg.end = now
         if transaction.first_byte == -inf:
             transaction.first_byte = now
         if now > leg.late_after:
@@ -303,8 +303,13 @@ class LineMachine:
         transaction, exchange = self._wire.transaction, self._wire.exchange
         assert transaction is not None
         assert exchange is not None
-        answered = exchange.answered
+        answered, leg = exchange.answered, self._leg
+        if step.rest and exchange.owed and _begins_so(step.rest, exchange.answers):
+            self._disbelieve("two answers came", step, now)
+            return
         if answered:
+            if leg.end > leg.begun_at:  # an unpaced port: what was answered has left
+                leg.end = leg.begun_at
             if self._in_step.alert:
                 verdict = self._trust.weigh(self._wire, step, now)
                 if isinstance(verdict, str):
@@ -313,14 +318,13 @@ class LineMachine:
                 if verdict is not None:
                     self._deadlines.line = verdict
                     return
-            transaction.node.note_reply(exchange.answers, transaction.command, self._leg.begun_at - self._leg.end)
+            transaction.node.note_reply(exchange.answers, transaction.command, leg.begun_at - leg.end)
         if step.send:
             self._wire.say(step.send, now)
         self._end_exchange()
         self.dispatcher.succeeded(transaction, step.value, now)
         if step.rest:
             self._strays.note(step.rest, now, self._leg.quiet())
-            self._trust.strayed(now)
         if step.rest or self._wire.strayed or (self._echo.owed and not answered):
             self._settle(now)
             return
@@ -331,10 +335,15 @@ class LineMachine:
         self._counters.doubted += 1
         if step.rest:
             self._strays.note(step.rest, now, self._leg.quiet())
-        self._attempt_failed(FrameError(what, send=step.send), now)
+        self._attempt_failed(FrameError(what, send=step.send), now, doubted=True)
 
     def _attempt_failed(
-        self, error: FrameError, now: float, no_reply: bool = False, bug: Exception | None = None
+        self,
+        error: FrameError,
+        now: float,
+        no_reply: bool = False,
+        doubted: bool = False,
+        bug: Exception | None = None,
     ) -> None:
         transaction, leg, strays = self._wire.transaction, self._leg, self._strays
         assert transaction is not None
@@ -354,7 +363,7 @@ class LineMachine:
             self._wire.say(error.send, now)
         self._end_exchange(failed=True)
         if bug is None:
-            self.dispatcher.attempt_failed(transaction, no_reply, what, now)
+            self.dispatcher.attempt_failed(transaction, no_reply, what, now, doubted)
         else:
             self.dispatcher.broken(transaction, bug, now)
         self._settle(now, begun=spared)
@@ -366,19 +375,17 @@ class LineMachine:
         """
         transaction = self._wire.transaction
         assert transaction is not None
-        if self._in_step.debts:
-            if not transaction.check:
-                self._attempt_failed(FrameError("a refusal that may be an earlier request's"), now)
-                return
+        certain = not self._in_step.debts
+        if not certain:
             self._trust.owe(self._wire, heard=False)
         confirmed = transaction.refusals > 0
         transaction.last_byte = now
         self._end_exchange()
-        self.dispatcher.refused(transaction, refusal, now)
-        if transaction.writes:
+        self.dispatcher.refused(transaction, refusal, certain, now)
+        if transaction.writes and certain:
             self._release(self._leg.timing.turnaround, now)
         else:
-            self._settle(now, begun=confirmed)
+            self._settle(now, begun=confirmed and certain)
 
     def _end_exchange(self, failed: bool = False) -> None:
         self._wire.end(failed)
@@ -425,7 +432,7 @@ class LineMachine:
                 self.dispatcher.fault = None
                 self._events.append(LineChanged(LineChange.QUIET))
         self._enter(READY, now)
-        self._deadlines.line = inf
+        self._deadlines.line = self._strays.look_before(inf, now)
         self._advance(now)
 
     def _stray(self, data: bytes, now: float) -> None:
@@ -433,7 +440,6 @@ class LineMachine:
         strays = self._strays
         strays.note(data, now, self._leg.quiet())
         self._leg.strayed(now)
-        self._trust.strayed(now)
         if self.state is OFFLINE:
             return
         self._settle(now)
@@ -503,3 +509,8 @@ class LineMachine:
 
     def _offline(self) -> BusError:
         return LineDown(f"the line is down: {self._cause}")
+
+
+def _begins_so(rest: bytes, answers: Sequence[bytes]) -> bool:
+    """What came behind an answer is another one like it."""
+    return any(rest.startswith(key) for key in answers)

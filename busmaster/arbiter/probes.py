@@ -50,7 +50,6 @@ class Probes:
         probe = Transaction(node, node.profile.probe, priority=BACKGROUND, retries=0, probe=True)
         probe.paid = cost
         probe.queued = now
-        node.probed_at = now
         node.counters.probes += 1
         self._running = probe
         self._deadlines.health = inf

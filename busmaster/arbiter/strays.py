@@ -86,6 +86,8 @@ class Strays:
 
     def look_before(self, due: float, now: float) -> float:
         """When to look at the line again, where nothing is to be done before `due`."""
+        if self._unanswered is not None and now - self._unanswered[1] > STRAGGLER_MEMORY:
+            self._unanswered = None
         if self._unanswered is not None:
             due = min(due, now + self._unanswered[2] / LOOKS)
             self.looked(now, due)

@@ -8,9 +8,6 @@ from busmaster.arbiter.in_step import ANY_BYTE, InStep
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.exchange import Done
 
-SLOWER, SLOWER_BY = 1.25, 0.001
-"""A doubtful answer is not believed if it comes later than so many times its node's slowest reply, and seconds."""
-
 
 class Trust:
     """Of one line. `strict`: a doubtful answer is held until another could have come, not delivered at once."""
@@ -34,14 +31,13 @@ class Trust:
             in_step.doubtful_answer(answers)
             return "its answer may be an earlier request's, whose own never came"
         if in_step.is_doubtful(answers, now) and not held:
-            slowest = transaction.node.slowest
-            latest = leg.end + (SLOWER * slowest + SLOWER_BY if slowest else leg.timing.nominal) + leg.latency
+            latest = leg.end + transaction.node.latest(leg.timing.nominal) + leg.latency
             if step.rest or leg.begun_at > latest:
                 return "its answer may be another's, said late or twice"
-            if self._strict:
+            if self._strict or in_step.doubts(now):
                 self.held = step
                 return max(now, latest) + 2 * leg.byte_time
-        in_step.answered(transaction.node, transaction.started, now)
+        in_step.answered(transaction.node, transaction.started, now, leg.timing.nominal)
         in_step.said(answers, now)
         return None
 
@@ -55,8 +51,4 @@ class Trust:
         if heard:
             keys += (ANY_BYTE,)
         if exchange.answered:
-            self._in_step.owe(keys, transaction.node, wire.leg.end, wire.leg.past())
-
-    def strayed(self, now: float) -> None:
-        """Bytes came that nobody asked for: more of the kind may be held up."""
-        self._in_step.owe((ANY_BYTE,), None, now, now)
+            self._in_step.owe(keys, transaction.node, wire.leg.end, wire.leg.past(), not heard)
