@@ -9,6 +9,7 @@ from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import Completed, Event, Polled
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import Poll, set_members
+from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.exchange import Command, Timings
 from busmaster.profile import Profile
@@ -55,8 +56,18 @@ def right_answer(request: str, value: int = 5) -> str:
 class Bench:
     """One arbiter with its line up and nothing left from before."""
 
-    def __init__(self, *, echo: bool = False, paced: bool = False, latency: float = 0.0, capacity: int = 1000) -> None:
-        self.arbiter = Arbiter(TAU, echo=echo, receive_latency=latency, capacity=capacity)
+    def __init__(
+        self,
+        *,
+        echo: bool = False,
+        paced: bool = False,
+        latency: float = 0.0,
+        capacity: int = 1000,
+        strict: bool = False,
+    ) -> None:
+        self.arbiter = Arbiter(TAU, echo=echo, receive_latency=latency, capacity=capacity, strict=strict)
+        self.unsent: int | None = None
+        """How many bytes the port has not sent yet, for ports that can tell."""
         self.now = 0.0
         self.events: list[Event] = []
         self.cycles: list[Poll] = []
@@ -95,6 +106,12 @@ class Bench:
         self.arbiter.data_received(bytes.fromhex(data), self.now)
         self.listen()
 
+    def hear_bytewise(self, data: str, after: float = 0.0) -> None:
+        """As `hear`, each byte by itself, a byte time after the one before."""
+        self.wait(after)
+        for byte in data.split():
+            self.hear(byte, after=TAU)
+
     def answer(self, value: int = 5, after: float = 0.004) -> str:
         """The node answers what was sent last, of whatever element it is. Returns what that was."""
         asked = self.sent() or self.asked
@@ -119,6 +136,8 @@ class Bench:
         """Turn the clock, stopping at every deadline on the way."""
         while (due := self.arbiter.poll_timeout()) <= time:
             self.now = max(self.now, due)
+            if self.unsent is not None and self.arbiter.line_due(self.now):
+                self.arbiter.unsent(self.unsent, self.now)
             self.arbiter.handle_timeout(self.now)
             self.listen()
         self.now = max(self.now, time)
@@ -135,6 +154,13 @@ class Bench:
             assert due - start < limit, "nothing was sent in time"
             self.to(due)
         return self.now - start
+
+    def until_ready(self, limit: float = 10.0) -> None:
+        """Turn the clock until the line has nothing to do."""
+        start = self.now
+        while self.arbiter.state is not LineState.READY:
+            assert self.arbiter.poll_timeout() - start < limit, "the line is never free"
+            self.to(self.arbiter.poll_timeout())
 
     def _is_sent(self) -> bool:
         self._out += self.arbiter.poll_transmit() or b""
@@ -168,3 +194,24 @@ def dead(bench: Bench) -> NodeRecord:
     bench.sent()
     assert record.health is Health.DOWN
     return record
+
+
+def up(bench: Bench, address: int = 1) -> NodeRecord:
+    """A node that is UP: it has answered a read of element 1 after 4 ms."""
+    record = bench.node(address)
+    bench.ask(record)
+    bench.until_sent()
+    bench.answer(after=8 * TAU + 0.004)
+    bench.until_ready()
+    assert record.health is Health.UP
+    return record
+
+
+def lost(bench: Bench, record: NodeRecord, command: Command[Any] | None = None) -> Transaction:
+    """What was asked of it, once, and not answered, on a line that has settled since: its reply is owed (R15)."""
+    asked = bench.ask(record, command, retries=0)
+    bench.until_sent()
+    bench.sent()
+    bench.until_ready()
+    assert asked.error is not None
+    return asked
