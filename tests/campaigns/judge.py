@@ -266,8 +266,8 @@ class Judge:
             self.count_problem(f"WRONG: {what}")
 
     def _check_wait(self, transaction: Transaction, asked: Asked) -> None:
-        """R9: an urgent read waits for the exchange on the wire, for what is ahead in its class, and for the few that may
-        go before each of those (R15)."""
+        """R9: an urgent read waits for the exchange on the wire, for what is ahead in its class, and for the few that
+        may go before each of those (R15)."""
         ahead = transaction.exchanges_ahead
         most = 1 + MOST_BEFORE + (1 + MOST_BEFORE) * asked.urgent_ahead
         if transaction.priority is Priority.URGENT and not transaction.writes and ahead > most:

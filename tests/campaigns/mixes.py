@@ -23,13 +23,14 @@ class Standstill:
 
     `requests` and `replies`: the network on either way, as a share of the frames. `process`: the process, between what
     the arbiter says and the bytes leaving, and as often at any other moment. `held`: the driver keeps its output, and
-    can tell that it has not left.
+    can tell that it has not left. `within`: the share of these that begin inside of a frame.
     """
 
     requests: float = 0.0
     replies: float = 0.0
     process: float = 0.0
     held: float = 0.0
+    within: float = 0.0
     shortest: float = 0.005
     longest: float = 2.0
 
@@ -205,6 +206,15 @@ IN_STEP = (
         reconnects=2.0,
         writes=0.1,
     ),
+    Mix("network, runs", "likewise, short commands", stands=EITHER_WAY, in_step=True, runs=True),
+    Mix(
+        "network, within",
+        "likewise, within frames",
+        stands=Standstill(requests=0.01, replies=0.01, within=0.7),
+        in_step=True,
+        equal=True,
+        writes=0.1,
+    ),
     Mix("process", "the process stands still", stands=Standstill(process=0.01), in_step=True),
     Mix(
         "process, equal",
@@ -222,6 +232,14 @@ IN_STEP = (
         in_step=True,
         equal=True,
         writes=0.02,
+    ),
+    Mix(
+        "held, within",
+        "likewise, within frames",
+        stands=Standstill(held=0.01, within=0.7, shortest=0.1, longest=0.8),
+        in_step=True,
+        equal=True,
+        writes=0.1,
     ),
     Mix(
         "all stand still",

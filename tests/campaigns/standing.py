@@ -33,6 +33,10 @@ class Channel:
 
     def put(self, data: bytes, now: float) -> None:
         if self._rate and self._own.random() < self._rate:
+            if self._own.random() < self._stands.within and len(data) > 1:
+                cut = self._own.randrange(1, len(data))
+                self.waiting.append((max(now, self.still_until), data[:cut]))
+                data = data[cut:]
             self.still_until = max(self.still_until, now + seconds(self._stands, self._own))
         self.waiting.append((max(now, self.still_until), data))
 

@@ -13,7 +13,7 @@ import sys
 from tests.real_wire.kinds import KINDS
 from tests.real_wire.trial import PORTS, Verdict, trial
 
-COLUMNS = ("standstills", "values", "wrong", "written", "falsely", "failed", "back", "longest")
+COLUMNS = ("standstills", "values", "wrong", "written", "falsely", "failed", "back", "longest", "later")
 
 
 def main() -> int:
@@ -51,11 +51,14 @@ def _parse() -> argparse.Namespace:
 
 
 def _report(protocol: str, port: str, what: str, verdict: Verdict) -> None:
+    """`back`, `longest`: seconds until all nodes gave good values again after standstills of up to a second, the
+    median and the longest; `later`: the longest after longer ones."""
     back = sorted(verdict.back)
     median = back[len(back) // 2] if back else 0.0
     counts = (
         *(len(verdict.standstills), verdict.values, len(verdict.wrong), verdict.written),
         *(len(verdict.falsely_confirmed), verdict.failed, f"{median:.3f}", f"{verdict.longest_back:.3f}"),
+        f"{max(verdict.back_later, default=0.0):.3f}",
     )
     _say(f"{protocol:8}{port:8}{what:10}{''.join(str(count).rjust(12) for count in counts)}")
     for what_happened in (*verdict.wrong[:1], *verdict.falsely_confirmed[:1]):

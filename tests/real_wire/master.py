@@ -24,7 +24,8 @@ from tests.campaigns.kinds import elements_of
 from tests.real_wire.kinds import KINDS, Kind, make_line
 from tests.real_wire.slaves import tell
 
-READS_A_WRITE = 60
+READS, WRITES = 60, 20
+"""How many of each in a row: all callers read at a time, and write at a time, so that answers are alike."""
 BREATH = 0.01
 """Seconds that a caller waits after an error."""
 ABSENT_EVERY = 1.0
@@ -41,8 +42,8 @@ class Caller:
 
     async def ask(self, address: int) -> None:
         """One node, without end."""
-        for number in count(1):
-            if number % READS_A_WRITE:
+        for number in count():
+            if number % (READS + WRITES) < READS:
                 await self._read(address)
             else:
                 await self.write(address)
