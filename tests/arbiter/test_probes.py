@@ -18,7 +18,8 @@ from busmaster.arbiter.health import (
     note_success,
 )
 from busmaster.errors import NodeDown, NoReply
-from busmaster.protocols import hcp2
+from busmaster.profile import Profile
+from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
 from busmaster.protocols.comms import CHECKED
 from tests.arbiter.bench import NAK, READ_1_OF_NODE_1, Bench, dead, request_of
 
@@ -138,6 +139,26 @@ def test_r11_a_flapping_node_that_returns_tells_nothing_about_the_others() -> No
     assert other.probe_at == due
     assert flapping.health is UP
     assert other.counters.probes == 0
+
+
+@pytest.mark.parametrize(
+    "profile", [hcp.PROFILE, hcp2.PROFILE, mentor.PROFILE, dc104.PROFILE, msc.PROFILE], ids=lambda profile: profile.name
+)
+def test_r11_on_an_idle_line_a_lone_dead_node_is_never_left_alone_for_more_than_a_second(profile: Profile) -> None:
+    """Whenever it comes back, however long it was away: nobody else wants the line."""
+    bench = Bench()
+    bench.arbiter.byte_time = profile.line.byte_time
+    record = bench.node(profile.addresses[-1], profile)
+    bench.wait(2.0)
+    bench.ask(record, profile.probe, retries=0)
+    bench.sent()
+    bench.until_ready()
+    longest = 0.0
+    while bench.now < 200.0:
+        longest = max(longest, bench.until_sent(limit=60.0))
+        bench.sent()
+        bench.until_ready()
+    assert longest <= 1.0
 
 
 # what they may cost
