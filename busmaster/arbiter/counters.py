@@ -47,6 +47,31 @@ class NodeStatistics:
 
 
 @dataclass(frozen=True, slots=True)
+class DriverErrors:
+    """What a serial driver has counted of its UART's errors: `overruns` are bytes lost in the UART, `buffer_overruns`
+    bytes lost behind it because nobody read them in time."""
+
+    framing: int
+    parity: int
+    breaks: int
+    overruns: int
+    buffer_overruns: int
+
+
+@dataclass(frozen=True, slots=True)
+class UartStatistics:
+    """What the UART found wrong with what came since the port was opened or the counts were reset.
+
+    `damaged` bytes (a parity or framing error) and `breaks` came marked, and failed the attempt that was on the wire.
+    `driver` is the driver's own count, which tells them apart and has losses too; None where it keeps none.
+    """
+
+    damaged: int
+    breaks: int
+    driver: DriverErrors | None
+
+
+@dataclass(frozen=True, slots=True)
 class LineStatistics:
     """Counts of the line since the last reset; times in seconds."""
 
@@ -66,6 +91,8 @@ class LineStatistics:
     backlog: int
     waits: tuple[Quantiles, Quantiles, Quantiles, Quantiles]
     """From being queued to being started, for URGENT, COMMAND, POLL and BACKGROUND."""
+    uart: UartStatistics | None = None
+    """What a serial port's UART found wrong; None for ports that are none, and while the port is lost."""
 
     @property
     def utilisation(self) -> float:

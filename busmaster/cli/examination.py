@@ -129,7 +129,9 @@ def driver(descriptor: int) -> Iterator[Finding]:
 
 async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     where = patient.endpoint
+    assert wire.port is not None
     await wire.hear_all(OPENING)
+    wire.port.reset()
     heard = await wire.hear_all(LISTENING)
     talk = diagnosis.unasked(heard, patient.protocol)
     tell(talk)
@@ -148,6 +150,8 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     byte_time = (profile.line if settings is None else settings).byte_time
     prober = Prober(wire, profile, timings, byte_time, echo=heard.startswith(HARMLESS))
     records = await ask_all(patient, prober)
+    for finding in diagnosis.uart(wire.port.uart()):
+        tell(finding)
     if any(record.lives for record in records):
         for finding in diagnosis.nodes(records, timings.read):
             tell(finding)

@@ -50,6 +50,18 @@ LINE_COUNTS = {
     "losses": "Times the port was lost",
 }
 
+UART_COUNTS = {
+    "damaged": "Bytes that came with a parity or framing error",
+    "breaks": "Breaks that came",
+}
+DRIVER_COUNTS = {
+    "framing": "Framing errors, by the driver's count",
+    "parity": "Parity errors, by the driver's count",
+    "breaks": "Breaks, by the driver's count",
+    "overruns": "Bytes lost in the UART, by the driver's count",
+    "buffer_overruns": "Bytes lost because nobody read in time, by the driver's count",
+}
+
 
 class MetricsOutput(Output):
     """Serves until it is closed. Raises InvalidCommand if the extra is missing."""
@@ -135,6 +147,12 @@ class MetricsOutput(Output):
         yield GaugeMetricFamily("busmaster_line_backlog", "Transactions that wait", value=line.backlog)
         for name, text in LINE_COUNTS.items():
             yield CounterMetricFamily(f"busmaster_line_{name}", text, value=getattr(line, name))
+        uart = line.uart
+        for name, text in UART_COUNTS.items() if uart is not None else ():
+            yield CounterMetricFamily(f"busmaster_uart_{name}", text, value=getattr(uart, name))
+        driver = None if uart is None else uart.driver
+        for name, text in DRIVER_COUNTS.items() if driver is not None else ():
+            yield CounterMetricFamily(f"busmaster_uart_driver_{name}", text, value=getattr(driver, name))
         waits = GaugeMetricFamily(
             "busmaster_line_wait_p99_seconds", "From being queued to being sent, 99 of 100", labels=["priority"]
         )
