@@ -137,11 +137,11 @@ UART_ERRORS = {
     "damaged": ("parity or framing error", "wrong baud rate or parity, or no termination"),
     "breaks": (
         "break",
-        "swapped wires A and B, a loose contact, missing biasing, or a sender far slower than this port",
+        "swapped wires A and B, a loose contact, missing biasing, or a far slower sender",
     ),
     "overruns": (
         "byte lost in the UART",
-        "this machine comes too late: use an adapter that buffers more, or less load",
+        "this machine comes too late: use an adapter that buffers more",
     ),
     "buffer_overruns": ("byte lost in the driver", "nobody read in time: look for what keeps this machine busy"),
 }
