@@ -39,7 +39,7 @@ class Driver:
         self.queue = 0
         self.counts: dict[int, int] | None = {}
         self._really = fcntl.ioctl
-        monkeypatch.setattr(kernel.fcntl, "ioctl", self.ioctl)
+        monkeypatch.setattr(fcntl, "ioctl", self.ioctl)
 
     def ioctl(self, descriptor: int, request: int, answer: Any = 0, *rest: Any) -> Any:
         if request == termios.TIOCOUTQ:
@@ -90,11 +90,11 @@ async def test_what_lies_in_the_drivers_queue_has_not_left(far_end: FarEnd, driv
 async def test_the_drivers_counts_run_from_the_opening_or_the_reset_and_over_their_end(
     far_end: FarEnd, driver: Driver
 ) -> None:
-    driver.counts = {6: 10, 7: 20, 8: -1, 9: 40, 10: 50}  # frame, overrun, parity, brk, buf_overrun
+    driver.counts = {6: 10, 7: 20, 8: 2**31 - 1, 9: 40, 10: 50}  # frame, overrun, parity, brk, buf_overrun
     transport, recorder = await opened(far_end.path)
     port = open_port(transport)
     assert port.uart() == UartStatistics(0, 0, DriverErrors(0, 0, 0, 0, 0))
-    driver.counts = {6: 11, 7: 22, 8: 2, 9: 44, 10: 55}
+    driver.counts = {6: 11, 7: 22, 8: -(2**31) + 2, 9: 44, 10: 55}
     port.note(Mark.BREAK)
     port.note(Mark.DAMAGED)
     port.note(Mark.DAMAGED)
@@ -156,6 +156,11 @@ class Peer:
         port = open_port(transport)
         assert isinstance(port, Socket)
         return transport, port, recorder
+
+    def read_all(self) -> None:
+        """Read to the end of the connection."""
+        while self.connection.recv(1_000_000):
+            pass
 
     def close(self) -> None:
         self.connection.close()
@@ -226,8 +231,7 @@ def test_what_a_peer_that_stops_reading_has_no_room_for_has_not_left(peer: Peer,
         transport.abort()
         await recorder.lost()
         with pytest.raises(ConnectionResetError):
-            while peer.connection.recv(1_000_000):
-                pass
+            peer.read_all()
 
     run(main())
 

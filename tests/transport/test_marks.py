@@ -19,7 +19,6 @@ from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import serve_pty
 from busmaster.protocols import msc
-from busmaster.transport import marks
 from busmaster.transport.marks import Unescape
 from busmaster.transport.serial_port import PortTransport
 from busmaster.wire.checks import xor
@@ -50,14 +49,14 @@ class Marked(Recorder):
 
     def __init__(self) -> None:
         super().__init__()
-        self.heard: list[tuple[bytes, Mark | None]] = []
+        self.pieces: list[tuple[bytes, Mark | None]] = []
 
     def data_received(self, data: bytes) -> None:
-        self.heard.append((data, None))
+        self.pieces.append((data, None))
         super().data_received(data)
 
     def byte_marked(self, byte: bytes, mark: Mark) -> None:
-        self.heard.append((byte, mark))
+        self.pieces.append((byte, mark))
         super().data_received(b"")
 
 
@@ -142,7 +141,7 @@ async def marked(far_end: FarEnd) -> tuple[PortTransport, Marked]:
 async def test_errors_and_breaks_come_in_order_with_the_data(far_end: FarEnd) -> None:
     transport, recorder = await marked(far_end)
     far_end.write(SAID)
-    await recorder.until(lambda _: joined(recorder.heard) == HEARD)
+    await recorder.until(lambda _: joined(recorder.pieces) == HEARD)
     await closed(transport, recorder)
 
 
@@ -154,7 +153,7 @@ async def test_a_mark_split_over_reads_is_put_together(far_end: FarEnd) -> None:
         far_end.write(bytes((byte,)))
         readable(transport.get_extra_info("serial").fileno())
         transport._read_ready()
-    assert joined(recorder.heard) == HEARD
+    assert joined(recorder.pieces) == HEARD
     await closed(transport, recorder)
 
 
@@ -213,7 +212,7 @@ async def test_where_the_driver_refuses_to_mark_data_passes_as_before(
     def refuse(descriptor: int, when: int, settings: list[Any]) -> None:
         really_set(descriptor, when, [settings[0] & ~termios.PARMRK, *settings[1:]])
 
-    monkeypatch.setattr(marks.termios, "tcsetattr", refuse)
+    monkeypatch.setattr(termios, "tcsetattr", refuse)
     transport, recorder = await opened(far_end.path)
     assert not transport.get_extra_info("serial").marks
     far_end.write(SAID)

@@ -62,6 +62,12 @@ class Ledger:
     def get_write_buffer_size(self) -> int:
         return self.has
 
+    def discard_unsent(self) -> None:
+        self.notes.append(("discarded",))
+
+    def abort(self) -> None:
+        self.notes.append(("aborted",))
+
     # the arbiter
 
     out: bytes | None = None
@@ -139,6 +145,20 @@ def test_a_write_that_the_port_did_not_take_is_told_at_once_and_so_is_its_leavin
     ]
 
 
+def test_output_that_is_given_up_is_discarded_before_its_transport_is_aborted(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    assert pump._port is not None
+    pump._port.discard_unsent = ledger.discard_unsent  # type: ignore[method-assign]
+    ledger.is_due, ledger.has = True, 2
+    pump._on_time()
+    ledger.time = STUCK_AFTER - 0.1
+    pump._on_time()
+    assert ("aborted",) not in ledger.notes
+    ledger.time = STUCK_AFTER
+    pump._on_time()
+    assert ledger.notes[-3:] == [("discarded",), ("aborted",), ("timeout", STUCK_AFTER, False)]
+
+
 # -- a port that holds its output ------------------------------------------------------------------------------------
 
 
@@ -155,7 +175,7 @@ def test_a_request_held_back_is_waited_for_and_nothing_else_is_sent_meanwhile(he
             await asyncio.sleep(held)
             assert transport_of(bus).get_write_buffer_size() == len(hcp2.Read(1).open(1, first.node.timings).request)
             transport_of(bus).release()
-            assert await reading == [11, 22]
+            assert tuple(await reading) == (11, 22)
             assert held + 0.18 < bus.now() - began < held + 0.3
             assert first.node.statistics().no_reply == 0
 
