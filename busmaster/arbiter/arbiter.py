@@ -40,7 +40,7 @@ from busmaster.arbiter.counters import LineCounters, LineStatistics
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.echo import Echo
-from busmaster.arbiter.events import Event, LineChange, LineChanged, Mark, Strayed
+from busmaster.arbiter.events import Event, LineChange, LineChanged, Strayed
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.schedule import Poll
@@ -51,8 +51,6 @@ from busmaster.errors import BusClosed, BusError, LineDown, LineNoisy, Refused
 from busmaster.exchange import NO_REPLY, Abandonable, Done, Exchange, Expect, FrameError, ReplyTiming, Timings
 from busmaster.profile import Profile
 
-ASK_AGAIN = 0.005
-"""Seconds after which output that had not left is asked for again."""
 UNKNOWN_LATENESS = 0.150
 """Assumed of an earlier master's nodes while none is known."""
 
@@ -83,8 +81,6 @@ class Arbiter:
         self._cause = "not open yet"
         self._closed = False
         self._out = b""
-        self._handed = now
-        self._held = False
         # the exchange on the wire
         self._transaction: Transaction | None = None
         self._exchange: Exchange[Any] | None = None
@@ -191,46 +187,6 @@ class Arbiter:
             self._strays.last_byte = now
             self._take(data, now)
 
-    def transmitted(self, now: float) -> None:
-        """What `poll_transmit` gave was handed to the port at this time."""
-        late = now - self._handed
-        self._handed = now
-        if late > 0 and not self._held:
-            self._leg.shift(late)
-            if self.state is not READY:
-                self._deadlines.line += late
-
-    def line_due(self, now: float) -> bool:
-        """A window, a gap, a holdoff or a settle is over."""
-        return now >= self._deadlines.line
-
-    def unsent(self, count: int, now: float) -> None:
-        """So many bytes have not left yet: nothing runs out; when it is none after it was some, times start here."""
-        if count > 0:
-            self._held = True
-            self._deadlines.line = now + ASK_AGAIN
-        elif self._held:
-            self._held = False
-            self._leg.shift(max(0.0, now - self._leg.end))
-            if self.state is SETTLING:
-                self._settle(now)
-            elif self.state is HOLDOFF or (self._exchange is not None and not self._exchange.answered):
-                self._deadlines.line = now + self._leg.timing.turnaround
-            elif self.state is EXCHANGE and self._leg.begun:
-                self._deadlines.line = self._leg.gap_over(now)
-            elif self.state is EXCHANGE:
-                self._deadlines.line = self._leg.echoed(now)
-            else:
-                self._deadlines.line = inf
-
-    def byte_marked(self, mark: Mark, now: float) -> None:
-        """The UART marked a byte: the attempt on the wire fails, between exchanges it is a stray."""
-        self._strays.last_byte = now
-        if self.state is EXCHANGE:
-            self._attempt_failed(FrameError(mark.value), now)
-        elif self.state is not OFFLINE:
-            self._settle(now)
-
     def handle_timeout(self, now: float, *, unread: bool = False) -> None:
         """`unread`: bytes have come that were not handed over yet, so the silence of the line is not known."""
         deadlines = self._deadlines
@@ -303,7 +259,6 @@ class Arbiter:
         """Say `send`; its reply must begin within the window, and end within the bound of R2."""
         byte_time = self.byte_time
         said = len(send) * byte_time
-        self._handed = now
         self._deadlines.line = self._leg.begin(timing, said, longest * byte_time, now)
         if send:
             self._out += send
@@ -422,7 +377,6 @@ class Arbiter:
     def _say(self, send: bytes, now: float) -> float:
         """Send what closes an exchange; returns when it is out."""
         self._out += send
-        self._handed = now
         self._echo.sent(send)
         self._leg.end = now + len(send) * self.byte_time
         return self._leg.end
@@ -520,7 +474,6 @@ class Arbiter:
         self._enter(OFFLINE, now)
         self.noisy = False
         self._deadlines.line = inf
-        self._held = False
         self._out = b"" if transaction is not None else self._out
         self._echo.forget()
         self._strays.answered()

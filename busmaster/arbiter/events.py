@@ -57,13 +57,6 @@ class LineChange(enum.Enum):
     QUIET = "quiet"
 
 
-class Mark(enum.Enum):
-    """What a UART found wrong with a byte. The value is how an error calls it."""
-
-    DAMAGED = "parity or framing error"
-    BREAK = "break"
-
-
 @dataclass(frozen=True, slots=True)
 class LineChanged:
     """The line changed, and why where that is known."""

@@ -59,13 +59,6 @@ class Leg:
         self.end = now
         return now + self.timing.window + self.latency
 
-    def shift(self, late: float) -> None:
-        """What was said left so many seconds later than was believed."""
-        self.end += late
-        self._limit += late
-        self.late_after += late
-        self.taint_until += late
-
     def quiet(self) -> float:
         """The silence, in seconds, after which nothing more of a frame can come."""
         return max(QUIET, self.timing.byte_gap)
