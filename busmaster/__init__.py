@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles, UartStatistics
+from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
 from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, NodeChanged
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.state import LineState
@@ -107,7 +107,6 @@ __all__ = [
     "TcpPort",
     "Timeline",
     "Timings",
-    "UartStatistics",
     "VerifyFailed",
     "WriteUnconfirmed",
     "endpoint",

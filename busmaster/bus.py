@@ -245,12 +245,12 @@ class Bus:
 
     def statistics(self) -> LineStatistics:
         """An immutable snapshot of the line's counts since it was opened or reset."""
-        return replace(self._arbiter.statistics(self.now()), uart=self.pump.uart())
+        return replace(self._arbiter.statistics(self.now()), driver=self.pump.driver_errors())
 
     def reset_statistics(self) -> None:
         """Start all counts of line, nodes and groups again."""
         self._arbiter.reset_statistics(self.now())
-        self.pump.reset_uart()
+        self.pump.reset_driver_errors()
         for group in self._groups:
             group.reset_statistics()
 

@@ -140,16 +140,18 @@ Step: TypeAlias = Need | Expect | Done[T_co]
 class FrameError(Exception):
     """This is no reply: the attempt failed. Never reaches a caller.
 
-    `whole` is True only for a whole frame with the right echo and a bad checksum: then nothing more can follow and
-    the line need not wait for stragglers (R3). `send` is a closing ACK owed to the device all the same (MSC), else
-    it retransmits into other exchanges.
+    `whole` is True only for a whole frame with the right echo and a bad checksum: its reply has begun, so the line
+    need not wait for stragglers, only for silence (R3). `send` is a closing ACK owed to the device all the same
+    (MSC), else it retransmits into other exchanges. `heard` is all that came in place of the reply, where it may be
+    another request's: it pays what is owed (R15).
     """
 
-    def __init__(self, what: str, *, whole: bool = False, send: bytes = b"") -> None:
+    def __init__(self, what: str, *, whole: bool = False, send: bytes = b"", heard: bytes = b"") -> None:
         super().__init__(what)
         self.what = what
         self.whole = whole
         self.send = send
+        self.heard = heard
 
 
 class Exchange(Protocol[T_co]):
@@ -181,6 +183,19 @@ class Exchange(Protocol[T_co]):
     @property
     def starts(self) -> bytes:
         """The legal first bytes of the first reply leg; anything else is a FrameError."""
+        ...
+
+    @property
+    def answers(self) -> Sequence[bytes]:
+        """What its good replies begin with, or are where they are one byte: one for each reply that decides.
+
+        Two exchanges that share one could be taken for each other (R15). Empty for a broadcast.
+        """
+        ...
+
+    @property
+    def owed(self) -> Sequence[bytes]:
+        """What its node may still say if the attempt ends now, unheard: of the same kind as `answers` (R15)."""
         ...
 
     @property

@@ -58,7 +58,9 @@ class Profile:
 
     `probe` is its cheapest read, asked of a node that may be dead. `merge` proposes cheaper exchanges for commands of
     one node; a poll group and the planner weigh them by line time. `listen` reads what arrives while nothing is
-    asked. `exchange_limit` bounds one exchange as a whole, in seconds (MSC: past it a bad packet is ACKed away); its
+    asked. `checks` are further cheap reads that harm no node and whose answers differ: where an answer could be
+    another request's, one of those is asked that cannot be (R15); a node that refuses one is asked another.
+    `exchange_limit` bounds one exchange as a whole, in seconds (MSC: past it a bad packet is ACKed away); its
     exchanges are `Abandonable`.
     """
 
@@ -68,6 +70,7 @@ class Profile:
     line: LineSettings
     timings: Timings
     probe: Command[Any]
+    checks: Sequence[Command[Any]] = ()
     broadcast: int | None = None
     addressed: bool = True
     retries: int = 2

@@ -24,10 +24,15 @@ SETTLING   stray: silence starts  READY                    down: OFFLINE, all fa
 =========  =====================  =======================  ==========================  ====================
 
 READY never lasts while something waits: whatever leads to READY starts the next transaction in the same call.
-An exchange ends in READY or HOLDOFF only when its outcome is certain: a reply that matches, with nothing behind it; a
-NAK to a write; or a whole frame with the right echo whose checksum is bad. Everything else settles.
+An exchange ends in READY or HOLDOFF only when its outcome is certain: a reply that matches, with nothing behind it, or
+a NAK to a write. Everything else settles: until silence and past the lateness (leg.py has the times), or until silence
+alone where the reply is known to have begun.
 
-What goes next and what becomes of a failed attempt is the dispatcher's business (dispatcher.py).
+Time starts when bytes have left. `poll_transmit` hands them over; `transmitted` says when the port had taken them, and
+`unsent`, asked for when a deadline of the line falls due, how many have not left yet: until then, nothing runs out.
+
+What goes next is chosen in choice.py, by what is owed (in_step.py). What becomes of a failed attempt is dispatcher.py's
+business.
 """
 
 from __future__ import annotations
@@ -36,16 +41,18 @@ from collections.abc import Callable
 from math import inf
 from typing import Any, cast
 
+from busmaster.arbiter.choice import Choice
 from busmaster.arbiter.counters import LineCounters, LineStatistics
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.echo import Echo
-from busmaster.arbiter.events import Event, LineChange, LineChanged, Strayed
-from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.events import Event, LineChange, LineChanged, Mark, Strayed
+from busmaster.arbiter.health import DOWN, NodeRecord
+from busmaster.arbiter.in_step import ANY_BYTE, InStep
 from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
-from busmaster.arbiter.strays import QUIET, Strays
+from busmaster.arbiter.strays import LOOK_SLACK, QUIET, Strays
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import BusClosed, BusError, LineDown, LineNoisy, Refused
 from busmaster.exchange import NO_REPLY, Abandonable, Done, Exchange, Expect, FrameError, ReplyTiming, Timings
@@ -53,6 +60,10 @@ from busmaster.profile import Profile
 
 UNKNOWN_LATENESS = 0.150
 """Assumed of an earlier master's nodes while none is known."""
+HELD_LOOK = 0.002
+"""Seconds after which a port that holds what was said is asked again."""
+SLOWER, SLOWER_BY = 1.25, 0.001
+"""A doubtful answer is not believed if it comes later than so many times its node's slowest reply, and seconds."""
 
 
 class Arbiter:
@@ -67,8 +78,8 @@ class Arbiter:
         receive_latency: float = 0.0,
         capacity: int = 1000,
         jitter: Callable[[], float] = lambda: 0.5,
+        strict: bool = False,
     ) -> None:
-        self.byte_time = byte_time
         self.state = OFFLINE
         self.noisy = False
         self._echo = Echo(echo)
@@ -81,15 +92,31 @@ class Arbiter:
         self._cause = "not open yet"
         self._closed = False
         self._out = b""
+        self._said_at = -inf
+        self._held = False
         # the exchange on the wire
         self._transaction: Transaction | None = None
         self._exchange: Exchange[Any] | None = None
-        self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency)
+        self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency, byte_time)
         self._strayed_within = False
+        self._in_step = InStep()
+        self._choice = Choice(self.dispatcher, self._in_step)
+        self._strict = strict
+        self._doubted: Done[Any] | None = None
         # the line
         self._strays = Strays(self._events, self._counters)
         self._up_at = -inf
         self._quarantine = -inf
+        self._silent_at = -inf
+
+    @property
+    def byte_time(self) -> float:
+        """tau: seconds per byte of this line."""
+        return self._leg.byte_time
+
+    @byte_time.setter
+    def byte_time(self, seconds: float) -> None:
+        self._leg.byte_time = seconds
 
     # commands
 
@@ -107,7 +134,7 @@ class Arbiter:
         self.dispatcher.nodes.append(node)
         if profile.listen is not None and self._strays.listener is None:
             self._strays.listener = profile.listen()
-        self._quarantine = max(self._quarantine, self._up_at + node.lateness + self._leg.latency)
+        self._quarantine = max(self._quarantine, self._up_at + node.lateness + self._leg.latency + self.byte_time)
         return node
 
     def submit(self, transaction: Transaction, now: float) -> bool:
@@ -161,7 +188,7 @@ class Arbiter:
         self._events.append(LineChanged(LineChange.UP))
         lateness = max((node.lateness for node in self.dispatcher.nodes), default=UNKNOWN_LATENESS)
         self._up_at = now
-        self._quarantine = now + lateness + self._leg.latency
+        self._quarantine = now + lateness + self._leg.latency + self.byte_time
         self._settle(now)
 
     def line_down(self, cause: str, now: float) -> None:
@@ -187,6 +214,59 @@ class Arbiter:
             self._strays.last_byte = now
             self._take(data, now)
 
+    def byte_marked(self, mark: Mark, now: float) -> None:
+        """The UART says that a byte came damaged, or a break: whatever it was, it is nobody's answer."""
+        if mark is Mark.BREAK:
+            self._counters.breaks += 1
+        else:
+            self._counters.damaged += 1
+        self._strays.last_byte = now
+        self._echo.forget()
+        if self.state is EXCHANGE:
+            self._leg.begun = True
+            self._attempt_failed(FrameError(f"{mark.value} in the reply, says the port"), now)
+        else:
+            self._stray(b"\0", now)
+
+    def transmitted(self, now: float) -> None:
+        """The port has taken only now what `poll_transmit` gave: whoever held the process up meanwhile."""
+        late = now - self._said_at
+        if late > 0:
+            self._said_at = now
+            self._leg.shift(late)
+            self._deadlines.line += late
+            if self.state is SETTLING:
+                self._silent_at += late
+            if late > LOOK_SLACK and self._transaction is not None:
+                self._transaction.started += late
+
+    def line_due(self, now: float) -> bool:
+        """A deadline of the line falls due: `unsent` is to be told first, where it is known."""
+        return now >= self._deadlines.line
+
+    def unsent(self, count: int, now: float) -> None:
+        """So many of the bytes said have not left: until they have, nothing runs out and nothing else is said."""
+        if count:
+            self._held = True
+            self._deadlines.line = now + max(count * self.byte_time, HELD_LOOK)
+        elif self._held:
+            self._held = False
+            self._leg.shift(max(0.0, now - self._leg.end))
+            self._deadlines.line = self._due_anew(now)
+
+    def _due_anew(self, now: float) -> float:
+        """The deadline of the line, from the end of what has only just left."""
+        leg = self._leg
+        if self.state is EXCHANGE:
+            if leg.begun:
+                return leg.gap_over(now)
+            answered = self._exchange is not None and self._exchange.answered
+            return now + (leg.timing.window + leg.latency if answered else leg.timing.turnaround)
+        if self.state is SETTLING:
+            self._settle(now)
+            return self._deadlines.line
+        return now + leg.timing.turnaround if self.state is HOLDOFF else inf
+
     def handle_timeout(self, now: float, *, unread: bool = False) -> None:
         """`unread`: bytes have come that were not handed over yet, so the silence of the line is not known."""
         deadlines = self._deadlines
@@ -196,10 +276,15 @@ class Arbiter:
             self.dispatcher.expire(now)
         if now >= deadlines.health:
             self._enter(self.state, now)
-            self.dispatcher.probe(now)
+            self.dispatcher.probe(now, self.state is READY)
         if now >= deadlines.line and not unread:
             if self.state is EXCHANGE:
-                self._take(None, now)
+                if self._doubted is None:
+                    self._take(None, now)
+                else:
+                    self._complete(self._doubted, now)
+            elif self.state is SETTLING and now < self._silent_at:
+                deadlines.line = self._strays.look_before(self._silent_at, now)
             else:
                 self._free(now)
         elif self.state is READY:
@@ -229,39 +314,39 @@ class Arbiter:
 
     # one exchange
 
-    def _advance(self, now: float, free: float = -inf) -> bool:
-        """Start the next transaction, right behind our own last byte, which is out at `free`. False if none waits."""
+    def _advance(self, now: float) -> bool:
+        """Start the next transaction, right behind our own last byte. False if none waits."""
         if now < self._quarantine:
             self._settle(now)
             return True
-        while (transaction := self.dispatcher.next(now)) is not None:
-            node = transaction.node
-            try:
-                exchange = transaction.command.open(node.address, node.timings)
-            except Exception as bug:
-                self.dispatcher.unsendable(transaction, bug, now)
-            else:
-                break
-        else:
+        chosen = self._choice.next(now, now - self._strays.last_byte - self._leg.latency)
+        if chosen is None:
             return False
+        if type(chosen) is not tuple:
+            self._quarantine = cast("float", chosen)
+            self._settle(now)
+            return True
+        transaction, exchange = chosen
         self.dispatcher.started(transaction, now)
         self._transaction = transaction
         self._exchange = exchange
         self._strayed_within = False
         if self.state is not EXCHANGE:
             self._enter(EXCHANGE, now)
-        self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, free if free > now else now)
+        self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, now)
         if not exchange.answered:
             self._deadlines.line = self._leg.end + exchange.timing.turnaround
+        if self._strays.watching:
+            self._strays.looked(now, self._deadlines.line)
         return True
 
     def _begin_leg(self, timing: ReplyTiming, longest: int, send: bytes, now: float) -> None:
         """Say `send`; its reply must begin within the window, and end within the bound of R2."""
-        byte_time = self.byte_time
-        said = len(send) * byte_time
-        self._deadlines.line = self._leg.begin(timing, said, longest * byte_time, now)
+        said = len(send)
+        self._deadlines.line = self._leg.begin(timing, said, longest, now)
         if send:
             self._out += send
+            self._said_at = now
             if self._echo.declared:
                 self._echo.sent(send)
             elif self._paced:
@@ -289,6 +374,8 @@ class Arbiter:
                 return b""
             data = kept
         leg.begun = True
+        if leg.end > now:  # an unpaced port: what was answered has left
+            leg.end = now
         if transaction.first_byte == -inf:
             transaction.first_byte = now
         if now > leg.late_after:
@@ -310,9 +397,11 @@ class Arbiter:
         except Refused as refusal:
             self._refused(refusal, now)
         except Exception as bug:
-            self._attempt_failed(FrameError(f"a bug in the protocol's reader: {bug!r}"), now)
+            self._attempt_failed(FrameError(f"a bug in the protocol's reader: {bug!r}"), now, bug=bug)
         else:
-            if type(step) is Done:
+            if self._doubted is not None:
+                self._second_answer(data or b"", now)
+            elif type(step) is Done:
                 self._complete(step, now)
             elif self._leg.begun:
                 self._deadlines.line = self._leg.gap_over(now)
@@ -328,79 +417,154 @@ class Arbiter:
 
     def _complete(self, step: Done[Any], now: float) -> None:
         """A value: the line is free when the closing ACK has left and the node has let go of the line."""
-        transaction = self._transaction
+        transaction, exchange = self._transaction, self._exchange
         assert transaction is not None
-        answered = self._exchange is not None and self._exchange.answered
-        free = self._say(step.send, now) if step.send else now
+        assert exchange is not None
+        answered = exchange.answered
+        if answered:
+            if self._in_step.alert and not self._believes(step, now):
+                return
+            took = transaction.first_byte - self._leg.end
+            transaction.node.note_reply(exchange.answers, transaction.command, took)
+        if step.send:
+            self._say(step.send, now)
         self._end_exchange()
         self.dispatcher.succeeded(transaction, step.value, now)
         if step.rest:
             self._strays.note(step.rest, now, self._leg.quiet())
+            self._in_step.owe((ANY_BYTE,), None, now, now)
         if step.rest or self._strayed_within or (self._echo.owed and not answered):
             self._settle(now)
             return
         self._strays.answered()
-        self._release(free, self._leg.timing.turnaround if answered else 0.0, now)
+        self._release(self._leg.timing.turnaround if answered else 0.0, now)
 
-    def _attempt_failed(self, error: FrameError, now: float, no_reply: bool = False) -> None:
-        transaction = self._transaction
+    def _believes(self, step: Done[Any], now: float) -> bool:
+        """R15: this answer can be nobody else's. If it could, the attempt has failed, or is held for a while."""
+        transaction, exchange, in_step, leg = self._transaction, self._exchange, self._in_step, self._leg
+        assert transaction is not None
+        assert exchange is not None
+        answers = exchange.answers
+        held, self._doubted = self._doubted is not None, None
+        if in_step.clashes(answers):
+            in_step.doubtful_answer(answers)
+            self._doubt("its answer may be an earlier request's, whose own never came", step, now)
+            return False
+        if in_step.is_doubtful(answers, now) and not held:
+            slowest = transaction.node.slowest
+            latest = leg.end + (SLOWER * slowest + SLOWER_BY if slowest else leg.timing.nominal) + leg.latency
+            if step.rest or transaction.first_byte > latest:
+                self._doubt("its answer may be another's, said late or twice", step, now)
+                return False
+            if self._strict:
+                self._doubted = step
+                self._deadlines.line = max(now, latest) + 2 * self.byte_time
+                return False
+        in_step.answered(transaction.node, transaction.started, now)
+        in_step.said(answers, now)
+        return True
+
+    def _doubt(self, what: str, step: Done[Any], now: float) -> None:
+        self._counters.doubted += 1
+        if step.rest:
+            self._strays.note(step.rest, now, self._leg.quiet())
+        self._attempt_failed(FrameError(what, send=step.send), now)
+
+    def _second_answer(self, data: bytes, now: float) -> None:
+        """More came while an answer was held: two where one is due, and neither is believed."""
+        step, self._doubted = self._doubted, None
+        assert step is not None
+        self._doubt("two answers came", Done(None, data, step.send), now)
+
+    def _attempt_failed(
+        self, error: FrameError, now: float, no_reply: bool = False, bug: Exception | None = None
+    ) -> None:
+        transaction, leg, strays = self._transaction, self._leg, self._strays
         assert transaction is not None
         what = error.what
         if no_reply:
-            self._strays.unanswered(transaction.node, self._leg.end, self._leg.timing.lateness)
+            strays.unanswered(transaction.node, leg.end, leg.timing.lateness)
             if what == NO_REPLY:
-                what = f"no reply within {self._leg.timing.window * 1000:g} ms"
+                what = f"no reply within {leg.timing.window * 1000:g} ms"
             if self._echo.owed:
                 what += ", and no echo of the request: if the adapter has none, leave echo out"
         elif not error.whole:
-            self._strays.blame(now)
-        free = self._say(error.send, now) if error.send else now
+            strays.blame(now)
+        if error.heard:
+            strays.run[:] = error.heard
+        spared = error.whole and not self._in_step.debts
+        self._owe(error.whole, no_reply)
+        if error.send:
+            self._say(error.send, now)
         self._end_exchange(failed=True)
-        self.dispatcher.attempt_failed(transaction, no_reply, what, now)
-        if error.whole:
-            self._release(free, self._leg.timing.turnaround, now)
+        if bug is None:
+            self.dispatcher.attempt_failed(transaction, no_reply, what, now)
         else:
-            self._settle(now)
+            self.dispatcher.broken(transaction, bug, now)
+        self._settle(now, begun=spared)
+
+    def _owe(self, whole: bool, no_reply: bool) -> None:
+        """The attempt ends: its reply, or what is left of it, may still come (R15)."""
+        transaction, exchange = self._transaction, self._exchange
+        if transaction is not None and exchange is not None and exchange.answered:
+            keys = () if whole else tuple(exchange.owed)
+            if not no_reply:
+                keys += (ANY_BYTE,)
+            self._in_step.owe(keys, transaction.node, self._leg.end, self._leg.past())
 
     def _refused(self, refusal: Refused, now: float) -> None:
-        """A NAK to a write is certain; a NAK to a read may be noise before the true reply (R7)."""
+        """A NAK to a write is certain; a NAK to a read may be noise before the true reply (R7).
+
+        While something is owed, no refusal is certain: it may be an earlier request's (R15).
+        """
         transaction = self._transaction
         assert transaction is not None
+        if self._in_step.debts:
+            if not transaction.check:
+                self._attempt_failed(FrameError("a refusal that may be an earlier request's"), now)
+                return
+            self._owe(False, True)
+        confirmed = transaction.refusals > 0
         transaction.last_byte = now
         self._end_exchange()
         self.dispatcher.refused(transaction, refusal, now)
         if transaction.writes:
-            self._release(now, self._leg.timing.turnaround, now)
+            self._release(self._leg.timing.turnaround, now)
         else:
-            self._settle(now)
+            self._settle(now, begun=confirmed)
 
-    def _say(self, send: bytes, now: float) -> float:
-        """Send what closes an exchange; returns when it is out."""
+    def _say(self, send: bytes, now: float) -> None:
+        """Send what closes an exchange, or answers a stray packet."""
         self._out += send
+        self._said_at = now
         self._echo.sent(send)
-        self._leg.end = now + len(send) * self.byte_time
-        return self._leg.end
+        self._leg.say(len(send), now)
 
     def _end_exchange(self, failed: bool = False) -> None:
         if failed and self._exchange is not None:
             self._leg.give_up(self._exchange.later)
         self._transaction = None
         self._exchange = None
+        self._doubted = None
         self._counters.exchanges += 1
 
     # the line between exchanges
 
-    def _release(self, free: float, hold: float, now: float) -> None:
+    def _release(self, hold: float, now: float) -> None:
         """The outcome was certain: the next request may follow `hold` seconds behind our own last byte."""
         if self._closed:
             self._go_offline(now)
-        elif hold or not self._advance(now, free):
-            held = free + hold > now
+        elif hold or not self._advance(now):
+            free = max(now, self._leg.end) + hold
+            held = free > now
             self._enter(HOLDOFF if held else READY, now)
-            self._deadlines.line = free + hold if held else inf
+            self._deadlines.line = free if held else inf
 
-    def _settle(self, now: float) -> None:
-        """Discard until it has been silent long enough and nothing can come any more (R3)."""
+    def _settle(self, now: float, begun: bool = False) -> None:
+        """Discard until it has been silent long enough, and nothing can come any more (R3).
+
+        `begun`: the reply to the last request is known to have begun, so that silence is enough.
+        """
         if self._closed:
             self._go_offline(now)
             return
@@ -408,13 +572,15 @@ class Arbiter:
             self._counters.settles += 1
             self._enter(SETTLING, now)
         self._echo.forget()
-        silent = self._strays.last_byte + self._leg.quiet()
-        self._deadlines.line = max(self._leg.past(), silent, self._quarantine, now)
+        silent = max(self._strays.last_byte + self._leg.quiet(), self._quarantine, now)
+        self._silent_at = silent if begun else max(silent, self._leg.past())
+        self._deadlines.line = self._strays.look_before(self._silent_at, now)
 
     def _free(self, now: float) -> None:
         """A holdoff or a settle is over."""
         if self.state is SETTLING:
-            self._strays.silent()
+            self._leg.settled()
+            self._hear_out(self._strays.silent(), now)
             if self._answer_stray(self._strays.reply_to_silence(), now):
                 return
             if self.noisy:
@@ -430,6 +596,7 @@ class Arbiter:
         strays = self._strays
         strays.note(data, now, self._leg.quiet())
         self._leg.strayed(now)
+        self._in_step.owe((ANY_BYTE,), None, now, now)
         if self.state is OFFLINE:
             return
         self._settle(now)
@@ -441,6 +608,13 @@ class Arbiter:
             self._events.append(LineChanged(LineChange.NOISY))
             self.dispatcher.fault = lambda: LineNoisy("the line has not been silent for a second")
             self.dispatcher.fail_all(now)
+
+    def _hear_out(self, run: bytes, now: float) -> None:
+        """The line is silent, and this came before: whoever said it, and owed it, is alive (R11, R15)."""
+        node = self._in_step.heard(run, now) if run else None
+        if node is not None and node.health is DOWN:
+            node.probe_at = min(node.probe_at, now)
+            self.dispatcher.probes.plan()
 
     def _answer_stray(self, send: bytes, now: float) -> bool:
         """True if an answer was owed: then the line settles again."""
@@ -479,6 +653,7 @@ class Arbiter:
         self._strays.answered()
         self._strays.silent()
         if transaction is not None:
+            self._owe(False, False)
             self._end_exchange(failed=True)
             self.dispatcher.cut_off(transaction, self._offline(), now)
 

@@ -48,27 +48,16 @@ class NodeStatistics:
 
 @dataclass(frozen=True, slots=True)
 class DriverErrors:
-    """What a serial driver has counted of its UART's errors: `overruns` are bytes lost in the UART, `buffer_overruns`
-    bytes lost behind it because nobody read them in time."""
+    """What a serial driver has counted of its UART's errors, since the port was opened or the counts were reset.
+
+    `overruns` are bytes lost in the UART, `buffer_overruns` bytes lost behind it because nobody read them in time.
+    """
 
     framing: int
     parity: int
     breaks: int
     overruns: int
     buffer_overruns: int
-
-
-@dataclass(frozen=True, slots=True)
-class UartStatistics:
-    """What the UART found wrong with what came since the port was opened or the counts were reset.
-
-    `damaged` bytes (a parity or framing error) and `breaks` came marked, and failed the attempt that was on the wire.
-    `driver` is the driver's own count, which tells them apart and has losses too; None where it keeps none.
-    """
-
-    damaged: int
-    breaks: int
-    driver: DriverErrors | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +80,16 @@ class LineStatistics:
     backlog: int
     waits: tuple[Quantiles, Quantiles, Quantiles, Quantiles]
     """From being queued to being started, for URGENT, COMMAND, POLL and BACKGROUND."""
-    uart: UartStatistics | None = None
-    """What a serial port's UART found wrong; None for ports that are none, and while the port is lost."""
+    checks: int = 0
+    """Reads that were asked to prove that the line is in step (R15)."""
+    doubted: int = 0
+    """Answers that were not believed, since they could have been another request's (R15)."""
+    damaged: int = 0
+    """Bytes that the UART marked: a parity or framing error."""
+    breaks: int = 0
+    """Breaks that the UART saw."""
+    driver: DriverErrors | None = None
+    """What the serial driver has counted; None where it counts nothing, and while the port is lost."""
 
     @property
     def utilisation(self) -> float:
@@ -144,9 +141,13 @@ class LineCounters:
     __slots__ = (
         "_before",
         "_entered",
+        "breaks",
         "cancelled",
+        "checks",
         "collisions",
         "completed",
+        "damaged",
+        "doubted",
         "exchanges",
         "losses",
         "noise_bytes",
@@ -171,6 +172,7 @@ class LineCounters:
         self.since = since
         self.completed = self.cancelled = self.stray_bytes = self.noise_bytes = 0
         self.tainted = self.collisions = self.settles = self.noisy = self.losses = 0
+        self.checks = self.doubted = self.damaged = self.breaks = 0
         self._before = (self.exchanges, self._times(state, since))
         self.waits = (Histogram(), Histogram(), Histogram(), Histogram())
 
@@ -208,4 +210,8 @@ class LineCounters:
             self.losses,
             backlog,
             (Quantiles.of(first), Quantiles.of(second), Quantiles.of(third), Quantiles.of(fourth)),
+            self.checks,
+            self.doubted,
+            self.damaged,
+            self.breaks,
         )

@@ -48,6 +48,21 @@ class LatenessRaised:
     lateness: float
 
 
+@dataclass(frozen=True, slots=True)
+class LatenessLowered:
+    """An hour of prompt replies: this node's lateness is what it was before it was raised."""
+
+    node: NodeRecord
+    lateness: float
+
+
+class Mark(enum.Enum):
+    """What the UART says of a byte that it received."""
+
+    DAMAGED = "parity or framing error"
+    BREAK = "break"
+
+
 class LineChange(enum.Enum):
     """What became of the line: its port UP or DOWN, the line NOISY (nothing is sent) or QUIET again."""
 
@@ -73,4 +88,4 @@ class Strayed:
     collision: bool = False
 
 
-Event: TypeAlias = Completed | Polled | NodeChanged | LatenessRaised | LineChanged | Strayed
+Event: TypeAlias = Completed | Polled | NodeChanged | LatenessRaised | LatenessLowered | LineChanged | Strayed

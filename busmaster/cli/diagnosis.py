@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from busmaster.arbiter.counters import UartStatistics
+from busmaster.arbiter.counters import DriverErrors
 from busmaster.capture.decode import Decoder
 from busmaster.capture.dialects import dialect
 from busmaster.capture.frames import Kind
@@ -148,26 +148,23 @@ UART_ERRORS = {
 """How each count is called, and what to look for."""
 
 
-def uart_counts(found: UartStatistics) -> dict[str, int]:
-    """What was found wrong, by the keys of UART_ERRORS: the driver's counts where it has any, else our own."""
-    if found.driver is not None:
-        counts = {name: getattr(found.driver, name) for name in UART_ERRORS if name != "damaged"}
-        if any(counts.values()):
-            return {name: count for name, count in counts.items() if count}
-    return {name: count for name in ("damaged", "breaks") if (count := getattr(found, name))}
+def uart_counts(damaged: int, breaks: int, driver: DriverErrors | None) -> dict[str, int]:
+    """What was found wrong, by the keys of UART_ERRORS: the driver's counts where it has any, else the marks."""
+    counts = {} if driver is None else {name: getattr(driver, name) for name in UART_ERRORS if name != "damaged"}
+    if not any(counts.values()):
+        counts = {"damaged": damaged, "breaks": breaks}
+    return {name: count for name, count in counts.items() if count}
 
 
-def uart_text(found: UartStatistics) -> str:
+def uart_text(counts: Mapping[str, int]) -> str:
     """What was found wrong in a few words; empty if nothing was."""
-    return ", ".join(counted(count, UART_ERRORS[name][0]) for name, count in uart_counts(found).items())
+    return ", ".join(counted(count, UART_ERRORS[name][0]) for name, count in counts.items())
 
 
-def uart(found: UartStatistics | None) -> Iterator[Finding]:
+def uart(damaged: int, breaks: int, driver: DriverErrors | None) -> Iterator[Finding]:
     """What the UART found wrong while nodes were asked. Nothing is said of a port that cannot tell."""
-    if found is None:
-        return
-    counts = uart_counts(found)
-    if found.driver is not None and not counts:
+    counts = uart_counts(damaged, breaks, driver)
+    if driver is not None and not counts:
         yield Finding("uart", True, "no byte was damaged or lost")
     for name, count in counts.items():
         what, advice = UART_ERRORS[name]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import enum
-from collections import deque
+from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -43,6 +43,7 @@ class Wire(asyncio.Protocol):
         self.paced = False
         self.transport: asyncio.Transport | None = None
         self.port: OpenPort | None = None
+        self.marked: Counter[Mark] = Counter()
         self.closed = anyio.Event()
         self._tap = tap
         self._cause: Exception | None = None
@@ -56,8 +57,7 @@ class Wire(asyncio.Protocol):
 
     def byte_marked(self, byte: bytes, mark: Mark) -> None:
         """What is damaged is heard all the same: whoever looks for what is wrong wants to see it."""
-        assert self.port is not None
-        self.port.note(mark)
+        self.marked[mark] += 1
         self.data_received(byte)
 
     def data_received(self, data: bytes) -> None:

@@ -16,7 +16,7 @@ from busmaster.arbiter.state import LineState
 from busmaster.bus import Bus
 from busmaster.cli.app import OK
 from busmaster.cli.arguments import View, parse_value
-from busmaster.cli.diagnosis import uart_text
+from busmaster.cli.diagnosis import uart_counts, uart_text
 from busmaster.cli.drawing import draw
 from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row
 from busmaster.cli.output import emit_all, json_line, note, value_text
@@ -203,7 +203,7 @@ class Watch:
                 f"{node.label}: {node.requests} requests, {node.failed} failed, "
                 f"p50 {node.p50 * 1000:.2f} ms, p99 {node.p99 * 1000:.2f} ms"
             )
-        if counts.uart is not None and (text := uart_text(counts.uart)):
+        if text := uart_text(uart_counts(counts.damaged, counts.breaks, counts.driver)):
             note(f"uart: {text}; `busmaster doctor` says what to look for")
 
 

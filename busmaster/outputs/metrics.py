@@ -48,12 +48,10 @@ LINE_COUNTS = {
     "settles": "Times the line was left to settle",
     "noisy": "Times the line would not be silent",
     "losses": "Times the port was lost",
+    "damaged": "Bytes that came marked with a parity or framing error",
+    "breaks": "Breaks that came marked",
 }
 
-UART_COUNTS = {
-    "damaged": "Bytes that came with a parity or framing error",
-    "breaks": "Breaks that came",
-}
 DRIVER_COUNTS = {
     "framing": "Framing errors, by the driver's count",
     "parity": "Parity errors, by the driver's count",
@@ -147,12 +145,8 @@ class MetricsOutput(Output):
         yield GaugeMetricFamily("busmaster_line_backlog", "Transactions that wait", value=line.backlog)
         for name, text in LINE_COUNTS.items():
             yield CounterMetricFamily(f"busmaster_line_{name}", text, value=getattr(line, name))
-        uart = line.uart
-        for name, text in UART_COUNTS.items() if uart is not None else ():
-            yield CounterMetricFamily(f"busmaster_uart_{name}", text, value=getattr(uart, name))
-        driver = None if uart is None else uart.driver
-        for name, text in DRIVER_COUNTS.items() if driver is not None else ():
-            yield CounterMetricFamily(f"busmaster_uart_driver_{name}", text, value=getattr(driver, name))
+        for name, text in DRIVER_COUNTS.items() if line.driver is not None else ():
+            yield CounterMetricFamily(f"busmaster_driver_{name}", text, value=getattr(line.driver, name))
         waits = GaugeMetricFamily(
             "busmaster_line_wait_p99_seconds", "From being queued to being sent, 99 of 100", labels=["priority"]
         )

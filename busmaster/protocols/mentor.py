@@ -190,7 +190,7 @@ class Reading(TelegramReader[int]):
 class RunReading:
     """One attempt to read a run: a leg for each parameter."""
 
-    __slots__ = ("_leg", "_next", "_short", "_values", "later", "request", "timing")
+    __slots__ = ("_leg", "_next", "_short", "_values", "answers", "later", "request", "timing")
 
     sizes: ClassVar[Sizes] = Reading.sizes
     starts: ClassVar[bytes] = Reading.starts
@@ -205,7 +205,13 @@ class RunReading:
         self._short = _SHORT_COMMANDS[run.step]
         self._next = [b"%02d%02d" % (run.menu, number) for number in reversed(numbers[1:])]
         self._leg = Reading(self.request, echo, timing)
+        self.answers = tuple(STX + b"%02d%02d" % (run.menu, number) for number in numbers)
         self._values: list[int] = []
+
+    @property
+    def owed(self) -> Sequence[bytes]:
+        """The parameter asked for last: the next ones take a word from the host."""
+        return self._leg.answers
 
     def feed(self, data: bytes) -> Need | Expect | Done[tuple[int, ...]]:
         step = self._leg.feed(data)
@@ -243,6 +249,8 @@ class Broadcast(SingleLeg):
     sizes: ClassVar[Sizes] = Sizes(0, 0)
     starts: ClassVar[bytes] = b""
     answered: ClassVar[bool] = False
+    answers: ClassVar[Sequence[bytes]] = ()
+    owed: ClassVar[Sequence[bytes]] = ()
 
     def __init__(self, request: bytes, timing: ReplyTiming) -> None:
         super().__init__(request, replace(timing, turnaround=max(timing.turnaround, timing.nominal)))
@@ -297,6 +305,7 @@ PROFILE = Profile(
     line=LineSettings(9600, bytesize=7, parity="E"),
     timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.15, lateness=0.3, byte_gap=0.05)),
     probe=Read(1, 17),
+    checks=tuple(Read(1, number) for number in range(17, 22)),
 )
 CHAINED = replace(PROFILE, merge=merge_runs)
 """For lines on which short commands are safe: poll groups read neighbours as runs."""

@@ -322,6 +322,7 @@ PROFILE = Profile(
     line=LineSettings(9600),
     timings=Timings(read=_FIRST, write=_FIRST, packet=ReplyTiming(0.5, 1.0, 1.0, 0.1)),
     probe=ReadStatus(),
+    checks=(ReadStatus(), ReadFlag(0)),
     exchange_limit=2.0,
     listen=StalePacketListener,
 )

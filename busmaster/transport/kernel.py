@@ -15,8 +15,7 @@ import struct
 import termios
 from collections.abc import Callable
 
-from busmaster.arbiter.counters import DriverErrors, UartStatistics
-from busmaster.arbiter.events import Mark
+from busmaster.arbiter.counters import DriverErrors
 
 DELAYED_ACK = 0.050
 """Seconds for which a healthy peer may keep an acknowledgement back (Linux: 40 ms)."""
@@ -54,15 +53,12 @@ class OpenPort:
     def discard_unsent(self) -> None:
         """See to it that what has not left never leaves when the transport is aborted."""
 
-    def note(self, mark: Mark) -> None:
-        """Count a damaged byte."""
-
-    def uart(self) -> UartStatistics | None:
-        """What its UART found wrong since it was opened or reset; None where there is none to ask."""
+    def errors(self) -> DriverErrors | None:
+        """What its driver has counted since it was opened or reset; None where there is none that counts."""
         return None
 
     def reset(self) -> None:
-        """Start the UART's counts again."""
+        """Start the driver's counts again."""
 
 
 class _Descriptor(OpenPort):
@@ -97,24 +93,16 @@ class Tty(_Descriptor):
     def unsent(self, waited: float) -> int | None:
         return (super().unsent(waited) or 0) + self._count(termios.TIOCOUTQ)
 
-    def note(self, mark: Mark) -> None:
-        if mark is Mark.BREAK:
-            self._breaks += 1
-        else:
-            self._damaged += 1
-
-    def uart(self) -> UartStatistics | None:
+    def errors(self) -> DriverErrors | None:
         now, before = self._counted(), self._before
-        driver = None
-        if now is not None and before is not None:
-            framing, overruns, parity, breaks, lost = (
-                (now[field] - before[field]) & WRAP for field in (FRAME, OVERRUN, PARITY, BRK, BUF_OVERRUN)
-            )
-            driver = DriverErrors(framing, parity, breaks, overruns, lost)
-        return UartStatistics(self._damaged, self._breaks, driver)
+        if now is None or before is None:
+            return None
+        framing, overruns, parity, breaks, lost = (
+            (now[field] - before[field]) & WRAP for field in (FRAME, OVERRUN, PARITY, BRK, BUF_OVERRUN)
+        )
+        return DriverErrors(framing, parity, breaks, overruns, lost)
 
     def reset(self) -> None:
-        self._damaged = self._breaks = 0
         self._before = self._counted()
 
     def _counted(self) -> array.array[int] | None:

@@ -16,7 +16,7 @@ from typing import Any, Protocol, cast
 import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.counters import UartStatistics
+from busmaster.arbiter.counters import DriverErrors
 from busmaster.arbiter.events import Completed, Event, Mark, Polled
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import LineState
@@ -130,11 +130,11 @@ class Pump(asyncio.Protocol):
             self._run_out = anyio.Event()
             await self._run_out.wait()
 
-    def uart(self) -> UartStatistics | None:
-        """What the UART of the port that is open found wrong."""
-        return None if self._port is None else self._port.uart()
+    def driver_errors(self) -> DriverErrors | None:
+        """What the driver of the port that is open has counted: the arbiter does not know of it."""
+        return None if self._port is None else self._port.errors()
 
-    def reset_uart(self) -> None:
+    def reset_driver_errors(self) -> None:
         if self._port is not None:
             self._port.reset()
 
@@ -167,8 +167,6 @@ class Pump(asyncio.Protocol):
         now = self.clock()
         if self.tap is not None:
             self.tap.received(now, byte)
-        if self._port is not None:
-            self._port.note(mark)
         self.arbiter.byte_marked(mark, now)
         self.turn()
 

@@ -274,9 +274,9 @@ def test_r11_a_probe_that_is_answered_costs_what_it_took() -> None:
     bench = Bench()
     dead(bench)
     bench.until_sent()
-    before = bench.arbiter.dispatcher._budget.tokens
+    before = bench.arbiter.dispatcher.probes.budget.tokens
     bench.hear(FIVE, after=0.004)
-    assert bench.arbiter.dispatcher._budget.tokens == pytest.approx(before + PROBE_COST - 0.004, abs=0.002)
+    assert bench.arbiter.dispatcher.probes.budget.tokens == pytest.approx(before + PROBE_COST - 0.004, abs=0.002)
 
 
 def test_r11_a_request_to_a_dead_node_is_tried_once_while_the_budget_allows_and_then_fails_at_once() -> None:
@@ -298,7 +298,7 @@ def test_r11_a_request_to_a_dead_node_is_tried_once_while_the_budget_allows_and_
 def test_r11_an_owner_may_probe_at_any_time() -> None:
     bench = Bench()
     record = dead(bench)
-    bench.arbiter.dispatcher._budget.tokens = 0.0
+    bench.arbiter.dispatcher.probes.budget.tokens = 0.0
     probe = bench.ask(record, record.profile.probe, probe=True)
     bench.sent()
     bench.hear(FIVE, after=0.004)
@@ -321,7 +321,7 @@ def test_r11_what_waits_for_a_node_that_dies_is_not_sent() -> None:
     bench = Bench()
     record = bench.node()
     first = bench.ask(record, retries=0)
-    bench.arbiter.dispatcher._budget.tokens = 0.0
+    bench.arbiter.dispatcher.probes.budget.tokens = 0.0
     second = bench.ask(record, hcp2.Read(2))
     bench.wait(0.2)
     assert isinstance(first.error, NoReply)

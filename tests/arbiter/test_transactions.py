@@ -332,7 +332,7 @@ def test_r7_an_urgent_write_that_is_not_worth_line_time_still_supersedes_what_wa
     assert dead.health is Health.DOWN
     bench.ask(other)
     enable = bench.ask(dead, write(5))
-    bench.arbiter.dispatcher._budget.tokens = 0.0
+    bench.arbiter.dispatcher.probes.budget.tokens = 0.0
     disable = bench.ask(dead, write(0), priority=Priority.URGENT)
     assert isinstance(disable.error, NodeDown)
     assert isinstance(enable.error, Superseded)
@@ -385,7 +385,7 @@ def test_r11_whoever_looks_at_the_statistics_does_not_shorten_the_pauses_that_pa
         node = bench.node()
         bench.ask(node)
         bench.hear(FIVE, after=0.004)
-        budget = bench.arbiter.dispatcher._budget
+        budget = bench.arbiter.dispatcher.probes.budget
         budget.tokens, budget.probe = 0.0, 0.150
         for _ in range(looks):
             bench.wait(0.05)

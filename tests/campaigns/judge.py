@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
 from busmaster.arbiter.schedule import Poll
@@ -225,9 +226,11 @@ class Judge:
             self.problem(f"WRONG: {what}")
 
     def _check_wait(self, transaction: Transaction, asked: Asked) -> None:
-        """R9: an urgent read waits for the exchange on the wire and for what is ahead in its class."""
+        """R9: an urgent read waits for the exchange on the wire, for what is ahead in its class, and for the few that may
+        go before each of those (R15)."""
         ahead = transaction.exchanges_ahead
-        if transaction.priority is Priority.URGENT and not transaction.writes and ahead > 1 + asked.urgent_ahead:
+        most = 1 + MOST_BEFORE + (1 + MOST_BEFORE) * asked.urgent_ahead
+        if transaction.priority is Priority.URGENT and not transaction.writes and ahead > most:
             self.problem(f"R9: {ahead} exchanges went before an urgent one")
         if transaction.started > transaction.start_by + ROUNDING:
             self.problem(f"R12: {transaction.command} was sent after its time")

@@ -14,8 +14,7 @@ from typing import Any, cast
 import pytest
 import uvloop
 
-from busmaster.arbiter.counters import DriverErrors, UartStatistics
-from busmaster.arbiter.events import Mark
+from busmaster.arbiter.counters import DriverErrors
 from busmaster.transport import kernel
 from busmaster.transport.kernel import DELAYED_ACK, TIOCGICOUNT, Socket, open_port
 from busmaster.transport.tcp import TcpPort
@@ -93,22 +92,18 @@ async def test_the_drivers_counts_run_from_the_opening_or_the_reset_and_over_the
     driver.counts = {6: 10, 7: 20, 8: 2**31 - 1, 9: 40, 10: 50}  # frame, overrun, parity, brk, buf_overrun
     transport, recorder = await opened(far_end.path)
     port = open_port(transport)
-    assert port.uart() == UartStatistics(0, 0, DriverErrors(0, 0, 0, 0, 0))
+    assert port.errors() == DriverErrors(0, 0, 0, 0, 0)
     driver.counts = {6: 11, 7: 22, 8: -(2**31) + 2, 9: 44, 10: 55}
-    port.note(Mark.BREAK)
-    port.note(Mark.DAMAGED)
-    port.note(Mark.DAMAGED)
-    found = DriverErrors(framing=1, parity=3, breaks=4, overruns=2, buffer_overruns=5)
-    assert port.uart() == UartStatistics(damaged=2, breaks=1, driver=found)
+    assert port.errors() == DriverErrors(framing=1, parity=3, breaks=4, overruns=2, buffer_overruns=5)
     port.reset()
-    assert port.uart() == UartStatistics(0, 0, DriverErrors(0, 0, 0, 0, 0))
+    assert port.errors() == DriverErrors(0, 0, 0, 0, 0)
     await closed(transport, recorder)
 
 
 @pytest.mark.asyncio
 async def test_a_pty_has_no_counts_of_a_driver(far_end: FarEnd) -> None:
     transport, recorder = await opened(far_end.path)
-    assert open_port(transport).uart() == UartStatistics(0, 0, None)
+    assert open_port(transport).errors() is None
     await closed(transport, recorder)
 
 
@@ -120,7 +115,7 @@ def test_a_transport_that_cannot_tell_is_not_asked() -> None:
     port = open_port(cast("asyncio.Transport", Foreign()))
     assert port.unsent(LATER) is None
     assert not port.unread()
-    assert port.uart() is None
+    assert port.errors() is None
     assert open_port(asyncio.Transport()).unsent(LATER) is None
 
 
