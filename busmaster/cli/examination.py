@@ -9,7 +9,7 @@ from typing import Any
 import anyio.to_thread
 
 from busmaster.arbiter.events import Mark
-from busmaster.cli import diagnosis
+from busmaster.cli import diagnosis, uart
 from busmaster.cli.diagnosis import Record
 from busmaster.cli.probing import Outcome, Prober, Wire, opened
 from busmaster.cli.progress import Bar
@@ -152,7 +152,7 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     byte_time = (profile.line if settings is None else settings).byte_time
     prober = Prober(wire, profile, timings, byte_time, echo=heard.startswith(HARMLESS))
     records = await ask_all(patient, prober)
-    for finding in diagnosis.uart(wire.marked[Mark.DAMAGED], wire.marked[Mark.BREAK], wire.port.errors()):
+    for finding in uart.findings(wire.marked[Mark.DAMAGED], wire.marked[Mark.BREAK], wire.port.errors()):
         tell(finding)
     if any(record.lives for record in records):
         for finding in diagnosis.nodes(records, timings.read):

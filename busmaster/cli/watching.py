@@ -14,9 +14,9 @@ import anyio
 
 from busmaster.arbiter.state import LineState
 from busmaster.bus import Bus
+from busmaster.cli import uart
 from busmaster.cli.app import OK
 from busmaster.cli.arguments import View, parse_value
-from busmaster.cli.diagnosis import uart_counts, uart_text
 from busmaster.cli.drawing import draw
 from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row
 from busmaster.cli.output import emit_all, json_line, note, value_text
@@ -203,7 +203,7 @@ class Watch:
                 f"{node.label}: {node.requests} requests, {node.failed} failed, "
                 f"p50 {node.p50 * 1000:.2f} ms, p99 {node.p99 * 1000:.2f} ms"
             )
-        if text := uart_text(uart_counts(counts.damaged, counts.breaks, counts.driver)):
+        if text := uart.damage_text(uart.damage(counts.damaged, counts.breaks, counts.driver)):
             note(f"uart: {text}; `busmaster doctor` says what to look for")
 
 

@@ -224,36 +224,36 @@ async def test_where_the_driver_refuses_to_mark_data_passes_as_before(
 # -- up to the caller -------------------------------------------------------------------------------------------------
 
 
-def reply(value: int) -> bytes:
-    body = f"01{value}".encode() + b"\x03"
+def reply(value: int, element: bytes = b"01") -> bytes:
+    body = element + f"{value}".encode() + b"\x03"
     return b"\x02" + body + bytes([xor(body)])
 
 
 @pytest.mark.asyncio
 async def test_a_reply_with_a_damaged_byte_fails_the_attempt_and_is_counted(far_end: FarEnd) -> None:
     """Two flipped bits in two bytes pass any exclusive-or: only the UART knows."""
+
+    async def node() -> None:
+        """Answers what it is asked: the first time with a mark within."""
+        damage = b"\xff\x00"
+        while True:
+            if request := await asyncio.to_thread(far_end.read, 0.02):
+                good = reply(234, request[4:6])
+                far_end.write(good[:3] + damage + good[3:])
+                damage = b""
+
     async with Bus(SerialPort(far_end.path, baudrate=57600)) as bus:
         transport = bus.pump._transport
         assert transport is not None
         set_input_flags(transport.get_extra_info("serial").fileno(), 0)
+        answering = asyncio.ensure_future(node())
         axis = Hcp2Controller(bus, 1)
-
-        async def asked() -> None:
-            while not await asyncio.to_thread(far_end.read, 0.05):
-                pass
-
-        reading = asyncio.ensure_future(axis.read(1, retries=0))
-        await asked()
-        good = reply(234)
-        far_end.write(good[:3] + b"\xff\x00" + good[3:])
         with pytest.raises(GarbledReply, match="parity"):
-            await reading
-        reading = asyncio.ensure_future(axis.read(1, retries=0))
-        await asked()
-        far_end.write(good)
-        assert await reading == 234
+            await axis.read(1, retries=0)
+        assert await axis.read(1) == 234
         line = bus.statistics()
         assert (line.damaged, line.breaks, line.driver) == (1, 0, None)
+        answering.cancel()
 
 
 @pytest.mark.asyncio
