@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import array
 import asyncio
+import contextlib
 import fcntl
 import select
 import socket
@@ -131,7 +132,8 @@ class Socket(_Descriptor):
 
     def discard_unsent(self) -> None:
         """Closing would leave it to the kernel, which goes on sending: have the connection reset instead."""
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        with contextlib.suppress(OSError):  # it may be gone already
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
     def _usual_acknowledgement(self) -> float:
         """Seconds, as the kernel reckons for its own repeats; 0 where it does not tell."""

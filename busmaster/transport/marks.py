@@ -44,6 +44,14 @@ def mark_errors(descriptor: int) -> bool:
     return bool(termios.tcgetattr(descriptor)[0] & termios.PARMRK)
 
 
+def stop_marking(descriptor: int) -> None:
+    """Leave the tty as a program that knows nothing of marks expects it: some drivers keep the flags when it is closed."""
+    with contextlib.suppress(termios.error):
+        settings = termios.tcgetattr(descriptor)
+        settings[0] &= ~_INPUT_FLAGS
+        termios.tcsetattr(descriptor, termios.TCSANOW, settings)
+
+
 def taker_of_marked_bytes(protocol: asyncio.Protocol) -> MarkedByte:
     """Return the protocol's own `byte_marked(byte, mark)`; a protocol without it takes a damaged byte for data."""
     own: MarkedByte | None = getattr(protocol, "byte_marked", None)

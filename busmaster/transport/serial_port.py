@@ -30,7 +30,7 @@ from busmaster.errors import InvalidCommand, LineDown
 from busmaster.profile import LineSettings
 from busmaster.transport import adapters
 from busmaster.transport.aside import aside
-from busmaster.transport.marks import ESCAPE, MarkingSerial, Unescape, taker_of_marked_bytes
+from busmaster.transport.marks import ESCAPE, MarkingSerial, Unescape, stop_marking, taker_of_marked_bytes
 
 if TYPE_CHECKING:
 
@@ -359,10 +359,14 @@ def _code(error: Exception) -> int | None:
 
 
 def _release(device: serial.Serial, exclusive: bool) -> None:
-    """Discard what has not left, give both locks back (they would outlive us where a pty stays open), and close."""
+    """Discard what has not left, give back the locks (they would outlive us where a pty stays open), and close.
+
+    The flags are given back too, unless somebody else may be using the port with them.
+    """
     with contextlib.suppress(OSError, termios.error):
         termios.tcflush(device.fileno(), termios.TCOFLUSH)
     if exclusive:
+        stop_marking(device.fileno())
         with contextlib.suppress(OSError):
             fcntl.ioctl(device.fileno(), termios.TIOCNXCL)
         with contextlib.suppress(OSError):

@@ -183,6 +183,17 @@ async def test_whatever_another_program_left_set_is_cleared(far_end: FarEnd) -> 
 
 
 @pytest.mark.asyncio
+async def test_a_port_that_is_closed_marks_no_more_for_whoever_opens_it_next(far_end: FarEnd) -> None:
+    bystander = os.open(far_end.path, os.O_RDWR | os.O_NOCTTY)
+    for exclusive, left in ((True, 0), (False, RAW)):
+        transport, recorder = await opened(far_end.path, exclusive=exclusive)
+        assert input_flags(bystander) == RAW
+        await closed(transport, recorder)
+        assert input_flags(bystander) == left
+    os.close(bystander)
+
+
+@pytest.mark.asyncio
 async def test_a_port_that_is_configured_anew_still_marks(far_end: FarEnd) -> None:
     transport, recorder = await opened(far_end.path)
     device = transport.get_extra_info("serial")
