@@ -45,7 +45,7 @@ def mark_errors(descriptor: int) -> bool:
 
 
 def stop_marking(descriptor: int) -> None:
-    """Leave the tty as a program that knows nothing of marks expects it: some drivers keep the flags when it is closed."""
+    """Leave the tty as a program that knows no marks expects it: some drivers keep its flags when it is closed."""
     with contextlib.suppress(termios.error):
         settings = termios.tcgetattr(descriptor)
         settings[0] &= ~_INPUT_FLAGS
