@@ -44,6 +44,7 @@ class Leg:
         "_follows_until",
         "_limit",
         "begun",
+        "begun_at",
         "byte_time",
         "end",
         "late_after",
@@ -55,6 +56,8 @@ class Leg:
     def __init__(self, timing: ReplyTiming, latency: float, byte_time: float) -> None:
         self.timing = timing
         self.begun = False
+        self.begun_at = -inf
+        """When the first byte of its reply was received."""
         self.end = -inf
         """When the last byte sent is on the wire."""
         self.latency = latency
@@ -105,6 +108,7 @@ class Leg:
         """What was said is out so much later than was thought."""
         self.end += seconds
         self.late_after += seconds
+        self.taint_until += seconds
         self._limit += seconds
 
     def quiet(self) -> float:

@@ -41,7 +41,7 @@ class MemoryPort:
 
     @property
     def paced(self) -> bool:
-        return self.line.tau > 0
+        return self.line.paced
 
     def identity(self) -> None:
         """It never goes away."""
