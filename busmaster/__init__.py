@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from busmaster.arbiter.counters import LineStatistics, NodeStatistics, Quantiles
+from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
 from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, NodeChanged
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.state import LineState
@@ -58,6 +58,7 @@ __all__ = [
     "BusError",
     "CommandWord",
     "Dc104Drive",
+    "DriverErrors",
     "Endpoint",
     "GarbledReply",
     "GroupPlan",

@@ -6,6 +6,7 @@ import asyncio
 import random
 import warnings
 from collections.abc import Coroutine, Iterable, Sequence
+from dataclasses import replace
 from math import inf
 from types import TracebackType
 from typing import Any
@@ -73,6 +74,7 @@ class Bus:
             on_written=lambda transaction: self.touched(transaction, transaction.ended_at),
             paced=lambda transport: is_paced(endpoint, transport),
             tap=tap,
+            name=endpoint.name,
         )
         self._nodes: dict[tuple[str, int], Node] = {}
         self._groups: list[PollGroup] = []
@@ -243,11 +245,12 @@ class Bus:
 
     def statistics(self) -> LineStatistics:
         """An immutable snapshot of the line's counts since it was opened or reset."""
-        return self._arbiter.statistics(self.now())
+        return replace(self._arbiter.statistics(self.now()), driver=self.pump.driver_errors())
 
     def reset_statistics(self) -> None:
         """Start all counts of line, nodes and groups again."""
         self._arbiter.reset_statistics(self.now())
+        self.pump.reset_driver_errors()
         for group in self._groups:
             group.reset_statistics()
 

@@ -15,7 +15,7 @@ from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import DOWN, UP, NodeRecord
 from busmaster.arbiter.in_step import LONGEST_ALIKE, InStep
 from busmaster.arbiter.transaction import URGENT, Transaction
-from busmaster.errors import Refused
+from busmaster.errors import NoReply
 from busmaster.exchange import Command, Exchange
 
 MOST_BEFORE = 3
@@ -107,12 +107,16 @@ class Choice:
             return other
         if self._gone_before >= MOST_BEFORE:
             return first
-        other = self._another(first, now, in_step.clashes)
+        owing = {node for node in in_step.owing(answers) if node.health is UP}
+        other = None
+        if self._gone_before < MOST_BEFORE - 1:
+            of = first[0].node if first[0].node in owing else None  # only its own answer proves that it owes no more
+            other = self._another(first, now, in_step.clashes, of)
         if other is None:
             ends = in_step.ends(answers)
             if ends < inf:
                 return ends
-            other = self._ask_check(now, in_step.clashes, in_step.owing(answers))
+            other = self._ask_check(now, in_step.clashes, owing)
         if other is not None:
             self._gone_before += 1
             return other
@@ -133,15 +137,18 @@ class Choice:
                 return probe, exchange
         return None
 
-    def _another(self, first: Chosen, now: float, unfit: Callable[[Sequence[bytes]], bool]) -> Chosen | None:
-        """One of the same class. Nothing overtakes a write to its node, and a write nothing that is for its node."""
+    def _another(
+        self, first: Chosen, now: float, unfit: Callable[[Sequence[bytes]], bool], of: NodeRecord | None = None
+    ) -> Chosen | None:
+        """One of the same class, `of` this node if one is given. No read overtakes a write to its node, and no write
+        anything that is for its node."""
         opened: list[Exchange[Any]] = []
         passed = {first[0].node}
         written = {first[0].node} if first[0].writes else set()
 
         def suits(other: Transaction) -> bool:
             in_order = other.node not in (passed if other.writes else written)
-            if in_order and self._dispatcher.may_go(other, now):
+            if in_order and of in (None, other.node) and self._dispatcher.may_go(other, now):
                 exchange = _opened(other)
                 if exchange is not None and exchange.answered and not unfit(exchange.answers):
                     opened.append(exchange)
@@ -159,9 +166,9 @@ class Choice:
     ) -> Chosen | None:
         """A read whose answer is fit to prove something: of a node that owes, if it answers; else of one that does."""
         check = self._check
-        if check is not None and check.error is not None and not isinstance(check.error, Refused):
+        if check is not None and isinstance(check.error, NoReply):
             self._silent_checks.add(check.node)
-        for node in (*(node for node in owing if node.health is UP), *self._those_who_answer(now)):
+        for node in (*owing, *self._those_who_answer(now)):
             if node in self._silent_checks:
                 continue
             for command in checks_of(node):

@@ -47,6 +47,20 @@ class NodeStatistics:
 
 
 @dataclass(frozen=True, slots=True)
+class DriverErrors:
+    """What a serial driver has counted of its UART's errors, since the port was opened or the counts were reset.
+
+    `overruns` are bytes lost in the UART, `buffer_overruns` bytes lost behind it because nobody read them in time.
+    """
+
+    framing: int
+    parity: int
+    breaks: int
+    overruns: int
+    buffer_overruns: int
+
+
+@dataclass(frozen=True, slots=True)
 class LineStatistics:
     """Counts of the line since the last reset; times in seconds."""
 
@@ -74,6 +88,8 @@ class LineStatistics:
     """Bytes that the UART marked: a parity or framing error."""
     breaks: int = 0
     """Breaks that the UART saw."""
+    driver: DriverErrors | None = None
+    """What the serial driver has counted; None where it counts nothing, and while the port is lost."""
 
     @property
     def utilisation(self) -> float:

@@ -18,6 +18,7 @@ from busmaster.arbiter import health
 from busmaster.arbiter.backlog import Backlog
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
+from busmaster.arbiter.endings import make_error, name_error, not_started
 from busmaster.arbiter.events import Completed, Event, LatenessLowered, NodeChanged, Polled
 from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
 from busmaster.arbiter.probes import Probes
@@ -30,7 +31,6 @@ from busmaster.errors import (
     GarbledReply,
     NodeDown,
     NoReply,
-    NotStarted,
     Refused,
     Superseded,
     WriteUnconfirmed,
@@ -77,7 +77,7 @@ class Dispatcher:
         transaction.queued = now
         self._waits(transaction)
         if self.fault is not None:
-            self._end(transaction, now, _named(self.fault(), transaction))
+            self._end(transaction, now, name_error(self.fault(), transaction))
             return False
         if transaction.writes and transaction.priority is URGENT:
             self._supersede(node, now)
@@ -85,7 +85,7 @@ class Dispatcher:
         if transaction.writes:
             waiting = max(waiting, len(node.writes))
         if waiting >= self._capacity:
-            self._end(transaction, now, _error(BacklogFull, f"{waiting} requests are waiting already", transaction))
+            self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return False
         if not self._may_ask(transaction, now):
             return False
@@ -115,7 +115,7 @@ class Dispatcher:
         while (transaction := self.backlog.pop()) is not None:
             node = transaction.node
             if transaction.start_by < now and transaction.queued < now and not transaction.attempts:
-                self._end(transaction, now, _not_started(transaction, now))
+                self._end(transaction, now, not_started(transaction, now))
             elif transaction.writes and node.writes[0] is not transaction:
                 self._park(transaction)
             elif (node.health is not DOWN and not node.holds and node.suspended_until <= now) or self._may_ask(
@@ -204,14 +204,14 @@ class Dispatcher:
         kind: type[BusError] = NoReply if no_reply else GarbledReply
         if transaction.writes:
             kind = WriteUnconfirmed
-        self._end(transaction, now, _error(kind, what, transaction))
+        self._end(transaction, now, make_error(kind, what, transaction))
 
     def broken(self, transaction: Transaction, bug: Exception, now: float) -> None:
         """The protocol's reader failed on what came: a bug there. To ask again would meet it again."""
         what = f"a bug in the {transaction.node.profile.name} reader: {bug!r}"
         transaction.node.counters.garbled += 1
         kind = WriteUnconfirmed if transaction.writes else BusError
-        error = _error(kind, what, transaction)
+        error = make_error(kind, what, transaction)
         error.hint = "this is not the line's fault: please report it, with a capture"
         error.__cause__ = bug
         self._end(transaction, now, error)
@@ -237,15 +237,15 @@ class Dispatcher:
         transaction.refused_cycles += 1
         if transaction.refused_cycles > 1:
             transaction.refused_until = now + REFUSED_POLL_PAUSE
-        self._end(transaction, now, _named(refusal, transaction))
+        self._end(transaction, now, name_error(refusal, transaction))
 
     def unsendable(self, transaction: Transaction, bug: Exception, now: float) -> None:
         """Its protocol cannot encode it: a bug there, but nobody may wait for ever."""
-        self._end(transaction, now, _error(BusError, f"its protocol could not encode it: {bug!r}", transaction))
+        self._end(transaction, now, make_error(BusError, f"its protocol could not encode it: {bug!r}", transaction))
 
     def cut_off(self, transaction: Transaction, error: BusError, now: float) -> None:
         """The line was lost under it: a write may have been carried out."""
-        self._end(transaction, now, _named(error, transaction))
+        self._end(transaction, now, name_error(error, transaction))
 
     # everything at once
 
@@ -255,10 +255,10 @@ class Dispatcher:
         assert fault is not None
         for node in self.nodes:
             for write in [w for w in node.writes if w.phase is PARKED]:
-                self._end(write, now, _named(fault(), write))
+                self._end(write, now, name_error(fault(), write))
         for transaction in self.backlog.drain():
             transaction.phase = PARKED
-            self._end(transaction, now, _named(fault(), transaction))
+            self._end(transaction, now, name_error(fault(), transaction))
 
     def expire(self, now: float) -> None:
         """Fail what should have started by now (R12)."""
@@ -270,7 +270,7 @@ class Dispatcher:
             if transaction.phase is QUEUED:
                 self.backlog.discard(transaction, PARKED)
             if transaction.phase is PARKED:
-                self._end(transaction, now, _not_started(transaction, now))
+                self._end(transaction, now, not_started(transaction, now))
         self._deadlines.expiry = nextafter(heap[0][0], inf) if heap else inf
 
     # polls
@@ -308,22 +308,18 @@ class Dispatcher:
     def _reason_to_park(self, transaction: Transaction, now: float) -> BusError | None:
         node = transaction.node
         if self.fault is not None:
-            return _named(self.fault(), transaction)
+            return name_error(self.fault(), transaction)
         if now < node.suspended_until:
-            return _error(NodeDown, SUSPENDED, transaction)
+            return make_error(NodeDown, SUSPENDED, transaction)
         if node.health is DOWN:
-            return _error(NodeDown, "down: it is probed, its polls wait", transaction)
+            return make_error(NodeDown, "down: it is probed, its polls wait", transaction)
         if node.holds:
-            return _error(NodeDown, "back, and its on_return hook is still running", transaction)
+            return make_error(NodeDown, "back, and its on_return hook is still running", transaction)
         if now < transaction.refused_until:
-            return _error(Refused, "refused again and again: polled every 10 s", transaction)
+            return make_error(Refused, "refused again and again: polled every 10 s", transaction)
         return None
 
     # dead nodes
-
-    def idle(self, seconds: float) -> None:
-        """The line had nothing to do for so long: a part of it may be spent on probes."""
-        self.probes.budget.idle(seconds)
 
     def suspend(self, node: NodeRecord, until: float) -> None:
         node.suspended_until = until
@@ -358,13 +354,13 @@ class Dispatcher:
         if transaction.poll is not None:
             error = self._reason_to_park(transaction, now)
         elif now < node.suspended_until:
-            error = _error(NodeDown, SUSPENDED, transaction)
+            error = make_error(NodeDown, SUSPENDED, transaction)
         elif node.health is DOWN and not (transaction.paid or transaction.probe):
-            if self.probes.budget.take(node.lateness, now):
+            if self.probes.spare(node.lateness, now):
                 transaction.paid = node.lateness
                 transaction.retries = 0
             else:
-                error = _error(NodeDown, "down: no answer for a while", transaction)
+                error = make_error(NodeDown, "down: no answer for a while", transaction)
         if error is not None:
             self._end(transaction, now, error)
         return error is None
@@ -429,7 +425,7 @@ class Dispatcher:
             elif write.priority > URGENT:
                 if write.phase is QUEUED:
                     self.backlog.discard(write, PARKED)
-                self._end(write, now, _error(Superseded, "overtaken by an urgent write to the same node", write))
+                self._end(write, now, make_error(Superseded, "overtaken by an urgent write to the same node", write))
 
     def _expect_start(self, transaction: Transaction) -> None:
         heap = self._expiries
@@ -444,7 +440,7 @@ class Dispatcher:
         if transaction.writes:
             unsure = transaction.unsure or (transaction.attempts > 0 and not isinstance(error, NOT_DONE))
             if unsure and error is not None and not isinstance(error, WriteUnconfirmed):
-                error = _error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
+                error = make_error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
             self._next_write(transaction)
         if not transaction.attempts:
             self._count_ahead(transaction)
@@ -485,20 +481,3 @@ class Dispatcher:
                 self.backlog.push_front(writes[0])
         elif transaction in writes:
             writes.remove(transaction)
-
-
-def _error(kind: type[BusError], what: str, transaction: Transaction) -> BusError:
-    return _named(kind(what), transaction)
-
-
-def _named(error: BusError, transaction: Transaction) -> BusError:
-    """Say which node, which command and how often."""
-    error.node = transaction.node.label
-    error.command = str(transaction.command)
-    error.attempts = transaction.attempts
-    return error
-
-
-def _not_started(transaction: Transaction, now: float) -> BusError:
-    waited = (now - transaction.queued) * 1000
-    return _error(NotStarted, f"not sent within its time: it waited {waited:.0f} ms for the line", transaction)

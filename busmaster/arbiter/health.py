@@ -170,18 +170,26 @@ class NodeRecord:
 class ProbeBudget:
     """A token bucket of line time, in seconds. `probe`: what a probe costs if it is not answered."""
 
-    __slots__ = ("_earned_at", "_generous_until", "probe", "tokens")
+    __slots__ = ("_earned_at", "_generous_until", "_pause", "probe", "tokens")
 
     def __init__(self, now: float) -> None:
         self.tokens = BUDGET_CAPACITY
         self.probe = 0.0
         self._earned_at = now
         self._generous_until = -inf
+        self._pause = 0.0
 
-    def idle(self, seconds: float) -> None:
-        """The line had a pause. One too short for a probe earns nothing: there a probe would delay what comes next."""
-        if seconds > self.probe:
-            self.tokens = min(BUDGET_CAPACITY, self.tokens + BUDGET_IDLE_SHARE * (seconds - self.probe))
+    def idle(self, seconds: float, over: bool) -> None:
+        """The line had a pause for so long (more), which is over or goes on.
+
+        One too short for a probe earns nothing: there a probe would delay what comes next.
+        """
+        before = max(0.0, self._pause - self.probe)
+        self._pause += seconds
+        earned = BUDGET_IDLE_SHARE * (max(0.0, self._pause - self.probe) - before)
+        self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)
+        if over:
+            self._pause = 0.0
 
     def node_returned(self, now: float) -> None:
         self._earn(now)

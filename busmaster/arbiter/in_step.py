@@ -140,30 +140,49 @@ class InStep:
     def heard(self, run: bytes, now: float) -> NodeRecord | None:
         """Take all that came up to a silence, unasked or in place of a reply. Returns who owed it, if that is known.
 
-        Lone bytes pay only if nothing else came. What nobody owed, though it is like the last answers, was said twice.
-        What is not explained so may be a part of something: another part may come.
+        What nobody owed, though it is like the last answers, was said twice. Of what is no lone answer, a part may
+        be still to come: a byte of any kind.
         """
-        payers = [debt for debt in self.debts if _is(run, debt.key)]
-        explained = bool(payers)
-        place = 0
-        for debt in payers:
-            place = run.find(debt.key, place) + len(debt.key)
-            if place < len(debt.key):
-                break
-            self.debts.remove(debt)
-            self._share(debt)
-        for entry in self._doubted:
-            if not explained and entry[1] > now and _is(run, entry[0]):
-                self._doubted.remove(entry)
-                explained = True
-                break
-        if not explained:
-            if any(_is(run, key) for key in (*self.last, *self.before)):
-                self._doubt_until = now + DOUBT_PERIOD
-                self.alert = True
-            else:
-                self.owe((ANY_BYTE,), None, now, now)
+        payers: list[Debt] = []
+        rest = run
+        while (debt := self._owed_byte(rest)) is not None:
+            payers.append(debt)
+            self._pay(debt)
+            rest = rest[1:]
+        for debt in [debt for debt in self.debts if len(debt.key) > 1]:
+            place = rest.find(debt.key)
+            if place >= 0:
+                payers.append(debt)
+                self._pay(debt)
+                rest = rest[:place] + rest[place + len(debt.key) :]
+        if payers and not rest:
+            return payers[0].node
+        if not payers and any(until > now and _is(run, key) for key, until in self._doubted):
+            self._doubted = [entry for entry in self._doubted if not _is(run, entry[0])]
+        elif not payers and any(_is(run, key) for key in (*self.last, *self.before)):
+            self._doubt_until = now + DOUBT_PERIOD
+            self.alert = True
+        else:
+            self.owe((ANY_BYTE,), None, now, now)
         return payers[0].node if payers else None
+
+    def _owed_byte(self, run: bytes) -> Debt | None:
+        """The debt that the first byte pays: one that is alone, or before more of its kind, or before an owed reply."""
+        more = run[1:]
+        if (
+            more
+            and more != run[:1] * len(more)
+            and not any(len(d.key) > 1 and more.startswith(d.key) for d in self.debts)
+        ):
+            return None
+        return next((debt for debt in self.debts if debt.key and debt.key == run[:1]), None)
+
+    def _pay(self, paid: Debt) -> None:
+        """One of several nodes may have paid with the same words: which is not known, so the rest are nobody's."""
+        self.debts.remove(paid)
+        for debt in self.debts:
+            if debt.key == paid.key and debt.node is not paid.node:
+                debt.node = None
 
     # how far an answer can be trusted
 
@@ -188,12 +207,6 @@ class InStep:
             if any(key in answers for key in said):
                 return True
         return False
-
-    def _share(self, paid: Debt) -> None:
-        """One of several nodes paid with the same words: it is not known which, so the rest are nobody's."""
-        for debt in self.debts:
-            if debt.key == paid.key and debt.node is not paid.node:
-                debt.node = None
 
 
 def _could_be(debt: Debt, answers: Sequence[bytes]) -> bool:

@@ -49,6 +49,7 @@ class Leg:
         "end",
         "late_after",
         "latency",
+        "out",
         "taint_until",
         "timing",
     )
@@ -59,7 +60,9 @@ class Leg:
         self.begun_at = -inf
         """When the first byte of its reply was received."""
         self.end = -inf
-        """When the last byte sent is on the wire."""
+        """When the last byte of the request is on the wire: lateness counts from there."""
+        self.out = -inf
+        """When all that was said is on the wire, a closing ACK too."""
         self.latency = latency
         self.byte_time = byte_time
         self._follows: ReplyTiming | None = None
@@ -72,9 +75,9 @@ class Leg:
 
     def say(self, count: int, now: float) -> float:
         """Note that the host says so many bytes, behind what it has said already. Returns when they are out."""
-        end = self.end
-        self.end = end = (end if end > now else now) + count * self.byte_time
-        return end
+        out = self.out
+        self.out = out = (out if out > now else now) + count * self.byte_time
+        return out
 
     def begin(self, timing: ReplyTiming, said: int, longest: int, now: float) -> float:
         """The host says `said` bytes, and the reply has at most `longest`. Returns when it must have begun."""
@@ -82,8 +85,8 @@ class Leg:
         self.begun = False
         self._follows = None
         byte_time = self.byte_time
-        end = self.end
-        self.end = end = (end if end > now else now) + said * byte_time
+        out = self.out
+        self.out = self.end = end = (out if out > now else now) + said * byte_time
         latency = self.latency
         self.late_after = end + timing.nominal + latency
         due = end + timing.window + latency
@@ -107,9 +110,15 @@ class Leg:
     def shift(self, seconds: float) -> None:
         """What was said is out so much later than was thought."""
         self.end += seconds
+        self.out += seconds
         self.late_after += seconds
         self.taint_until += seconds
         self._limit += seconds
+
+    def answered(self) -> None:
+        """It was answered rightly, so it has left, whatever the baud rate says: the port is not paced."""
+        if self.end > self.begun_at:
+            self.end = self.out = self.begun_at
 
     def quiet(self) -> float:
         """The silence, in seconds, after which nothing more of a frame can come."""

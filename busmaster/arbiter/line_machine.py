@@ -37,7 +37,7 @@ business.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import inf
 from typing import Any, cast
 
@@ -178,6 +178,11 @@ class LineMachine:
         """A deadline of the line falls due: `unsent` is to be told first, where it is known."""
         return now >= self._deadlines.line
 
+    @property
+    def output_held(self) -> bool:
+        """Some of the bytes said had not left when the port was asked last: it is asked again before it is heard."""
+        return self._wire.output.held
+
     def unsent(self, count: int, now: float) -> None:
         """So many of the bytes said have not left: until they have, nothing runs out and nothing else is said."""
         again = self._wire.output.unsent(count, now)
@@ -254,32 +259,20 @@ class LineMachine:
 
     def _begin_reply(self, data: bytes, now: float) -> bytes:
         """The first bytes of a leg: returns those that may be its reply."""
-        transaction, exchange, leg = self._wire.transaction, self._wire.exchange, self._leg
-        assert transaction is not None
-        assert exchange is not None
-        if now < leg.taint_until:
+        exchange = self._wire.exchange
+        if now < self._leg.taint_until or self._wire.output.held:
             self._counters.tainted += 1
             self._strays.last_byte = now
             self._attempt_failed(FrameError("bytes came before the request was out", heard=data), now)
             return b""
-        if not exchange.answered:
+        if exchange is not None and not exchange.answered:
             self._strays.note(data, now, self._leg.quiet())
             self._wire.strayed = True
             return b""
-        if transaction.node.profile.noise_tolerant:
-            kept = data.lstrip(bytes(set(data) - set(exchange.starts)))
-            self._counters.noise_bytes += len(data) - len(kept)
-            self._strays.last_byte = now
-            if not kept:
-                return b""
-            data = kept
-        leg.begun = True
-        leg.begun_at = now
-        if transaction.first_byte == -inf:
-            transaction.first_byte = now
-        if now > leg.late_after:
-            transaction.late = True
-        return data
+        kept = self._wire.begin_reply(data, now)
+        self._counters.noise_bytes += len(data) - len(kept)
+        self._strays.last_byte = now
+        return kept
 
     def _take(self, data: bytes | None, now: float) -> None:
         """Hand the reader these bytes, or the news (None) that none came in time, and do what it makes of them."""
@@ -304,13 +297,9 @@ class LineMachine:
         assert transaction is not None
         assert exchange is not None
         answered, leg = exchange.answered, self._leg
-        if step.rest and exchange.owed and _begins_so(step.rest, exchange.answers):
-            self._disbelieve("two answers came", step, now)
-            return
         if answered:
-            if leg.end > leg.begun_at:  # an unpaced port: what was answered has left
-                leg.end = leg.begun_at
-            if self._in_step.alert:
+            leg.answered()
+            if self._in_step.alert or step.rest:
                 verdict = self._trust.weigh(self._wire, step, now)
                 if isinstance(verdict, str):
                     self._disbelieve(verdict, step, now)
@@ -399,7 +388,7 @@ class LineMachine:
         if self._closed:
             self._go_offline(now)
         elif hold or not self._advance(now):
-            free = max(now, self._leg.end) + hold
+            free = max(now, self._leg.out) + hold
             held = free > now
             self._enter(HOLDOFF if held else READY, now)
             self._deadlines.line = free if held else inf
@@ -456,8 +445,7 @@ class LineMachine:
         """The line is silent, and this came before: whoever said it, and owed it, is alive (R11, R15)."""
         node = self._in_step.heard(run, now) if run else None
         if node is not None and node.health is DOWN:
-            node.probe_at = min(node.probe_at, now)
-            self.dispatcher.probes.plan()
+            self.dispatcher.probes.alive(node, now)
 
     def _answer_stray(self, send: bytes, now: float) -> bool:
         """True if an answer was owed: then the line settles again."""
@@ -504,13 +492,8 @@ class LineMachine:
     def _enter(self, state: LineState, now: float) -> None:
         spent = self._counters.spend(self.state, now)
         if self.state is READY:
-            self.dispatcher.idle(spent)
+            self.dispatcher.probes.budget.idle(spent, over=state is not READY)
         self.state = state
 
     def _offline(self) -> BusError:
         return LineDown(f"the line is down: {self._cause}")
-
-
-def _begins_so(rest: bytes, answers: Sequence[bytes]) -> bool:
-    """What came behind an answer is another one like it."""
-    return any(rest.startswith(key) for key in answers)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 from typing import Any, cast
 
 from busmaster.arbiter.deadlines import Deadlines
@@ -39,6 +40,23 @@ class OnWire:
         self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, now)
         if not exchange.answered:
             self._deadlines.line = self.leg.end + exchange.timing.turnaround
+
+    def begin_reply(self, data: bytes, now: float) -> bytes:
+        """Note that its reply begins with these bytes; returns them, without the noise that the profile tolerates."""
+        transaction, exchange, leg = self.transaction, self.exchange, self.leg
+        assert transaction is not None
+        assert exchange is not None
+        if transaction.node.profile.noise_tolerant:
+            data = data.lstrip(bytes(set(data) - set(exchange.starts)))
+            if not data:
+                return data
+        leg.begun = True
+        leg.begun_at = now
+        if transaction.first_byte == -inf:
+            transaction.first_byte = now
+        if now > leg.late_after:
+            transaction.late = True
+        return data
 
     def read(self, data: bytes | None, now: float) -> Step[Any]:
         """Hand the reader these bytes, or the news (None) that none came in time; go from leg to leg as it says.

@@ -14,13 +14,14 @@ HELD_LOOK = 0.002
 class Output:
     """The bytes to be sent on one line, and the times of its leg that follow from when they leave."""
 
-    __slots__ = ("_bytes", "_echo", "_held", "_leg", "said_at")
+    __slots__ = ("_bytes", "_echo", "_leg", "held", "said_at")
 
     def __init__(self, leg: Leg, echo: Echo) -> None:
         self._bytes = b""
         self._leg = leg
         self._echo = echo
-        self._held = False
+        self.held = False
+        """The port had not sent all of it when it was asked last."""
         self.said_at = -inf
         """The time from which the leg of what was said last is reckoned."""
 
@@ -36,8 +37,9 @@ class Output:
         return data
 
     def discard(self) -> None:
-        """What has not been handed over is not said."""
+        """What has not been handed over is not said, and what the port holds goes with it."""
         self._bytes = b""
+        self.held = False
 
     def taken(self, now: float) -> float:
         """The port has it only now: its leg begins so many seconds later."""
@@ -51,10 +53,10 @@ class Output:
     def unsent(self, count: int, now: float) -> float | None:
         """So many bytes have not left. Returns when to ask again; None if all have, inf if they have just left."""
         if count:
-            self._held = True
+            self.held = True
             return now + max(count * self._leg.byte_time, HELD_LOOK)
-        if not self._held:
+        if not self.held:
             return None
-        self._held = False
-        self._leg.shift(max(0.0, now - self._leg.end))
+        self.held = False
+        self._leg.shift(max(0.0, now - self._leg.out))
         return inf

@@ -8,7 +8,8 @@ from typing import Any
 
 import anyio.to_thread
 
-from busmaster.cli import diagnosis
+from busmaster.arbiter.events import Mark
+from busmaster.cli import diagnosis, uart
 from busmaster.cli.diagnosis import Record
 from busmaster.cli.probing import Outcome, Prober, Wire, opened
 from busmaster.cli.progress import Bar
@@ -129,7 +130,10 @@ def driver(descriptor: int) -> Iterator[Finding]:
 
 async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     where = patient.endpoint
+    assert wire.port is not None
     await wire.hear_all(OPENING)
+    wire.port.reset()
+    wire.marked.clear()
     heard = await wire.hear_all(LISTENING)
     talk = diagnosis.unasked(heard, patient.protocol)
     tell(talk)
@@ -148,6 +152,8 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     byte_time = (profile.line if settings is None else settings).byte_time
     prober = Prober(wire, profile, timings, byte_time, echo=heard.startswith(HARMLESS))
     records = await ask_all(patient, prober)
+    for finding in uart.findings(wire.marked[Mark.DAMAGED], wire.marked[Mark.BREAK], wire.port.errors()):
+        tell(finding)
     if any(record.lives for record in records):
         for finding in diagnosis.nodes(records, timings.read):
             tell(finding)

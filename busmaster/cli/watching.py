@@ -14,6 +14,7 @@ import anyio
 
 from busmaster.arbiter.state import LineState
 from busmaster.bus import Bus
+from busmaster.cli import uart
 from busmaster.cli.app import OK
 from busmaster.cli.arguments import View, parse_value
 from busmaster.cli.drawing import draw
@@ -202,6 +203,8 @@ class Watch:
                 f"{node.label}: {node.requests} requests, {node.failed} failed, "
                 f"p50 {node.p50 * 1000:.2f} ms, p99 {node.p99 * 1000:.2f} ms"
             )
+        if text := uart.damage_text(uart.damage(counts.damaged, counts.breaks, counts.driver)):
+            note(f"uart: {text}; `busmaster doctor` says what to look for")
 
 
 def p99_of(periods: Iterable[float]) -> float | None:

@@ -9,6 +9,7 @@ from typing import cast
 
 from busmaster.errors import LineDown
 from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.marks import taker_of_marked_bytes
 
 FIRST_DELAY = 0.1
 LONGEST_DELAY = 5.0
@@ -134,6 +135,7 @@ class _Link(asyncio.Protocol):
         self._protocol = protocol
         self._closing = closing
         self.data_received = protocol.data_received  # type: ignore[method-assign]  # no step more on the hot path
+        self.byte_marked = taker_of_marked_bytes(protocol)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast("asyncio.Transport", transport)  # uvloop's are none by inheritance

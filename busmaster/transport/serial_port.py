@@ -1,7 +1,11 @@
 """A serial port, on pyserial and pyserial-asyncio with the latter's traps mended.
 
-What is mended, and why, stands at each method of `PortTransport`. Nothing that can block (opening, configuring,
-draining, closing) ever runs on the loop's thread: a driver may take seconds, or for ever.
+Inherited from pyserial is how a port is opened and configured, and from pyserial-asyncio the reader and writer on the
+loop, pausing and resuming, and the write buffer. Mended is all that costs time or hides something: a write leaves at
+once instead of a turn of the loop later; reading asks no select(), which fails above descriptor 1023; every loss is
+reported, once, and never from within a write; bytes with parity or framing errors come marked (pyserial switches the
+check off); and nothing that can block (opening, configuring, draining, closing) runs on the loop's thread: a driver may
+take seconds, or for ever. Why stands at each method of `PortTransport`.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ from busmaster.errors import InvalidCommand, LineDown
 from busmaster.profile import LineSettings
 from busmaster.transport import adapters
 from busmaster.transport.aside import aside
+from busmaster.transport.marks import ESCAPE, MarkingSerial, Unescape, stop_marking, taker_of_marked_bytes
 
 if TYPE_CHECKING:
 
@@ -34,12 +39,12 @@ if TYPE_CHECKING:
 
         _loop: asyncio.AbstractEventLoop
         _protocol: asyncio.Protocol
-        _serial: serial.Serial
+        _serial: MarkingSerial
         _closing: bool
         _write_buffer: list[bytes]
 
         def __init__(
-            self, loop: asyncio.AbstractEventLoop, protocol: asyncio.Protocol, serial_instance: serial.Serial
+            self, loop: asyncio.AbstractEventLoop, protocol: asyncio.Protocol, serial_instance: MarkingSerial
         ) -> None: ...
         def _ensure_writer(self) -> None: ...
         def _remove_writer(self) -> None: ...
@@ -132,17 +137,23 @@ class SerialPort:
 
 
 class PortTransport(_SerialTransport):
-    """pyserial-asyncio's transport, made to write at once, to report every loss and never to block or hang."""
+    """pyserial-asyncio's transport, made to write at once, to report every loss and never to block or hang.
+
+    A damaged byte goes to the protocol's `byte_marked(byte, mark)`, in order with `data_received`; to that itself
+    where the protocol has no such method.
+    """
 
     def __init__(
         self,
         loop: asyncio.AbstractEventLoop,
         protocol: asyncio.Protocol,
-        device: serial.Serial,
+        device: MarkingSerial,
         port: SerialPort,
         paced: bool,
     ) -> None:
         self._fd = device.fileno()
+        self._escapes = Unescape()
+        self._byte_marked = taker_of_marked_bytes(protocol)
         self._port = port
         self._paced = paced
         self._lost = False
@@ -168,10 +179,19 @@ class PortTransport(_SerialTransport):
         except OSError as error:
             self._lose(error)
             return
-        if data:
-            self._protocol.data_received(data)
-        else:  # VMIN is 1, so nothing to read would be BlockingIOError: this is a hang-up
+        if not data:  # VMIN is 1, so nothing to read would be BlockingIOError: this is a hang-up
             self._lose(None)
+        elif (ESCAPE in data or self._escapes.begun) and self._serial.marks:
+            self._take_marked(data)
+        else:
+            self._protocol.data_received(data)
+
+    def _take_marked(self, data: bytes) -> None:
+        for piece, mark in self._escapes.take(data):
+            if mark is None:
+                self._protocol.data_received(piece)
+            else:
+                self._byte_marked(piece, mark)
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """At once if nothing is buffered: else the bytes would leave one turn of the loop later than their stamp."""
@@ -260,9 +280,9 @@ def _names_pty(path: str) -> bool:
         return False
 
 
-def _open(port: SerialPort) -> tuple[serial.Serial, bool]:
+def _open(port: SerialPort) -> tuple[MarkingSerial, bool]:
     """Open and configure the device; also says whether it is paced. Blocks. Raises LineDown."""
-    device = serial.Serial()
+    device = MarkingSerial()
     device.port = port.path
     device.baudrate, device.stopbits = port.baudrate, port.stopbits
     if not _names_pty(port.path):  # a pty stays at 8N1, and the C library calls a change that changes nothing an error
@@ -339,10 +359,14 @@ def _code(error: Exception) -> int | None:
 
 
 def _release(device: serial.Serial, exclusive: bool) -> None:
-    """Discard what has not left, give both locks back (they would outlive us where a pty stays open), and close."""
+    """Discard what has not left, give back the locks (they would outlive us where a pty stays open), and close.
+
+    The flags are given back too, unless somebody else may be using the port with them.
+    """
     with contextlib.suppress(OSError, termios.error):
         termios.tcflush(device.fileno(), termios.TCOFLUSH)
     if exclusive:
+        stop_marking(device.fileno())
         with contextlib.suppress(OSError):
             fcntl.ioctl(device.fileno(), termios.TIOCNXCL)
         with contextlib.suppress(OSError):
@@ -351,7 +375,7 @@ def _release(device: serial.Serial, exclusive: bool) -> None:
         device.close()
 
 
-def _drop(opening: Future[tuple[serial.Serial, bool]]) -> None:
+def _drop(opening: Future[tuple[MarkingSerial, bool]]) -> None:
     """Nobody waited for this opening any more."""
     if not opening.cancelled() and opening.exception() is None:
         device, _paced = opening.result()

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import os
 import select
+import socket
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -16,6 +19,9 @@ from busmaster.transport.serial_port import PortTransport, SerialPort
 PATIENCE = 2.0
 VIRTUAL_PATIENCE = 1000.0
 """Seconds after which something that should happen has not."""
+SO_ATTACH_FILTER, SO_DETACH_FILTER = 26, 27
+BPF_RETURN = 6
+"""Linux: asm/socket.h, linux/bpf_common.h."""
 
 
 class Recorder(asyncio.Protocol):
@@ -116,6 +122,18 @@ def plugged(link: Path | None = None) -> Iterator[FarEnd]:
         far_end.unplug()
         if link is not None:
             link.unlink()
+
+
+@contextlib.contextmanager
+def standing_still(sock: socket.socket) -> Iterator[None]:
+    """A network path on which nothing reaches this end meanwhile: a socket filter drops it, unacknowledged."""
+    nothing = ctypes.create_string_buffer(struct.pack("HBBI", BPF_RETURN, 0, 0, 0))
+    program = struct.pack("HL" if struct.calcsize("P") == 4 else "HxxxxxxQ", 1, ctypes.addressof(nothing))
+    sock.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, program)
+    try:
+        yield
+    finally:
+        sock.setsockopt(socket.SOL_SOCKET, SO_DETACH_FILTER, 0)
 
 
 async def opened(path: str, **options: Any) -> tuple[PortTransport, Recorder]:
