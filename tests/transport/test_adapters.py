@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.transport import adapters
+from busmaster.transport import adapters, identity
 from busmaster.transport.adapters import (
     Finding,
     Holder,
@@ -33,13 +33,14 @@ def far_end() -> Iterator[FarEnd]:
 
 
 @pytest.fixture
-def sysfs(tmp_path: Path, far_end: FarEnd) -> Path:
+def sysfs(tmp_path: Path, far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A /sys in which the pty is an FTDI adapter with its timer at 16 ms."""
     device = tmp_path / "sys/class/tty" / os.path.basename(far_end.path) / "device"
     device.mkdir(parents=True)
     (device / "latency_timer").write_text("16\n")
     (tmp_path / "drivers/ftdi_sio").mkdir(parents=True)
     (device / "driver").symlink_to(tmp_path / "drivers/ftdi_sio")
+    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
     return tmp_path / "sys"
 
 
@@ -63,7 +64,7 @@ def test_a_port_in_order_has_nothing_against_it(far_end: FarEnd) -> None:
 
 
 def test_every_fault_comes_with_what_to_do(tmp_path: Path, far_end: FarEnd, sysfs: Path, process: int) -> None:
-    found = inspect(far_end.path, sys=sysfs)
+    found = inspect(far_end.path)
     assert topics(found) == {"port": True, "permission": True, "holders": False, "driver": True, "latency": False}
     assert all(finding.advice for finding in found if not finding.ok)
     text = "\n".join(finding.what for finding in found)
@@ -75,8 +76,9 @@ def test_every_fault_comes_with_what_to_do(tmp_path: Path, far_end: FarEnd, sysf
 def test_a_quick_adapter_is_in_order(far_end: FarEnd, sysfs: Path) -> None:
     timer = sysfs / "class/tty" / os.path.basename(far_end.path) / "device/latency_timer"
     timer.write_text("1\n")
-    assert latency_timer(far_end.path, sys=sysfs) == 1
-    assert topics(inspect(far_end.path, sys=sysfs))["latency"]
+    assert latency_timer(far_end.path) == 1
+    assert topics(inspect(far_end.path))["latency"]
+    timer.unlink()
     assert latency_timer(far_end.path) is None
 
 

@@ -16,6 +16,7 @@ from busmaster.profile import LineSettings
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport import reconnect
 from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.identity import Identity
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -42,6 +43,10 @@ class Wire:
         self.protocol = protocol
         self.stuck = stuck
         self.aborted = False
+        self.device: Identity | None = None
+
+    def get_extra_info(self, name: str) -> Any:
+        return self.device if name == "identity" else None
 
     def close(self) -> None:
         if not self.stuck:
@@ -69,13 +74,18 @@ class Told:
         self.stuck = stuck
         self.attempts: list[float] = []
         self.wires: list[Wire] = []
-        self.device: Hashable | None = None
+        self.seen: Hashable | None = None
+        self.errors: list[Exception] = []
 
-    def identity(self) -> Hashable | None:
-        return self.device
+    def presence(self) -> Hashable | None:
+        return self.seen
 
-    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> asyncio.Transport:
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> asyncio.Transport:
         self.attempts.append(asyncio.get_running_loop().time())
+        if self.errors:
+            raise self.errors.pop(0)
         if len(self.attempts) <= self.failures:
             raise LineDown("told does not exist")
         wire = Wire(protocol_factory(), self.stuck)
@@ -113,13 +123,13 @@ class Even(random.Random):
         return 1.0
 
 
-def test_attempts_back_off_by_doubling_up_to_the_longest_delay_and_are_reported() -> None:
+def test_attempts_back_off_by_doubling_up_to_the_longest_delay_and_their_reason_is_told_once() -> None:
     async def fail() -> None:
         told, recorder, causes = Told(failures=5), Recorder(), list[LineDown]()
         async with kept(told, recorder, on_failed=causes.append, first_delay=1.0, longest_delay=4.0, jitter=Even()):
             await recorder.connected()
         assert told.pauses == pytest.approx([1, 2, 4, 4, 4])
-        assert [cause.what for cause in causes] == ["told does not exist"] * 5
+        assert [cause.what for cause in causes] == ["told does not exist"]
 
     run_in_virtual_time(fail())
 
@@ -157,7 +167,7 @@ def test_a_device_that_is_seen_to_return_is_opened_at_once_and_the_delays_begin_
         async with kept(told, recorder, first_delay=1.0, longest_delay=100.0, jitter=Even()):
             await asyncio.sleep(9.0)
             assert len(told.attempts) == 4
-            told.device = "back"
+            told.seen = "back"
             await recorder.connected()
         assert told.attempts == pytest.approx([0, 1, 3, 7, 9, 10], abs=reconnect.LOOK_EVERY)
 
