@@ -219,9 +219,12 @@ def _pids(proc: Path) -> list[int]:
 def _has_open(process: Path, device: str) -> bool:
     """False too where we may not look, or it has just ended. To know a node (O_PATH) is not to have it open."""
     with contextlib.suppress(OSError):
-        for link in os.scandir(process / "fd"):
+        for number in os.listdir(process / "fd"):
             with contextlib.suppress(OSError):
-                if os.readlink(link.path) == device and not _flags(process / "fdinfo" / link.name) & os.O_PATH:
+                if (
+                    os.readlink(process / "fd" / number) == device
+                    and not _flags(process / "fdinfo" / number) & os.O_PATH
+                ):
                     return True
     return False
 

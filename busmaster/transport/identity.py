@@ -107,13 +107,16 @@ class PtyIdentity:
 
     advice = "restart to go on with the other, or name it by a symbolic link, which is followed when it is made anew"
 
+    _node = -1
+
     def __init__(self, path: str) -> None:
         self._node = os.open(path, os.O_PATH)
         self._links = tuple(_links(path))
         self._made = datetime.fromtimestamp(os.fstat(self._node).st_ctime, UTC)
 
     def __del__(self) -> None:
-        os.close(self._node)
+        if self._node >= 0:
+            os.close(self._node)
 
     def __str__(self) -> str:
         return f"the pseudo-terminal made at {self._made:%Y-%m-%dT%H:%M:%S}.{self._made.microsecond // 1000:03d}Z"
