@@ -156,7 +156,7 @@ class Connection:
         if isinstance(error, LineDown):
             return error
         if isinstance(error, OSError):
-            return LineDown(f"cannot open {self.endpoint.name}: {error.strerror or error}")
+            return LineDown(f"cannot open {self.endpoint.name}: {error.strerror or str(error) or type(error).__name__}")
         cause = LineDown(
             f"cannot open {self.endpoint.name}: {type(error).__name__}: {error}",
             hint="this is a bug: please report it with what the log says",

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import select
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -129,3 +130,22 @@ async def closed(transport: PortTransport, recorder: Recorder) -> None:
     """Close it, and wait until it is."""
     transport.close()
     await recorder.lost()
+
+
+@contextlib.contextmanager
+def with_the_number_of(gone: FarEnd) -> Iterator[FarEnd]:
+    """Another pty that has the number of one that is gone; the lower ones are taken meanwhile, if they were free."""
+    wanted, lower = int(gone.path.rpartition("/")[2]), list[FarEnd]()
+    deadline = time.monotonic() + PATIENCE
+    while (far_end := FarEnd()).path != gone.path:
+        assert time.monotonic() < deadline, f"{gone.path} was not given again"
+        if int(far_end.path.rpartition("/")[2]) < wanted:
+            lower.append(far_end)
+        else:  # it is still being closed
+            far_end.unplug()
+            time.sleep(0.001)
+    try:
+        yield far_end
+    finally:
+        for end in (far_end, *lower):
+            end.unplug()

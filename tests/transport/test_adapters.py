@@ -24,6 +24,7 @@ from busmaster.transport.adapters import (
     rs485_mode,
 )
 from tests.transport.fakes import FarEnd, plugged
+from tests.transport.usb import UsbTree
 
 
 @pytest.fixture
@@ -162,3 +163,45 @@ def test_a_pty_has_no_low_latency_flag_and_a_driver_tells_its_own(
     for flag in (0, 1 << 13):
         monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings, flag=flag: settings.__setitem__(4, flag))
         assert low_latency(far_end.fd) is bool(flag)
+
+
+# -- a name that lasts -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def usb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UsbTree:
+    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
+    monkeypatch.setattr(identity, "LINKS", tmp_path / "serial")
+    return UsbTree(tmp_path / "sys")
+
+
+def name_of(port: str) -> Finding:
+    (finding,) = [finding for finding in inspect(port) if finding.topic == "name"]
+    assert finding.ok
+    return finding
+
+
+def test_the_name_to_use_for_an_adapter_is_said_unless_it_is_used(usb: UsbTree, far_end: FarEnd) -> None:
+    usb.plug(far_end.path, "A500ABC")
+    finding = name_of(far_end.path)
+    assert finding.what == f"{far_end.path} is FTDI A500ABC"
+    assert finding.advice == f"name it usb:A500ABC: {far_end.path} goes to whichever adapter is found first"
+    finding = name_of("usb:A500ABC")
+    assert finding.what == f"{far_end.path} is FTDI A500ABC, which usb:A500ABC finds again"
+    assert not finding.advice
+
+
+def test_an_adapter_without_a_serial_number_goes_by_its_place(usb: UsbTree, far_end: FarEnd, tmp_path: Path) -> None:
+    usb.plug(far_end.path, place="1-1.2")
+    assert name_of(far_end.path).advice == "it has no serial number: leave it in this USB port"
+    link = tmp_path / "serial/by-path/pci-0000:00:14.0-usb-0:1.2:1.0-port0"
+    link.parent.mkdir(parents=True)
+    link.symlink_to(far_end.path)
+    assert name_of(far_end.path).advice.startswith(f"name it {link}: ")
+    assert not name_of(str(link)).advice
+
+
+def test_a_serial_number_that_is_not_there_is_all_that_is_said(usb: UsbTree) -> None:
+    (finding,) = inspect("usb:A500ABC")
+    assert not finding.ok
+    assert finding.what == "usb:A500ABC is not plugged in: there is no USB serial port at all"
