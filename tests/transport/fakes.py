@@ -17,6 +17,7 @@ from busmaster.transport.serial_port import PortTransport, SerialPort
 PATIENCE = 2.0
 VIRTUAL_PATIENCE = 1000.0
 """Seconds after which something that should happen has not."""
+SPARE_NUMBERS = 32
 
 
 class Recorder(asyncio.Protocol):
@@ -77,6 +78,7 @@ class FarEnd:
     def __init__(self) -> None:
         self.fd, slave = os.openpty()
         self.path = os.ttyname(slave)
+        self.number = int(self.path.rpartition("/")[2])
         os.close(slave)
         os.set_blocking(self.fd, False)
 
@@ -133,13 +135,25 @@ async def closed(transport: PortTransport, recorder: Recorder) -> None:
 
 
 @contextlib.contextmanager
+def plugged_high() -> Iterator[FarEnd]:
+    """A pty whose number no other process gets when it is gone: the lowest is given, and many lower ones are free."""
+    ends = sorted((FarEnd() for _ in range(SPARE_NUMBERS)), key=lambda end: end.number)
+    for end in ends[:-1]:
+        end.unplug()
+    try:
+        yield ends[-1]
+    finally:
+        ends[-1].unplug()
+
+
+@contextlib.contextmanager
 def with_the_number_of(gone: FarEnd) -> Iterator[FarEnd]:
     """Another pty that has the number of one that is gone; the lower ones are taken meanwhile, if they were free."""
-    wanted, lower = int(gone.path.rpartition("/")[2]), list[FarEnd]()
+    lower: list[FarEnd] = []
     deadline = time.monotonic() + PATIENCE
     while (far_end := FarEnd()).path != gone.path:
         assert time.monotonic() < deadline, f"{gone.path} was not given again"
-        if int(far_end.path.rpartition("/")[2]) < wanted:
+        if far_end.number < gone.number:
             lower.append(far_end)
         else:  # it is still being closed
             far_end.unplug()

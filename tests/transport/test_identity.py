@@ -12,7 +12,7 @@ import pytest
 from busmaster.errors import LineDown
 from busmaster.transport import identity
 from busmaster.transport.identity import Identity, identify, lasting_name, resolve, usb_devices
-from tests.transport.fakes import FarEnd, plugged, with_the_number_of
+from tests.transport.fakes import FarEnd, plugged, plugged_high, with_the_number_of
 from tests.transport.usb import UsbTree
 
 CH340 = "1a86:7523"
@@ -183,7 +183,7 @@ def test_a_pseudo_terminal_stays_the_same_whatever_is_done_to_it(one: FarEnd, tw
 
 def with_reused_number(check: Callable[[Identity, FarEnd], None], link: Path | None = None) -> None:
     """Check what was known of a pseudo-terminal against another one that got its number."""
-    with plugged() as end:
+    with plugged_high() as end:
         if link is not None:
             link.symlink_to(end.path)
         known = identify(end.path if link is None else str(link))

@@ -23,7 +23,7 @@ from busmaster.transport import identity, serial_port
 from busmaster.transport.identity import identify
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
-from tests.transport.fakes import FarEnd, Recorder, opened, plugged, with_the_number_of
+from tests.transport.fakes import FarEnd, Recorder, opened, plugged, plugged_high, with_the_number_of
 from tests.transport.usb import UsbTree
 
 PATIENCE = 5.0
@@ -201,7 +201,7 @@ async def test_a_serial_number_follows_its_adapter_to_any_name_and_never_takes_a
 
 @pytest.mark.asyncio
 async def test_a_number_of_a_pseudo_terminal_that_another_device_got_is_refused(name: Path) -> None:
-    with plugged() as ours:
+    with plugged_high() as ours:
         port = Attempts(ours.path, baudrate=57600)
         async with kept(port) as (_, recorder, causes):
             ours.unplug()
