@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import serial
 
 from busmaster.arbiter.events import LineChange, LineChanged, PortFailed
 from busmaster.bus import Bus
@@ -149,14 +150,14 @@ async def test_another_device_is_not_even_opened(
     usb.plug(other.path, place="1-2")
     give(name, ours)
     async with kept(Attempts(str(name), baudrate=57600)) as (_, _, causes):
-        configured: list[int] = []
-        monkeypatch.setattr(termios, "tcgetattr", configured.append)  # each configuration begins with it
+        touched: list[serial.Serial] = []
+        monkeypatch.setattr(serial.Serial, "open", touched.append)
         give(name, other)
         ours.unplug()
         await causes.until(
             "is now FTDI at USB port 1-2, the line was opened on FTDI at USB port 1-1; plug it in at 1-1"
         )
-        assert configured == []
+        assert touched == []
 
 
 @pytest.mark.asyncio
