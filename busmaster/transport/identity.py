@@ -82,9 +82,8 @@ class UsbIdentity:
     @property
     def advice(self) -> str:
         if self.device.serial and self.alone:
-            return (
-                f"name it usb:{self.device.serial}, which finds it wherever it is, or restart to go on with the other"
-            )
+            name = f"{USB}{self.device.serial}" + (f":{self.device.interface}" if self.device.interface else "")
+            return f"name it {name}, which finds it wherever it is, or restart to go on with the other"
         return f"plug it in at {self.device.place} again, or restart to go on with the other"
 
     def accepts(self, found: Identity) -> bool:
