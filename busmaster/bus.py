@@ -15,12 +15,12 @@ import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineStatistics
-from busmaster.arbiter.events import Event, NodeChanged, Strayed
+from busmaster.arbiter.events import Event, NodeChanged, PortFailed, Strayed
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
-from busmaster.errors import BusClosed, InvalidCommand
+from busmaster.errors import BusClosed, InvalidCommand, LineDown
 from busmaster.exchange import Timings
 from busmaster.logbook import Logbook
 from busmaster.merging import Merge
@@ -43,7 +43,8 @@ class Bus:
 
     `capacity` bounds the requests that may wait in each priority class (R12). `seed` makes the jitter of probes and
     reconnects repeatable. `tap` sees every byte (see busmaster.capture). Entering raises LineDown if the port cannot
-    be opened; once open, a lost port fails its callers at once and is opened again by itself (R13).
+    be opened; once open, a lost port fails its callers at once and is opened again by itself, as soon as the same
+    device is back (R13); `events` tells of attempts that fail.
     """
 
     def __init__(
@@ -93,7 +94,7 @@ class Bus:
         self._check_not_closed()
         self.pump.bind(asyncio.get_running_loop())
         self._arbiter.reset_statistics(self.now())
-        connection = Connection(self.endpoint, self.pump, jitter=self._random)
+        connection = Connection(self.endpoint, self.pump, on_failed=self._on_failed, jitter=self._random)
         self._connection = connection
         self.running = True
         try:
@@ -134,6 +135,15 @@ class Bus:
             for task in self._tasks:
                 task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def accept_device(self) -> None:
+        """Let the next opening take whatever device has the port's name then, as if the program were started again.
+
+        Without it, only the device that the line was opened on is opened again. A port that is named by a serial
+        number (usb:SERIAL) never takes another one. A connection that is up stays as it is.
+        """
+        if self._connection is not None:
+            self._connection.accept_device()
 
     # nodes and groups
 
@@ -285,7 +295,7 @@ class Bus:
         return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 
     def events(self) -> Stream[Event]:
-        """What happens to the line and its nodes, from now on (NodeChanged, LineChanged, ...)."""
+        """What happens to the line and its nodes, from now on (NodeChanged, LineChanged, PortFailed, ...)."""
         self._check_not_closed()
         return Stream(self._streams, EVENT_BUFFER)
 
@@ -316,6 +326,9 @@ class Bus:
         if not isinstance(event, Strayed):
             for stream in self._streams:
                 stream.put(event)
+
+    def _on_failed(self, cause: LineDown) -> None:
+        self._on_event(PortFailed(cause.what, cause.hint, cause.__cause__))
 
     def _settings(self) -> LineSettings:
         if self.endpoint.settings is not None:
