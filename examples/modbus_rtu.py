@@ -20,12 +20,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
 
 from busmaster import Bus, InvalidCommand, MemoryPort, Point, Priority, Refused
+from busmaster.arguments import whole_number
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Line
 from busmaster.exchange import MORE, Done, FrameError, Leg, ReplyTiming, Sizes, Step, Timings, no_reply
 from busmaster.handles.base import Handle
 from busmaster.profile import LineSettings, Profile
-from busmaster.wire.integers import whole_number
 
 T = TypeVar("T")
 
