@@ -191,7 +191,7 @@ class Bus:
         Raises InvalidCommand for a name that is in use, and for times and priorities that are none.
         """
         self.check_loop()
-        if not self.running:
+        if self._closed or not self.running:
             raise self.not_open()
         period = seconds(period, f"poll group {name!r}: a period")
         if phase is not None:

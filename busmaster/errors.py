@@ -9,7 +9,7 @@ from __future__ import annotations
 
 
 class InvalidCommand(ValueError):
-    """An argument is out of range or cannot be written as the protocol demands, or a bus is used as it cannot be: opened
+    """An argument is out of range or cannot be written as the protocol demands, or a bus is used as none can be: opened
     twice, or from another thread or event loop than its own. Nothing was sent."""
 
 

@@ -49,6 +49,27 @@ def test_a_bus_that_was_closed_is_not_opened_again() -> None:
     run_in_virtual_time(story())
 
 
+def test_a_bus_that_is_being_closed_takes_nothing_new() -> None:
+    async def story() -> None:
+        bus = slow_bus()
+        await bus.__aenter__()
+        axis = Hcp2Controller(bus, 1)
+        await axis.read(1)
+        reading = asyncio.create_task(axis.read(1))
+        await asyncio.sleep(0.01)
+        closing = asyncio.create_task(bus.__aexit__(None, None, None))
+        await asyncio.sleep(0.01)
+        assert not closing.done()
+        with pytest.raises(BusClosed, match="the bus was closed"):
+            await axis.read(2)
+        with pytest.raises(BusClosed, match="the bus was closed"):
+            bus.poll_group("late", period=1.0, points=[axis.element(1)])
+        await closing
+        assert await reading == 0.0
+
+    run_in_virtual_time(story())
+
+
 def test_closing_ends_even_if_whoever_closes_is_cancelled_meanwhile() -> None:
     """The exchange on the wire may run out, for 80 ms; the owner's patience ends within them."""
 
