@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
-from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, NodeChanged
+from busmaster.arbiter.events import LatenessLowered, LatenessRaised, LineChange, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Timeline
@@ -67,6 +67,7 @@ __all__ = [
     "HcpController",
     "Health",
     "InvalidCommand",
+    "LatenessLowered",
     "LatenessRaised",
     "LineChange",
     "LineChanged",
@@ -91,6 +92,7 @@ __all__ = [
     "PlannedNode",
     "Point",
     "PollGroup",
+    "PortFailed",
     "Priority",
     "Profile",
     "ProgramStatus",

@@ -10,11 +10,11 @@ MSC needs two (ACK, then the packet) and more when a packet must be sent again.
 from __future__ import annotations
 
 import enum
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeAlias, TypeVar
 
+from busmaster.arguments import seconds
 from busmaster.errors import InvalidCommand, Refused
 
 T = TypeVar("T")
@@ -40,16 +40,15 @@ class ReplyTiming:
     """The node's driver holds the line this long after its reply."""
 
     def __post_init__(self) -> None:
-        times = (self.nominal, self.window, self.lateness, self.byte_gap, self.turnaround)
-        if not all(math.isfinite(t) for t in times):
-            raise InvalidCommand("reply times must be finite numbers of seconds")
-        if not 0 <= self.nominal <= self.window <= self.lateness:
+        for name in ("nominal", "window", "lateness", "byte_gap", "turnaround"):
+            seconds(getattr(self, name), f"a reply's {name}")
+        if not self.nominal <= self.window <= self.lateness:
             raise InvalidCommand(
                 f"reply times must satisfy 0 <= nominal <= window <= lateness, "
                 f"not {self.nominal:g}, {self.window:g}, {self.lateness:g} s"
             )
-        if self.byte_gap <= 0 or self.turnaround < 0:
-            raise InvalidCommand("byte_gap must be above 0 s and turnaround at least 0 s")
+        if not self.byte_gap:
+            raise InvalidCommand("a reply's byte_gap is above 0 s")
 
     def with_window(self, window: float) -> ReplyTiming:
         """The same with another reply window; nominal and lateness move only as far as they must."""

@@ -23,7 +23,7 @@ class LineSettings:
 
     def __post_init__(self) -> None:
         rate: object = self.baudrate
-        if not isinstance(rate, int) or rate <= 0:
+        if not isinstance(rate, int) or isinstance(rate, bool) or rate <= 0:
             raise InvalidCommand(f"baudrate must be a whole number above 0, not {rate!r}")
         if self.bytesize not in (5, 6, 7, 8) or self.parity not in tuple("NEOMS") or self.stopbits not in (1, 1.5, 2):
             raise InvalidCommand(

@@ -21,12 +21,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
 
 from busmaster import Bus, InvalidCommand, MemoryPort, Point, Priority, Refused
+from busmaster.arguments import whole_number
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Line
 from busmaster.exchange import MORE, Done, FrameError, Leg, ReplyTiming, Sizes, Step, Timings, no_reply
 from busmaster.handles.base import Handle
 from busmaster.profile import LineSettings, Profile
-from busmaster.wire.integers import whole_number
 
 T = TypeVar("T")
 
@@ -274,6 +274,7 @@ class EmulatedUnit(Device):
         if (self._frame and not self._pause_before(now - len(frame) * self.tau)) or len(frame) != _length(frame):
             return False
         self._frame = b""
+        self.attentive = False
         self._heard_until = now
         self._obey(frame, now)
         return True
@@ -291,13 +292,13 @@ class EmulatedUnit(Device):
         unit, function, first, count = struct.unpack(">BBHH", frame[:6])
         if function == WRITE_ONE:
             answer = self._write(first, (count,), frame[:6])
-        elif function == WRITE_MANY:
-            answer = self._write(first, struct.unpack(f">{frame[6] // 2}H", frame[7:-2]), frame[:6])
+        elif function == WRITE_MANY and count > 0 and frame[6] == 2 * count:
+            answer = self._write(first, struct.unpack(f">{count}H", frame[7:-2]), frame[:6])
         elif function == READ and count > 0 and first + count <= len(self.registers):
             values = self.registers[first : first + count]
             answer = struct.pack(f">BBB{count}H", unit, function, 2 * count, *values)
         else:
-            answer = bytes((unit, function | REFUSED, 2 if function == READ else 1))
+            answer = bytes((unit, function | REFUSED, {READ: 2, WRITE_MANY: 3}.get(function, 1)))
         if unit != BROADCAST:
             self.reply(with_crc(answer), now)
 

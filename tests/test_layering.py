@@ -12,14 +12,15 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "busmaster"
-BASE = {"errors", "exchange", "profile"}
+BASE = {"arguments", "errors", "exchange", "profile"}
 HOLDINGS = {"bus", "logbook", "node", "points", "polling", "samples"}
 ALL = {entry.stem for entry in PACKAGE.iterdir() if entry.suffix in ("", ".py") and entry.name[0] != "_"}
 
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
-    "exchange": {"errors"},
-    "profile": {"exchange", "errors"},
+    "arguments": {"errors"},
+    "exchange": {"arguments", "errors"},
+    "profile": {"arguments", "exchange", "errors"},
     "wire": {"wire"} | BASE,
     "arbiter": {"arbiter"} | BASE,
     "protocols": {"protocols", "wire"} | BASE,
@@ -39,7 +40,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "__main__": ALL,
     "cli": ALL,
 }
-TIMELESS = {"errors", "exchange", "profile", "wire", "protocols", "arbiter", "merging", "planning", "emulator"}
+TIMELESS = BASE | {"wire", "protocols", "arbiter", "merging", "planning", "emulator"}
 TIMELY = {"emulator.serve"}
 CLOCKS_AND_PORTS = {"asyncio", "anyio", "time", "random", "socket", "serial"}
 SEEDED = {"emulator": {"random"}}

@@ -178,13 +178,9 @@ class LineMachine:
         """A deadline of the line falls due: `unsent` is to be told first, where it is known."""
         return now >= self._deadlines.line
 
-    @property
-    def output_held(self) -> bool:
-        """Some of the bytes said had not left when the port was asked last: it is asked again before it is heard."""
-        return self._wire.output.held
-
     def unsent(self, count: int, now: float) -> None:
-        """So many of the bytes said have not left: until they have, nothing runs out and nothing else is said."""
+        """So many of the bytes said have not left: until they have, nothing runs out, nothing else is said and nothing
+        is their answer. Told again, then, before the bytes that come."""
         again = self._wire.output.unsent(count, now)
         if again is not None:
             self._deadlines.line = self._due_anew(now) if again == inf else again

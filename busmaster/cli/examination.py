@@ -70,7 +70,7 @@ async def examine(patient: Patient, tell: Tell, tap: Tap | None = None) -> None:
     """Tell all findings, in this order; one that makes the rest pointless is the last."""
     where = patient.endpoint
     if isinstance(where, SerialPort):
-        found = adapters.inspect(where.path)
+        found = await anyio.to_thread.run_sync(adapters.inspect, where.path)
         for finding in found:
             tell(finding)
         if not all(finding.ok for finding in found if finding.topic in ("port", "permission", "holders")):

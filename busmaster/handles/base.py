@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 class Handle:
     """An awaitable handle of one node: thin and typed, over `Node.request`.
 
-    Raises InvalidCommand for an address that the protocol does not have. Two handles of one address share the node.
+    Raises InvalidCommand for an address that the protocol does not have. Handles of one protocol and address share the
+    node, whatever their kind (Hcp2Controller and MicroFlexDrive both speak HCP2): what one leaves out, of timings,
+    retries and options of the protocol, is as the first said, and anything else than that raises InvalidCommand.
+    Another protocol at the same address is another node.
     """
 
     profile: ClassVar[Profile]

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from dataclasses import InitVar, dataclass
 from typing import ClassVar
 
+from busmaster.arguments import whole_number
 from busmaster.exchange import MORE, Done, FrameError, Need, ReplyTiming, Sizes, Timings, no_reply
 from busmaster.profile import LineSettings, Profile
 from busmaster.wire.checks import sum8
-from busmaster.wire.integers import whole_number
 from busmaster.wire.readers import NAK, STX, AcknowledgeReader, SingleLeg
 
 READ = 0xAA

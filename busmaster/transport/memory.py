@@ -11,6 +11,7 @@ from typing import Any
 from busmaster.emulator.line import Line
 from busmaster.profile import LineSettings
 from busmaster.transport.clock import clock_of
+from busmaster.transport.identity import Identity
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +44,13 @@ class MemoryPort:
     def paced(self) -> bool:
         return self.line.paced
 
-    def identity(self) -> None:
+    def presence(self) -> None:
         """It never goes away."""
         return None
 
-    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> MemoryTransport:
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> MemoryTransport:
         """Never fails."""
         return MemoryTransport(asyncio.get_running_loop(), protocol_factory(), self.line)
 

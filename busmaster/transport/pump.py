@@ -159,6 +159,8 @@ class Pump(asyncio.Protocol):
         now = self.clock()
         if self.tap is not None:
             self.tap.received(now, data)
+        if self._held_since < inf:  # what was held may have left since: only then can this be its answer
+            self._check_output(now)
         self.arbiter.data_received(data, now)
         self.turn()
 

@@ -124,8 +124,9 @@ def test_the_address_step_is_found_and_a_wrong_one_fails_verification(step: int)
             press = MscController(bus, 3)
             assert await press.find_address_step(2000) == step
             assert await press.read_block(2000, 39) == tuple(range(1, 40))
+            press.address_step = 5 - step
             with pytest.raises(VerifyFailed):
-                await MscController(bus, 3, address_step=5 - step).load_cam(3000, range(100))
+                await press.load_cam(3000, range(100))
 
     run_in_virtual_time(story())
 

@@ -9,6 +9,7 @@ import os
 import select
 import socket
 import struct
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -22,6 +23,7 @@ VIRTUAL_PATIENCE = 1000.0
 SO_ATTACH_FILTER, SO_DETACH_FILTER = 26, 27
 BPF_RETURN = 6
 """Linux: asm/socket.h, linux/bpf_common.h."""
+SPARE_NUMBERS = 32
 
 
 class Recorder(asyncio.Protocol):
@@ -82,6 +84,7 @@ class FarEnd:
     def __init__(self) -> None:
         self.fd, slave = os.openpty()
         self.path = os.ttyname(slave)
+        self.number = int(self.path.rpartition("/")[2])
         os.close(slave)
         os.set_blocking(self.fd, False)
 
@@ -147,3 +150,34 @@ async def closed(transport: PortTransport, recorder: Recorder) -> None:
     """Close it, and wait until it is."""
     transport.close()
     await recorder.lost()
+
+
+@contextlib.contextmanager
+def plugged_high() -> Iterator[FarEnd]:
+    """A pty whose number no other process gets when it is gone: the lowest is given, and many lower ones are free."""
+    ends = sorted((FarEnd() for _ in range(SPARE_NUMBERS)), key=lambda end: end.number)
+    for end in ends[:-1]:
+        end.unplug()
+    try:
+        yield ends[-1]
+    finally:
+        ends[-1].unplug()
+
+
+@contextlib.contextmanager
+def with_the_number_of(gone: FarEnd) -> Iterator[FarEnd]:
+    """Another pty that has the number of one that is gone; the lower ones are taken meanwhile, if they were free."""
+    lower: list[FarEnd] = []
+    deadline = time.monotonic() + PATIENCE
+    while (far_end := FarEnd()).path != gone.path:
+        assert time.monotonic() < deadline, f"{gone.path} was not given again"
+        if far_end.number < gone.number:
+            lower.append(far_end)
+        else:  # it is still being closed
+            far_end.unplug()
+            time.sleep(0.001)
+    try:
+        yield far_end
+    finally:
+        for end in (far_end, *lower):
+            end.unplug()
