@@ -174,7 +174,7 @@ class Dispatcher:
             node.last_reply = now
             if node.health is not UP:
                 self._heard(node, now)
-            if now > node.lateness_until:
+            if node.lateness_until < inf:
                 self._lower_lateness(transaction, now)
             if transaction.paid:
                 self.probes.budget.refund(transaction.paid - (now - transaction.started))
@@ -366,11 +366,11 @@ class Dispatcher:
         return error is None
 
     def _lower_lateness(self, transaction: Transaction, now: float) -> None:
-        """An hour has passed since its lateness was raised: back to what it was, unless this reply was late too."""
+        """Back to what it was, when an hour of prompt replies has passed since its lateness was raised."""
         node = transaction.node
         if transaction.late:
             node.lateness_until = now + health.CALM_LATENESS
-        else:
+        elif now > node.lateness_until:
             node.restore_lateness()
             self.events.append(LatenessLowered(node, node.lateness))
 
