@@ -12,16 +12,16 @@ never silent nobody waits longer either, but fails with LineNoisy.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from math import ceil, floor, inf, log10
 from typing import Any, TypeAlias
 
-from busmaster.arbiter.schedule import Poll, Priority, Schedule, line_time
+from busmaster.arbiter.schedule import SLICE, Poll, Priority, Schedule, line_time
 from busmaster.exchange import Command, Exchange, Timings
-from busmaster.merging import Merge, Served, cheapest
+from busmaster.merging import WEIGHING, Merge, Served, at_once, cheapest
 from busmaster.profile import LineSettings, Profile
 
 SHARE = 7
@@ -36,6 +36,8 @@ BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 HORIZON = 10
 """Periods of the slowest group over which the timetable is played through, at most TIMETABLE exchanges."""
 TIMETABLE = 20_000
+PIECE = 64
+"""Exchanges of the timetable that are played at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +73,12 @@ class PlannedGroup:
     phase: float | None = None
     priority: Priority = Priority.POLL
     merge: Sequence[Merge] = ()
+
+
+def shape(exchange: Exchange[Any]) -> tuple[object, ...]:
+    """What, beside its timings, tells how long an exchange can take: two of one shape take equally long."""
+    later = tuple((leg.sent, leg.sizes.longest) for leg in exchange.later)
+    return len(exchange.request), exchange.sizes.longest, later
 
 
 # the worst case
@@ -132,15 +140,26 @@ def bounds(
     reads: Iterable[Read], byte_time: float, receive_latency: float = 0.0, *, polls: int = 0, background: int = 0
 ) -> Bounds:
     """The bounds for a line on which nothing else is asked than these, and every node's probe."""
-    asked = set(reads)
-    asked |= {(node, node.profile.probe) for node, _ in asked if node.address != node.profile.broadcast}
-    holds = [(longest_hold(node.open(c), byte_time, receive_latency), node.profile.exchange_limit) for node, c in asked]
-    return Bounds(
-        hold=max((hold + (limit or 0.0) for hold, limit in holds), default=0.0),
-        urgent_hold=max((hold for hold, _ in holds), default=0.0),
-        polls=polls,
-        background=background,
-    )
+    return at_once(_bounds(reads, byte_time, receive_latency, polls, background))
+
+
+def _bounds(
+    reads: Iterable[Read], byte_time: float, receive_latency: float, polls: int, background: int
+) -> Generator[int, None, Bounds]:
+    hold = urgent_hold = 0.0
+    probed: set[tuple[int, int]] = set()
+    for node, command in reads:
+        asked = [command]
+        alike = (id(node.profile), id(node.timings))
+        if alike not in probed and node.address != node.profile.broadcast:
+            probed.add(alike)
+            asked.append(node.profile.probe)
+        for each in asked:
+            longest = longest_hold(node.open(each), byte_time, receive_latency)
+            hold = max(hold, longest + (node.profile.exchange_limit or 0.0))
+            urgent_hold = max(urgent_hold, longest)
+        yield WEIGHING
+    return Bounds(hold, urgent_hold, polls, background)
 
 
 # the plan
@@ -229,21 +248,38 @@ def plan(
     `others` may be asked beside them: the worst case reckons with those, and with every node's probe. `could_merge`
     are merges to be weighed that no group opts in to. Raises InvalidCommand for a period or phase that cannot be.
     """
+    steps = plan_steps(groups, line=line, receive_latency=receive_latency, others=others, could_merge=could_merge)
+    return at_once(steps)
+
+
+def plan_steps(
+    groups: Iterable[PlannedGroup],
+    *,
+    line: LineSettings,
+    receive_latency: float = 0.0,
+    others: Iterable[Read] = (),
+    could_merge: Sequence[Merge] = (),
+) -> Generator[int, None, Plan]:
+    """Do what `plan` does in steps: each yields how many units of work it took, of about a microsecond."""
     drafts = [_Draft(group, line.byte_time) for group in groups]
+    for draft in drafts:
+        yield from draft.weigh()
     asked = [(node, served.command) for draft in drafts for node, served in draft.exchanges]
     low = sum(len(draft.costs) for draft in drafts if draft.group.priority is Priority.BACKGROUND)
     polls = sum(len(draft.costs) for draft in drafts) - low
-    bound = bounds((*asked, *others), line.byte_time, receive_latency, polls=polls, background=low)
+    bound = yield from _bounds((*asked, *others), line.byte_time, receive_latency, polls, low)
     utilisation = sum(draft.utilisation for draft in drafts)
-    _play(drafts)
+    yield from _play(drafts)
+    for draft in drafts:
+        yield from draft.weigh_further(could_merge)
     return Plan(
         line=line,
         utilisation=utilisation,
-        groups=tuple(draft.planned(utilisation, bound, could_merge) for draft in drafts),
+        groups=tuple(draft.planned(utilisation, bound) for draft in drafts),
         typical_wait=max((cost for draft in drafts for cost in draft.costs), default=0.0),
-        dead_wait=max((_unanswered(node.open(c), line.byte_time) + receive_latency for node, c in asked), default=0.0),
+        dead_wait=max((draft.unanswered + receive_latency for draft in drafts if draft.costs), default=0.0),
         worst_waits={priority: bound.wait(priority) for priority in Priority},
-        fitting_baudrate=_fitting_baudrate(drafts, line) if utilisation > COMFORT else None,
+        fitting_baudrate=(yield from _fitting_baudrate(drafts, line)) if utilisation > COMFORT else None,
     )
 
 
@@ -253,9 +289,11 @@ class _Draft:
     def __init__(self, group: PlannedGroup, byte_time: float) -> None:
         self.group = group
         self.byte_time = byte_time
-        self.exchanges = list(_exchanges(group, group.merge, byte_time))
-        self.costs = [node.line_time(served.command, byte_time) for node, served in self.exchanges]
-        self.poll = Poll(group.name, group.period, phase=group.phase, cost=sum(self.costs))
+        self.exchanges: list[tuple[PlannedNode, Served]] = []
+        self.costs: list[float] = []
+        self.unanswered = 0.0
+        self.could_save = 0.0
+        self.poll = Poll(group.name, group.period, phase=group.phase)
         self.poll.waiter = self
         self.finished = 0
         self.total = self.longest = 0.0
@@ -269,12 +307,29 @@ class _Draft:
         self.total += seconds
         self.longest = max(self.longest, seconds)
 
-    def planned(self, utilisation: float, bound: Bounds, could_merge: Sequence[Merge]) -> GroupPlan:
+    def weigh(self) -> Generator[int, None, None]:
+        """Choose its exchanges, and reckon what each takes."""
+        self.exchanges = yield from _exchanges(self.group, self.group.merge, self.byte_time)
+        for node, served in self.exchanges:
+            exchange = node.open(served.command)
+            self.costs.append(line_time(exchange, self.byte_time, node.reply_time))
+            self.unanswered = max(self.unanswered, _unanswered(exchange, self.byte_time))
+            yield WEIGHING
+        self.poll.cost = sum(self.costs)
+
+    def weigh_further(self, could_merge: Sequence[Merge]) -> Generator[int, None, None]:
+        """Reckon what merges would save that nobody opted in to."""
+        if could_merge:
+            merge = (*self.group.merge, *could_merge)
+            further = _Draft(replace(self.group, merge=merge), self.byte_time)
+            yield from further.weigh()
+            self.could_save = max(0.0, self.poll.cost - further.poll.cost)
+
+    def planned(self, utilisation: float, bound: Bounds) -> GroupPlan:
         group, cost = self.group, self.poll.cost
         missed = self.poll.missed / (self.poll.missed + max(1, self.finished))
         left = COMFORT - (utilisation - self.utilisation)
         wait = bound.wait(group.priority, patience=self.poll.patience)
-        further = _exchanges(group, (*group.merge, *could_merge), self.byte_time)
         return GroupPlan(
             name=group.name,
             period=group.period,
@@ -293,26 +348,35 @@ class _Draft:
                 if s.batch
             ),
             fitting_period=_rounded_up(cost / left) if utilisation > COMFORT and left > 0 else None,
-            could_save=max(0.0, cost - sum(node.line_time(s.command, self.byte_time) for node, s in further)),
+            could_save=self.could_save,
         )
 
 
-def _exchanges(group: PlannedGroup, merges: Sequence[Merge], byte_time: float) -> Iterator[tuple[PlannedNode, Served]]:
+def _exchanges(
+    group: PlannedGroup, merges: Sequence[Merge], byte_time: float
+) -> Generator[int, None, list[tuple[PlannedNode, Served]]]:
     """Node by node, each command once."""
     commands: dict[PlannedNode, dict[Command[Any], None]] = {}
     for node, command in group.reads:
         commands.setdefault(node, {})[command] = None
+        yield 8
+    exchanges = []
     for node, wanted in commands.items():
         own = () if node.profile.merge is None else (node.profile.merge,)
-        for served in cheapest(tuple(wanted), (*own, *merges), partial(node.line_time, byte_time=byte_time)):
-            yield node, served
+        cost = partial(node.line_time, byte_time=byte_time)
+        chosen = yield from cheapest(tuple(wanted), (*own, *merges), cost)
+        exchanges += [(node, served) for served in chosen]
+    return exchanges
 
 
-def _play(drafts: Sequence[_Draft]) -> None:
+def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
     """The timetable, if every exchange takes its line time: earliest deadline first, and BACKGROUND as R9 has it."""
     schedule, order = Schedule(), count()
     for draft in drafts:
         schedule.add(draft.poll, 0.0)
+    while schedule.unplaced():
+        schedule.work(0.0)
+        yield SLICE
     waiting: list[tuple[float, int, float, _Draft]] = []
     background: list[tuple[float, int, float, _Draft]] = []
 
@@ -326,7 +390,9 @@ def _play(drafts: Sequence[_Draft]) -> None:
 
     end = HORIZON * max((draft.group.period for draft in drafts), default=0.0)
     now, streak = 0.0, 0
-    for _ in range(TIMETABLE):
+    for number in range(TIMETABLE):
+        if number % PIECE == 0:
+            yield SLICE
         if not waiting and not background:
             now = max(now, schedule.next_due())
             release(now)
@@ -350,11 +416,16 @@ def _play(drafts: Sequence[_Draft]) -> None:
 # what would fit
 
 
-def _fitting_baudrate(drafts: Sequence[_Draft], line: LineSettings) -> int | None:
+def _fitting_baudrate(drafts: Sequence[_Draft], line: LineSettings) -> Generator[int, None, int | None]:
     for baudrate in BAUDRATES:
         if baudrate > line.baudrate:
             byte_time = replace(line, baudrate=baudrate).byte_time
-            if sum(_Draft(draft.group, byte_time).utilisation for draft in drafts) <= COMFORT:
+            utilisation = 0.0
+            for draft in drafts:
+                faster = _Draft(draft.group, byte_time)
+                yield from faster.weigh()
+                utilisation += faster.utilisation
+            if utilisation <= COMFORT:
                 return baudrate
     return None
 

@@ -107,8 +107,13 @@ class Tally:
         self.cycle_time = Histogram()
         self.samples = dict.fromkeys(Quality, 0)
 
-    def note(self, poll: Poll) -> None:
-        """A cycle is over. What its first exchange waited for is what the cycle waited for."""
+    def note(self, poll: Poll, qualities: Mapping[Quality, int]) -> None:
+        """A cycle is over, with so many samples of each quality.
+
+        What its first exchange waited for is what the cycle waited for.
+        """
+        for quality, number in qualities.items():
+            self.samples[quality] += number
         begun = poll.started if poll.started > -inf else poll.due
         if self.first is None:
             self.first = begun

@@ -12,21 +12,13 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given, settings
 
-import busmaster.arbiter.schedule as schedule_module
+import busmaster.arbiter.phases as phases_module
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.schedule import (
-    KINKS,
-    LONGEST_PATIENCE,
-    Poll,
-    Schedule,
-    begin_cycle,
-    common_divisor,
-    line_time,
-    quietest_offset,
-    set_members,
-)
+from busmaster.arbiter.phases import KINKS, common_divisor, quietest_offset
+from busmaster.arbiter.schedule import LONGEST_PATIENCE, Poll, Schedule, begin_cycle, line_time, set_members
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import InvalidCommand
+from busmaster.merging import at_once
 from busmaster.profile import LineSettings
 from busmaster.protocols import hcp2, msc
 
@@ -109,7 +101,7 @@ def test_a_paused_poll_neither_starts_nor_misses_and_resumes_on_the_grid() -> No
 def test_a_removed_poll_is_not_due_again_and_cannot_come_back() -> None:
     poll, other = Poll("a", 0.1, phase=0.0), Poll("b", 0.3, phase=0.0)
     schedule = running(poll, other)
-    begin_cycle(poll, 0.0)
+    list(begin_cycle(poll, 0.0))
     schedule.remove(poll)
     assert {name for _, name in released(schedule, 1.0)} == {"b"}
     with pytest.raises(InvalidCommand, match="make a new one"):
@@ -140,7 +132,7 @@ def test_a_cycle_begins_with_fresh_transactions_that_want_to_be_done_within_the_
     poll = Poll("a", 0.5, phase=0.0)
     set_members(poll, members(1, 2), Priority.POLL)
     running(poll).release(0.0)
-    cycle = begin_cycle(poll, 0.001)
+    cycle = list(begin_cycle(poll, 0.001))
     assert [(t.queued, t.deadline) for t in cycle] == [(0.001, 0.5)] * 2
     assert poll.remaining == 2
 
@@ -149,7 +141,7 @@ def test_r9_a_slow_poll_waits_no_longer_for_later_fast_ones_than_its_patience() 
     poll = Poll("hourly", 3600.0, phase=0.0)
     set_members(poll, members(1))
     running(poll).release(0.0)
-    assert begin_cycle(poll, 0.0)[0].deadline == LONGEST_PATIENCE
+    assert next(begin_cycle(poll, 0.0)).deadline == LONGEST_PATIENCE
 
 
 def test_r11_a_node_that_was_never_heard_is_read_in_background() -> None:
@@ -165,10 +157,10 @@ def test_new_members_are_asked_from_the_next_cycle_on() -> None:
     poll = Poll("a", 0.5, phase=0.0)
     old, new = members(1, 2)
     set_members(poll, [old])
-    begin_cycle(poll, 0.0)
+    list(begin_cycle(poll, 0.0))
     set_members(poll, [new])
     assert list(poll.results) == [old]
-    assert begin_cycle(poll, 0.5) == [new]
+    assert list(begin_cycle(poll, 0.5)) == [new]
 
 
 # phases
@@ -214,13 +206,13 @@ def test_a_long_cycle_meets_as_little_as_can_be() -> None:
     polls = [Poll("fast", 0.05, phase=0.0, cost=0.01), Poll("slow", 2.0, phase=0.0, cost=0.4)]
     schedule = running(*polls)
     schedule.release(0.0)
-    assert 0.4 <= quietest_offset(Poll("another", 2.0, cost=0.4), polls, 0.0) <= 1.6
+    assert 0.4 <= at_once(quietest_offset(Poll("another", 2.0, cost=0.4), polls, 0.0)) <= 1.6
 
 
 def test_choosing_a_phase_among_many_polls_looks_at_a_bounded_number_of_kinks(monkeypatch: pytest.MonkeyPatch) -> None:
     """The 60th group costs the running line a few milliseconds, however its period relates to the others'."""
     looked_at = most = 0
-    kinks = schedule_module._kinks
+    kinks = phases_module._kinks
 
     def counted(*arguments: Any) -> Iterator[tuple[float, float]]:
         nonlocal looked_at
@@ -228,14 +220,14 @@ def test_choosing_a_phase_among_many_polls_looks_at_a_bounded_number_of_kinks(mo
             looked_at += 1
             yield kink
 
-    monkeypatch.setattr(schedule_module, "_kinks", counted)
+    monkeypatch.setattr(phases_module, "_kinks", counted)
     chance = random.Random(3)
     for period in (0.25, 10.0, 0.007, 3600.0, 0.333):
         others = [Poll(str(n), chance.choice([0.1, 0.25, 0.3, 1.0, 60.0]), cost=0.005) for n in range(59)]
         for other in others:
             other.base = chance.uniform(0.0, other.period)
         looked_at = 0
-        offset = quietest_offset(Poll("sixtieth", period, cost=0.005), others, 0.0)
+        offset = at_once(quietest_offset(Poll("sixtieth", period, cost=0.005), others, 0.0))
         most = max(most, looked_at)
         assert 0 <= offset < period
     assert 0 < most <= 2 * KINKS
@@ -261,7 +253,7 @@ def test_no_offset_is_quieter_than_the_one_chosen(others: list[tuple[float, floa
         polls.append(Poll(str(n), other_period, cost=min(cost, other_period)))
         polls[-1].base = phase * other_period
     poll = Poll("new", period, cost=0.01)
-    offset = quietest_offset(poll, polls, 0.0)
+    offset = at_once(quietest_offset(poll, polls, 0.0))
     chosen = overlap(poll, offset, polls, 2.0)
     tried = [overlap(poll, n / 40 * period, polls, 2.0) for n in range(40)]
     assert chosen <= min(tried) + 1e-6
