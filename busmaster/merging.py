@@ -53,6 +53,7 @@ def cheapest(
         saved = sum(single[i] for i in batch.serves) - cost(batch.command)
         weighed.append(Served(batch.command, batch.serves, True, saved))
         yield WEIGHING
+    yield len(commands)
     left = set(range(len(commands)))
     chosen: list[Served] = []
     for served in sorted(weighed, key=lambda served: -served.saved):

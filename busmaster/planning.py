@@ -261,21 +261,25 @@ def plan_steps(
     could_merge: Sequence[Merge] = (),
 ) -> Generator[int, None, Plan]:
     """Do what `plan` does in steps: each yields how many units of work it took, of about a microsecond."""
-    drafts = [_Draft(group, line.byte_time) for group in groups]
-    for draft in drafts:
-        yield from draft.weigh()
+    drafts: list[_Draft] = []
+    for group in groups:
+        drafts.append(_Draft(group, line.byte_time))
+        yield from drafts[-1].weigh()
     asked = [(node, served.command) for draft in drafts for node, served in draft.exchanges]
     low = sum(len(draft.costs) for draft in drafts if draft.group.priority is Priority.BACKGROUND)
     polls = sum(len(draft.costs) for draft in drafts) - low
     bound = yield from _bounds((*asked, *others), line.byte_time, receive_latency, polls, low)
     utilisation = sum(draft.utilisation for draft in drafts)
     yield from _play(drafts)
+    planned = []
     for draft in drafts:
         yield from draft.weigh_further(could_merge)
+        planned.append(draft.planned(utilisation, bound))
+        yield WEIGHING
     return Plan(
         line=line,
         utilisation=utilisation,
-        groups=tuple(draft.planned(utilisation, bound) for draft in drafts),
+        groups=tuple(planned),
         typical_wait=max((cost for draft in drafts for cost in draft.costs), default=0.0),
         dead_wait=max((draft.unanswered + receive_latency for draft in drafts if draft.costs), default=0.0),
         worst_waits={priority: bound.wait(priority) for priority in Priority},
@@ -374,28 +378,34 @@ def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
     schedule, order = Schedule(), count()
     for draft in drafts:
         schedule.add(draft.poll, 0.0)
+        yield WEIGHING
     while schedule.unplaced():
         schedule.work(0.0)
         yield SLICE
     waiting: list[tuple[float, int, float, _Draft]] = []
     background: list[tuple[float, int, float, _Draft]] = []
 
-    def release(now: float) -> None:
-        for poll in schedule.release(now):
-            draft: _Draft = poll.waiter
-            queue = background if draft.group.priority is Priority.BACKGROUND else waiting
-            poll.remaining = len(draft.costs)
-            for cost in draft.costs:
-                heapq.heappush(queue, (poll.due + poll.patience, next(order), cost, draft))
+    def release(now: float) -> Generator[int, None, float]:
+        """Have what is due wait; returns when more will be."""
+        while (due := schedule.next_due()) <= now:
+            for poll in schedule.release(now):
+                draft: _Draft = poll.waiter
+                yield 4 + len(draft.costs)
+                queue = background if draft.group.priority is Priority.BACKGROUND else waiting
+                poll.remaining = len(draft.costs)
+                for cost in draft.costs:
+                    heapq.heappush(queue, (poll.due + poll.patience, next(order), cost, draft))
+        return due
 
     end = HORIZON * max((draft.group.period for draft in drafts), default=0.0)
-    now, streak = 0.0, 0
+    now = due = 0.0
+    streak = 0
     for number in range(TIMETABLE):
         if number % PIECE == 0:
-            yield SLICE
+            yield 2 * PIECE
         if not waiting and not background:
-            now = max(now, schedule.next_due())
-            release(now)
+            now = max(now, due)
+            due = yield from release(now)
         if now >= end:
             break
         if background and (streak >= SHARE or not waiting):
@@ -407,7 +417,8 @@ def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
         else:
             continue
         now += cost
-        release(now)
+        if now >= due:
+            due = yield from release(now)
         draft.poll.remaining -= 1
         if not draft.poll.remaining:
             draft.note_cycle(now - draft.poll.due)

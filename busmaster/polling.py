@@ -17,7 +17,7 @@ from busmaster.merging import WEIGHING, Merge, Served, cheapest
 from busmaster.planning import PlannedGroup, shape
 from busmaster.points import Point
 from busmaster.profile import Batch
-from busmaster.samples import GroupStatistics, Quality, Sample, Snapshot, Stream, Tally
+from busmaster.samples import NO_SAMPLES, GroupStatistics, Quality, Sample, Snapshot, Stream, Tally
 
 if TYPE_CHECKING:
     from busmaster.bus import Bus
@@ -185,7 +185,7 @@ class PollGroup:
         if self._cycle != self._poll.cycles:
             self._cycle = self._poll.cycles
             self._samples = read.blank.copy()
-            self._qualities = dict.fromkeys(Quality, 0)
+            self._qualities = NO_SAMPLES.copy()
             self._line_time = 0.0
             self._refusals = []
         self._line_time += read.line_time

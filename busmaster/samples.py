@@ -30,6 +30,10 @@ class Quality(enum.Enum):
     BAD = "bad"
 
 
+NO_SAMPLES = dict.fromkeys(Quality, 0)
+"""To be copied: a count of each quality."""
+
+
 class Sample(NamedTuple):
     """One point's outcome in one cycle. Times are the bus's clock (`bus.now()`), in seconds."""
 
@@ -105,7 +109,7 @@ class Tally:
         self.exchanges_ahead = 0
         self.settling_ahead = 0.0
         self.cycle_time = Histogram()
-        self.samples = dict.fromkeys(Quality, 0)
+        self.samples = NO_SAMPLES.copy()
 
     def note(self, poll: Poll, qualities: Mapping[Quality, int]) -> None:
         """A cycle is over, with so many samples of each quality.

@@ -13,9 +13,19 @@ import pytest
 from hypothesis import given, settings
 
 import busmaster.arbiter.phases as phases_module
+import busmaster.arbiter.schedule as schedule_module
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.phases import KINKS, common_divisor, quietest_offset
-from busmaster.arbiter.schedule import LONGEST_PATIENCE, Poll, Schedule, begin_cycle, line_time, set_members
+from busmaster.arbiter.phases import KINKS, STRIDE, common_divisor, quietest_offset
+from busmaster.arbiter.schedule import (
+    AT_ONCE,
+    LONGEST_PATIENCE,
+    SLICE,
+    Poll,
+    Schedule,
+    begin_cycle,
+    line_time,
+    set_members,
+)
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import InvalidCommand
 from busmaster.merging import at_once
@@ -295,3 +305,162 @@ def test_r10_an_owner_who_was_late_starts_a_poll_once_even_if_the_clock_stands_o
     assert starting == [poll]
     assert poll.missed == cycles
     assert poll.next_due() > poll.base + cycles * period
+
+
+# nothing holds the loop up
+
+
+def counted_kinks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Counts, in its first item, the kinks that are looked at."""
+    looked_at = [0]
+    kinks = phases_module._kinks
+
+    def counted(*arguments: Any) -> Iterator[tuple[float, float]]:
+        for kink in kinks(*arguments):
+            looked_at[0] += 1
+            yield kink
+
+    monkeypatch.setattr(phases_module, "_kinks", counted)
+    return looked_at
+
+
+def two_hundred() -> list[Poll]:
+    periods = (0.25, 0.5, 1.0, 2.0, 0.1, 0.3, 0.7, 5.0)
+    return [Poll(str(n), periods[n % len(periods)], cost=0.001) for n in range(200)]
+
+
+def place_all(schedule: Schedule, now: float = 0.0) -> int:
+    """Until every poll has its place; the number of calls that it took."""
+    calls = 0
+    while schedule.unplaced():
+        assert schedule.next_due() <= now
+        schedule.release(now)
+        calls += 1
+    return calls
+
+
+def test_placing_two_hundred_polls_takes_many_calls_of_a_slice_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_at = counted_kinks(monkeypatch)
+    polls = two_hundred()
+    schedule = running(*polls)
+    slices = []
+    while schedule.unplaced():
+        before = looked_at[0]
+        schedule.release(0.0)
+        slices.append(looked_at[0] - before)
+    assert len(slices) > 100
+    assert max(slices) <= SLICE + STRIDE
+    assert all(poll.placed for poll in polls)
+
+
+def test_phases_do_not_depend_on_how_the_work_was_cut_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    cut, whole = two_hundred(), two_hundred()
+    place_all(running(*cut))
+    monkeypatch.setattr(schedule_module, "SLICE", 10**9)
+    assert place_all(running(*whole)) == 1
+    assert [poll.phase for poll in cut] == [poll.phase for poll in whole]
+
+
+def test_a_preparation_is_done_a_slice_at_a_time_and_then_the_poll_is_placed() -> None:
+    done = [0]
+
+    def work() -> Iterator[int]:
+        for _ in range(100):
+            done[0] += 10
+            yield 10
+
+    poll = Poll("large", 1.0)
+    poll.preparation = work()
+    schedule = running(poll)
+    steps = [done[0]]
+    while schedule.unplaced():
+        schedule.release(0.0)
+        steps.append(done[0])
+    assert steps[-1] == 1000
+    assert max(b - a for a, b in pairwise([0, *steps])) <= SLICE + 10
+    assert poll.placed
+
+
+def test_a_small_preparation_is_done_at_once_unless_other_work_waits() -> None:
+    schedule = Schedule()
+    done = []
+
+    def work(name: str) -> Iterator[int]:
+        done.append(name)
+        yield 1
+
+    for name in ("first", "second"):
+        poll = Poll(name, 1.0)
+        poll.preparation = work(name)
+        schedule.add(poll, 0.0)
+    assert done == ["first"]
+    place_all(schedule)
+    assert done == ["first", "second"]
+
+
+@pytest.mark.parametrize("calls", [0, 1, 2, 30])
+def test_polls_that_are_removed_while_they_are_placed_leave_nothing(calls: int) -> None:
+    stays, polls = Poll("stays", 0.4, phase=0.1), two_hundred()
+    for poll in polls[::2]:
+        poll.preparation = iter([10] * 30)
+    schedule = running(stays, *polls)
+    for _ in range(calls):
+        schedule.release(0.0)
+    for poll in polls:
+        schedule.remove(poll)
+    assert not schedule.unplaced()
+    assert schedule.next_due() == pytest.approx(0.1)
+    assert {name for _, name in released(schedule, 10.0)} == {"stays"}
+
+
+def test_a_large_cycle_is_started_so_many_exchanges_at_a_time() -> None:
+    poll = Poll("large", 10.0, phase=0.0)
+    large = members(*range(1, 201))
+    set_members(poll, large)
+    schedule = running(poll)
+    begun: list[Transaction] = []
+    while schedule.next_due() <= 0.0:
+        piece = schedule.begin(0.0)
+        assert len(piece) <= AT_ONCE
+        assert poll.running
+        begun += piece
+    assert begun == large
+    assert schedule.next_due() == pytest.approx(10.0)
+
+
+def test_a_poll_that_is_removed_while_its_cycle_starts_queues_no_more() -> None:
+    poll = Poll("large", 10.0, phase=0.0)
+    set_members(poll, members(*range(1, 201)))
+    schedule = running(poll)
+    assert len(schedule.begin(0.0)) == AT_ONCE
+    schedule.remove(poll)
+    assert schedule.begin(0.0) == []
+    assert schedule.next_due() == inf
+
+
+def test_polls_that_are_all_due_at_once_start_a_number_at_a_time_and_none_is_missed() -> None:
+    polls = [Poll(str(n), 1.0, phase=0.0) for n in range(200)]
+    schedule = running(*polls)
+    started = []
+    while schedule.next_due() <= 0.0:
+        piece = schedule.release(0.0)
+        assert len(piece) <= AT_ONCE
+        started += piece
+    assert started == polls
+    assert not any(poll.missed for poll in polls)
+
+
+def test_a_demand_waits_until_the_poll_is_prepared() -> None:
+    poll = Poll("large", 10.0, phase=5.0)
+    [member] = members(1)
+
+    def work() -> Iterator[int]:
+        yield 2 * SLICE
+        set_members(poll, [member])
+
+    poll.preparation = work()
+    schedule = running(poll)
+    schedule.demand(poll)
+    assert schedule.begin(0.0) == [member]
+    assert poll.due == 0.0
+    assert schedule.next_due() == pytest.approx(5.0)
