@@ -242,8 +242,6 @@ class Bus:
 
     def is_stale(self, point: Point[Any], started: float) -> bool:
         """Whether a write to the point's quantity, or to all of its node, has ended since its read was started."""
-        if point.node.touched <= started:
-            return False
         touched = self._touched
         return max(touched.get(point.quantity, -inf), touched.get(point.node, -inf)) > started
 

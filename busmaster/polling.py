@@ -33,16 +33,16 @@ WEIGHED_AGAIN = 8
 class _Read(NamedTuple):
     """One exchange of a group: the points that it serves, each with its place in a batch's value (None: all of it).
 
-    `bytes_time` is what its bytes take on the line, `after` what is behind its reply, `legs` how often a reply is
-    waited for, and `guess` what it takes as a whole while the node's reply time is unknown. `blank` has all points of
-    the group, in their order.
+    `bytes_time` is what its bytes take on the line up to the end of its reply, `unwaited` with what is behind it,
+    `legs` how often a reply is waited for, and `guess` what it takes as a whole while the node's reply time is
+    unknown. `blank` has all points of the group, in their order.
     """
 
     node: Node
     served: Served
     points: tuple[tuple[Point[Any], int | None], ...]
     bytes_time: float
-    after: float
+    unwaited: float
     legs: int
     guess: float
     blank: dict[Point[Any], Any]
@@ -51,7 +51,7 @@ class _Read(NamedTuple):
     def line_time(self) -> float:
         """Seconds of the line that it takes, by the node's reply time as measured so far."""
         wait = self.node.record.reply_time
-        return self.guess if wait is None else self.bytes_time + self.after + self.legs * wait
+        return self.guess if wait is None else self.unwaited + self.legs * wait
 
 
 class PollGroup:
@@ -222,7 +222,7 @@ class PollGroup:
         quality = Quality.BAD
         if error is None:
             quality = Quality.LATE if transaction.late else Quality.GOOD
-            if self._bus.is_stale(point, transaction.started):
+            if point.node.touched > transaction.started and self._bus.is_stale(point, transaction.started):
                 quality = Quality.STALE
             try:
                 value = point.value_of(transaction.value if place is None else transaction.value[place])
@@ -237,7 +237,9 @@ class PollGroup:
             return
         for point, sample in self._samples.items():
             fine = sample.quality in (Quality.GOOD, Quality.LATE)
-            if fine and sample.started is not None and self._bus.is_stale(point, sample.started):
+            if not fine or sample.started is None or point.node.touched <= sample.started:
+                continue
+            if self._bus.is_stale(point, sample.started):
                 self._qualities[sample.quality] -= 1
                 self._qualities[Quality.STALE] += 1
                 self._samples[point] = sample._replace(quality=Quality.STALE)
@@ -303,10 +305,9 @@ class PollGroup:
     ) -> _Read:
         exchange, byte_time = node.planned().open(served.command), self._bus.byte_time
         node.kinds.setdefault((type(served.command), *shape(exchange)), served.command)
-        after = exchange.closing * byte_time + exchange.timing.turnaround
-        bytes_time = line_time(exchange, byte_time, 0.0) - after
-        guess = line_time(exchange, byte_time)
-        return _Read(node, served, points, bytes_time, after, 1 + len(exchange.later), guess, blank)
+        unwaited, guess = line_time(exchange, byte_time, 0.0), line_time(exchange, byte_time)
+        bytes_time = unwaited - exchange.closing * byte_time - exchange.timing.turnaround
+        return _Read(node, served, points, bytes_time, unwaited, 1 + len(exchange.later), guess, blank)
 
     def _sound(self, merge: Merge, node: Node | None = None) -> Merge:
         """The same merge without what this node (or any, if None) has refused."""
