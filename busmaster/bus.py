@@ -202,7 +202,7 @@ class Bus:
 
     def prepare(self, poll: Poll) -> None:
         """Do what a poll group's new preparation says, while the line goes on."""
-        self._arbiter.prepare_poll(poll, self.now())
+        self._arbiter.dispatcher.prepare_poll(poll, self.now())
         self.pump.turn()
 
     def failed_choice(self, group: str, error: Exception) -> None:

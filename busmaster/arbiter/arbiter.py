@@ -126,10 +126,6 @@ class Arbiter:
         """Its first cycle waits until a line that has just been opened can be used."""
         self.dispatcher.add_poll(poll, max(now, self._quarantine))
 
-    def prepare_poll(self, poll: Poll, now: float) -> None:
-        """Do its new `preparation` while the line goes on."""
-        self.dispatcher.prepare_poll(poll, now)
-
     def remove_poll(self, poll: Poll, now: float) -> None:
         self.dispatcher.remove_poll(poll, now)
 
