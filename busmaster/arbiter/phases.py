@@ -8,7 +8,7 @@ from typing import Protocol
 
 KINKS = 2000
 """Bounds the work of choosing one phase: some 2000 of them cost a millisecond."""
-STRIDE = 128
+STRIDE = 64
 """Kinks, or other polls, that are looked at between two places at which the search can be interrupted."""
 MEETINGS = 8
 """Two polls whose cycles take longer than so many common divisors of their periods meet anyway."""

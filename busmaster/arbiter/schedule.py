@@ -24,9 +24,9 @@ LONGEST_PATIENCE = 10.0
 """Seconds after which a poll's cycle goes before those that came later, however long its period is."""
 FILL = 0.9
 """Cycles are spread over this share of the time when phases are chosen: the rest is left for what varies."""
-SLICE = 256
+SLICE = 128
 """Units of work, each of about a microsecond, that are done in one call for polls that cannot start yet."""
-AT_ONCE = 64
+AT_ONCE = 32
 """Cycles, and exchanges of cycles, that are started in one call."""
 
 

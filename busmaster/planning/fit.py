@@ -27,7 +27,7 @@ BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 HORIZON = 10
 """Periods of the slowest group over which the timetable is played through, at most TIMETABLE exchanges."""
 TIMETABLE = 20_000
-PIECE = 64
+PIECE = 32
 """Exchanges of the timetable that are played at once."""
 
 
