@@ -183,8 +183,7 @@ class Bus:
         `phase` (seconds, below the period) places the group on the grid; without it, it is placed where it meets the
         other groups least. `merge`: cheaper exchanges to opt in to, such as `protocols.mentor.merge_runs`, beside
         those that the nodes' profiles have; they are taken where they save line time, and no longer once refused.
-        What has to be worked out before hundreds of points or groups can start is done a slice at a time, while the
-        line goes on: they start some milliseconds later. A merge that raises is logged, and reads go one by one.
+        Hundreds of points or groups are worked out in slices while the line goes on, and start some milliseconds later.
         """
         if name in self._groups:
             raise InvalidCommand(f"there is a poll group {name!r} already")
