@@ -25,7 +25,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "arbiter": {"arbiter"} | BASE,
     "protocols": {"protocols", "wire"} | BASE,
     "merging": BASE,
-    "planning": {"arbiter.schedule", "merging"} | BASE,
+    "planning": {"planning", "arbiter.schedule", "merging"} | BASE,
     "transport": {"transport", "arbiter"} | BASE,
     "transport.memory": {"transport", "arbiter", "emulator.line"} | BASE,
     **dict.fromkeys(HOLDINGS, HOLDINGS | {"transport", "arbiter", "merging", "planning"} | BASE),
