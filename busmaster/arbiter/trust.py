@@ -29,7 +29,7 @@ class Trust:
         held, self.held = self.held is not None, None
         if any(step.rest.startswith(key) for key in answers):
             return "two answers came"
-        if in_step.clashes(answers):
+        if in_step.clashes(answers, now, transaction.node):
             in_step.doubtful_answer(answers)
             return "its answer may be an earlier request's, whose own never came"
         if in_step.is_doubtful(answers, now) and not held:
