@@ -161,8 +161,7 @@ class InStep:
         if not payers and any(until > now and _is(run, key) for key, until in self._doubted):
             self._doubted = [entry for entry in self._doubted if not _is(run, entry[0])]
         elif not payers and any(_is(run, key) for key in (*self.last, *self.before)):
-            self._doubt_until = now + DOUBT_PERIOD
-            self.alert = True
+            self.said_twice(now)
         else:
             self.owe((ANY_BYTE,), None, now, now)
         return payers[0].node if payers else None
@@ -186,6 +185,11 @@ class InStep:
                 debt.node = None
 
     # how far an answer can be trusted
+
+    def said_twice(self, now: float) -> None:
+        """More was answered than was asked."""
+        self._doubt_until = now + DOUBT_PERIOD
+        self.alert = True
 
     def said(self, answers: Sequence[bytes], now: float) -> None:
         """A right answer was delivered; in case it is said again."""
