@@ -73,7 +73,9 @@ class Choice:
         answers = exchange.answers
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
-        elif in_step.clashes(answers):
+        elif transaction.probe and in_step.clashes(answers, now, transaction.node):
+            chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
+        elif in_step.clashes(answers, now):
             chosen = self._instead_of(first, now)
         elif in_step.alike >= LONGEST_ALIKE:
             unlike = self._another(first, now, answers.__eq__)
@@ -96,21 +98,23 @@ class Choice:
     def _instead_of(self, first: Chosen, now: float) -> Chosen | float:
         """What goes in place of one whose answer could be one that is owed."""
         in_step, answers = self._in_step, first[1].answers
-        if first[0].probe and (other := self._other_probe(first[0])) is not None:
-            return other
         if self._gone_before >= MOST_BEFORE:
             return first
-        owing = dict.fromkeys(in_step.owing(answers))
+
+        def clashes(answers: Sequence[bytes]) -> bool:
+            return in_step.clashes(answers, now)
+
+        owing = dict.fromkeys(in_step.owing(answers, now))
         other = None
         if self._gone_before < MOST_BEFORE - 1:
             of = first[0].node if first[0].node in owing else None  # only its own answer proves that it owes no more
-            other = self._another(first, now, in_step.clashes, of)
+            other = self._another(first, now, clashes, of)
         if other is None:
-            ends = in_step.ends(answers)
+            ends = in_step.ends(answers, now)
             if ends < inf:
                 return ends
             asked, silent = self._whom_to_ask(now)
-            other = self._ask_check([*owing, *asked], now, in_step.clashes)
+            other = self._ask_check([*owing, *asked], now, clashes)
             if other is None and not silent:  # there is nothing unlike to ask
                 over = in_step.over(answers)
                 if now < over:
@@ -121,12 +125,12 @@ class Choice:
         self._gone_before += 1
         return other
 
-    def _other_probe(self, probe: Transaction) -> Chosen | None:
+    def _other_probe(self, probe: Transaction, now: float) -> Chosen | None:
         """The same dead node asked for something that is not owed."""
         node = probe.node
         for command in checks_of(node):
             exchange = command.open(node.address, node.timings)
-            if not self._in_step.clashes(exchange.answers):
+            if not self._in_step.clashes(exchange.answers, now, node):
                 probe.command = command
                 return probe, exchange
         return None
