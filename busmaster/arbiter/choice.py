@@ -12,13 +12,14 @@ from math import inf
 from typing import Any, TypeAlias
 
 from busmaster.arbiter.dispatcher import Dispatcher
-from busmaster.arbiter.health import DOWN, UP, NodeRecord
+from busmaster.arbiter.health import UP, NodeRecord
 from busmaster.arbiter.in_step import LONGEST_ALIKE, SILENT, InStep
 from busmaster.arbiter.transaction import URGENT, Transaction
 from busmaster.exchange import Command, Exchange
 
 MOST_BEFORE = 3
-"""Exchanges that may go before one that is held back; then it goes, and its answer is doubted (R9 counts them)."""
+"""Exchanges that may go before one that is held back; then it goes, and its answer is doubted. The bounds of R9, in
+planning, count them."""
 
 Chosen: TypeAlias = tuple[Transaction, Exchange[Any]]
 
@@ -176,9 +177,9 @@ class Choice:
             for node in self._dispatcher.nodes
             if node.address != node.profile.broadcast and node.suspended_until <= now
         ]
-        alive = [node for node in nodes if node.health is not DOWN and node.unheard < SILENT]
+        alive = [node for node in nodes if node.unheard < SILENT]
         alive.sort(key=lambda node: (node.health is not UP, -node.last_reply))
-        return alive, [node for node in nodes if node.health is DOWN or node.unheard >= SILENT]
+        return alive, [node for node in nodes if node.unheard >= SILENT]
 
 
 def _fit_checks(

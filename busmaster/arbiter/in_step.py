@@ -26,7 +26,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
 
-from busmaster.arbiter.health import UP, NodeRecord
+from busmaster.arbiter.health import NodeRecord
 
 ANY_BYTE = b""
 """The key of a debt that any lone byte could pay."""
@@ -221,8 +221,7 @@ def _could_be(debt: Debt, answers: Sequence[bytes]) -> bool:
 
 def _is_silent(debt: Debt) -> bool:
     """Its node does not answer, as far as is known: another's answer must do. One that does is asked itself."""
-    node = debt.node
-    return node is None or node.unheard >= SILENT or node.health is not UP
+    return debt.node is None or debt.node.unheard >= SILENT
 
 
 def _is(run: bytes, key: bytes) -> bool:
