@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from busmaster.arbiter.health import SILENT
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import GarbledReply, NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols import hcp2
@@ -188,6 +189,7 @@ def test_r15_a_debt_is_paid_by_any_nodes_answer_once_its_lateness_is_over() -> N
     bench = Bench()
     node, other = up(bench), up(bench, 2)
     lost(bench, node)
+    node.unheard = SILENT
     bench.served(bench.ask(other, hcp2.Read(3)))
     read = bench.ask(other)
     bench.until_sent()
@@ -232,6 +234,7 @@ def overtaken(bench: Bench) -> tuple[str, str]:
     """Two nodes that are UP; the first owes element 1, and the other's answer has paid: the channel keeps order."""
     node, other = up(bench), up(bench, 2)
     lost(bench, node)
+    node.unheard = SILENT
     bench.served(bench.ask(other, hcp2.Read(3)))
     return request_of(1), request_of(1, 2)
 
