@@ -114,8 +114,10 @@ class Choice:
             if ends < inf:
                 return ends
             asked, silent = self._whom_to_ask(now)
+            if not (owing or asked or first[0].attempts):  # all are silent: its own node as well as it itself
+                asked = [first[0].node]
             other = self._ask_check([*owing, *asked], now, clashes)
-            if other is None and not silent:  # there is nothing unlike to ask
+            if other is None and not any(_fit_checks(silent, clashes)):  # there is nothing unlike to ask
                 over = in_step.over(answers)
                 if now < over:
                     return over
@@ -163,15 +165,12 @@ class Choice:
         self, nodes: Iterable[NodeRecord], now: float, unfit: Callable[[Sequence[bytes]], bool]
     ) -> Chosen | None:
         """A read of the first of these nodes that has one whose answer is fit to prove something."""
-        for node in nodes:
-            for command in checks_of(node):
-                exchange = command.open(node.address, node.timings)
-                if not unfit(exchange.answers):
-                    return self._dispatcher.check(node, command, now), exchange
+        for node, command, exchange in _fit_checks(nodes, unfit):
+            return self._dispatcher.check(node, command, now), exchange
         return None
 
-    def _whom_to_ask(self, now: float) -> tuple[list[NodeRecord], bool]:
-        """The nodes that answer, as far as is known, the one that did so last first; and whether others are silent."""
+    def _whom_to_ask(self, now: float) -> tuple[list[NodeRecord], list[NodeRecord]]:
+        """The nodes that answer, as far as is known, the one that did so last first; and those that are silent."""
         nodes = [
             node
             for node in self._dispatcher.nodes
@@ -179,7 +178,18 @@ class Choice:
         ]
         alive = [node for node in nodes if node.health is not DOWN and node.unheard < SILENT]
         alive.sort(key=lambda node: (node.health is not UP, -node.last_reply))
-        return alive, len(alive) < len(nodes)
+        return alive, [node for node in nodes if node.health is DOWN or node.unheard >= SILENT]
+
+
+def _fit_checks(
+    nodes: Iterable[NodeRecord], unfit: Callable[[Sequence[bytes]], bool]
+) -> Iterator[tuple[NodeRecord, Command[Any], Exchange[Any]]]:
+    """The reads of these nodes whose answers are fit to prove something."""
+    for node in nodes:
+        for command in checks_of(node):
+            exchange = command.open(node.address, node.timings)
+            if not unfit(exchange.answers):
+                yield node, command, exchange
 
 
 def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:

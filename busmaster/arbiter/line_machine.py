@@ -150,10 +150,7 @@ class LineMachine:
 
     def byte_marked(self, mark: Mark, now: float) -> None:
         """The UART says that a byte came damaged, or a break: whatever it was, it is nobody's answer."""
-        if mark is Mark.BREAK:
-            self._counters.breaks += 1
-        else:
-            self._counters.damaged += 1
+        self._counters.mark(mark)
         self._strays.last_byte = now
         self._echo.forget()
         if self.state is EXCHANGE:
