@@ -12,11 +12,15 @@ from functools import partial
 from typing import Any
 
 from benchmarks.harness import Options, Outcome, Table
-from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Device
 from busmaster.exchange import Command, Expect, Timings
 from busmaster.profile import Profile
-from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
+from busmaster.registry import make_device
 from busmaster.testing import answers_of
 from examples import modbus_rtu
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
-from busmaster.errors import InvalidCommand
+from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.points import Point
 from busmaster.profile import Profile
 
 if TYPE_CHECKING:
     from busmaster.bus import Bus
-    from busmaster.exchange import Timings
+    from busmaster.exchange import Command, Timings
+
+Send: TypeAlias = Callable[[], Awaitable[None]]
+"""Sends what was prepared."""
 
 
 class Handle:
@@ -35,8 +38,60 @@ class Handle:
         """The names (not the numbers) that `point` knows."""
         return ()
 
+    @classmethod
+    def names_of_items(cls) -> Mapping[str, str]:
+        """Return the names of those items that have one, by what a listener reads from the line."""
+        return {}
+
+    # what ITEM and VALUE mean where a person writes them
+
+    async def read_item(self, item: str, **options: Any) -> Any:
+        """Read what ITEM names on the command line, in the way that is best for a single reading."""
+        return await self.point(item).read()
+
+    def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
+        """Return what writes the values to ITEM and those after it, once it is sure that all of them can be sent.
+
+        With `verify` they are read back, and VerifyFailed is raised where they differ. Raises InvalidCommand.
+        """
+        names = self.run_items(item, len(values)) if len(values) > 1 else (item,)
+        return [self.prepare_one(name, value, verify) for name, value in zip(names, values, strict=True)]
+
+    def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
+        """Return what writes one value to ITEM. Raises InvalidCommand for one that cannot be sent."""
+        point = self.point(item)
+        encoder(point)(value)
+
+        async def send() -> None:
+            await point.write(value)
+            if verify and (found := await point.read()) != value:
+                raise VerifyFailed(f"{item} reads {found!r} after {value!r} was written", node=self.node.label)
+
+        return send
+
+    def run_items(self, item: str, count: int) -> tuple[str, ...]:
+        """Return what each of `count` values from ITEM on is called: 1.17, 1.18, ... Raises InvalidCommand."""
+        first, colon, kind = item.partition(":")
+        suffix = f":{kind}" if colon and not is_decimal(kind) else ""
+        menu, dot, number = first.rpartition(".")
+        if not is_decimal(number):
+            raise InvalidCommand(f"several values begin at a number, not at {item!r}")
+        return tuple(f"{menu}{dot}{int(number) + i:0{len(number)}d}{suffix}" for i in range(count))
+
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.node.label}>"
+
+
+def encoder(point: Point[Any]) -> Callable[[Any], Command[None]]:
+    """Return what makes the command that writes a value. Raises InvalidCommand for a point that is read-only."""
+    if point.encode is None:
+        raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
+    return point.encode
+
+
+def is_decimal(text: str) -> bool:
+    """Return whether a text is a whole number without a sign, in digits as the command line takes them."""
+    return text.isascii() and text.isdigit()
 
 
 def item_text(item: str) -> str:

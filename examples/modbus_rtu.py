@@ -23,7 +23,7 @@ from busmaster import Bus, InvalidCommand, MemoryPort, Point, Priority, Refused
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Line
 from busmaster.exchange import MORE, Done, FrameError, Leg, ReplyTiming, Sizes, Step, Timings, no_reply
-from busmaster.handles.base import Handle
+from busmaster.handle import Handle
 from busmaster.profile import LineSettings, Profile
 from busmaster.wire.integers import whole_number
 

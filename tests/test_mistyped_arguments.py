@@ -8,10 +8,10 @@ from typing import Any, cast
 import pytest
 
 from busmaster import Bus, Hcp2Controller, InvalidCommand, MemoryPort, SerialPort, TcpPort
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
 from busmaster.profile import LineSettings
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.registry import make_device
 from busmaster.testing import run_in_virtual_time
 
 

@@ -12,7 +12,7 @@ from busmaster.arbiter.schedule import Poll, set_members
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.exchange import Command, Timings
 from busmaster.profile import Profile
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 
 TAU = 10 / 57600
 READ_1_OF_NODE_1 = "07 30 31 02 30 31 05 07"

@@ -11,7 +11,7 @@ from busmaster import BusClosed, InvalidCommand, MemoryPort, WriteUnconfirmed
 from busmaster.config import ConfiguredLine, emulated_line
 from busmaster.config.sections import read
 from busmaster.config.source import Source
-from busmaster.handles import Hcp2Controller
+from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.testing import run_in_virtual_time
 
 TEXT = """

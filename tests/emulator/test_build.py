@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from busmaster.emulator.build import MAKERS, make_device
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.hostcomms import HCP, HostCommsDevice
 from busmaster.emulator.oracle import Oracle, oracle_value
 from busmaster.errors import InvalidCommand
+from busmaster.protocols._comms.device import HCP, HostCommsDevice
+from busmaster.registry import kinds, make_device
 from tests.emulator.lines import ask, line_of
 
 
-@pytest.mark.parametrize("protocol", sorted(MAKERS))
+@pytest.mark.parametrize("protocol", list(kinds()))
 def test_every_protocol_has_a_device(protocol: str) -> None:
     device = make_device(protocol, 2, delay=Delay(0.01))
     assert device.address == 2

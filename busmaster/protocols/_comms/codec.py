@@ -38,6 +38,9 @@ class ReadElement:
     def __str__(self) -> str:
         return f"read element {self.element}"
 
+    def open(self, address: int, timings: Timings) -> Reading:
+        raise NotImplementedError
+
 
 @dataclass(frozen=True, slots=True)
 class WriteElements:
@@ -70,6 +73,9 @@ class WriteElements:
         many = len(self.values) - 1
         which = f"elements {self.element}-{self.element + many}" if many else f"element {self.element}"
         return f"write {which} = {self.text}"
+
+    def open(self, address: int, timings: Timings) -> Writing | WritingMany:
+        raise NotImplementedError
 
 
 class Reading(TelegramReader[float]):

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, overload
 
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command
-from busmaster.handles.base import Handle, item_text, unknown_item
+from busmaster.handle import Handle, Send, is_decimal, item_text, unknown_item
 from busmaster.points import Point
-from busmaster.protocols import hcp, hcp2
-from busmaster.protocols.comms import is_read_back, telegrams
-from busmaster.protocols.comms_array import Element
+from busmaster.protocols._comms.codec import ReadElement, WriteElements, is_read_back, telegrams
+from busmaster.protocols._comms.elements import Element
 
 if TYPE_CHECKING:
     from busmaster.node import Priority
@@ -23,8 +22,8 @@ T = TypeVar("T")
 class CommsHandle(Handle):
     """A handle of a node with a comms array. Each protocol says how an element is read and written, and its names."""
 
-    read_command: ClassVar[type[hcp.Read] | type[hcp2.Read]]
-    write_command: ClassVar[type[hcp.Write] | type[hcp2.Write]]
+    read_command: ClassVar[type[ReadElement]]
+    write_command: ClassVar[type[WriteElements]]
     elements: ClassVar[Mapping[str, Element[object]]] = {}
     form: ClassVar[str]
     """What an item looks like, for the message to someone who mistyped it."""
@@ -33,9 +32,13 @@ class CommsHandle(Handle):
     def items(cls) -> tuple[str, ...]:
         return tuple(cls.elements)
 
+    @classmethod
+    def names_of_items(cls) -> Mapping[str, str]:
+        return {str(element.number): name for name, element in cls.elements.items()}
+
     def point(self, item: str) -> Point[Any]:
         """An element by its number, decimal, or by its name."""
-        if item_text(item).isascii() and item.isdigit():
+        if is_decimal(item_text(item)):
             return self.element(int(item))
         return self.named(self._lookup(item))
 
@@ -99,9 +102,7 @@ class CommsHandle(Handle):
             for number, value in enumerate(values, commands[0].element):
                 await self._verify(number, value, priority)
 
-    def writes(
-        self, element: int | str, values: Sequence[float], idempotent: bool = False
-    ) -> list[hcp.Write | hcp2.Write]:
+    def writes(self, element: int | str, values: Sequence[float], idempotent: bool = False) -> list[WriteElements]:
         """What `write` sends. Raises InvalidCommand for a value that cannot be sent; and where the map has names, for a
         name that it calls read-only, or that another value of the list would go to."""
         number = element if isinstance(element, int) else self._lookup(element).number
@@ -112,6 +113,12 @@ class CommsHandle(Handle):
         if not values:
             raise InvalidCommand(f"{self.node.label}: there is no value to write")
         return [self.write_command(number + offset, part, idempotent) for offset, part in telegrams(values)]
+
+    def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
+        """Consecutive elements, in as many telegrams as it takes."""
+        element = int(item) if is_decimal(item) else item
+        self.writes(element, values)
+        return [lambda: self.write(element, *values, verify=verify)]
 
     async def _verify(self, number: int, written: float, priority: Priority | None) -> None:
         command = self.read_command(number)

@@ -6,9 +6,9 @@ import struct
 from collections.abc import Callable, Generator, Sequence
 
 from busmaster.emulator.device import NEVER, Delay
-from busmaster.emulator.devices.hostcomms import HCP2, Framing, HostCommsDevice
 from busmaster.emulator.motion import Axis, Motion
 from busmaster.emulator.oracle import Oracle
+from busmaster.protocols._comms.device import HCP2, Framing, HostCommsDevice
 
 LAST_COMMS = 99
 FIRST_AXIS = 100
@@ -26,13 +26,13 @@ LAG = 0.002
 """Seconds by which the position stays behind: following error over speed."""
 GREATEST_SINGLE = struct.unpack(">f", b"\x7f\x7f\xff\xff")[0]
 
-Program = Callable[["MintController"], Generator[int, None, None]]
+Program = Callable[["EmulatedMint"], Generator[int, None, None]]
 """What a controller runs, statement by statement: a generator that yields the number of the line it has executed."""
-Event = Callable[["MintController", int, float], None]
+Event = Callable[["EmulatedMint", int, float], None]
 """`Event commsX`: called with the controller, the element (1 to 5) and the time."""
 
 
-class MintController(HostCommsDevice):
+class EmulatedMint(HostCommsDevice):
     """Eight axes, I/O, and a comms array. By default it runs no program and has no events.
 
     `axes` fewer than 8: the others' elements are reserved. Reserved elements read 0 and refuse writes;
@@ -193,7 +193,7 @@ def single(value: float) -> float:
 # The programs of the documents (AN00110 and AN00129, "Use of the Comms Array" and "Events")
 
 
-def winding(mint: MintController) -> Generator[int, None, None]:
+def winding(mint: EmulatedMint) -> Generator[int, None, None]:
     """A drum traversed between Comms(1) and Comms(2) at the ratio Comms(3); Comms(4) is its position.
 
     The drum whose rotation axis 0 follows turns at 1 unit a second.
@@ -213,7 +213,7 @@ def winding(mint: MintController) -> Generator[int, None, None]:
         yield 5
 
 
-def command_handshake(mint: MintController) -> Generator[int, None, None]:
+def command_handshake(mint: EmulatedMint) -> Generator[int, None, None]:
     """A command in Comms(1), its data in Comms(2) to Comms(4); Comms(1) becomes 0 when it is done.
 
     The race is the document's: the last line clears Comms(1) whether or not a command was seen, so one that is
@@ -243,7 +243,7 @@ def command_handshake(mint: MintController) -> Generator[int, None, None]:
         yield 10
 
 
-def report_positions(mint: MintController) -> Generator[int, None, None]:
+def report_positions(mint: EmulatedMint) -> Generator[int, None, None]:
     """Not in the documents: keeps Comms(11) to Comms(18) at the positions of the axes, for a host that speaks HCP."""
     while True:
         for number, axis in enumerate(mint.axes):
@@ -251,7 +251,19 @@ def report_positions(mint: MintController) -> Generator[int, None, None]:
         yield 1
 
 
-def jog_on_comms1(mint: MintController, element: int, now: float) -> None:
+def jog_on_comms1(mint: EmulatedMint, element: int, now: float) -> None:
     """`Event comms1`: JOG(0) = COMMS(1), on every write to Comms(1), of an equal value too."""
     if element == 1:
         mint.axes[0].jog(mint.comms[1], now)
+
+
+def make_mint(framing: Framing, address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedMint:
+    """Make a controller; if it is lively, its axes swing, and its program reports their positions in its elements."""
+    controller = EmulatedMint(address, framing, delay=delay, oracle=oracle)
+    if lively:
+        controller.program = report_positions
+        controller.statement = 0.05
+        controller.start_program()
+        for number, axis in enumerate(controller.axes):
+            axis.swing(100.0, 8.0 + number, address / 7 + number / 3, 0.0)
+    return controller

@@ -26,7 +26,7 @@ LIVE = 1
 SWING, TURN = 10_000, 10.0
 
 
-class Dc104Drive(Device):
+class EmulatedDc104(Device):
     """The drive of a line. Parameters 1 to `last_parameter`; `allow_zero`: 0 too. `read_only` ones refuse writes.
 
     `eeprom` is the time that storing takes. `silent`: a read of what is not there gets no answer, in place of NAK,
@@ -129,3 +129,8 @@ def packet(parameter: int, value: int) -> bytes:
     """A reply to a read. It has no direction byte."""
     summed = bytes((parameter, value >> 8, value & 0xFF))
     return bytes((STX,)) + summed + bytes((sum8(summed),))
+
+
+def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedDc104:
+    """Make a drive; if it is lively, its parameter 1 moves."""
+    return EmulatedDc104(address, delay=delay, oracle=oracle, lively=lively)

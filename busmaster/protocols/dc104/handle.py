@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from busmaster.errors import VerifyFailed
 from busmaster.exchange import Command, Timings
-from busmaster.handles.base import Handle, item_text, unknown_item
+from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
 from busmaster.points import Point
 from busmaster.profile import Profile
-from busmaster.protocols import dc104
-from busmaster.protocols.dc104 import Read, Write
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.dc104.codec import Read, Write
 
 if TYPE_CHECKING:
     from busmaster.bus import Bus
@@ -46,7 +46,7 @@ class Dc104Drive(Handle):
 
     def point(self, item: str) -> Point[int]:
         """A parameter by its number, decimal."""
-        if not (item_text(item).isascii() and item.isdigit()):
+        if not is_decimal(item_text(item)):
             raise unknown_item(item, (), f"a parameter number, {self._minimum} to {self._maximum}")
         return self.parameter(int(item))
 
@@ -93,6 +93,10 @@ class Dc104Drive(Handle):
                 raise VerifyFailed(
                     f"parameter {parameter} reads {found} after {command.value} was written", node=self.node.label
                 )
+
+    def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
+        encoder(self.point(item))(value)
+        return lambda: self.write(int(item), value, verify=verify)
 
     def _read(self, parameter: int) -> Read:
         return Read(parameter, self._maximum, self._minimum)

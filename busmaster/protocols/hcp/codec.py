@@ -14,7 +14,7 @@ from typing import ClassVar
 
 from busmaster.exchange import Timings
 from busmaster.profile import Profile
-from busmaster.protocols.comms import LINE, TIMINGS, ReadElement, Reading, WriteElements, Writing, WritingMany
+from busmaster.protocols._comms.codec import LINE, TIMINGS, ReadElement, Reading, WriteElements, Writing, WritingMany
 from busmaster.wire.checks import xor
 from busmaster.wire.readers import ENQ, EOT, ETX, STX
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from busmaster.handles.comms import CommsHandle
 from busmaster.profile import Profile
-from busmaster.protocols import hcp
+from busmaster.protocols._comms.handle import CommsHandle
+from busmaster.protocols.hcp import codec as hcp
 
 
 class HcpController(CommsHandle):

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from busmaster.errors import InvalidCommand
-from busmaster.handles.comms import CommsHandle, Named
 from busmaster.points import Point
 from busmaster.profile import Profile
-from busmaster.protocols import comms_array, hcp2
+from busmaster.protocols._comms.handle import CommsHandle, Named
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2 import comms_array
 
 
 class Hcp2Controller(CommsHandle):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntFlag
 
-from busmaster.protocols.comms_array import Element, bits, by_name, whole
+from busmaster.protocols._comms.elements import Element, bits, by_name, whole
 
 FIRST_FIRMWARE = 5221
 """The firmware build that brought this map."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.hostcomms import HCP2, HostCommsDevice
 from busmaster.emulator.motion import Ramp
 from busmaster.emulator.oracle import Oracle
+from busmaster.protocols._comms.device import HCP2, HostCommsDevice
 
 COMMAND_WORD, TORQUE_REFERENCE, SPEED_REFERENCE = 108, 116, 118
 
@@ -38,7 +38,7 @@ LAG = 0.001
 """Seconds by which the position stays behind its demand."""
 
 
-class MicroFlexDrive(HostCommsDevice):
+class EmulatedMicroFlex(HostCommsDevice):
     """One axis, its command and status word, a speed that follows its reference, errors that latch.
 
     `current_control` False: speed control. `host_reference`: the references come from the host. Otherwise writes to
@@ -257,3 +257,13 @@ class MicroFlexDrive(HostCommsDevice):
         reference = self.torque_reference if self.current_control else self.speed_reference
         runs = self.enabled and not self.command_word & CANCEL and not self.stop_input
         self._motor.target = reference if runs else 0.0
+
+
+def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedMicroFlex:
+    """Make a drive; if it is lively, it runs."""
+    drive = EmulatedMicroFlex(address, delay=delay, oracle=oracle)
+    if lively:
+        drive.ripple = 0.01
+        drive.speed_reference = 20.0 + 5 * (address % 8)
+        drive.command(ENABLE, 0.0)
+    return drive

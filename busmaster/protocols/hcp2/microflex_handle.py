@@ -10,11 +10,12 @@ from weakref import WeakKeyDictionary
 import anyio
 
 from busmaster.errors import BusClosed, BusError, VerifyFailed, WriteUnconfirmed
-from busmaster.handles.comms import CommsHandle, Named
 from busmaster.node import Node, Priority
 from busmaster.profile import Profile
-from busmaster.protocols import hcp2, microflex
-from busmaster.protocols.microflex import CommandWord, StatusWord
+from busmaster.protocols._comms.handle import CommsHandle, Named
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2 import microflex
+from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
 
 CLEAR_WITHIN = 2.0
 """Seconds for which cancel_errors goes on trying to clear the cancel bit, even if its caller was cancelled."""

@@ -70,7 +70,7 @@ PARAMETERS = {
 """By menu x 100 + number. The numbers are the document's; what most of them do in a drive is not emulated."""
 
 
-class MentorDrive(Device):
+class EmulatedMentor(Device):
     """Addresses 1 to 99. The speed feedback 03.02 follows the speed reference 01.17, both in 0.1 %.
 
     `acceleration` is in 0.1 % per second; `ripple` by how much of itself, 0 to 1, the feedback swings with the shaft.
@@ -309,3 +309,12 @@ def telegram(parameter: int, value: int, wide: bool = False) -> bytes:
     """A reply to a read: always five characters of data."""
     summed = b"%04d" % parameter + (b"%05d" if wide else b"%+05d") % value + b"\x03"
     return b"\x02" + summed + bytes((bcc(summed),))
+
+
+def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedMentor:
+    """Make a drive; if it is lively, it runs."""
+    drive = EmulatedMentor(address, delay=delay, oracle=oracle)
+    if lively:
+        drive.ripple = 0.01
+        drive.set_value(SPEED_REFERENCE, 313 + 50 * (address % 8), 0.0)
+    return drive

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command, Timings
-from busmaster.handles.base import Handle, item_text, unknown_item
+from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
 from busmaster.points import Point
 from busmaster.profile import Profile
-from busmaster.protocols import mentor
-from busmaster.protocols.mentor import Read, ReadRun, Write, parse_parameter
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.mentor.codec import Read, ReadRun, Write, parse_parameter
 
 if TYPE_CHECKING:
     from busmaster.bus import Bus
@@ -69,7 +69,7 @@ class MentorDrive(Handle):
             menu, number = parse_parameter(text)
         except InvalidCommand:
             raise unknown_item(item, (), FORM) from None
-        if kind.isascii() and kind.isdigit():
+        if is_decimal(kind):
             return self._run_point(item, ReadRun(menu, number, int(kind)))
         if kind not in ("wide", "hires") and colon:
             raise unknown_item(item, (), FORM)
@@ -163,6 +163,18 @@ class MentorDrive(Handle):
         menu, number = parse_parameter(parameter)
         everyone = self.node.bus.node(mentor.PROFILE, 0)
         await everyone.request(self._write(menu, number, value, wide=wide, high_resolution=high_resolution))
+
+    async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
+        """As `point(item).read()`; a run without `chain` parameter by parameter, which is always safe."""
+        parameter, _, count = item_text(item).partition(":")
+        if is_decimal(count) and not chain:
+            return await self.read_run(parameter, int(count))
+        return await self.point(item).read()
+
+    def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
+        encoder(self.point(item))(value)
+        parameter, _, kind = item.partition(":")
+        return lambda: self.write(parameter, value, wide=kind == "wide", high_resolution=kind == "hires", verify=verify)
 
     def _check_readable(self) -> None:
         if self.node.address == self.profile.broadcast:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Timings
 from busmaster.points import Point
-from busmaster.protocols.msc import BLOCK, HIGHEST_ADDRESS, BlockRead, BlockWrite, DataRead, DataWrite
+from busmaster.protocols.msc.codec import BLOCK, HIGHEST_ADDRESS, BlockRead, BlockWrite, DataRead, DataWrite
 
 if TYPE_CHECKING:
-    from busmaster.handles.msc import MscController
     from busmaster.node import Priority
+    from busmaster.protocols.msc.handle import MscController
 
 Progress = Callable[[int, int], None]
 """Called with how many values are done, of how many."""

@@ -1,13 +1,15 @@
-"""The two binary protocols as a listener hears them: MSC and DC104 (PROTOCOLS 5 and 6)."""
+"""MSC as a listener hears it."""
 
 from __future__ import annotations
 
 import struct
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
-from busmaster.capture.frames import UNACKED, UNASKED, Frame, Kind
-from busmaster.capture.pcapng import Direction
-from busmaster.wire.checks import sum8, sum16
+from busmaster.capture.frames import UNACKED, UNASKED, Direction, Frame, Kind
+from busmaster.exchange import Command
+from busmaster.protocols.msc import codec
+from busmaster.wire.checks import sum16
 
 STX, ACK, NAK = 0x02, 0x06, 0x15
 _HEADER = 6
@@ -132,6 +134,22 @@ class MscDialect:
                 self._asked = None
         return frame
 
+    def command(self, request: Frame, continued: Sequence[Frame], /) -> Command[Any]:
+        where = int("".join(filter(str.isdigit, request.item.partition(":")[2 if "flag:" in request.item else 0])) or 0)
+        values = [int(value) for value in request.value.split(",")] if request.value else []
+        commands: Mapping[str, Callable[[], Command[Any]]] = {
+            "DREAD": lambda: codec.DataRead(where),
+            "DWRITE": lambda: codec.DataWrite(where, *values),
+            "BREAD": lambda: codec.BlockRead(where),
+            "BWRITE": lambda: codec.BlockWrite(where, tuple(values)),
+            "SFLAG": lambda: codec.SetFlag(where),
+            "CFLAG": lambda: codec.ClearFlag(where),
+            "RFLAG": lambda: codec.ReadFlag(where),
+            "RFLAGS": codec.ReadFlags,
+            "RQSTAT": codec.ReadStatus,
+        }
+        return commands[request.command]()
+
 
 def _explain_request(frame: Frame, op: Op, payload: bytes) -> None:
     where = int.from_bytes(payload[:2], "big")
@@ -155,69 +173,3 @@ def _value(command: str, payload: bytes) -> str:
 
 def _numbers(payload: bytes) -> str:
     return ",".join(str(number) for number in struct.unpack_from(f">{len(payload) // 4}i", payload))
-
-
-class Dc104Dialect:
-    """STX AA parameter check; STX 55 parameter high low check; STX parameter high low check.
-
-    Only the host's packets say their direction, and a reply for parameter 170 or 85 looks like one of them: then what
-    was asked decides, and the checksum.
-    """
-
-    starts = bytes((STX,))
-    _READ, _WRITE = 0xAA, 0x55
-
-    def __init__(self) -> None:
-        self._asked: Frame | None = None
-
-    def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
-        if data[0] in (ACK, NAK):
-            return 1
-        if data[0] != STX:
-            return -1
-        rest = -len(data) if quiet else 0
-        if len(data) < 2:
-            return rest
-        size = self._reply_or_request(data, sender, quiet)
-        return size if len(data) >= size else rest
-
-    def _reply_or_request(self, data: bytes, sender: Direction, quiet: bool) -> int:
-        request = {self._READ: 4, self._WRITE: 6}.get(data[1])
-        if request is None or sender is Direction.NODE:
-            return 5
-        asked = self._asked
-        doubtful = sender is Direction.UNKNOWN and asked and asked.kind is Kind.READ and asked.item == str(data[1])
-        if doubtful and len(data) < 5 and not quiet:
-            return 5
-        return 5 if doubtful and len(data) >= 5 and data[4] == sum8(data[1:4]) else request
-
-    def explain(self, raw: bytes, sender: Direction, /) -> Frame:
-        if len(raw) in (4, 6):
-            return self._request(raw)
-        asked, self._asked = self._asked, None
-        if len(raw) == 1:
-            frame = Frame(Kind.ACK if raw[0] == ACK else Kind.NAK, Direction.NODE, raw)
-            if asked and asked.kind is Kind.READ and frame.kind is Kind.ACK:
-                frame.fault = "an ACK answers no read"
-        else:
-            item, value = str(raw[1]), str(int.from_bytes(raw[2:4], "big"))
-            frame = Frame(Kind.VALUE, Direction.NODE, raw, item=item, value=value)
-            if asked and asked.kind is Kind.WRITE:
-                frame.fault = "a value answers no write"
-            elif asked and asked.item != item:
-                frame.fault = f"wrong parameter: {asked.item} was asked"
-        frame.answers = asked is not None
-        frame.fault = (_summed(raw) if len(raw) > 1 else "") or frame.fault or ("" if asked else UNASKED)
-        return frame
-
-    def _request(self, raw: bytes) -> Frame:
-        kind = Kind.READ if raw[1] == self._READ else Kind.WRITE
-        value = "" if kind is Kind.READ else str(int.from_bytes(raw[3:5], "big"))
-        frame = Frame(kind, Direction.HOST, raw, None, kind.value, str(raw[2]), value, _summed(raw))
-        self._asked = frame
-        return frame
-
-
-def _summed(raw: bytes) -> str:
-    right = sum8(raw[1:-1])
-    return "" if raw[-1] == right else f"bad checksum {raw[-1]:02X}, not {right:02X}"

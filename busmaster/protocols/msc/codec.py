@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Command, FrameError, ReplyTiming, Timings
 from busmaster.profile import Batch, LineSettings, Profile
-from busmaster.protocols.msc_exchange import UNITS, PacketExchange, Reply, StalePacketListener, packet
+from busmaster.protocols.msc.exchange import UNITS, PacketExchange, Reply, StalePacketListener, packet
 from busmaster.wire.integers import whole_number
 from busmaster.wire.readers import ACK
 

@@ -51,7 +51,7 @@ COUNT = 2000
 """The data address at which it counts."""
 
 
-class MscController(Device):
+class EmulatedMsc(Device):
     """One unit, 1 to 15. Its macroprogram is running: while flag 200 is on it adds 1 to the value at 2000, once every
     `period` seconds.
 
@@ -326,3 +326,11 @@ def packet(unit: int, body: bytes) -> bytes:
     """The block sequence number is "not presently used": 0."""
     summed = bytes((unit,)) + len(body).to_bytes(2, "big") + bytes(2) + body
     return bytes((STX,)) + summed + sum16(summed).to_bytes(2, "big")
+
+
+def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedMsc:
+    """Make a unit; if it is lively, its program counts."""
+    controller = EmulatedMsc(address, delay=delay, oracle=oracle)
+    if lively:
+        controller.flags.add(RUN_FLAG)
+    return controller

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from busmaster.errors import InvalidCommand, Refused, VerifyFailed
 from busmaster.exchange import Command, Timings
-from busmaster.handles.base import Handle, item_text, unknown_item
-from busmaster.handles.msc_blocks import Count, Part, Progress, Run, place, reads, reads_back, writes
+from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
 from busmaster.node import Node, Priority
 from busmaster.points import Point
 from busmaster.profile import Batch, Profile
-from busmaster.protocols import msc
-from busmaster.protocols.msc import (
+from busmaster.protocols.msc import codec as msc
+from busmaster.protocols.msc.blocks import Count, Part, Progress, Run, place, reads, reads_back, writes
+from busmaster.protocols.msc.codec import (
     BLOCK,
     FLAGS,
     BlockRead,
@@ -107,13 +107,33 @@ class MscController(Handle):
 
         return Point(self.node, f"flag:{flag}", ReadFlag(flag), encode=encode)
 
-    def run_items(self, item: str) -> tuple[str, ...]:
+    def run_items(self, item: str, count: int) -> tuple[str, ...]:
         """What each value of a run is called: its address, or the run's with the value's number where it is unknown."""
-        name, _, count = item.partition(":")
+        name = item.partition(":")[0]
         if self.address_step is None:
-            return tuple(f"{name}[{i}]" for i in range(int(count)))
+            return tuple(f"{name}[{i}]" for i in range(count))
         address = self.address_of(name)
-        return tuple(str(address + i * self.address_step) for i in range(int(count)))
+        return tuple(str(address + i * self.address_step) for i in range(count))
+
+    async def read_item(self, item: str, **options: Any) -> Any:
+        """As `point(item).read()`; the flags of a model without RFLAGS one by one."""
+        try:
+            return await self.point(item).read()
+        except Refused:
+            if item != "flags":
+                raise
+            return await self.flags()
+
+    def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
+        """Consecutive data addresses, in blocks and one by one."""
+        if len(values) == 1:
+            return super().prepare_write(item, values, verify)
+        name, _, count = item.partition(":")
+        if count and count != str(len(values)):
+            raise InvalidCommand(f"{item} takes {count} values, not {len(values)}")
+        encoder(self.point(name))
+        writes(self.address_of(name), values, self.address_step)
+        return [lambda: self.write_block(name, values, verify=verify)]
 
     def address_of(self, where: int | str) -> int:
         """The data address of a symbol; an address is returned as it is. Raises InvalidCommand for no such symbol."""
@@ -306,7 +326,3 @@ class MscController(Handle):
             return await self.read(address)
         except Refused:
             return None
-
-
-def is_decimal(text: str) -> bool:
-    return text.isascii() and text.isdigit()
