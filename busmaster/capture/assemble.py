@@ -36,10 +36,8 @@ def protocol_of(request: bytes, declared: str = "") -> str:
     in which captures came to know them.
     """
     known = sorted(kinds().values(), key=lambda kind: (not kind.capture_id, kind.capture_id))
-    for name in (declared, *(kind.name for kind in known)):
-        if name and _is_request(request, name):
-            return name
-    return ""
+    names = (declared, *(kind.name for kind in known))
+    return next((name for name in names if name and _is_request(request, name)), "")
 
 
 def _is_request(said: bytes, protocol: str) -> bool:
@@ -108,6 +106,7 @@ class Assembler:
         self, write: Callable[[Packet], object], *, protocol: str = "", echo: bool = False, offset: float = 0.0
     ) -> None:
         self._write = write
+        kinds()  # they are looked for now, not while the line runs
         self._protocol_of = lru_cache(REQUESTS_KEPT)(partial(protocol_of, declared=protocol))
         self._echo = echo
         self._echo_owed = b""

@@ -33,13 +33,12 @@ def node() -> NodeRecord:
     return NodeRecord(hcp2.PROFILE, 1, hcp2.PROFILE.timings, 2)
 
 
-def even() -> float:
-    """No jitter."""
+def no_jitter() -> float:
     return 0.5
 
 
 def fail(record: NodeRecord, now: float) -> Health:
-    note_failure(record, now, even)
+    note_failure(record, now, no_jitter)
     return record.health
 
 

@@ -9,7 +9,7 @@ The checksum is the sum, modulo 256, of all bytes between STX and itself ("Readi
 
 from __future__ import annotations
 
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 from busmaster.exchange import MORE, Done, FrameError, Need, ReplyTiming, Sizes, Timings, no_reply
@@ -77,14 +77,14 @@ class Read:
     """
 
     parameter: int
-    maximum: InitVar[int] = HIGHEST_PARAMETER
-    minimum: InitVar[int] = 1
+    maximum: int = field(default=HIGHEST_PARAMETER, compare=False, repr=False)
+    minimum: int = field(default=1, compare=False, repr=False)
 
     writes: ClassVar[bool] = False
     idempotent: ClassVar[bool] = True
 
-    def __post_init__(self, maximum: int, minimum: int) -> None:
-        _check_parameter(self, maximum, minimum)
+    def __post_init__(self) -> None:
+        _check_parameter(self)
 
     def __str__(self) -> str:
         return f"read parameter {self.parameter}"
@@ -99,14 +99,14 @@ class Write:
 
     parameter: int
     value: int
-    maximum: InitVar[int] = HIGHEST_PARAMETER
-    minimum: InitVar[int] = 1
+    maximum: int = field(default=HIGHEST_PARAMETER, compare=False, repr=False)
+    minimum: int = field(default=1, compare=False, repr=False)
 
     writes: ClassVar[bool] = True
     idempotent: ClassVar[bool] = False
 
-    def __post_init__(self, maximum: int, minimum: int) -> None:
-        _check_parameter(self, maximum, minimum)
+    def __post_init__(self) -> None:
+        _check_parameter(self)
         object.__setattr__(self, "value", whole_number(self.value, 0, HIGHEST_VALUE, "a value"))
 
     def __str__(self) -> str:
@@ -116,9 +116,9 @@ class Write:
         return Writing(packet(WRITE, self.parameter, self.value >> 8, self.value & 0xFF), timings.write)
 
 
-def _check_parameter(command: Read | Write, maximum: int, minimum: int) -> None:
-    lowest = whole_number(minimum, 0, 1, "minimum")
-    highest = whole_number(maximum, 1, HIGHEST_PARAMETER, "maximum")
+def _check_parameter(command: Read | Write) -> None:
+    lowest = whole_number(command.minimum, 0, 1, "minimum")
+    highest = whole_number(command.maximum, 1, HIGHEST_PARAMETER, "maximum")
     object.__setattr__(command, "parameter", whole_number(command.parameter, lowest, highest, "a parameter"))
 
 
