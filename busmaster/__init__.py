@@ -39,6 +39,7 @@ from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
 from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from busmaster.protocols.mentor.handle import MentorDrive
+from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.protocols.msc.codec import ProgramStatus
 from busmaster.protocols.msc.handle import MscController
 from busmaster.transport.endpoints import Endpoint, endpoint
@@ -75,6 +76,7 @@ __all__ = [
     "MemoryPort",
     "MentorDrive",
     "MicroFlexDrive",
+    "ModbusUnit",
     "MscController",
     "NoReply",
     "NoSuchParameter",

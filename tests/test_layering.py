@@ -58,7 +58,7 @@ WITHIN = {
     "": {"codec", "handle", "capture"},
 }
 """A device never imports its master's codec: the two must not share a mistake."""
-PART_OF = {"blocks": "handle", "mint": "device"}
+PART_OF = {"mint": "device"}
 """Modules whose name does not end in that of their part. Any other is of the codec: exchanges, and maps as data."""
 TIMELESS = {"errors", "exchange", "profile", "wire", "arbiter", "merging", "planning", "emulator"}
 TIMELY = {"emulator.serve"}

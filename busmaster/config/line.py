@@ -155,7 +155,7 @@ class ConfiguredLine:
             source = _known(handle, name, node.points)
             return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
         decimals = 0 if node.kind.takes_decimals else section.decimals
-        scale = Scale.of(section.factor, section.offset, decimals, whole=node.kind.whole_numbers)
+        scale = Scale.of(section.factor, section.offset, decimals, whole=node.kind.whole_numbers(section.item))
         return NamedPoint.of(handle.point(section.item), where=where, name=name, unit=section.unit, scale=scale)
 
     def _add_outputs(self) -> None:

@@ -7,7 +7,7 @@ packages by their entry points in the group `busmaster.protocols`, when one is f
 from __future__ import annotations
 
 from busmaster.registry.discovery import GROUP, find, kinds, make_device, protocols
-from busmaster.registry.protocol import DeviceMaker, NodeKind, Option, Protocol, device_of
+from busmaster.registry.protocol import DeviceMaker, NodeKind, Option, Protocol, device_of, everywhere, nowhere
 
 __all__ = [
     "GROUP",
@@ -16,8 +16,10 @@ __all__ = [
     "Option",
     "Protocol",
     "device_of",
+    "everywhere",
     "find",
     "kinds",
     "make_device",
+    "nowhere",
     "protocols",
 ]

@@ -59,6 +59,16 @@ def device_of(module: str) -> DeviceMaker:
     return make_device
 
 
+def everywhere(item: str) -> bool:
+    """Return True, whatever the item."""
+    return True
+
+
+def nowhere(item: str) -> bool:
+    """Return False, whatever the item."""
+    return False
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeKind:
     """Describe the nodes that go by one name: on the command line, in LINE.toml and in captures.
@@ -75,8 +85,8 @@ class NodeKind:
     """Arguments of its handle."""
     read_options: tuple[Option, ...] = ()
     """Arguments of its handle's `read_item`, for the command line."""
-    whole_numbers: bool = False
-    """The line carries whole numbers: a value scaled by LINE.toml is rounded to one before it is written."""
+    whole_numbers: Callable[[str], bool] = nowhere
+    """Whether the line carries whole numbers for an item: a value scaled by LINE.toml is then rounded to one."""
     takes_decimals: bool = False
     """Its handle has an argument `decimals`, digits by item, and scales by it; LINE.toml leaves it to that."""
     capture_id: int = 0

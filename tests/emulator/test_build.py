@@ -34,6 +34,7 @@ def test_something_moves_on_a_lively_device() -> None:
         ("msc", "02 02 00 08 00 00 44 52 45 41 44 2C 07 D0 02 6D"),  # DREAD 2000, what its program counts
         ("mentor", "04 30 30 32 32 30 33 30 32 05"),  # 03.02, the speed feedback
         ("dc104", "02 AA 01 AB"),
+        ("modbus", "02 03 00 00 00 01 84 39"),  # holding register 0
     ):
         line = line_of(make_device(protocol, 2, lively=True))
         assert len({ask(line, request, now) for now in range(1000, 1005)}) > 3
@@ -47,5 +48,5 @@ def test_the_oracle_answers_in_their_place() -> None:
 
 
 def test_a_protocol_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(InvalidCommand, match="no such protocol 'modbus'"):
-        make_device("modbus", 1)
+    with pytest.raises(InvalidCommand, match="no such protocol 'profibus'"):
+        make_device("profibus", 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from busmaster.protocols.dc104.capture import Dc104Dialect
 from busmaster.protocols.dc104.codec import PROFILE, Read, Write
 from busmaster.protocols.dc104.handle import Dc104Drive
-from busmaster.registry import NodeKind, Option, Protocol, device_of
+from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -16,7 +16,7 @@ PROTOCOL = Protocol(
             device_of("busmaster.protocols.dc104.device"),
             items="a parameter, 1 to 255",
             options=(Option("maximum", "whole"), Option("allow_zero", "flag")),
-            whole_numbers=True,
+            whole_numbers=everywhere,
             capture_id=6,
         ),
     ),

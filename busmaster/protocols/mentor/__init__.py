@@ -5,7 +5,7 @@ from __future__ import annotations
 from busmaster.protocols.mentor.capture import MentorDialect
 from busmaster.protocols.mentor.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.mentor.handle import MentorDrive
-from busmaster.registry import NodeKind, Option, Protocol, device_of
+from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -17,7 +17,7 @@ PROTOCOL = Protocol(
             items="1.17 (menu and parameter), 15.60:wide, 1.17:hires, 1.17:20 (20 parameters from there on)",
             options=(Option("chained", "flag"),),
             read_options=(Option("chain", "flag", "read a run in one exchange, where no other drive can mistake it"),),
-            whole_numbers=True,
+            whole_numbers=everywhere,
             takes_decimals=True,
             capture_id=5,
         ),

@@ -6,7 +6,7 @@ from busmaster.protocols.msc import codec
 from busmaster.protocols.msc.capture import MscDialect
 from busmaster.protocols.msc.codec import PROFILE
 from busmaster.protocols.msc.handle import MscController
-from busmaster.registry import NodeKind, Option, Protocol, device_of
+from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -21,7 +21,7 @@ PROTOCOL = Protocol(
                 Option("address_step", "whole", "addresses from one value to the next"),
                 Option("model", "text"),
             ),
-            whole_numbers=True,
+            whole_numbers=everywhere,
             capture_id=4,
         ),
     ),

@@ -1,19 +1,12 @@
-"""Transfers of many MSC values: which exchanges they take, how far they are, and runs of values as points."""
+"""Transfers of many values: which exchanges they take, and how far they are."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
+from typing import NamedTuple
 
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import Timings
-from busmaster.points import Point
 from busmaster.protocols.msc.codec import BLOCK, HIGHEST_ADDRESS, BlockRead, BlockWrite, DataRead, DataWrite
-
-if TYPE_CHECKING:
-    from busmaster.node import Priority
-    from busmaster.protocols.msc.handle import MscController
 
 Progress = Callable[[int, int], None]
 """Called with how many values are done, of how many."""
@@ -85,60 +78,3 @@ class Count:
         self._done += values
         if self._progress is not None:
             self._progress(self._done, self._total)
-
-
-@dataclass(frozen=True, slots=True)
-class LongRun:
-    """Stands for a run of more than one block, which is more than one exchange and cannot be polled."""
-
-    address: int
-    count: int
-
-    writes: ClassVar[bool] = False
-    idempotent: ClassVar[bool] = True
-
-    def __str__(self) -> str:
-        return f"read {self.count} values from data {self.address}"
-
-    def open(self, address: int, timings: Timings, /) -> NoReturn:
-        raise InvalidCommand(f"a point that is polled has at most {BLOCK} values, not {self.count}: poll several")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Run(Point[tuple[int, ...]]):
-    """Consecutive values as one point, of any length. One block of 32 at most can be polled."""
-
-    handle: MscController = field(compare=False)
-    address: int
-    count: int
-
-    @classmethod
-    def of(cls, handle: MscController, item: str, address: int, count: int) -> Run:
-        """Raises InvalidCommand for more than one block while the address step is unknown."""
-        reads(address, count, handle.address_step)
-        command = BlockRead(address) if count <= BLOCK else LongRun(address, count)
-        return cls(
-            node=handle.node,
-            item=item,
-            command=command,
-            decode=lambda block: block[:count],
-            handle=handle,
-            address=address,
-            count=count,
-        )
-
-    @property
-    def writable(self) -> bool:
-        return True
-
-    async def read(self, *, max_age: float | None = None, **options: Any) -> tuple[int, ...]:
-        """As `Point.read`; `MscController.read_block` where it is longer than a block."""
-        if self.count <= BLOCK:
-            return await Point.read(self, max_age=max_age, **options)
-        return await self.handle.read_block(self.address, self.count, **options)
-
-    async def write(self, value: Sequence[int], *, priority: Priority | None = None, **options: Any) -> None:
-        """As `MscController.write_block`. Raises InvalidCommand unless there are as many values as in the run."""
-        if len(value) != self.count:
-            raise InvalidCommand(f"{self.node.label}: {self.item} takes {self.count} values, not {len(value)}")
-        await self.handle.write_block(self.address, value, priority=priority, **options)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 from busmaster.errors import InvalidCommand, Refused, VerifyFailed
 from busmaster.exchange import Command, Timings
@@ -13,7 +13,7 @@ from busmaster.node import Node, Priority
 from busmaster.points import Point
 from busmaster.profile import Batch, Profile
 from busmaster.protocols.msc import codec as msc
-from busmaster.protocols.msc.blocks import Count, Part, Progress, Run, place, reads, reads_back, writes
+from busmaster.protocols.msc.blocks import Count, Part, Progress, place, reads, reads_back, writes
 from busmaster.protocols.msc.codec import (
     BLOCK,
     FLAGS,
@@ -326,3 +326,60 @@ class MscController(Handle):
             return await self.read(address)
         except Refused:
             return None
+
+
+@dataclass(frozen=True, slots=True)
+class LongRun:
+    """Stands for a run of more than one block, which is more than one exchange and cannot be polled."""
+
+    address: int
+    count: int
+
+    writes: ClassVar[bool] = False
+    idempotent: ClassVar[bool] = True
+
+    def __str__(self) -> str:
+        return f"read {self.count} values from data {self.address}"
+
+    def open(self, address: int, timings: Timings, /) -> NoReturn:
+        raise InvalidCommand(f"a point that is polled has at most {BLOCK} values, not {self.count}: poll several")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run(Point[tuple[int, ...]]):
+    """Consecutive values as one point, of any length. One block of 32 at most can be polled."""
+
+    handle: MscController = field(compare=False)
+    address: int
+    count: int
+
+    @classmethod
+    def of(cls, handle: MscController, item: str, address: int, count: int) -> Run:
+        """Raises InvalidCommand for more than one block while the address step is unknown."""
+        reads(address, count, handle.address_step)
+        command = BlockRead(address) if count <= BLOCK else LongRun(address, count)
+        return cls(
+            node=handle.node,
+            item=item,
+            command=command,
+            decode=lambda block: block[:count],
+            handle=handle,
+            address=address,
+            count=count,
+        )
+
+    @property
+    def writable(self) -> bool:
+        return True
+
+    async def read(self, *, max_age: float | None = None, **options: Any) -> tuple[int, ...]:
+        """As `Point.read`; `MscController.read_block` where it is longer than a block."""
+        if self.count <= BLOCK:
+            return await Point.read(self, max_age=max_age, **options)
+        return await self.handle.read_block(self.address, self.count, **options)
+
+    async def write(self, value: Sequence[int], *, priority: Priority | None = None, **options: Any) -> None:
+        """As `MscController.write_block`. Raises InvalidCommand unless there are as many values as in the run."""
+        if len(value) != self.count:
+            raise InvalidCommand(f"{self.node.label}: {self.item} takes {self.count} values, not {len(value)}")
+        await self.handle.write_block(self.address, value, priority=priority, **options)

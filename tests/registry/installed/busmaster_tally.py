@@ -20,7 +20,7 @@ from busmaster.emulator.oracle import Oracle
 from busmaster.exchange import MORE, Command, Done, FrameError, Need, ReplyTiming, Sizes, Timings, no_reply
 from busmaster.handle import Handle, unknown_item
 from busmaster.profile import LineSettings, Profile
-from busmaster.registry import NodeKind, Option, Protocol
+from busmaster.registry import NodeKind, Option, Protocol, everywhere
 from busmaster.wire.integers import whole_number
 from busmaster.wire.readers import SingleLeg
 
@@ -185,7 +185,7 @@ PROTOCOL = Protocol(
             make_device,
             items="a counter, a to z, or gate",
             options=(Option("gate", "whole", "which counter the gate has, 1 for a"),),
-            whole_numbers=True,
+            whole_numbers=everywhere,
         ),
     ),
     commands={"count": Count, "preset": Preset},
