@@ -33,8 +33,8 @@ CASES: list[tuple[Profile, int, Callable[[], Command[Any]]]] = [
     (msc.PROFILE, 3, lambda: msc.BlockRead(2008)),
     (mentor.PROFILE, 12, lambda: mentor.Read(1, 17)),
     (mentor.PROFILE, 12, lambda: mentor.Write(1, 17, -100)),
-    (dc104.PROFILE, dc104.PROFILE.addresses.start, lambda: dc104.Read(12)),
-    (dc104.PROFILE, dc104.PROFILE.addresses.start, lambda: dc104.Write(12, 300)),
+    (dc104.PROFILE, dc104.PROFILE.addresses[0], lambda: dc104.Read(12)),
+    (dc104.PROFILE, dc104.PROFILE.addresses[0], lambda: dc104.Write(12, 300)),
     (modbus.PROFILE, 17, lambda: modbus.ReadRegisters(7, 10)),
     (modbus.PROFILE, 17, lambda: modbus.WriteRegisters(7, (555,))),
 ]

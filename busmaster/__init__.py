@@ -33,6 +33,7 @@ from busmaster.planning import GroupPlan, Plan, PlannedGroup, PlannedNode
 from busmaster.points import Point
 from busmaster.polling import GroupStatistics, PollGroup, Quality, Sample, Snapshot, Stream
 from busmaster.profile import LineSettings, Profile
+from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
 from busmaster.protocols.dc104.handle import Dc104Drive
 from busmaster.protocols.hcp.handle import HcpController
 from busmaster.protocols.hcp2.handle import Hcp2Controller
@@ -56,6 +57,7 @@ __all__ = [
     "BusClosed",
     "BusError",
     "CommandWord",
+    "CtAnsiDrive",
     "Dc104Drive",
     "Endpoint",
     "GarbledReply",

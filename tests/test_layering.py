@@ -55,9 +55,10 @@ WITHIN = {
     "handle": {"codec", "handle"},
     "device": {"device"},
     "capture": {"codec", "capture"},
-    "": {"codec", "handle", "capture"},
+    "": {"", "codec", "handle", "capture"},
 }
 """A device never imports its master's codec: the two must not share a mistake."""
+BUILT_ON = {"ct_ansi": "mentor"}
 PART_OF = {"mint": "device"}
 """Modules whose name does not end in that of their part. Any other is of the codec: exchanges, and maps as data."""
 TIMELESS = {"errors", "exchange", "profile", "wire", "arbiter", "merging", "planning", "emulator"}
@@ -119,8 +120,8 @@ def folder_of(module: str) -> str:
 
 
 def builds_on(module: str, other: str) -> bool:
-    """A protocol's modules use those of their own folder, and of what protocols share."""
-    return folder_of(other).startswith("_") or folder_of(other) == folder_of(module)
+    """A protocol's modules use those of their own folder, of what protocols share, and of the one that it builds on."""
+    return folder_of(other).startswith("_") or folder_of(other) in (folder_of(module), BUILT_ON.get(folder_of(module)))
 
 
 def is_pure(module: str) -> bool:

@@ -101,7 +101,7 @@ def line_settings(profile: Profile, baud: int | None) -> LineSettings:
 def only_address(profile: Profile) -> int:
     if profile.addressed:
         raise click.UsageError(f"{profile.name} needs a node: one of {span(profile)}")
-    return profile.addresses.start
+    return profile.addresses[0]
 
 
 def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
@@ -115,14 +115,14 @@ def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
 def slaves_of(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
     """The addresses to emulate: those of --nodes, else 1, or the one drive. Raises UsageError."""
     if nodes is None:
-        return (1,) if profile.addressed else (profile.addresses.start,)
+        return (1,) if 1 in profile.addresses else (profile.addresses[0],)
     if profile.broadcast in nodes:
         raise click.UsageError(f"{profile.name}: no node has address {profile.broadcast}, which means all of them")
     return checked(profile, nodes)
 
 
 def span(profile: Profile) -> str:
-    return f"{profile.addresses.start}-{profile.addresses.stop - 1}"
+    return f"{profile.addresses[0]}-{profile.addresses[-1]}"
 
 
 def connected(command: F) -> F:

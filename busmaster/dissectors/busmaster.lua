@@ -1,4 +1,4 @@
--- Wireshark dissector for the captures of busmaster: HCP, HCP2, MicroFlex, MSC, Mentor II and DC104; what Modbus
+-- Wireshark dissector for the captures of busmaster: HCP, HCP2, MicroFlex, MSC, Mentor II, DC104, CT-ANSI; what Modbus
 -- frames say is left to Wireshark's own dissector.
 --
 -- Copy it into the folder that Help > About Wireshark > Folders calls "Personal Lua Plugins", or run
@@ -9,9 +9,9 @@
 local HEADER, VERSION, NO_NODE = 6, 1, 0xFFFF
 local STX, ETX, EOT, ENQ, ACK, BEL, BS, NAK = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x15
 local FROM_NODE, FROM_HOST = 1, 2
-local HCP, HCP2, MICROFLEX, MSC, MENTOR, DC104, MODBUS = 1, 2, 3, 4, 5, 6, 7
+local HCP, HCP2, MICROFLEX, MSC, MENTOR, DC104, MODBUS, CT_ANSI = 1, 2, 3, 4, 5, 6, 7, 8
 
-local TITLES = { [0] = "unknown", "HCP", "HCP2", "MicroFlex", "MSC", "Mentor", "DC104", "Modbus" }
+local TITLES = { [0] = "unknown", "HCP", "HCP2", "MicroFlex", "MSC", "Mentor", "DC104", "Modbus", "CT-ANSI" }
 local DIRECTIONS = { [0] = "unknown", "node to host", "host to node" }
 local OUTCOMES = { [0] = "-", "ok", "no reply", "garbled", "refused", "stray" }
 local NO_REPLY, STRAY = 2, 5
@@ -442,7 +442,7 @@ end
 
 -- The conversation: which request a reply answers --------------------------------------------------------------------
 
-local READERS = { comms, comms, comms, msc, mentor, dc104, modbus }
+local READERS = { comms, comms, comms, msc, mentor, dc104, modbus, mentor }
 local asked, links = nil, {}
 
 function line.init()

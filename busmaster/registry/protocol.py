@@ -118,8 +118,8 @@ class Protocol:
     kinds: tuple[NodeKind, ...]
     commands: Mapping[str, type[Command[Any]]]
     dialect: Callable[[], Dialect]
-    shares_line: bool = True
-    """Nodes of other protocols may be on the same line."""
+    shares_line_with: frozenset[str] = frozenset()
+    """The other protocols whose nodes may be on the same line."""
 
     def __post_init__(self) -> None:
         if not self.kinds:

@@ -113,7 +113,7 @@ def test_on_a_line_in_order_every_node_is_measured_and_nothing_is_to_be_mended()
 
 @pytest.mark.parametrize("protocol", list(kinds()))
 def test_every_protocol_is_asked_its_cheapest_read(protocol: str) -> None:
-    address = find(protocol).profile.addresses.start
+    address = find(protocol).profile.addresses[0]
     findings = examined(line_of(protocol, [make_device(protocol, address)]), (address,), protocol)
     assert findings.wrong == set()
     label = find(protocol).profile.label(address)
@@ -142,7 +142,7 @@ def test_a_node_is_left_with_nothing_unacknowledged() -> None:
 def test_the_harmless_bytes_begin_no_frame_and_acknowledge_nothing() -> None:
     for protocol, handle in kinds().items():
         profile = handle.profile
-        request = profile.probe.open(profile.addresses.start, profile.timings).request
+        request = profile.probe.open(profile.addresses[0], profile.timings).request
         assert not set(HARMLESS) & {request[0], 0x02, 0x04, 0x06, 0x07, 0x08, 0x15}, protocol
 
 

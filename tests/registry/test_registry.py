@@ -13,11 +13,13 @@ import pytest
 from busmaster.emulator.device import Delay
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Command
+from busmaster.protocols.ct_ansi import codec as ct_ansi
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.microflex import CommandWord
 from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
 from busmaster.registry import NodeKind, Protocol, find, kinds, make_device, protocols
 
@@ -29,9 +31,10 @@ every_protocol = pytest.mark.parametrize("protocol", protocols(), ids=lambda pro
 def test_a_kind_of_node_has_a_handle_and_a_device_that_speak_its_protocol(kind: NodeKind) -> None:
     assert kind.handle.profile is kind.profile is kind.protocol.profile
     assert kind in kind.protocol.kinds
-    device = make_device(kind.name, 2, delay=Delay(0.01))
+    address = kind.profile.addresses[-1]
+    device = make_device(kind.name, address, delay=Delay(0.01))
     assert type(device).__name__.startswith("Emulated")
-    request = kind.profile.probe.open(2, kind.profile.timings).request
+    request = kind.profile.probe.open(address, kind.profile.timings).request
     assert any(request.startswith(route) for route in device.routes)
     assert kind.items
 
@@ -40,6 +43,13 @@ def test_every_protocol_goes_by_a_name_of_its_own() -> None:
     assert [protocol.name for protocol in protocols()] == sorted({protocol.name for protocol in protocols()})
     assert list(kinds()) == sorted(kinds())
     assert find("microflex").protocol is find("hcp2").protocol
+
+
+def test_who_may_share_a_line_is_said_by_both() -> None:
+    by_name = {protocol.name: protocol for protocol in protocols()}
+    for protocol in protocols():
+        for other in protocol.shares_line_with:
+            assert protocol.name in by_name[other].shares_line_with
 
 
 def test_a_protocol_that_does_not_exist_is_refused_with_those_that_do() -> None:
@@ -70,6 +80,14 @@ COMMANDS: list[tuple[str, Command[Any]]] = [
     ("mentor", mentor.ReadRun(1, 17, 3)),
     ("mentor", mentor.Write(4, 26, True)),
     ("mentor", mentor.Write(15, 60, 65535, wide=True)),
+    ("ct-ansi", ct_ansi.Read(1, 21)),
+    ("ct-ansi", ct_ansi.ReadRun(1, 21, 3)),
+    ("ct-ansi", ct_ansi.Write(1, 21, -47.6)),
+    ("ct-ansi", ct_ansi.Write(1, 21, True)),
+    ("modbus", modbus.ReadRegisters(7, 10, "input")),
+    ("modbus", modbus.ReadBits(7)),
+    ("modbus", modbus.WriteCoils(7, (True, False), idempotent=True)),
+    ("modbus", modbus.WriteRegisters(7, (65535,))),
     ("dc104", dc104.Read(0, minimum=0)),
     ("dc104", dc104.Write(12, 1500, maximum=100)),
     ("msc", msc.DataRead(2008)),
@@ -89,7 +107,7 @@ def test_a_command_is_written_down_and_read_back(name: str, command: Command[Any
     written = json.loads(json.dumps(protocol.write_down(command)))
     again = protocol.read_back(written)
     assert again == command
-    address, timings = protocol.profile.addresses.start, protocol.profile.timings
+    address, timings = protocol.profile.addresses[0], protocol.profile.timings
     assert again.open(address, timings).request == command.open(address, timings).request
 
 

@@ -22,5 +22,4 @@ PROTOCOL = Protocol(
     ),
     commands={"read": Read, "write": Write},
     dialect=Dc104Dialect,
-    shares_line=False,
 )

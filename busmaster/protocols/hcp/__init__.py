@@ -20,4 +20,5 @@ PROTOCOL = Protocol(
     ),
     commands={"read": Read, "write": Write},
     dialect=HcpDialect,
+    shares_line_with=frozenset({"hcp2"}),
 )

@@ -30,4 +30,5 @@ PROTOCOL = Protocol(
     ),
     commands={"read": Read, "write": Write},
     dialect=Hcp2Dialect,
+    shares_line_with=frozenset({"hcp"}),
 )

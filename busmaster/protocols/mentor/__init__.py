@@ -7,6 +7,8 @@ from busmaster.protocols.mentor.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.mentor.handle import MentorDrive
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
+CHAIN = Option("chain", "flag", "read a run in one exchange, where no other drive can mistake it")
+
 PROTOCOL = Protocol(
     profile=PROFILE,
     kinds=(
@@ -16,7 +18,7 @@ PROTOCOL = Protocol(
             device_of("busmaster.protocols.mentor.device"),
             items="1.17 (menu and parameter), 15.60:wide, 1.17:hires, 1.17:20 (20 parameters from there on)",
             options=(Option("chained", "flag"),),
-            read_options=(Option("chain", "flag", "read a run in one exchange, where no other drive can mistake it"),),
+            read_options=(CHAIN,),
             whole_numbers=everywhere,
             takes_decimals=True,
             capture_id=5,
@@ -24,4 +26,5 @@ PROTOCOL = Protocol(
     ),
     commands={"read": Read, "read_run": ReadRun, "write": Write},
     dialect=MentorDialect,
+    shares_line_with=frozenset({"ct-ansi"}),
 )

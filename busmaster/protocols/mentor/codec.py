@@ -14,7 +14,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, ClassVar, NoReturn
+from typing import Any, ClassVar, NoReturn, TypeVar
 
 from busmaster.errors import InvalidCommand, NoSuchParameter, Refused
 from busmaster.exchange import Command, Done, Expect, FrameError, Leg, Need, ReplyTiming, Sizes, Timings
@@ -40,6 +40,8 @@ LONGEST_BATCH = 8
 """Parameters that `merge_runs` reads in one exchange, so that a command never waits longer for it."""
 
 _BS = b"\x08"
+T = TypeVar("T")
+
 _SHORT_COMMANDS = {1: ACK, 0: NAK, -1: _BS}
 _SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))
 _REFUSALS = {NAK[0]: Refused, EOT[0]: NoSuchParameter}
@@ -86,7 +88,7 @@ class Read:
 
     def open(self, address: int, timings: Timings) -> Reading:
         """Raises InvalidCommand for the broadcast address: every drive would answer at once."""
-        request, echo = _read_request(address, self.menu, self.number)
+        request, echo = read_request(address, self.menu, self.number)
         return Reading(request, echo, timings.read)
 
 
@@ -163,23 +165,30 @@ class Write:
 
     def open(self, address: int, timings: Timings) -> Writing | Broadcast:
         body = b"%02d%02d%b" % (self.menu, self.number, self.text.encode()) + ETX
-        request = _reset(address) + STX + body + bytes((bcc(body),))
+        request = reset(address) + STX + body + bytes((bcc(body),))
         return Writing(request, timings.write) if address else Broadcast(request, timings.write)
 
 
-class Reading(TelegramReader[int]):
-    """One attempt to read a parameter, or one leg of a run."""
+class ParameterReading(TelegramReader[T]):
+    """One attempt to read a parameter, or one leg of a run, whatever its data look like."""
 
     __slots__ = ()
 
     check = staticmethod(bcc)
-    longest = LONGEST_DATA
-    sizes: ClassVar[Sizes] = telegram_sizes(echo=4, typical=LONGEST_DATA, longest=LONGEST_DATA)
     starts: ClassVar[bytes] = with_parity(STX + NAK + EOT)
     refusals = _REFUSALS
 
-    def feed(self, data: bytes) -> Need | Expect | Done[int]:
+    def feed(self, data: bytes) -> Need | Expect | Done[T]:
         return super().feed(data.translate(_SEVEN_BITS))
+
+
+class Reading(ParameterReading[int]):
+    """Mentor II's: a whole number."""
+
+    __slots__ = ()
+
+    longest = LONGEST_DATA
+    sizes: ClassVar[Sizes] = telegram_sizes(echo=4, typical=LONGEST_DATA, longest=LONGEST_DATA)
 
     def parse(self, field: bytes) -> int:
         if _VALUE.fullmatch(field) is None:
@@ -192,6 +201,8 @@ class RunReading:
 
     __slots__ = ("_leg", "_next", "_short", "_values", "later", "request", "timing")
 
+    reading: ClassVar[type[ParameterReading[Any]]] = Reading
+    """What reads each leg."""
     sizes: ClassVar[Sizes] = Reading.sizes
     starts: ClassVar[bytes] = Reading.starts
     closing: ClassVar[int] = 0
@@ -199,15 +210,15 @@ class RunReading:
 
     def __init__(self, run: ReadRun, address: int, timing: ReplyTiming) -> None:
         numbers = [run.number + run.step * i for i in range(run.count)]
-        self.request, echo = _read_request(address, run.menu, run.number)
+        self.request, echo = read_request(address, run.menu, run.number)
         self.timing = timing
         self.later: Sequence[Leg] = (Leg(timing, self.sizes, sent=1),) * (run.count - 1)
         self._short = _SHORT_COMMANDS[run.step]
         self._next = [b"%02d%02d" % (run.menu, number) for number in reversed(numbers[1:])]
-        self._leg = Reading(self.request, echo, timing)
-        self._values: list[int] = []
+        self._leg = self.reading(self.request, echo, timing)
+        self._values: list[Any] = []
 
-    def feed(self, data: bytes) -> Need | Expect | Done[tuple[int, ...]]:
+    def feed(self, data: bytes) -> Need | Expect | Done[tuple[Any, ...]]:
         step = self._leg.feed(data)
         if not isinstance(step, Done):
             return step
@@ -216,7 +227,7 @@ class RunReading:
             return Done(tuple(self._values), rest=step.rest)
         if step.rest:
             raise FrameError("bytes came before the next parameter was asked for")
-        self._leg = Reading(self._short, self._next.pop(), self.timing)
+        self._leg = self.reading(self._short, self._next.pop(), self.timing)
         return Expect(self.timing, self.sizes, self._short)
 
     def expired(self, started: bool) -> NoReturn:
@@ -277,14 +288,14 @@ def merge_runs(commands: Sequence[Command[Any]]) -> list[Batch]:
 
 
 @lru_cache(maxsize=4096)
-def _read_request(address: int, menu: int, number: int) -> tuple[bytes, bytes]:
+def read_request(address: int, menu: int, number: int) -> tuple[bytes, bytes]:
     if not address:
         raise InvalidCommand("a read cannot go to all drives: they would answer at once")
     echo = b"%02d%02d" % (menu, number)
-    return _reset(address) + echo + ENQ, echo
+    return reset(address) + echo + ENQ, echo
 
 
-def _reset(address: int) -> bytes:
+def reset(address: int) -> bytes:
     tens, units = divmod(address, 10)
     return EOT + b"%d%d%d%d" % (tens, tens, units, units)
 

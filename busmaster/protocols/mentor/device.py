@@ -252,19 +252,14 @@ class EmulatedMentor(Device):
         if parameter not in self.parameters:
             self._say(NO_SUCH_PARAMETER, now)
         else:
-            self._say(telegram(parameter, self.value(parameter, now), self.parameters[parameter].wide), now)
+            self._say(self._telegram(parameter, now), now)
 
     def _write(self, name: bytes, data: bytes, now: float) -> bool:
         parameter = self.parameters.get(int(name)) if name.isdigit() else None
         if parameter is None or not parameter.writable:
             return False
-        if HIGH_RESOLUTION.fullmatch(data):
-            fine = int(data)
-            if not parameter.fine:
-                return False
-        elif VALUE.fullmatch(data) and len(data) <= LONGEST_VALUE:
-            fine = int(data) * FINE
-        else:
+        fine = self._fine_of(parameter, data)
+        if fine is None:
             return False
         if self.oracle is not None:
             self.oracle.write(int(name), fine / FINE)
@@ -273,6 +268,18 @@ class EmulatedMentor(Device):
         else:
             return False
         return True
+
+    def _telegram(self, parameter: int, now: float) -> bytes:
+        """The reply to a read of one that is there."""
+        return telegram(parameter, self.value(parameter, now), self.parameters[parameter].wide)
+
+    def _fine_of(self, parameter: Parameter, data: bytes) -> int | None:
+        """The value that a write carries, in steps of the high resolution; None for what is none."""
+        if HIGH_RESOLUTION.fullmatch(data):
+            return int(data) if parameter.fine else None
+        if VALUE.fullmatch(data) and len(data) <= LONGEST_VALUE:
+            return int(data) * FINE
+        return None
 
     def _say(self, data: bytes, now: float) -> None:
         self.reply(data.translate(EVEN_PARITY) if self._parity else data, now)
