@@ -87,7 +87,7 @@ def take_options(offered: Iterable[Offer], protocol: str, given: dict[str, Any])
         if value in (None, False):
             continue
         if protocol not in names:
-            raise click.UsageError(f"--{option.name.replace('_', '-')} is {' and '.join(names)}'s alone")
+            raise click.UsageError(f"--{option.name.replace('_', '-')} is for {' and '.join(names)} alone")
         taken[option.name] = value
     return taken
 

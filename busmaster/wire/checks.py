@@ -1,4 +1,4 @@
-"""The checksums that several documents have in common, or that a codec and a device share. Which bytes they cover is the protocol's business."""
+"""Checksums. Which bytes they cover is the protocol's business."""
 
 from __future__ import annotations
 

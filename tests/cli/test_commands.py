@@ -103,7 +103,7 @@ def test_a_bad_assignment_is_status_2_and_nothing_is_sent(busmaster: Command, as
         (("read", "PORT", *HCP2, "--node", "1"), "missing argument 'ITEM...'"),
         (("read", "PORT", *HCP2, "--node", "1", "axis0.positoin"), "did you mean 'axis0.position'?"),
         (("read", "PORT", *HCP2, "--node", "1", "1", "--timeout", "0"), "a time is above 0"),
-        (("read", "PORT", *HCP2, "--node", "1", "1", "--chain"), "--chain is mentor's alone"),
+        (("read", "PORT", *HCP2, "--node", "1", "1", "--chain"), "--chain is for ct-ansi and mentor alone"),
         (("read", "PORT?baud=3", *HCP2, "--node", "1", "1"), "did you mean 'baudrate'?"),
         (("read", "rfc2217://host:1", *HCP2, "--node", "1", "1"), "use socket://host:1"),
         (("read", "host:5020", *HCP2, "--node", "1", "1"), "a TCP port is written socket://host:5020"),

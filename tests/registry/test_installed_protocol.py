@@ -102,7 +102,7 @@ def test_the_help_names_it_with_its_items_and_options(tally: None, busmaster: Co
 def test_an_option_of_its_own_is_no_option_of_others(tally: None, busmaster: Command) -> None:
     wrong = busmaster("read", "/dev/null", "--protocol", "hcp2", "--node", "1", "1", "--gate", "2")
     assert wrong.status == 2
-    assert "--gate is tally's alone" in wrong.err
+    assert "--gate is for tally alone" in wrong.err
 
 
 def test_the_doctor_asks_its_nodes(served: TcpServer, busmaster: Command) -> None:
