@@ -19,6 +19,7 @@ from typing import Any
 
 from busmaster.profile import LineSettings
 from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.identity import Identity
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -47,10 +48,12 @@ class SocketPort:
     receive_latency: float = 0.0
     paced: bool | None = None
 
-    def identity(self) -> None:
+    def presence(self) -> None:
         return None
 
-    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> asyncio.Transport:
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> asyncio.Transport:
         transport, _ = await asyncio.get_running_loop().create_connection(protocol_factory, sock=self.sock)
         return transport
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from busmaster.arbiter.counters import LineStatistics, NodeStatistics, Quantiles
-from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, NodeChanged
+from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
+from busmaster.arbiter.events import LatenessLowered, LatenessRaised, LineChange, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Timeline
@@ -59,6 +59,7 @@ __all__ = [
     "CommandWord",
     "CtAnsiDrive",
     "Dc104Drive",
+    "DriverErrors",
     "Endpoint",
     "GarbledReply",
     "GroupPlan",
@@ -67,6 +68,7 @@ __all__ = [
     "HcpController",
     "Health",
     "InvalidCommand",
+    "LatenessLowered",
     "LatenessRaised",
     "LineChange",
     "LineChanged",
@@ -92,6 +94,7 @@ __all__ = [
     "PlannedNode",
     "Point",
     "PollGroup",
+    "PortFailed",
     "Priority",
     "Profile",
     "ProgramStatus",

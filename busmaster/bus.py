@@ -6,7 +6,9 @@ import asyncio
 import random
 import warnings
 from collections.abc import Coroutine, Iterable, Sequence
+from dataclasses import replace
 from math import inf
+from threading import current_thread, get_ident
 from types import TracebackType
 from typing import Any
 
@@ -14,16 +16,17 @@ import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineStatistics
-from busmaster.arbiter.events import Event, NodeChanged, Strayed
+from busmaster.arbiter.events import Event, NodeChanged, PortFailed, Strayed
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
-from busmaster.errors import BusClosed, InvalidCommand
+from busmaster.arguments import seconds, whole_number
+from busmaster.errors import BusClosed, InvalidCommand, LineDown
 from busmaster.exchange import Timings
 from busmaster.logbook import Logbook
 from busmaster.merging import Merge
-from busmaster.node import Node
+from busmaster.node import Node, checked_priority, checked_retries
 from busmaster.planning import Plan, PlannedGroup, Read, bounds, plan
 from busmaster.points import Point
 from busmaster.polling import PollGroup, Sample, Stream
@@ -35,6 +38,7 @@ from busmaster.transport.serial_port import SerialPort
 
 BYTE_TIME_UNTIL_KNOWN = 10 / 9600
 EVENT_BUFFER = 256
+MOST_CAPACITY = 1_000_000
 
 
 class Bus:
@@ -42,14 +46,14 @@ class Bus:
 
     `capacity` bounds the requests that may wait in each priority class (R12). `seed` makes the jitter of probes and
     reconnects repeatable. `tap` sees every byte (see busmaster.capture). Entering raises LineDown if the port cannot
-    be opened; once open, a lost port fails its callers at once and is opened again by itself (R13).
+    be opened; once open, a lost port fails its callers at once and is opened again by itself, as soon as the same
+    device is back (R13); `events` tells of attempts that fail.
     """
 
     def __init__(
         self, endpoint: Endpoint, *, capacity: int = 1000, seed: int | None = None, tap: Tap | None = None
     ) -> None:
-        if capacity < 1:
-            raise InvalidCommand(f"a bus needs room for at least one request, not {capacity}")
+        capacity = whole_number(capacity, 1, MOST_CAPACITY, "a bus's capacity")
         if isinstance(endpoint, str):
             raise InvalidCommand(
                 f"a bus needs an endpoint, not text: Bus(endpoint({endpoint!r})), or SerialPort, TcpPort"
@@ -73,6 +77,7 @@ class Bus:
             on_written=lambda transaction: self.touched(transaction, transaction.ended_at),
             paced=lambda transport: is_paced(endpoint, transport),
             tap=tap,
+            name=endpoint.name,
         )
         self._nodes: dict[tuple[str, int], Node] = {}
         self._groups: list[PollGroup] = []
@@ -80,18 +85,21 @@ class Bus:
         self._streams: list[Stream[Event]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._connection: Connection | None = None
+        self._thread = 0
         self.running = False
         self._closed = False
 
     # opening and closing
 
     async def __aenter__(self) -> Bus:
-        if self.running:
-            raise InvalidCommand("this bus is open already")
         self._check_not_closed()
-        self.pump.bind(asyncio.get_running_loop())
+        if self.running:
+            raise InvalidCommand(f"the bus on {self.endpoint.name} is open already: enter it once, and share it")
+        self._loop = asyncio.get_running_loop()
+        self._thread = get_ident()
+        self.pump.bind(self._loop)
         self._arbiter.reset_statistics(self.now())
-        connection = Connection(self.endpoint, self.pump, jitter=self._random)
+        connection = Connection(self.endpoint, self.pump, on_failed=self._on_failed, jitter=self._random)
         self._connection = connection
         self.running = True
         try:
@@ -107,6 +115,7 @@ class Bus:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Waiting callers get BusClosed at once; the exchange on the wire may end, within its own window."""
+        self.check_loop()
         self._closed = True
         for group in list(self._groups):
             group.close()
@@ -133,23 +142,35 @@ class Bus:
                 task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
+    def accept_device(self) -> None:
+        """Let the next opening take whatever device has the port's name then, as if the program were started again.
+
+        Without it, only the device that the line was opened on is opened again. A port that is named by a serial
+        number (usb:SERIAL) never takes another one. A connection that is up stays as it is.
+        """
+        if self._connection is not None:
+            self._connection.accept_device()
+
     # nodes and groups
 
     def node(
         self, profile: Profile, address: int, *, timings: Timings | None = None, retries: int | None = None
     ) -> Node:
-        """The node at this address. Raises InvalidCommand for an address that the protocol does not have, and for
-        other timings or retries than it was first asked with."""
+        """The node at this address: a protocol and an address are one node, however often it is asked for.
+
+        Raises InvalidCommand for an address that the protocol does not have, and for another profile, timings or
+        retries than it was first asked with; what is None was left open.
+        """
+        self.check_loop()
         profile.check_address(address)
+        if timings is not None and not isinstance(timings, Timings):
+            raise InvalidCommand(f"{profile.label(address)}: timings are a Timings, not {timings!r}")
+        if retries is not None:
+            retries = checked_retries(retries, profile.label(address))
         known = self._nodes.get((profile.name, address))
         if known is not None:
-            if timings not in (None, known.timings) or retries not in (None, known.record.retries):
-                raise InvalidCommand(f"{known.label} is in use with other timings or retries")
-            if profile.merge is not None:
-                known.record.profile = profile
+            known.check_shared(profile, timings, retries)
             return known
-        if retries is not None and not 0 <= retries <= 100:
-            raise InvalidCommand(f"retries must be 0 to 100, not {retries}")
         self._check_framing(profile)
         node = Node(self, self._arbiter.add_node(profile, address, self.now(), timings, retries))
         node.record.waiter = node
@@ -179,10 +200,17 @@ class Bus:
         `phase` (seconds, below the period) places the group on the grid; without it, it is placed where it meets the
         other groups least. `merge`: cheaper exchanges to opt in to, such as `protocols.mentor.merge_runs`, beside
         those that the nodes' profiles have; they are taken where they save line time, and no longer once refused.
+        Raises InvalidCommand for a name that is in use, and for times and priorities that are none.
         """
+        self.check_loop()
+        if self._closed or not self.running:
+            raise self.not_open()
+        period = seconds(period, f"poll group {name!r}: a period")
+        if phase is not None:
+            phase = seconds(phase, f"poll group {name!r}: a phase")
+        priority = checked_priority(priority)
         if any(group.name == name for group in self._groups):
             raise InvalidCommand(f"there is a poll group {name!r} already")
-        self._check_not_closed()
         for other in self._groups:
             other.weigh()
         group = PollGroup(self, name, period, points, phase=phase, priority=priority, merge=merge)
@@ -193,6 +221,7 @@ class Bus:
 
     def remove_group(self, group: PollGroup) -> None:
         """What `PollGroup.close` does: its polls end, and what they have on the wire goes unheard."""
+        self.check_loop()
         if group in self._groups:
             self._groups.remove(group)
             self._arbiter.remove_poll(group.poll, self.now())
@@ -200,11 +229,13 @@ class Bus:
 
     def demand(self, poll: Poll) -> None:
         """What `PollGroup.demand` does."""
+        self.check_loop()
         self._arbiter.demand(poll, self.now())
         self.pump.turn()
 
     def suspend(self, node: Node, seconds: float) -> None:
         """What `Node.suspend` does."""
+        self.check_loop()
         self._arbiter.dispatcher.suspend(node.record, self.now() + seconds)
         self.pump.turn()
 
@@ -243,16 +274,20 @@ class Bus:
 
     def statistics(self) -> LineStatistics:
         """An immutable snapshot of the line's counts since it was opened or reset."""
-        return self._arbiter.statistics(self.now())
+        self.check_loop()
+        return replace(self._arbiter.statistics(self.now()), driver=self.pump.driver_errors())
 
     def reset_statistics(self) -> None:
         """Start all counts of line, nodes and groups again."""
+        self.check_loop()
         self._arbiter.reset_statistics(self.now())
+        self.pump.reset_driver_errors()
         for group in self._groups:
             group.reset_statistics()
 
     def plan(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
         """What becomes of the groups that run, and of `more`, by the reply times measured so far."""
+        self.check_loop()
         groups = [*(group.planned() for group in self._groups), *more]
         latency = self.endpoint.receive_latency
         return plan(
@@ -265,6 +300,8 @@ class Bus:
         It reckons with what is polled, what waits already, every node's probe, and each kind of command that was
         asked so far; with nodes that are dead, late or trickling; not with a line that is never silent.
         """
+        self.check_loop()
+        priority = checked_priority(priority)
         backlog = self._arbiter.dispatcher.backlog
         polled = [(poll, t) for poll in self._arbiter.dispatcher.schedule.polls for t in poll.results]
         low = sum(poll.priority is Priority.BACKGROUND for poll, _ in polled)
@@ -282,15 +319,39 @@ class Bus:
         return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 
     def events(self) -> Stream[Event]:
-        """What happens to the line and its nodes, from now on (NodeChanged, LineChanged, ...)."""
+        """What happens to the line and its nodes, from now on (NodeChanged, LineChanged, PortFailed, ...)."""
+        self.check_loop()
         self._check_not_closed()
         return Stream(self._streams, EVENT_BUFFER)
+
+    # misuse
+
+    def check_loop(self) -> None:
+        """Raise InvalidCommand where an open bus is used from another thread, or from another event loop."""
+        if self.running and (get_ident() != self._thread or not self._loop.is_running()):
+            self._check_elsewhere()
+
+    def _check_elsewhere(self) -> None:
+        """Its loop does not run here: right only in its own thread, between two runs of the loop."""
+        if get_ident() != self._thread or is_any_loop_running():
+            raise InvalidCommand(
+                f"the bus on {self.endpoint.name} was used from thread {current_thread().name!r} outside the "
+                "event loop that opened it: hand the call to that loop, with portal.call (anyio.from_thread) or "
+                "asyncio.run_coroutine_threadsafe"
+            )
+
+    def not_open(self, *, node: str | None = None, command: str | None = None) -> BusClosed:
+        """Return the error for what needs an open bus, before it is entered or after it was left."""
+        if not self._closed:
+            return BusClosed("the bus is not open", node=node, command=command)
+        hint = "make a new Bus: one is opened and closed once"
+        return BusClosed("the bus was closed", node=node, command=command, hint=hint)
 
     # inside
 
     def _check_not_closed(self) -> None:
         if self._closed:
-            raise BusClosed("the bus was closed", hint="make a new Bus: one is opened and closed once")
+            raise self.not_open()
 
     def _check_framing(self, profile: Profile) -> None:
         settings = self.endpoint.settings
@@ -313,6 +374,9 @@ class Bus:
         if not isinstance(event, Strayed):
             for stream in self._streams:
                 stream.put(event)
+
+    def _on_failed(self, cause: LineDown) -> None:
+        self._on_event(PortFailed(cause.what, cause.hint, cause.__cause__))
 
     def _settings(self) -> LineSettings:
         if self.endpoint.settings is not None:
@@ -342,3 +406,12 @@ class Bus:
             self._logbook.failed_hook(node.label, error)
         finally:
             self._arbiter.dispatcher.release_node(node.record)
+
+
+def is_any_loop_running() -> bool:
+    """Return whether an event loop runs in this thread."""
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return False
+    return True

@@ -2,14 +2,15 @@
 
 Every transaction that fails raises one fresh instance of a `BusError` subclass. It carries the node, the
 command and the number of attempts, and its text says in one sentence what happened, where, and what to try.
-A wrong argument is not a bus error: it raises `InvalidCommand` when the command is built.
+A wrong argument is not a bus error: it raises `InvalidCommand` when the command is built, or when it is asked for.
 """
 
 from __future__ import annotations
 
 
 class InvalidCommand(ValueError):
-    """An argument is out of range or cannot be written as the protocol demands. Nothing was sent."""
+    """An argument is out of range or cannot be written as the protocol demands, or a bus is used as none can be: opened
+    twice, or from another thread or event loop than its own. Nothing was sent."""
 
 
 class BusError(Exception):

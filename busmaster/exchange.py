@@ -10,11 +10,11 @@ MSC needs two (ACK, then the packet) and more when a packet must be sent again.
 from __future__ import annotations
 
 import enum
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeAlias, TypeVar
 
+from busmaster.arguments import seconds
 from busmaster.errors import InvalidCommand, Refused
 
 T = TypeVar("T")
@@ -40,16 +40,15 @@ class ReplyTiming:
     """The node's driver holds the line this long after its reply."""
 
     def __post_init__(self) -> None:
-        times = (self.nominal, self.window, self.lateness, self.byte_gap, self.turnaround)
-        if not all(math.isfinite(t) for t in times):
-            raise InvalidCommand("reply times must be finite numbers of seconds")
-        if not 0 <= self.nominal <= self.window <= self.lateness:
+        for name in ("nominal", "window", "lateness", "byte_gap", "turnaround"):
+            seconds(getattr(self, name), f"a reply's {name}")
+        if not self.nominal <= self.window <= self.lateness:
             raise InvalidCommand(
                 f"reply times must satisfy 0 <= nominal <= window <= lateness, "
                 f"not {self.nominal:g}, {self.window:g}, {self.lateness:g} s"
             )
-        if self.byte_gap <= 0 or self.turnaround < 0:
-            raise InvalidCommand("byte_gap must be above 0 s and turnaround at least 0 s")
+        if not self.byte_gap:
+            raise InvalidCommand("a reply's byte_gap is above 0 s")
 
     def with_window(self, window: float) -> ReplyTiming:
         """The same with another reply window; nominal and lateness move only as far as they must."""
@@ -140,16 +139,18 @@ Step: TypeAlias = Need | Expect | Done[T_co]
 class FrameError(Exception):
     """This is no reply: the attempt failed. Never reaches a caller.
 
-    `whole` is True only for a whole frame with the right echo and a bad checksum: then nothing more can follow and
-    the line need not wait for stragglers (R3). `send` is a closing ACK owed to the device all the same (MSC), else
-    it retransmits into other exchanges.
+    `whole` is True only for a whole frame with the right echo and a bad checksum: its reply has begun, so the line
+    need not wait for stragglers, only for silence (R3). `send` is a closing ACK owed to the device all the same
+    (MSC), else it retransmits into other exchanges. `heard` is all that came in place of the reply, where it may be
+    another request's: it pays what is owed (R15).
     """
 
-    def __init__(self, what: str, *, whole: bool = False, send: bytes = b"") -> None:
+    def __init__(self, what: str, *, whole: bool = False, send: bytes = b"", heard: bytes = b"") -> None:
         super().__init__(what)
         self.what = what
         self.whole = whole
         self.send = send
+        self.heard = heard
 
 
 class Exchange(Protocol[T_co]):
@@ -181,6 +182,19 @@ class Exchange(Protocol[T_co]):
     @property
     def starts(self) -> bytes:
         """The legal first bytes of the first reply leg; anything else is a FrameError."""
+        ...
+
+    @property
+    def answers(self) -> Sequence[bytes]:
+        """What its good replies begin with, or are where they are one byte: one for each reply that decides.
+
+        Two exchanges that share one could be taken for each other (R15). Empty for a broadcast.
+        """
+        ...
+
+    @property
+    def owed(self) -> Sequence[bytes]:
+        """What its node may still say if the attempt ends now, unheard: of the same kind as `answers` (R15)."""
         ...
 
     @property

@@ -21,7 +21,10 @@ Send: TypeAlias = Callable[[], Awaitable[None]]
 class Handle:
     """An awaitable handle of one node: thin and typed, over `Node.request`.
 
-    Raises InvalidCommand for an address that the protocol does not have. Two handles of one address share the node.
+    Raises InvalidCommand for an address that the protocol does not have. Handles of one protocol and address share the
+    node, whatever their kind (a controller and a drive that speak alike): what one leaves out, of timings, retries and
+    options of the protocol, is as the first said, and anything else than that raises InvalidCommand. Another protocol
+    at the same address is another node.
     """
 
     profile: ClassVar[Profile]

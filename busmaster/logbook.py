@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Hashable
 
-from busmaster.arbiter.events import Event, LatenessRaised, LineChange, LineChanged, NodeChanged, Strayed
+from busmaster.arbiter.events import Event, LatenessRaised, LineChange, LineChanged, NodeChanged, PortFailed, Strayed
 from busmaster.arbiter.health import Health
 
 logger = logging.getLogger("busmaster")
@@ -22,7 +22,7 @@ class Logbook:
         self._written: dict[Hashable, tuple[float, int]] = {}
 
     def note(self, event: Event, now: float) -> None:
-        """Write a line for a change of a node or of the line, for a collision and for a raised lateness."""
+        """Write a line for a change of a node or of the line, for a collision, a raised lateness, a failed opening."""
         if isinstance(event, NodeChanged):
             level = logging.WARNING if event.after is Health.DOWN else logging.INFO
             text = f"{event.node.label} is {event.after.value} (was {event.before.value})"
@@ -37,6 +37,9 @@ class Logbook:
                 f"its lateness is now {event.lateness * 1000:.0f} ms"
             )
             self._write((event.node, LatenessRaised), logging.WARNING, text, now)
+        elif isinstance(event, PortFailed):
+            text = f"cannot reconnect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
+            self._write((PortFailed, event.cause), logging.WARNING, text, now, event.bug)
         elif isinstance(event, Strayed) and event.collision:
             text = f"the echo differs from what was sent: a collision ({event.data.hex(' ')})"
             self._write(Strayed, logging.WARNING, text, now)
@@ -45,10 +48,11 @@ class Logbook:
         """A user's on_return hook raised."""
         logger.error("%s: the on_return hook of %s failed", self._name, label, exc_info=error)
 
-    def _write(self, key: Hashable, level: int, text: str, now: float) -> None:
+    def _write(self, key: Hashable, level: int, text: str, now: float, bug: BaseException | None = None) -> None:
         last, more = self._written.get(key, (-PAUSE, 0))
         if now - last < PAUSE:
             self._written[key] = (last, more + 1)
             return
         self._written[key] = (now, 0)
-        logger.log(level, "%s: %s%s", self._name, text, f" ({more} more since the last such line)" if more else "")
+        again = f" ({more} more since the last such line)" if more else ""
+        logger.log(level, "%s: %s%s", self._name, text, again, exc_info=bug)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from math import inf
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import COMMAND, Priority, Timeline, Transaction
-from busmaster.errors import BusClosed, BusError, InvalidCommand, Refused
-from busmaster.exchange import Command
+from busmaster.arguments import seconds, whole_number
+from busmaster.errors import BusError, InvalidCommand, Refused
+from busmaster.exchange import Command, Timings
+from busmaster.merging import Merge
 from busmaster.planning import PlannedNode
 from busmaster.profile import Profile
 
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     from busmaster.points import Point
 
 T = TypeVar("T")
+MOST_RETRIES = 100
 
 __all__ = ["Health", "Node", "NodeStatistics", "Priority", "Timeline"]
 
@@ -76,6 +80,28 @@ class Node:
         self._on_return = hook
         self.record.has_hook = hook is not None
 
+    def check_shared(self, profile: Profile, timings: Timings | None, retries: int | None) -> None:
+        """Raise InvalidCommand where somebody asks for this node with anything else than it was first asked with.
+
+        What is None was left open: a profile's `merge` too.
+        """
+        own = self.profile
+        wanted = {
+            "other timings": timings not in (None, self.timings),
+            "other retries": retries not in (None, self.record.retries),
+            "another profile": profile != own or profile.merge not in (None, own.merge),
+        }
+        for what, differs in wanted.items():
+            if differs:
+                raise InvalidCommand(
+                    f"{self.label} is in use already, and now asked for with {what}: "
+                    "give all handles of an address the same options, or leave them out in all but the first"
+                )
+
+    def merge_reads(self, merge: Merge) -> None:
+        """Have poll groups propose `merge` for this node's reads from now on, in place of what its profile had."""
+        self.record.profile = replace(self.record.profile, merge=merge)
+
     async def request(
         self,
         command: Command[T],
@@ -88,10 +114,10 @@ class Node:
     ) -> T:
         """Run one command and return its value.
 
-        `priority` defaults to COMMAND. `start_within` (seconds) fails the request with NotStarted if it could not be
-        sent by then. `retries` (0 to 100) overrides the node's; writes are not retried unless the command or
-        `idempotent` says that they may be repeated (R7). `touches` names the point that a write changes: samples
-        older than the write are marked stale; without it, all of the node's.
+        `priority`, a Priority or its number, defaults to COMMAND. `start_within` (seconds) fails the request with
+        NotStarted if it could not be sent by then. `retries` (0 to 100) overrides the node's; writes are not retried
+        unless the command or `idempotent` says that they may be repeated (R7). `touches` names the point that a write
+        changes: samples older than the write are marked stale; without it, all of the node's.
 
         Raises a BusError subclass. Cancelling it frees the caller at once and never disturbs the line (R6).
         """
@@ -127,21 +153,24 @@ class Node:
     ) -> tuple[Transaction, asyncio.Future[Any]]:
         record = self.record
         profile = record.profile
-        if retries is not None and not 0 <= retries <= 100:
-            raise InvalidCommand(f"{self.label}: retries must be 0 to 100, not {retries}")
-        if start_within is not None and not 0 <= start_within < inf:
-            raise InvalidCommand(f"{self.label}: start_within is a time of 0 s or more, not {start_within!r}")
+        if retries is not None:
+            retries = checked_retries(retries, self.label)
+        if start_within is not None:
+            start_within = seconds(start_within, f"{self.label}: start_within")
+        if priority is None:
+            priority = COMMAND
+        elif type(priority) is not Priority:
+            priority = checked_priority(priority)
         if record.address == profile.broadcast and not command.writes:
             raise InvalidCommand(f"{profile.name}: address {self.address} is for writes to all; nobody answers a read")
         bus = self.bus
         if not bus.running:
-            raise BusClosed("the bus is not open", node=self.label, command=str(command))
+            raise bus.not_open(node=self.label, command=str(command))
+        bus.check_loop()
         if type(command) not in self.kinds:
             if not hasattr(command, "open"):
                 raise InvalidCommand(f"{self.label}: {command!r} is no command; read it through a handle, or its point")
             self.kinds[type(command)] = command
-        if priority is None:
-            priority = COMMAND
         start_by = inf if start_within is None else bus.now() + start_within
         transaction = Transaction(record, command, priority, start_by, retries, idempotent, probe)
         transaction.touches = self if touches is None else touches.quantity
@@ -170,9 +199,7 @@ class Node:
 
     def suspend(self, for_: float) -> None:
         """For maintenance: its polls rest and its requests fail with NodeDown for so many seconds, 0 to end it now."""
-        if not 0 <= for_ < inf:
-            raise InvalidCommand(f"{self.label}: a suspension lasts 0 s or more, not {for_!r}")
-        self.bus.suspend(self, for_)
+        self.bus.suspend(self, seconds(for_, f"{self.label}: a suspension"))
 
     @property
     def suspended(self) -> bool:
@@ -180,4 +207,15 @@ class Node:
 
     def statistics(self) -> NodeStatistics:
         """Counts and latencies since the bus was opened or its statistics were reset."""
+        self.bus.check_loop()
         return self.record.counters.snapshot(self.record.lateness)
+
+
+def checked_priority(value: Priority | int) -> Priority:
+    """Return the class that `value` is, or is the number of. Raises InvalidCommand for anything else."""
+    return Priority(whole_number(value, min(Priority), max(Priority), "a priority"))
+
+
+def checked_retries(value: int, label: str) -> int:
+    """Return `value` as an int. Raises InvalidCommand, naming the node, unless it is 0 to 100."""
+    return whole_number(value, 0, MOST_RETRIES, f"{label}: retries")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import inf
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from busmaster.arguments import seconds
 from busmaster.errors import GarbledReply, InvalidCommand
 from busmaster.exchange import Command
 
@@ -68,6 +70,8 @@ class Point(Generic[T]):
     ) -> T:
         """Its value now, or, with `max_age` in seconds, a poll group's latest sample if that is young enough."""
         if max_age is not None:
+            if max_age != inf:
+                max_age = seconds(max_age, f"{self.node.label}: max_age")
             sample = self.node.bus.latest(self)
             if sample is not None and sample.error is None and sample.age(self.node.bus.now()) <= max_age:
                 value: T = sample.value

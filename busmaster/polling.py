@@ -115,6 +115,7 @@ class PollGroup:
 
     def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
         """A consumer with a buffer of so many snapshots. Close it when it is not read any more."""
+        self._bus.check_loop()
         if not self._poll.active:
             raise BusClosed(f"poll group {self.name!r} is closed")
         return Stream(self._consumers, buffer)
@@ -129,6 +130,7 @@ class PollGroup:
 
     def statistics(self) -> GroupStatistics:
         """An immutable snapshot of its counts."""
+        self._bus.check_loop()
         return self._tally.statistics(self._poll)
 
     def reset_statistics(self) -> None:
@@ -186,6 +188,7 @@ class PollGroup:
     # which exchanges bring the values
 
     def _set_points(self, points: Iterable[Point[Any]]) -> None:
+        self._bus.check_loop()
         unique = tuple(dict.fromkeys(points))
         for point in unique:
             if point.node.bus is not self._bus:

@@ -23,7 +23,7 @@ class LineSettings:
 
     def __post_init__(self) -> None:
         rate: object = self.baudrate
-        if not isinstance(rate, int) or rate <= 0:
+        if not isinstance(rate, int) or isinstance(rate, bool) or rate <= 0:
             raise InvalidCommand(f"baudrate must be a whole number above 0, not {rate!r}")
         if self.bytesize not in (5, 6, 7, 8) or self.parity not in tuple("NEOMS") or self.stopbits not in (1, 1.5, 2):
             raise InvalidCommand(
@@ -58,7 +58,9 @@ class Profile:
 
     `probe` is its cheapest read, asked of a node that may be dead. `merge` proposes cheaper exchanges for commands of
     one node; a poll group and the planner weigh them by line time. `listen` reads what arrives while nothing is
-    asked. `exchange_limit` bounds one exchange as a whole, in seconds (MSC: past it a bad packet is ACKed away); its
+    asked. `checks` are further cheap reads that harm no node and whose answers differ: where an answer could be
+    another request's, one of those is asked that cannot be (R15); a node that refuses one is asked another.
+    `exchange_limit` bounds one exchange as a whole, in seconds (MSC: past it a bad packet is ACKed away); its
     exchanges are `Abandonable`.
     """
 
@@ -69,6 +71,7 @@ class Profile:
     line: LineSettings
     timings: Timings
     probe: Command[Any]
+    checks: Sequence[Command[Any]] = ()
     broadcast: int | None = None
     addressed: bool = True
     retries: int = 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import sys
 from collections import deque
 from collections.abc import AsyncIterator, Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,8 @@ from busmaster.arbiter.counters import Quantiles
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Timeline
-from busmaster.errors import BusError, InvalidCommand
+from busmaster.arguments import whole_number
+from busmaster.errors import BusError
 from busmaster.points import Point
 
 T = TypeVar("T")
@@ -142,10 +144,8 @@ class Stream(Generic[T]):
     """One consumer, at its own pace: bounded, it drops the oldest and counts them in `dropped`."""
 
     def __init__(self, listeners: list[Stream[T]], buffer: int) -> None:
-        if buffer < 1:
-            raise InvalidCommand(f"a buffer holds at least one item, not {buffer}")
         self._listeners = listeners
-        self._items: deque[T] = deque(maxlen=buffer)
+        self._items: deque[T] = deque(maxlen=whole_number(buffer, 1, sys.maxsize, "a buffer"))
         self._arrived = anyio.Event()
         self._closed = False
         self.dropped = 0

@@ -12,15 +12,16 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "busmaster"
-BASE = {"errors", "exchange", "profile"}
+BASE = {"arguments", "errors", "exchange", "profile"}
 HOLDINGS = {"bus", "handle", "logbook", "node", "points", "polling", "samples"}
 ALL = {entry.stem for entry in PACKAGE.iterdir() if entry.suffix in ("", ".py") and entry.name[0] != "_"}
 RUNNING = {"transport", "arbiter", "merging", "planning"}
 
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
-    "exchange": {"errors"},
-    "profile": {"exchange", "errors"},
+    "arguments": {"errors"},
+    "exchange": {"arguments", "errors"},
+    "profile": {"arguments", "exchange", "errors"},
     "wire": {"wire"} | BASE,
     "arbiter": {"arbiter"} | BASE,
     "merging": BASE,
@@ -61,7 +62,7 @@ WITHIN = {
 BUILT_ON = {"ct_ansi": "mentor"}
 PART_OF = {"mint": "device"}
 """Modules whose name does not end in that of their part. Any other is of the codec: exchanges, and maps as data."""
-TIMELESS = {"errors", "exchange", "profile", "wire", "arbiter", "merging", "planning", "emulator"}
+TIMELESS = BASE | {"wire", "arbiter", "merging", "planning", "emulator"}
 TIMELY = {"emulator.serve"}
 CLOCKS_AND_PORTS = {"asyncio", "anyio", "time", "random", "socket", "serial"}
 SEEDED = {"emulator": {"random"}}

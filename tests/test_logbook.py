@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, NodeChanged, Strayed
+from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, NodeChanged, PortFailed, Strayed
 from busmaster.arbiter.health import Health
 from busmaster.logbook import PAUSE, Logbook
 from tests.arbiter.bench import Bench
@@ -48,3 +48,15 @@ def test_r14_strays_are_counted_and_not_logged_but_a_collision_is(lines: pytest.
 def test_r14_a_raised_lateness_names_node_and_times(lines: pytest.LogCaptureFixture) -> None:
     Logbook("line").note(LatenessRaised(Bench().node(3), 0.14, 0.224), PAUSE)
     assert lines.messages == ["line: node 3 answered 140 ms after its request: its lateness is now 224 ms"]
+
+
+def test_r13_a_failed_attempt_is_logged_with_what_to_try_and_a_bug_with_where(lines: pytest.LogCaptureFixture) -> None:
+    logbook = Logbook("line")
+    logbook.note(PortFailed("line is in use by gpsd", "end that first"), 0.0)
+    logbook.note(PortFailed("line is in use by gpsd", "end that first"), 1.0)
+    logbook.note(PortFailed("cannot open line: ValueError: odd", bug=ValueError("odd")), 2.0)
+    assert lines.messages == [
+        "line: cannot reconnect: line is in use by gpsd; end that first",
+        "line: cannot reconnect: cannot open line: ValueError: odd",
+    ]
+    assert [record.exc_info is None for record in lines.records] == [True, False]

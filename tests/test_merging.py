@@ -48,7 +48,7 @@ def test_a_run_saves_nine_bytes_for_each_parameter_but_the_first() -> None:
 
 def test_a_block_of_32_is_read_only_where_it_takes_less_time_than_the_values_that_are_wanted() -> None:
     """BREAD costs 124 more bytes than DREAD: a few values are cheaper one by one, unless replies are slow."""
-    merge = msc.merging(address_step=4)
+    merge = msc.Merging(address_step=4)
 
     def exchanges(count: int, reply_time: float) -> int:
         node = PlannedNode(msc.PROFILE, 1, reply_time=reply_time)

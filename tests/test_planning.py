@@ -176,7 +176,7 @@ def test_merged_reads_are_told_with_what_they_save() -> None:
 
 
 def test_merges_of_the_profile_need_no_asking() -> None:
-    profile = replace(msc.PROFILE, merge=msc.merging(address_step=4))
+    profile = replace(msc.PROFILE, merge=msc.Merging(address_step=4))
     node = PlannedNode(profile, 1, reply_time=0.005)
     reads = [(node, msc.DataRead(2000 + 4 * n)) for n in range(8)]
     assert plan([PlannedGroup("press", 1.0, reads)], line=msc.PROFILE.line).groups[0].exchanges == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
 
 from busmaster.arbiter.transaction import BACKGROUND, POLL, QUEUED, Phase, Priority, Transaction
@@ -13,6 +13,8 @@ SHARE = 7
 """Consecutive exchanges of higher classes after which a waiting lower class gets one slot."""
 SLACK = 64
 """Entries of ended transactions that a queue may hold beside as many live ones."""
+LOOKED_AT = 8
+"""Waiting transactions of a class among which one is picked that may go before the first (R15)."""
 
 
 class _Fifo:
@@ -38,6 +40,22 @@ class _Fifo:
             if transaction.phase is QUEUED:
                 self.live -= 1
                 return transaction
+
+    def pick(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
+        """Take out the first of the first few that suits."""
+        passed: list[Transaction] = []
+        found = None
+        while self.live > len(passed) and len(passed) < LOOKED_AT and found is None:
+            transaction = self._entries.popleft()
+            if transaction.phase is not QUEUED:
+                continue
+            if suits(transaction):
+                found = transaction
+                self.live -= 1
+            else:
+                passed.append(transaction)
+        self._entries.extendleft(reversed(passed))
+        return found
 
     def discard(self) -> None:
         self.live -= 1
@@ -71,6 +89,23 @@ class _EarliestDeadlineFirst:
         heapq.heappush(self._entries, (transaction.deadline, -next(self._order), transaction))
         self.live += 1
 
+    def pick(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
+        """Take out the first of the first few that suits."""
+        passed: list[tuple[float, int, Transaction]] = []
+        found = None
+        while self.live > len(passed) and len(passed) < LOOKED_AT and found is None:
+            entry = heapq.heappop(self._entries)
+            if entry[2].phase is not QUEUED:
+                continue
+            if suits(entry[2]):
+                found = entry[2]
+                self.live -= 1
+            else:
+                passed.append(entry)
+        for entry in passed:
+            heapq.heappush(self._entries, entry)
+        return found
+
     def pop(self) -> Transaction:
         while True:
             transaction = heapq.heappop(self._entries)[2]
@@ -96,12 +131,13 @@ class _EarliestDeadlineFirst:
 class Backlog:
     """The waiting transactions of all classes. A transaction in it has the phase QUEUED."""
 
-    __slots__ = ("_queues", "_rotated", "_streak")
+    __slots__ = ("_before", "_queues", "_rotated", "_streak")
 
     def __init__(self) -> None:
         self._queues = (_Fifo(), _Fifo(), _EarliestDeadlineFirst(), _EarliestDeadlineFirst())
         self._streak = 0
         self._rotated = BACKGROUND
+        self._before = (0, BACKGROUND)
 
     def __len__(self) -> int:
         urgent, command, poll, background = self._queues
@@ -125,6 +161,15 @@ class Backlog:
         transaction.phase = phase
         self._queues[transaction.priority].discard()
 
+    def restore(self, transaction: Transaction) -> None:
+        """Put back what was popped last: it is the next to be popped, and its class keeps its turn."""
+        self._streak, self._rotated = self._before
+        self.push_front(transaction)
+
+    def pick(self, priority: Priority, suits: Callable[[Transaction], bool]) -> Transaction | None:
+        """Take out the first of the first few of a class that suits; the others keep their places."""
+        return self._queues[priority].pick(suits)
+
     def promote(self, transaction: Transaction, priority: Priority) -> None:
         """To the front of a higher class: a write that a write of that class must not overtake."""
         self._queues[transaction.priority].remove(transaction)
@@ -134,6 +179,7 @@ class Backlog:
     def pop(self) -> Transaction | None:
         """The next to go, or None. URGENT first, always; below it a waiting lower class gets every eighth slot."""
         urgent, command, poll, background = self._queues
+        self._before = (self._streak, self._rotated)
         if urgent.live:
             return urgent.pop()
         if command.live:

@@ -47,6 +47,20 @@ class NodeStatistics:
 
 
 @dataclass(frozen=True, slots=True)
+class DriverErrors:
+    """What a serial driver has counted of its UART's errors, since the port was opened or the counts were reset.
+
+    `overruns` are bytes lost in the UART, `buffer_overruns` bytes lost behind it because nobody read them in time.
+    """
+
+    framing: int
+    parity: int
+    breaks: int
+    overruns: int
+    buffer_overruns: int
+
+
+@dataclass(frozen=True, slots=True)
 class LineStatistics:
     """Counts of the line since the last reset; times in seconds."""
 
@@ -66,6 +80,16 @@ class LineStatistics:
     backlog: int
     waits: tuple[Quantiles, Quantiles, Quantiles, Quantiles]
     """From being queued to being started, for URGENT, COMMAND, POLL and BACKGROUND."""
+    checks: int = 0
+    """Reads that were asked to prove that the line is in step (R15)."""
+    doubted: int = 0
+    """Answers that were not believed, since they could have been another request's (R15)."""
+    damaged: int = 0
+    """Bytes that the UART marked: a parity or framing error."""
+    breaks: int = 0
+    """Breaks that the UART saw."""
+    driver: DriverErrors | None = None
+    """What the serial driver has counted; None where it counts nothing, and while the port is lost."""
 
     @property
     def utilisation(self) -> float:
@@ -117,9 +141,13 @@ class LineCounters:
     __slots__ = (
         "_before",
         "_entered",
+        "breaks",
         "cancelled",
+        "checks",
         "collisions",
         "completed",
+        "damaged",
+        "doubted",
         "exchanges",
         "losses",
         "noise_bytes",
@@ -144,6 +172,7 @@ class LineCounters:
         self.since = since
         self.completed = self.cancelled = self.stray_bytes = self.noise_bytes = 0
         self.tainted = self.collisions = self.settles = self.noisy = self.losses = 0
+        self.checks = self.doubted = self.damaged = self.breaks = 0
         self._before = (self.exchanges, self._times(state, since))
         self.waits = (Histogram(), Histogram(), Histogram(), Histogram())
 
@@ -181,4 +210,8 @@ class LineCounters:
             self.losses,
             backlog,
             (Quantiles.of(first), Quantiles.of(second), Quantiles.of(third), Quantiles.of(fourth)),
+            self.checks,
+            self.doubted,
+            self.damaged,
+            self.breaks,
         )

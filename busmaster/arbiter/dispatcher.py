@@ -18,8 +18,10 @@ from busmaster.arbiter import health
 from busmaster.arbiter.backlog import Backlog
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.events import Completed, Event, NodeChanged, Polled
-from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord, ProbeBudget
+from busmaster.arbiter.endings import make_error, name_error, not_started
+from busmaster.arbiter.events import Completed, Event, LatenessLowered, NodeChanged, Polled
+from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
+from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.schedule import Poll, Schedule, begin_cycle
 from busmaster.arbiter.state import SETTLING
 from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
@@ -29,11 +31,11 @@ from busmaster.errors import (
     GarbledReply,
     NodeDown,
     NoReply,
-    NotStarted,
     Refused,
     Superseded,
     WriteUnconfirmed,
 )
+from busmaster.exchange import Command
 
 REFUSED_POLL_PAUSE = 10.0
 """Seconds between polls of a point that was refused again and again."""
@@ -41,8 +43,8 @@ RETRY_PATIENCE = 1.0
 """Seconds after which a request in POLL or BACKGROUND wants to be answered; the period, for a poll."""
 EXPIRY_SLACK = 64
 SUSPENDED = "suspended for maintenance"
-TELLING = (Refused, Superseded, WriteUnconfirmed)
-"""Errors that say themselves what may have become of a write that was on the wire."""
+NOT_DONE = (Refused, Superseded)
+"""Errors that say of a write that it was not carried out, unless an attempt before them may have been."""
 
 
 class Dispatcher:
@@ -61,12 +63,11 @@ class Dispatcher:
         self.fault: Callable[[], BusError] | None = None
         """Makes the error with which everything fails while the line cannot be used."""
         self._deadlines = deadlines
-        self._budget = ProbeBudget(now)
+        self.probes = Probes(deadlines, self.nodes, now)
         self._capacity = capacity
         self._jitter = jitter
         self._expiries: list[tuple[float, int, Transaction]] = []
         self._order = count()
-        self._probe: Transaction | None = None
 
     # requests
 
@@ -76,7 +77,7 @@ class Dispatcher:
         transaction.queued = now
         self._waits(transaction)
         if self.fault is not None:
-            self._end(transaction, now, _named(self.fault(), transaction))
+            self._end(transaction, now, name_error(self.fault(), transaction))
             return False
         if transaction.writes and transaction.priority is URGENT:
             self._supersede(node, now)
@@ -84,7 +85,7 @@ class Dispatcher:
         if transaction.writes:
             waiting = max(waiting, len(node.writes))
         if waiting >= self._capacity:
-            self._end(transaction, now, _error(BacklogFull, f"{waiting} requests are waiting already", transaction))
+            self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return False
         if not self._may_ask(transaction, now):
             return False
@@ -106,7 +107,7 @@ class Dispatcher:
         if transaction.phase is QUEUED:
             self.backlog.discard(transaction, PARKED)
         if transaction.phase is PARKED:
-            self._budget.refund(transaction.paid)
+            self.probes.budget.refund(transaction.paid)
             self._end(transaction, now)
 
     def next(self, now: float) -> Transaction | None:
@@ -114,7 +115,7 @@ class Dispatcher:
         while (transaction := self.backlog.pop()) is not None:
             node = transaction.node
             if transaction.start_by < now and transaction.queued < now and not transaction.attempts:
-                self._end(transaction, now, _not_started(transaction, now))
+                self._end(transaction, now, not_started(transaction, now))
             elif transaction.writes and node.writes[0] is not transaction:
                 self._park(transaction)
             elif (node.health is not DOWN and not node.holds and node.suspended_until <= now) or self._may_ask(
@@ -126,10 +127,18 @@ class Dispatcher:
     def urgent_waits(self) -> bool:
         return self.backlog.waiting(URGENT) > 0
 
+    def may_go(self, transaction: Transaction, now: float) -> bool:
+        """Whether a transaction that waits may be sent before the first one; nothing is changed."""
+        node = transaction.node
+        if node.health is DOWN or node.holds or node.suspended_until > now:
+            return False
+        in_time = transaction.start_by >= now or transaction.attempts > 0
+        return in_time and not (transaction.writes and node.writes[0] is not transaction)
+
     def started(self, transaction: Transaction, now: float) -> None:
         """Its next attempt goes out now."""
         counters = self.counters
-        if transaction.attempts == 0:
+        if transaction.attempts == 0 and not transaction.check:
             counters.waits[transaction.priority].record(now - transaction.queued)
             self._count_ahead(transaction)
             poll = transaction.poll
@@ -165,35 +174,60 @@ class Dispatcher:
             node.last_reply = now
             if node.health is not UP:
                 self._heard(node, now)
+            if now > node.lateness_until:
+                self._lower_lateness(transaction, now)
             if transaction.paid:
-                self._budget.refund(transaction.paid - (now - transaction.started))
+                self.probes.budget.refund(transaction.paid - (now - transaction.started))
             transaction.refused_cycles = 0
             self._end(transaction, now)
 
-    def attempt_failed(self, transaction: Transaction, no_reply: bool, what: str, now: float) -> None:
+    def attempt_failed(
+        self, transaction: Transaction, no_reply: bool, what: str, now: float, doubted: bool = False
+    ) -> None:
+        """`doubted`: an answer came and was not believed, which says nothing of the node (R15)."""
         node = transaction.node
+        transaction.unsure = True
         if no_reply:
             node.counters.no_reply += 1
         else:
             node.counters.garbled += 1
-        if transaction.retried < transaction.retries and self._worth_a_retry(transaction) and self._wanted(transaction):
+        worth = doubted or self._worth_a_retry(transaction)
+        if transaction.retried < transaction.retries and worth and self._wanted(transaction):
             transaction.retried += 1
             node.counters.retries += 1
             self._requeue(transaction, now)
             return
-        before = node.health
-        health.note_failure(node, now, self._jitter)
-        self._report(node, before)
+        if not (doubted or transaction.check):
+            before = node.health
+            health.note_failure(node, now, self._jitter)
+            self._report(node, before)
         kind: type[BusError] = NoReply if no_reply else GarbledReply
         if transaction.writes:
             kind = WriteUnconfirmed
-        self._end(transaction, now, _error(kind, what, transaction))
+        self._end(transaction, now, make_error(kind, what, transaction))
 
-    def refused(self, transaction: Transaction, refusal: Refused, now: float) -> None:
-        """A NAK or EOT: asked once more where that can tell something new, then final (R7)."""
+    def broken(self, transaction: Transaction, bug: Exception, now: float) -> None:
+        """The protocol's reader failed on what came: a bug there. To ask again would meet it again."""
+        what = f"a bug in the {transaction.node.profile.name} reader: {bug!r}"
+        transaction.node.counters.garbled += 1
+        kind = WriteUnconfirmed if transaction.writes else BusError
+        error = make_error(kind, what, transaction)
+        error.hint = "this is not the line's fault: please report it, with a capture"
+        error.__cause__ = bug
+        self._end(transaction, now, error)
+
+    def refused(self, transaction: Transaction, refusal: Refused, certain: bool, now: float) -> None:
+        """A NAK or EOT: asked once more where that can tell something new, then final (R7).
+
+        Not `certain`: it may be an earlier request's (R15). A read is asked once more; a write was perhaps carried out.
+        """
         node = transaction.node
         node.counters.refused += 1
-        if refusal.confirm and not transaction.refusals and self._wanted(transaction):
+        if not transaction.writes:
+            node.note_refused(transaction.command)
+        transaction.unsure = transaction.unsure or not certain
+        again = refusal.confirm if certain else not transaction.writes or transaction.idempotent
+        if again and not transaction.refusals and not transaction.probe and self._wanted(transaction):
             transaction.refusals += 1
             self._requeue(transaction, now)
             return
@@ -203,15 +237,15 @@ class Dispatcher:
         transaction.refused_cycles += 1
         if transaction.refused_cycles > 1:
             transaction.refused_until = now + REFUSED_POLL_PAUSE
-        self._end(transaction, now, _named(refusal, transaction))
+        self._end(transaction, now, name_error(refusal, transaction))
 
     def unsendable(self, transaction: Transaction, bug: Exception, now: float) -> None:
         """Its protocol cannot encode it: a bug there, but nobody may wait for ever."""
-        self._end(transaction, now, _error(BusError, f"its protocol could not encode it: {bug!r}", transaction))
+        self._end(transaction, now, make_error(BusError, f"its protocol could not encode it: {bug!r}", transaction))
 
     def cut_off(self, transaction: Transaction, error: BusError, now: float) -> None:
         """The line was lost under it: a write may have been carried out."""
-        self._end(transaction, now, _named(error, transaction))
+        self._end(transaction, now, name_error(error, transaction))
 
     # everything at once
 
@@ -221,10 +255,10 @@ class Dispatcher:
         assert fault is not None
         for node in self.nodes:
             for write in [w for w in node.writes if w.phase is PARKED]:
-                self._end(write, now, _named(fault(), write))
+                self._end(write, now, name_error(fault(), write))
         for transaction in self.backlog.drain():
             transaction.phase = PARKED
-            self._end(transaction, now, _named(fault(), transaction))
+            self._end(transaction, now, name_error(fault(), transaction))
 
     def expire(self, now: float) -> None:
         """Fail what should have started by now (R12)."""
@@ -236,7 +270,7 @@ class Dispatcher:
             if transaction.phase is QUEUED:
                 self.backlog.discard(transaction, PARKED)
             if transaction.phase is PARKED:
-                self._end(transaction, now, _not_started(transaction, now))
+                self._end(transaction, now, not_started(transaction, now))
         self._deadlines.expiry = nextafter(heap[0][0], inf) if heap else inf
 
     # polls
@@ -274,62 +308,44 @@ class Dispatcher:
     def _reason_to_park(self, transaction: Transaction, now: float) -> BusError | None:
         node = transaction.node
         if self.fault is not None:
-            return _named(self.fault(), transaction)
+            return name_error(self.fault(), transaction)
         if now < node.suspended_until:
-            return _error(NodeDown, SUSPENDED, transaction)
+            return make_error(NodeDown, SUSPENDED, transaction)
         if node.health is DOWN:
-            return _error(NodeDown, "down: it is probed, its polls wait", transaction)
+            return make_error(NodeDown, "down: it is probed, its polls wait", transaction)
         if node.holds:
-            return _error(NodeDown, "back, and its on_return hook is still running", transaction)
+            return make_error(NodeDown, "back, and its on_return hook is still running", transaction)
         if now < transaction.refused_until:
-            return _error(Refused, "refused again and again: polled every 10 s", transaction)
+            return make_error(Refused, "refused again and again: polled every 10 s", transaction)
         return None
 
     # dead nodes
 
-    def idle(self, seconds: float) -> None:
-        """The line had nothing to do for so long: a part of it may be spent on probes."""
-        self._budget.idle(seconds)
-
     def suspend(self, node: NodeRecord, until: float) -> None:
         node.suspended_until = until
-        self.plan_probes()
+        self.probes.plan()
 
     def release_node(self, node: NodeRecord) -> None:
         """Its hook has run: its polls resume with their next cycle, unless it has died and come back meanwhile."""
         node.holds = max(0, node.holds - 1)
 
-    def plan_probes(self) -> None:
-        """Set the deadline of the next probe. One probe at a time is out."""
-        if self._probe is not None:
-            self._deadlines.health = inf
-            return
-        down = [node for node in self.nodes if node.health is DOWN]
-        self._budget.probe = max((node.lateness for node in down), default=0.0)
-        self._deadlines.health = min((max(node.probe_at, node.suspended_until) for node in down), default=inf)
+    def probe(self, now: float, idle: bool) -> None:
+        """Ask the dead node whose turn it is, if the budget allows. `idle`: the line has nothing else to do."""
+        probe = self.probes.next(now, self.fault is None, idle)
+        if probe is not None:
+            self._waits(probe)
+            probe.deadline = now + RETRY_PATIENCE
+            self.backlog.push(probe)
 
-    def probe(self, now: float) -> None:
-        """Ask the dead node whose turn it is, if the budget allows."""
-        ready = [n for n in self.nodes if n.health is DOWN and max(n.probe_at, n.suspended_until) <= now]
-        if self._probe is not None or not ready or self.fault is not None:
-            self._deadlines.health = inf if self._probe is not None else now + health.LONGEST_BUDGET_WAIT
-            if not ready:
-                self.plan_probes()
-            return
-        node = min(ready, key=lambda n: n.probe_at)
-        cost = node.lateness
-        if not self._budget.take(cost, now):
-            self._deadlines.health = now + self._budget.wait_for(cost, now)
-            return
-        probe = Transaction(node, node.profile.probe, priority=BACKGROUND, retries=0, probe=True)
-        probe.paid = cost
-        probe.queued = now
-        self._waits(probe)
-        probe.deadline = now + RETRY_PATIENCE
-        node.counters.probes += 1
-        self._probe = probe
-        self._deadlines.health = inf
-        self.backlog.push(probe)
+    def check(self, node: NodeRecord, command: Command[Any], now: float) -> Transaction:
+        """A read by which the line proves that it is in step (R15). It goes at once; nobody waits for it."""
+        self.counters.checks += 1
+        check = Transaction(node, command, priority=BACKGROUND, retries=0, probe=True)
+        check.check = True
+        check.heard = False
+        check.queued = now
+        self._waits(check)
+        return check
 
     def _may_ask(self, transaction: Transaction, now: float) -> bool:
         """Whether a node that is down, back or suspended is worth this request's line time; if not, it is ended."""
@@ -338,23 +354,32 @@ class Dispatcher:
         if transaction.poll is not None:
             error = self._reason_to_park(transaction, now)
         elif now < node.suspended_until:
-            error = _error(NodeDown, SUSPENDED, transaction)
+            error = make_error(NodeDown, SUSPENDED, transaction)
         elif node.health is DOWN and not (transaction.paid or transaction.probe):
-            if self._budget.take(node.lateness, now):
+            if self.probes.spare(node.lateness, now):
                 transaction.paid = node.lateness
                 transaction.retries = 0
             else:
-                error = _error(NodeDown, "down: no answer for a while", transaction)
+                error = make_error(NodeDown, "down: no answer for a while", transaction)
         if error is not None:
             self._end(transaction, now, error)
         return error is None
+
+    def _lower_lateness(self, transaction: Transaction, now: float) -> None:
+        """An hour has passed since its lateness was raised: back to what it was, unless this reply was late too."""
+        node = transaction.node
+        if transaction.late:
+            node.lateness_until = now + health.CALM_LATENESS
+        else:
+            node.restore_lateness()
+            self.events.append(LatenessLowered(node, node.lateness))
 
     def _heard(self, node: NodeRecord, now: float) -> None:
         before = node.health
         flaps = health.flaps(node, now)
         health.note_success(node, now)
         if before is DOWN and not flaps:
-            self._budget.node_returned(now)
+            self.probes.budget.node_returned(now)
             for other in self.nodes:
                 if other.health is DOWN:
                     other.probe_at = min(other.probe_at, now)
@@ -365,7 +390,7 @@ class Dispatcher:
             returning = before is DOWN and node.has_hook
             node.holds += returning
             self.events.append(NodeChanged(node, before, node.health, returning))
-        self.plan_probes()
+        self.probes.plan()
 
     # the ways of one transaction
 
@@ -400,7 +425,7 @@ class Dispatcher:
             elif write.priority > URGENT:
                 if write.phase is QUEUED:
                     self.backlog.discard(write, PARKED)
-                self._end(write, now, _error(Superseded, "overtaken by an urgent write to the same node", write))
+                self._end(write, now, make_error(Superseded, "overtaken by an urgent write to the same node", write))
 
     def _expect_start(self, transaction: Transaction) -> None:
         heap = self._expiries
@@ -413,20 +438,20 @@ class Dispatcher:
     def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:
         """Exactly once (R8). A write that was on the wire before something else ended it may have been carried out."""
         if transaction.writes:
-            if transaction.attempts and error is not None and not isinstance(error, TELLING):
-                error = _error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
+            unsure = transaction.unsure or (transaction.attempts > 0 and not isinstance(error, NOT_DONE))
+            if unsure and error is not None and not isinstance(error, WriteUnconfirmed):
+                error = make_error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
             self._next_write(transaction)
         if not transaction.attempts:
             self._count_ahead(transaction)
         transaction.phase = ENDED
         transaction.ended_at = now
         transaction.error = error
-        if error is not None:
+        if error is not None and not transaction.check:
             transaction.node.counters.failed += 1
-        if transaction is self._probe:
-            self._probe = None
-            self.plan_probes()
-        if not transaction.heard:
+        if transaction.probe:
+            self.probes.over(transaction)
+        if not transaction.heard and not transaction.check:
             transaction.node.counters.unheard += transaction.attempts > 0
         poll = transaction.poll
         if poll is not None:
@@ -456,20 +481,3 @@ class Dispatcher:
                 self.backlog.push_front(writes[0])
         elif transaction in writes:
             writes.remove(transaction)
-
-
-def _error(kind: type[BusError], what: str, transaction: Transaction) -> BusError:
-    return _named(kind(what), transaction)
-
-
-def _named(error: BusError, transaction: Transaction) -> BusError:
-    """Say which node, which command and how often."""
-    error.node = transaction.node.label
-    error.command = str(transaction.command)
-    error.attempts = transaction.attempts
-    return error
-
-
-def _not_started(transaction: Transaction, now: float) -> BusError:
-    waited = (now - transaction.queued) * 1000
-    return _error(NotStarted, f"not sent within its time: it waited {waited:.0f} ms for the line", transaction)

@@ -1,4 +1,4 @@
-"""What the arbiter tells its owner, in the order in which it happened.
+"""What the arbiter and the transport tell their owner, in the order in which it happened.
 
 Of what happens in one call, the successes may come last: they are noted when the next request has left.
 """
@@ -48,6 +48,21 @@ class LatenessRaised:
     lateness: float
 
 
+@dataclass(frozen=True, slots=True)
+class LatenessLowered:
+    """An hour of prompt replies: this node's lateness is what it was before it was raised."""
+
+    node: NodeRecord
+    lateness: float
+
+
+class Mark(enum.Enum):
+    """What the UART says of a byte that it received."""
+
+    DAMAGED = "parity or framing error"
+    BREAK = "break"
+
+
 class LineChange(enum.Enum):
     """What became of the line: its port UP or DOWN, the line NOISY (nothing is sent) or QUIET again."""
 
@@ -66,6 +81,18 @@ class LineChanged:
 
 
 @dataclass(frozen=True, slots=True)
+class PortFailed:
+    """The port is down and could not be opened again: why, and what to try. Told once until the cause changes.
+
+    It is tried again all the same. `bug` is the exception where it was no fault of the port. The transport tells it.
+    """
+
+    cause: str
+    hint: str = ""
+    bug: BaseException | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Strayed:
     """Bytes came that nobody had asked for, or an echo did not match (`collision`)."""
 
@@ -73,4 +100,6 @@ class Strayed:
     collision: bool = False
 
 
-Event: TypeAlias = Completed | Polled | NodeChanged | LatenessRaised | LineChanged | Strayed
+Event: TypeAlias = (
+    Completed | Polled | NodeChanged | LatenessRaised | LatenessLowered | LineChanged | PortFailed | Strayed
+)

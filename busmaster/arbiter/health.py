@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import enum
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
+from typing import Any
 
 from busmaster.arbiter.counters import NodeCounters
 from busmaster.arbiter.transaction import Transaction
-from busmaster.exchange import Timings
+from busmaster.exchange import Command, Timings
 from busmaster.profile import Profile
 
 DOWN_AFTER_FAILURES = 3
@@ -31,6 +32,15 @@ BUDGET_CAPACITY = 0.5
 """Seconds of line time that may be saved up."""
 LONGEST_BUDGET_WAIT = 1.0
 
+CALM_LATENESS = 3600.0
+"""Seconds of prompt replies after which a lateness that was raised comes down again."""
+MOST_ANSWERED = 3
+"""Commands that are remembered of a node because it has answered them."""
+SLOWER, SLOWER_BY = 1.25, 0.001
+"""A reply is later than its node usually is if it takes so many times its slowest one, and so many seconds."""
+SLOWEST_DECAY = 0.002
+"""By how much of the difference a node's slowest reply is forgotten with each one that is faster."""
+
 
 class Health(enum.Enum):
     """UNKNOWN was never heard; SUSPECT failed lately; DOWN is probed, and its polls are parked."""
@@ -48,7 +58,9 @@ class NodeRecord:
     """What the arbiter knows of one node. Changed by the arbiter alone."""
 
     __slots__ = (
+        "_before_raised",
         "address",
+        "answered",
         "counters",
         "failed_at",
         "failures",
@@ -57,13 +69,17 @@ class NodeRecord:
         "holds",
         "label",
         "last_reply",
+        "lateness_until",
         "measured",
         "probe_at",
         "probe_delay",
+        "probed_at",
         "profile",
+        "refused",
         "replies",
         "reply_time",
         "retries",
+        "slowest",
         "suspended_until",
         "timings",
         "up_since",
@@ -94,11 +110,55 @@ class NodeRecord:
         self.counters = NodeCounters()
         self.probe_delay = FIRST_PROBE_DELAY
         self.probe_at = inf
+        self.probed_at = -inf
         self.suspended_until = -inf
         self.has_hook = False
         self.holds = 0
         """Returns whose on_return hook has not ended: its polls wait."""
         self.waiter: object = None
+        self.answered: dict[Sequence[bytes], Command[Any]] = {}
+        """A few reads that it has answered, by what their answers look like (R15)."""
+        self.refused: set[Command[Any]] = set()
+        """Checks that it has refused."""
+        self.slowest = 0.0
+        """Seconds to the first byte of about the slowest of its last replies."""
+        self.lateness_until = inf
+        """When a lateness that was raised comes down again, if all replies are prompt until then."""
+        self._before_raised: Timings | None = None
+
+    def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
+        """It has answered rightly, after so many seconds."""
+        slowest = self.slowest
+        self.slowest = took if took > slowest else slowest - SLOWEST_DECAY * (slowest - took)
+        if len(self.answered) < MOST_ANSWERED and answers not in self.answered and not command.writes:
+            self.answered[answers] = command
+
+    def latest(self, unknown: float) -> float:
+        """Seconds to the first byte of its replies that are no later than usual; `unknown` if none was timed."""
+        return SLOWER * self.slowest + SLOWER_BY if self.slowest else unknown
+
+    def note_refused(self, command: Command[Any]) -> None:
+        """It has refused this read: it is no check, unless it has refused them all. Then one of them may have been
+        refused by mistake."""
+        if command in self.profile.checks:
+            self.refused.add(command)
+        if len(self.refused) >= len(self.profile.checks):
+            self.refused.clear()
+        self.answered = {key: read for key, read in self.answered.items() if read != command}
+
+    def raise_lateness(self, lateness: float, now: float) -> None:
+        """It was slower than was believed."""
+        if self._before_raised is None:
+            self._before_raised = self.timings
+        self.timings = self.timings.with_lateness(lateness)
+        self.lateness_until = now + CALM_LATENESS
+
+    def restore_lateness(self) -> None:
+        """Back to what it was before it was raised."""
+        if self._before_raised is not None:
+            self.timings = self._before_raised
+        self._before_raised = None
+        self.lateness_until = inf
 
     @property
     def lateness(self) -> float:
@@ -110,18 +170,26 @@ class NodeRecord:
 class ProbeBudget:
     """A token bucket of line time, in seconds. `probe`: what a probe costs if it is not answered."""
 
-    __slots__ = ("_earned_at", "_generous_until", "probe", "tokens")
+    __slots__ = ("_earned_at", "_generous_until", "_pause", "probe", "tokens")
 
     def __init__(self, now: float) -> None:
         self.tokens = BUDGET_CAPACITY
         self.probe = 0.0
         self._earned_at = now
         self._generous_until = -inf
+        self._pause = 0.0
 
-    def idle(self, seconds: float) -> None:
-        """The line had a pause. One too short for a probe earns nothing: there a probe would delay what comes next."""
-        if seconds > self.probe:
-            self.tokens = min(BUDGET_CAPACITY, self.tokens + BUDGET_IDLE_SHARE * (seconds - self.probe))
+    def idle(self, seconds: float, over: bool) -> None:
+        """The line had a pause for so long (more), which is over or goes on.
+
+        One too short for a probe earns nothing: there a probe would delay what comes next.
+        """
+        before = max(0.0, self._pause - self.probe)
+        self._pause += seconds
+        earned = BUDGET_IDLE_SHARE * (max(0.0, self._pause - self.probe) - before)
+        self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)
+        if over:
+            self._pause = 0.0
 
     def node_returned(self, now: float) -> None:
         self._earn(now)
@@ -196,4 +264,5 @@ def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> N
 
 def _probe_later(node: NodeRecord, delay: float, now: float, jitter: Callable[[], float]) -> None:
     node.probe_delay = delay
+    node.probed_at = now
     node.probe_at = now + delay * (1 + PROBE_JITTER * (2 * jitter() - 1))

@@ -1,4 +1,24 @@
-"""The times of one leg of an exchange (R2-R4): when its reply may begin, how long it may last, when it is past."""
+"""The times of one leg of an exchange (R2-R4): when its reply may begin, how long it may last, when it is past.
+
+All of R3's reckoning is here. Assumed of a node: its reply's *start bit* falls within `lateness` of the last byte sent,
+and a pause within it ends, with the next start bit, within `byte_gap`. What is received of it comes later than that:
+
+===============================  ==========================================================================
+what was said last               when the last byte that it caused can have been received, at the latest
+===============================  ==========================================================================
+a request, one leg               a silence of `quiet()` that ends at or after `end + lateness + latency + byte time`
+a request whose ACK was heard    likewise from the end of that ACK, with the packet's lateness (MSC)
+a request whose ACK was not      likewise; the packet's lateness counts from the request's end, and anew from
+heard (MSC: it may be lost)      each stray, which may be the missing ACK
+a request on an echoing port     likewise, `end` being the last byte of its echo
+a closing ACK                    when it is out; nothing answers it
+a broadcast                      when it is out, and `turnaround` later
+===============================  ==========================================================================
+
+`latency` is what an adapter or a server may hold bytes back; one byte time is added because a start bit in time is
+received as a byte only that much later; and the silence reckons with both, since a pause within a frame looks longer
+by them. `end` is when the last byte said is on the wire, behind all that was said before it and had not left.
+"""
 
 from __future__ import annotations
 
@@ -14,65 +34,117 @@ TAINT_SHARE = 0.9
 
 
 class Leg:
-    """The leg on the wire, or the last one. `latency`: how long received bytes may lie in an adapter, in seconds."""
+    """The leg on the wire, or the last one.
 
-    __slots__ = ("_follows", "_limit", "begun", "end", "late_after", "latency", "taint_until", "timing")
+    `latency`: how long received bytes may lie in an adapter, in seconds. `byte_time` is tau, in seconds per byte.
+    """
 
-    def __init__(self, timing: ReplyTiming, latency: float) -> None:
+    __slots__ = (
+        "_follows",
+        "_follows_until",
+        "_limit",
+        "begun",
+        "begun_at",
+        "byte_time",
+        "end",
+        "late_after",
+        "latency",
+        "out",
+        "taint_until",
+        "timing",
+    )
+
+    def __init__(self, timing: ReplyTiming, latency: float, byte_time: float) -> None:
         self.timing = timing
         self.begun = False
+        self.begun_at = -inf
+        """When the first byte of its reply was received."""
         self.end = -inf
-        """When the last byte sent is on the wire."""
+        """When the last byte of the request is on the wire: lateness counts from there."""
+        self.out = -inf
+        """When all that was said is on the wire, a closing ACK too."""
         self.latency = latency
+        self.byte_time = byte_time
         self._follows: ReplyTiming | None = None
+        self._follows_until = -inf
         self._limit = inf
         self.taint_until = -inf
         """What comes before cannot be its reply."""
         self.late_after = -inf
         """A reply that begins then is late, and counts all the same."""
 
-    def begin(self, timing: ReplyTiming, said: float, longest: float, now: float) -> float:
-        """The host says something that takes `said` seconds; the longest reply takes `longest`. When it must begin."""
+    def say(self, count: int, now: float) -> float:
+        """Note that the host says so many bytes, behind what it has said already. Returns when they are out."""
+        out = self.out
+        self.out = out = (out if out > now else now) + count * self.byte_time
+        return out
+
+    def begin(self, timing: ReplyTiming, said: int, longest: int, now: float) -> float:
+        """The host says `said` bytes, and the reply has at most `longest`. Returns when it must have begun."""
         self.timing = timing
         self.begun = False
         self._follows = None
-        self.end = end = now + said
+        byte_time = self.byte_time
+        out = self.out
+        self.out = self.end = end = (out if out > now else now) + said * byte_time
         latency = self.latency
         self.late_after = end + timing.nominal + latency
         due = end + timing.window + latency
-        self._limit = due + longest + timing.byte_gap
+        self._limit = due + longest * byte_time + timing.byte_gap
         return due
 
-    def taint(self, said: float, now: float) -> None:
+    def taint(self, said: int, now: float) -> None:
         """On a paced line: bytes that come before most of the request is out cannot be its reply."""
-        self.taint_until = now + TAINT_SHARE * said
+        self.taint_until = now + TAINT_SHARE * said * self.byte_time
 
     def gap_over(self, now: float) -> float:
         """When the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
-        due = now + self.timing.byte_gap + self.latency
+        due = now + self.timing.byte_gap + self.latency + self.byte_time
         return due if due < self._limit else self._limit
 
     def echoed(self, now: float) -> float:
         """The last byte of its echo came: its times start here. When its reply must begin."""
-        self._limit += now - self.end
-        self.late_after += now - self.end
-        self.end = now
+        self.shift(now - self.end)
         return now + self.timing.window + self.latency
+
+    def shift(self, seconds: float) -> None:
+        """What was said is out so much later than was thought."""
+        self.end += seconds
+        self.out += seconds
+        self.late_after += seconds
+        self.taint_until += seconds
+        self._limit += seconds
+
+    def answered(self) -> None:
+        """It was answered rightly, so it has left, whatever the baud rate says: the port is not paced."""
+        if self.end > self.begun_at:
+            self.end = self.out = self.begun_at
 
     def quiet(self) -> float:
         """The silence, in seconds, after which nothing more of a frame can come."""
-        return max(QUIET, self.timing.byte_gap)
+        return max(QUIET, self.timing.byte_gap) + self.latency + self.byte_time
 
     def give_up(self, later: Sequence[LaterLeg]) -> None:
         """Its reply may still come; then its node goes on by itself with those of the `later` legs that need no word
         from the host (MSC: the packet after its ACK)."""
         self._follows = later[0].timing if later and not later[0].sent else None
+        if self._follows is not None:
+            self._follows_until = self._past(self.end, self._follows)
 
     def strayed(self, now: float) -> None:
-        """Something came: perhaps the reply that was given up, and its next leg begins here."""
+        """Something came: perhaps the reply that was given up, and its next leg begins here. Or it was noise, and the
+        next leg is still to come after that: what is known of it is kept until the line has settled."""
         if self._follows is not None:
-            self.timing, self.end, self._follows = self._follows, now, None
+            self._follows_until = max(self._follows_until, self._past(now, self._follows))
+
+    def settled(self) -> None:
+        """Nothing of it can come any more."""
+        self._follows = None
 
     def past(self) -> float:
-        """From then on, no reply to it can begin (R3)."""
-        return self.end + self.timing.lateness + self.latency
+        """From then on, no byte of a reply to it can be the first one that is received (R3)."""
+        past = self._past(self.end, self.timing)
+        return past if self._follows is None else max(past, self._follows_until)
+
+    def _past(self, end: float, timing: ReplyTiming) -> float:
+        return end + timing.lateness + self.latency + self.byte_time

@@ -19,6 +19,12 @@ STRAGGLER_MARGIN = 1.6
 LONGEST_LATENESS = 0.5
 STRAGGLER_MEMORY = 1.0
 """Seconds after which a stray byte is no longer blamed on the last unanswered request."""
+LOOKS = 10
+"""In so many parts of a lateness the line is looked at while a straggler may come."""
+LOOK_SLACK = 0.005
+"""Seconds by which a look may be late before it is thought that nobody looked at the line meanwhile."""
+LONGEST_RUN = 512
+"""Bytes between two silences that are kept to be told apart; more is noise."""
 
 
 class Strays:
@@ -26,6 +32,10 @@ class Strays:
 
     def __init__(self, events: deque[Event], counters: LineCounters) -> None:
         self.last_byte = -inf
+        self.run = bytearray()
+        """What came since the line was last silent, or in place of a reply."""
+        self._looked = -inf
+        self._look_at = inf
         self.listener: Listener | None = None
         self._events = events
         self._counters = counters
@@ -36,6 +46,8 @@ class Strays:
     def note(self, data: bytes, now: float, quiet: float) -> None:
         """Count them; `quiet` is the silence, in seconds, after which a run of noise is over."""
         self._counters.stray_bytes += len(data)
+        if len(self.run) < LONGEST_RUN:
+            self.run += data
         self._events.append(Strayed(data))
         if now - self.last_byte > quiet or self._noise_since == inf:
             self._noise_since = now
@@ -46,8 +58,12 @@ class Strays:
         """They have not paused for so long that nothing can be sent."""
         return now - self._noise_since >= NOISY_AFTER
 
-    def silent(self) -> None:
+    def silent(self) -> bytes:
+        """The line is silent: returns what came before."""
         self._noise_since = inf
+        run = bytes(self.run)
+        self.run.clear()
+        return run
 
     # stragglers (R3)
 
@@ -58,16 +74,36 @@ class Strays:
     def answered(self) -> None:
         self._unanswered = None
 
+    @property
+    def watching(self) -> bool:
+        """A request was not answered: what comes next may be its straggler."""
+        return self._unanswered is not None
+
+    def looked(self, now: float, due: float) -> None:
+        """Nothing lies unread now, and the line is looked at again by `due`: so well is a straggler's age known."""
+        self._looked = now
+        self._look_at = due
+
+    def look_before(self, due: float, now: float) -> float:
+        """When to look at the line again, where nothing is to be done before `due`."""
+        if self._unanswered is not None and now - self._unanswered[1] > STRAGGLER_MEMORY:
+            self._unanswered = None
+        if self._unanswered is not None:
+            due = min(due, now + self._unanswered[2] / LOOKS)
+            self.looked(now, due)
+        return due
+
     def blame(self, first_byte: float) -> None:
         """A reply came long after its request: its node is slower than was believed, so its lateness is raised."""
         if self._unanswered is None:
             return
         node, asked, lateness = self._unanswered
         self._unanswered = None
-        age = first_byte - asked
+        stalled = first_byte > self._look_at + LOOK_SLACK  # it may have lain unread for as long
+        age = (self._looked if stalled else first_byte) - asked
         raised = min(STRAGGLER_MARGIN * age, LONGEST_LATENESS)
         if STRAGGLER_SHARE * lateness < age <= STRAGGLER_MEMORY and raised > lateness:
-            node.timings = node.timings.with_lateness(raised)
+            node.raise_lateness(raised, first_byte)
             self._events.append(LatenessRaised(node, age, raised))
 
     # what may be owed an answer: MSC sends a packet again until it is ACKed

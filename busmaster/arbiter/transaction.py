@@ -59,6 +59,7 @@ class Transaction:
 
     __slots__ = (
         "attempts",
+        "check",
         "command",
         "deadline",
         "ended_at",
@@ -86,6 +87,7 @@ class Transaction:
         "started",
         "superseded",
         "touches",
+        "unsure",
         "value",
         "waiter",
         "writes",
@@ -117,6 +119,8 @@ class Transaction:
         self.waiter = waiter
         self.poll = poll
         self.probe = probe
+        self.check = False
+        """It is asked for the sake of its answer's likeness alone (R15): nobody waits for it, nothing counts it."""
         self.touches: object = None
         """What a write changes, for its owner to know."""
         self.refused_until = -inf
@@ -132,6 +136,8 @@ class Transaction:
         self.paid = 0.0
         self.heard = True
         self.superseded = False
+        self.unsure = False
+        """An attempt was sent whose outcome is not known: it may have been carried out (R7)."""
         self.late = False
         self.deadline = inf
         self.value: Any = None

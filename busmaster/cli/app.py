@@ -80,8 +80,9 @@ def version(ctx: click.Context, _parameter: click.Parameter, asked: bool) -> Non
 def cli() -> None:
     """One master for many drives on one serial line.
 
-    PORT is a device path, with options as in a URL (/dev/ttyUSB0?baudrate=9600&parity=E), or socket://HOST:PORT
-    for a serial device server that passes raw TCP.
+    PORT is a device path, with options as in a URL (/dev/ttyUSB0?baudrate=9600&parity=E); usb:SERIAL for the USB
+    adapter with that serial number, whatever its path; or socket://HOST:PORT for a serial device server that passes
+    raw TCP.
     """
 
 

@@ -20,6 +20,7 @@ from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, serve_pty, serve_tcp
 from busmaster.errors import LineDown
 from busmaster.registry import find, make_device
+from busmaster.transport.identity import USB
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -97,7 +98,8 @@ def own_port(port: SerialPort | TcpPort) -> tuple[str | None, tuple[str, int] | 
     """The link, or the address, by which `busmaster run` with the same file will find the line."""
     if isinstance(port, TcpPort):
         return None, (port.host, port.port)
-    return None if os.path.abspath(port.path).startswith("/dev/") else port.path, None
+    is_device = port.path.startswith(USB) or os.path.abspath(port.path).startswith("/dev/")
+    return None if is_device else port.path, None
 
 
 def drives(

@@ -8,7 +8,8 @@ from typing import Any
 
 import anyio.to_thread
 
-from busmaster.cli import diagnosis
+from busmaster.arbiter.events import Mark
+from busmaster.cli import diagnosis, uart
 from busmaster.cli.diagnosis import Record
 from busmaster.cli.probing import Outcome, Prober, Wire, opened
 from busmaster.cli.progress import Bar
@@ -69,7 +70,7 @@ async def examine(patient: Patient, tell: Tell, tap: Tap | None = None) -> None:
     """Tell all findings, in this order; one that makes the rest pointless is the last."""
     where = patient.endpoint
     if isinstance(where, SerialPort):
-        found = adapters.inspect(where.path)
+        found = await anyio.to_thread.run_sync(adapters.inspect, where.path)
         for finding in found:
             tell(finding)
         if not all(finding.ok for finding in found if finding.topic in ("port", "permission", "holders")):
@@ -129,7 +130,10 @@ def driver(descriptor: int) -> Iterator[Finding]:
 
 async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     where = patient.endpoint
+    assert wire.port is not None
     await wire.hear_all(OPENING)
+    wire.port.reset()
+    wire.marked.clear()
     heard = await wire.hear_all(LISTENING)
     talk = diagnosis.unasked(heard, patient.protocol)
     tell(talk)
@@ -148,6 +152,8 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     byte_time = (profile.line if settings is None else settings).byte_time
     prober = Prober(wire, profile, timings, byte_time, echo=heard.startswith(HARMLESS))
     records = await ask_all(patient, prober)
+    for finding in uart.findings(wire.marked[Mark.DAMAGED], wire.marked[Mark.BREAK], wire.port.errors()):
+        tell(finding)
     if any(record.lives for record in records):
         for finding in diagnosis.nodes(records, timings.read):
             tell(finding)

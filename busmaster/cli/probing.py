@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import enum
-from collections import deque
+from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -16,12 +16,14 @@ from typing import Any
 import anyio
 
 from busmaster.arbiter.echo import Echo
+from busmaster.arbiter.events import Mark
 from busmaster.cli.output import value_text
 from busmaster.errors import LineDown, Refused
 from busmaster.exchange import Command, Done, Exchange, Expect, FrameError, ReplyTiming, Timings
 from busmaster.profile import Profile
 from busmaster.transport.clock import clock_of
 from busmaster.transport.endpoints import Endpoint, is_paced
+from busmaster.transport.kernel import OpenPort, open_port
 from busmaster.transport.pump import Tap
 
 QUIET = 0.02
@@ -40,6 +42,8 @@ class Wire(asyncio.Protocol):
         self.latency = endpoint.receive_latency
         self.paced = False
         self.transport: asyncio.Transport | None = None
+        self.port: OpenPort | None = None
+        self.marked: Counter[Mark] = Counter()
         self.closed = anyio.Event()
         self._tap = tap
         self._cause: Exception | None = None
@@ -49,6 +53,12 @@ class Wire(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self.transport = transport
+        self.port = open_port(transport)
+
+    def byte_marked(self, byte: bytes, mark: Mark) -> None:
+        """What is damaged is heard all the same: whoever looks for what is wrong wants to see it."""
+        self.marked[mark] += 1
+        self.data_received(byte)
 
     def data_received(self, data: bytes) -> None:
         now = self.clock()
@@ -66,8 +76,8 @@ class Wire(asyncio.Protocol):
         """Returns when it was handed to the port. Raises LineDown if that is gone."""
         if self.transport is None or self.closed.is_set():
             raise self._loss()
-        now = self.clock()
         self.transport.write(data)
+        now = self.clock()
         if self._tap is not None:
             self._tap.transmitted(now, data)
         return now

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 
 import click
 
@@ -12,7 +11,7 @@ from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import file_argument, load, other_port, port_option
 from busmaster.cli.output import note
-from busmaster.cli.watching import Watch, follow, shown_on_screen
+from busmaster.cli.watching import Watch, follow
 from busmaster.config import ConfiguredLine
 from busmaster.outputs.base import OutputStatistics
 
@@ -54,18 +53,11 @@ async def run(line: ConfiguredLine, view: View) -> int:
                 note("nothing is polled: the file has no [groups.NAME]")
             for group in line.groups.values():
                 watch.add(group)
-            line.outputs.tell = partial(tell, watch)
+            line.outputs.tell = watch.announce
             return await follow(watch)
     finally:
         for counts in line.outputs.statistics() if entered else ():
             note(output_text(counts))
-
-
-def tell(watch: Watch, text: str) -> None:
-    """What happens to an output: an event on the screen, else a line on standard error."""
-    watch.tell(text)
-    if not shown_on_screen(watch.view):
-        note(text)
 
 
 def output_text(counts: OutputStatistics) -> str:

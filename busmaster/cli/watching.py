@@ -12,8 +12,10 @@ from typing import Any
 
 import anyio
 
+from busmaster.arbiter.events import Event, LineChange, LineChanged, PortFailed
 from busmaster.arbiter.state import LineState
 from busmaster.bus import Bus
+from busmaster.cli import uart
 from busmaster.cli.app import OK
 from busmaster.cli.arguments import View
 from busmaster.cli.drawing import draw
@@ -77,12 +79,20 @@ class Watch:
         """Keep the last events, as text, until cancelled."""
         async for event in self.bus.events():
             text = event_text(event)
-            if text:
+            if text and is_of_port(event):
+                self.announce(text)
+            elif text:
                 self.tell(text)
 
     def tell(self, text: str) -> None:
         """Add to the last events."""
         self.events.append(f"{self.bus.now() - self.start:7.1f} s  {text}")
+
+    def announce(self, text: str) -> None:
+        """Add to the last events; without a screen to show them, print a line on standard error."""
+        self.tell(text)
+        if not shown_on_screen(self.view):
+            note(text)
 
     def picture(self) -> Frame:
         """For the screen. Cheap: it is taken on the loop that owns the line."""
@@ -203,6 +213,15 @@ class Watch:
                 f"{node.label}: {node.requests} requests, {node.failed} failed, "
                 f"p50 {node.p50 * 1000:.2f} ms, p99 {node.p99 * 1000:.2f} ms"
             )
+        if text := uart.damage_text(uart.damage(counts.damaged, counts.breaks, counts.driver)):
+            note(f"uart: {text}; `busmaster doctor` says what to look for")
+
+
+def is_of_port(event: Event) -> bool:
+    """Whether it is about the port, on which everything hangs."""
+    return isinstance(event, PortFailed) or (
+        isinstance(event, LineChanged) and event.change in (LineChange.UP, LineChange.DOWN)
+    )
 
 
 def p99_of(periods: Iterable[float]) -> float | None:

@@ -90,6 +90,9 @@ class Line:
         self.chunk = chunk
         self.latency = latency
         self.turnaround = turnaround
+        self.paced = paced
+        """Whether the host may rely on the baud rate (R4). Set it to False for a line behind a network: there bytes
+        take their time, and arrive at any."""
         self.prompt = True
         """A frame's first byte is an event of its own, and so is each piece of a long one, as on a real port.
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable
 from itertools import count
-from math import inf
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
@@ -45,11 +44,13 @@ class World:
         capacity: int = 1000,
         now: float = 0.0,
         jitter: Callable[[], float] = lambda: 0.5,
+        strict: bool = False,
     ) -> None:
         self.line = line
         line.prompt = False
         self.now = now
         self.plugged = False
+        options: dict[str, Any] = {"strict": True} if strict else {}
         self.arbiter = Arbiter(
             line.settings.byte_time,
             now=now,
@@ -57,6 +58,7 @@ class World:
             receive_latency=line.latency,
             capacity=capacity,
             jitter=jitter,
+            **options,
         )
         self._on_event = on_event
         self._record = record
@@ -89,7 +91,7 @@ class World:
         if not self.plugged:
             self.plugged = True
             self.line.receive(self.now)
-            self.arbiter.line_up(self.now, paced=self.line.tau > 0)
+            self.arbiter.line_up(self.now, paced=self.line.paced)
 
     def unplug(self, cause: str = "unplugged") -> None:
         """The port is gone, and what the line has for the host is lost until it is back."""
@@ -102,7 +104,7 @@ class World:
     def run(self, until: float) -> None:
         """To that time."""
         arbiter, line, actions = self.arbiter, self.line, self._actions
-        steps, moment = 0, -inf
+        steps = 0
         self._pump()
         while True:
             heard_at = line.next_event()
@@ -112,16 +114,15 @@ class World:
                 now = actions[0][0]
             if now > until:
                 break
-            if now > moment:
-                steps, moment = 0, now
+            if now > self.now:
+                steps, self.now = 0, now
             else:
-                now = moment
                 steps += 1
                 if steps > FOREVER_STEPS:
-                    raise StuckWorldError(f"at {now:.6f} s: line {heard_at}, arbiter {due_at} in {arbiter.state.name}")
-            self.now = now
-            self._step(now, due_at)
-        self.now = until
+                    state = arbiter.state.name
+                    raise StuckWorldError(f"at {self.now:.6f} s: line {heard_at}, arbiter {due_at} in {state}")
+            self._step(self.now, due_at)
+        self.now = max(self.now, until)
 
     def run_until(self, done: Callable[[], bool], limit: float) -> bool:
         """Until `done()` holds, at most `limit` seconds on. Returns whether it came to hold."""

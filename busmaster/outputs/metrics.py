@@ -48,6 +48,16 @@ LINE_COUNTS = {
     "settles": "Times the line was left to settle",
     "noisy": "Times the line would not be silent",
     "losses": "Times the port was lost",
+    "damaged": "Bytes that came marked with a parity or framing error",
+    "breaks": "Breaks that came marked",
+}
+
+DRIVER_COUNTS = {
+    "framing": "Framing errors, by the driver's count",
+    "parity": "Parity errors, by the driver's count",
+    "breaks": "Breaks, by the driver's count",
+    "overruns": "Bytes lost in the UART, by the driver's count",
+    "buffer_overruns": "Bytes lost because nobody read in time, by the driver's count",
 }
 
 
@@ -135,6 +145,8 @@ class MetricsOutput(Output):
         yield GaugeMetricFamily("busmaster_line_backlog", "Transactions that wait", value=line.backlog)
         for name, text in LINE_COUNTS.items():
             yield CounterMetricFamily(f"busmaster_line_{name}", text, value=getattr(line, name))
+        for name, text in DRIVER_COUNTS.items() if line.driver is not None else ():
+            yield CounterMetricFamily(f"busmaster_driver_{name}", text, value=getattr(line.driver, name))
         waits = GaugeMetricFamily(
             "busmaster_line_wait_p99_seconds", "From being queued to being sent, 99 of 100", labels=["priority"]
         )

@@ -10,7 +10,7 @@ from collections.abc import Set as AbstractSet
 from decimal import Decimal
 from typing import Any
 
-from busmaster.arbiter.events import Event, LatenessRaised, LineChanged, NodeChanged
+from busmaster.arbiter.events import Event, LatenessRaised, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health
 from busmaster.polling import Quality, Sample, Snapshot
 
@@ -117,5 +117,7 @@ def event_text(event: Event) -> str:
             )
         case LineChanged():
             return f"the line is {event.change.value}" + (f": {event.cause}" if event.cause else "")
+        case PortFailed():
+            return f"cannot reconnect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
         case _:
             return ""

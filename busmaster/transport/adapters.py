@@ -17,8 +17,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from busmaster.errors import LineDown
+from busmaster.transport import identity
+
 PROC = Path("/proc")
-SYS = Path("/sys")
 
 SLOW_LATENCY_TIMER = 2
 """Milliseconds; above that, an FTDI adapter's batching shows in every reply."""
@@ -52,18 +54,22 @@ class Holder:
         return "this program" if self.pid == os.getpid() else f"{self.command} (process {self.pid})"
 
 
-def inspect(path: str, *, proc: Path = PROC, sys: Path = SYS) -> tuple[Finding, ...]:
-    """Everything that can be said of the port at `path` without opening it."""
-    found = [_existence(path, sys)]
+def inspect(name: str, *, proc: Path = PROC) -> tuple[Finding, ...]:
+    """Everything that can be said without opening it of the port at a path, or of usb:SERIAL. May block."""
+    try:
+        path = identity.resolve(name)
+    except LineDown as error:
+        return (Finding("port", False, error.what, error.hint),)
+    found = [_existence(path)]
     if found[0].ok:
-        found += [_permission(path), _holders(path, proc), *_driver(path, sys), *_latency_timer(path, sys)]
+        found += [*_name(name, path), _permission(path), _holders(path, proc), *_driver(path), *_latency_timer(path)]
     return tuple(found)
 
 
 def holders(path: str, *, proc: Path = PROC) -> tuple[Holder, ...]:
     """Who has it open, of the processes that we may look into (root sees all)."""
     device = os.path.realpath(path)
-    return tuple(_holder(pid, proc) for pid in _pids(proc) if device in _open_files(proc / str(pid)))
+    return tuple(_holder(pid, proc) for pid in _pids(proc) if _has_open(proc / str(pid), device))
 
 
 def lock_owner(path: str, *, proc: Path = PROC) -> Holder | None:
@@ -91,10 +97,10 @@ def owning_group(path: str) -> str:
         return str(gid)
 
 
-def latency_timer(path: str, *, sys: Path = SYS) -> int | None:
+def latency_timer(path: str) -> int | None:
     """Milliseconds for which an FTDI adapter gathers bytes before it passes them on; None for other adapters."""
     try:
-        return int((_device(path, sys) / "latency_timer").read_text())
+        return int((_device(path) / "latency_timer").read_text())
     except (OSError, ValueError):
         return None
 
@@ -119,17 +125,35 @@ def rs485_mode(descriptor: int) -> bool | None:
     return bool(settings[0] & SER_RS485_ENABLED)
 
 
-def _existence(path: str, sys: Path) -> Finding:
+def _existence(path: str) -> Finding:
     if not os.path.exists(path):
         if os.path.islink(path):
             return Finding("port", False, f"{path} points to {os.readlink(path)}, which is gone", "plug it in again")
         return Finding("port", False, f"{path} does not exist", "see `python -m serial.tools.list_ports`")
     if not stat.S_ISCHR(os.stat(path).st_mode):
         return Finding("port", False, f"{path} is no device", "give the path of a serial port")
-    subsystem = _entry(path, sys) / "subsystem"
+    subsystem = _entry(path) / "subsystem"
     if subsystem.exists() and subsystem.resolve().name != "tty":
         return Finding("port", False, f"{path} is no serial port", "see `python -m serial.tools.list_ports`")
     return Finding("port", True, f"{path} is {os.path.realpath(path)}" if os.path.islink(path) else f"{path} exists")
+
+
+def _name(name: str, path: str) -> Iterator[Finding]:
+    """Which USB adapter it is, and by what name that is found again."""
+    with contextlib.suppress(OSError):  # it has just gone, which opening it will say
+        device = identity.usb_device(os.stat(path).st_rdev)
+        if device is None:
+            return
+        lasting = identity.lasting_name(device)
+        what = f"{path} is {identity.identify(path)}"
+        by_id, by_path = f"{identity.LINKS}/by-id/", f"{identity.LINKS}/by-path/"
+        if name.startswith((identity.USB, by_path)) or (name.startswith(by_id) and lasting.startswith(by_id)):
+            yield Finding("name", True, f"{what}, which {name} finds again")
+        elif lasting:
+            advice = f"name it {lasting}: {path} goes to whichever adapter is found first"
+            yield Finding("name", True, what, advice)
+        else:
+            yield Finding("name", True, what, "it has no serial number: leave it in this USB port")
 
 
 def _permission(path: str) -> Finding:
@@ -157,32 +181,32 @@ def _holders(path: str, proc: Path) -> Finding:
     )
 
 
-def _driver(path: str, sys: Path) -> Iterator[Finding]:
-    driver = _device(path, sys) / "driver"
+def _driver(path: str) -> Iterator[Finding]:
+    driver = _device(path) / "driver"
     if driver.exists():
         yield Finding("driver", True, f"its driver is {driver.resolve().name}")
 
 
-def _latency_timer(path: str, sys: Path) -> Iterator[Finding]:
-    timer = latency_timer(path, sys=sys)
+def _latency_timer(path: str) -> Iterator[Finding]:
+    timer = latency_timer(path)
     if timer is None:
         return
     what = f"the adapter gathers received bytes for up to {timer} ms (latency_timer)"
     if timer <= SLOW_LATENCY_TIMER:
         yield Finding("latency", True, what)
     else:
-        file = _device(path, sys) / "latency_timer"
+        file = _device(path) / "latency_timer"
         yield Finding("latency", False, what, f"open it with low_latency=True, or write 1 to {file}")
 
 
-def _entry(path: str, sys: Path) -> Path:
+def _entry(path: str) -> Path:
     """Where the kernel describes this device; a pseudo-terminal is not there."""
     number = os.stat(path).st_rdev
-    return sys / f"dev/char/{os.major(number)}:{os.minor(number)}"
+    return identity.SYS / f"dev/char/{os.major(number)}:{os.minor(number)}"
 
 
-def _device(path: str, sys: Path) -> Path:
-    return sys / "class/tty" / os.path.basename(os.path.realpath(path)) / "device"
+def _device(path: str) -> Path:
+    return identity.SYS / "class/tty" / os.path.basename(os.path.realpath(path)) / "device"
 
 
 def _pids(proc: Path) -> list[int]:
@@ -192,14 +216,22 @@ def _pids(proc: Path) -> list[int]:
         return []
 
 
-def _open_files(process: Path) -> set[str]:
-    """The paths of its open files; none where we may not look, or it has just ended."""
-    found = set()
+def _has_open(process: Path, device: str) -> bool:
+    """False too where we may not look, or it has just ended. To know a node (O_PATH) is not to have it open."""
     with contextlib.suppress(OSError):
-        for link in os.scandir(process / "fd"):
+        for number in os.listdir(process / "fd"):
             with contextlib.suppress(OSError):
-                found.add(os.readlink(link.path))
-    return found
+                if (
+                    os.readlink(process / "fd" / number) == device
+                    and not _flags(process / "fdinfo" / number) & os.O_PATH
+                ):
+                    return True
+    return False
+
+
+def _flags(descriptor: Path) -> int:
+    found = re.search(r"^flags:\s*(\d+)$", descriptor.read_text(), re.MULTILINE)
+    return int(found[1], 8) if found else 0
 
 
 def _serves(process: Path, device: str) -> bool:

@@ -11,6 +11,7 @@ from urllib.parse import parse_qsl, urlsplit
 
 from busmaster.errors import InvalidCommand
 from busmaster.profile import LineSettings
+from busmaster.transport.identity import USB, Identity
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -45,12 +46,20 @@ class Endpoint(Protocol):
         """Bytes leave at the baud rate. None: not known before it is open (see `is_paced`)."""
         ...
 
-    def identity(self) -> Hashable | None:
-        """Changes when the device behind the name is another or came back. None: absent, or not to be seen."""
+    def presence(self) -> Hashable | None:
+        """What is seen of the device without opening it: it changes when one comes. None: nothing is there or seen.
+
+        It is asked several times a second while the line is down, on the loop, and returns at once.
+        """
         ...
 
-    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> asyncio.Transport:
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> asyncio.Transport:
         """Open it; `connection_made` has been called when this returns. Raises LineDown.
+
+        `only` is the device to open, as the transport of an earlier opening tells it in its extra info "identity"
+        (None where a device cannot be told from another): where another has its name now, that is left alone.
 
         The transport writes at once when nothing is buffered, and calls `pause_writing` and `resume_writing` as soon
         as anything is. It calls `connection_lost` exactly once: with None only if it was closed from here (or by a
@@ -65,7 +74,7 @@ def is_paced(endpoint: Endpoint, transport: asyncio.BaseTransport) -> bool:
 
 
 def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | TcpPort:
-    """The endpoint that `url` names: "/dev/ttyUSB0", "/dev/ttyUSB0?baudrate=9600&parity=E", "socket://host:port".
+    """The endpoint that `url` names: "/dev/ttyUSB0", "usb:A500ABC?baudrate=9600&parity=E", "socket://host:port".
 
     `defaults` fills the line settings that a serial port's URL leaves open; behind a TCP port they are the server's.
     Raises InvalidCommand, naming the nearest option, for anything that it does not understand.
@@ -74,7 +83,7 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
         raise InvalidCommand(f"a port is named by text, such as '/dev/ttyUSB0?baudrate=57600', not {url!r}")
     if "://" not in url:
         path, _, query = url.partition("?")
-        if HOST_PORT.fullmatch(path):
+        if HOST_PORT.fullmatch(path) and not path.startswith(USB):
             raise InvalidCommand(f"{path!r} is no device path; a TCP port is written socket://{path}")
         return _serial_port(path, _options(query, SERIAL_OPTIONS), defaults)
     scheme, _, rest = url.partition("://")
@@ -84,7 +93,7 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
             f"settings fixed there, and use socket://{rest}"
         )
     if scheme != "socket":
-        raise InvalidCommand(f"no such kind of port: {scheme}://; use a device path or socket://HOST:PORT")
+        raise InvalidCommand(f"no such kind of port: {scheme}://; use a device path, usb:SERIAL or socket://HOST:PORT")
     return _tcp_port(url)
 
 

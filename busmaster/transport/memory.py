@@ -11,6 +11,7 @@ from typing import Any
 from busmaster.emulator.line import Line
 from busmaster.profile import LineSettings
 from busmaster.transport.clock import clock_of
+from busmaster.transport.identity import Identity
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +42,15 @@ class MemoryPort:
 
     @property
     def paced(self) -> bool:
-        return self.line.tau > 0
+        return self.line.paced
 
-    def identity(self) -> None:
+    def presence(self) -> None:
         """It never goes away."""
         return None
 
-    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> MemoryTransport:
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> MemoryTransport:
         """Never fails."""
         return MemoryTransport(asyncio.get_running_loop(), protocol_factory(), self.line)
 
@@ -62,6 +65,7 @@ class MemoryTransport(asyncio.Transport):
         self._protocol = protocol
         self._line = line
         self._closing = False
+        self._held: bytes | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._armed = inf
         line.prompt = True
@@ -74,10 +78,31 @@ class MemoryTransport(asyncio.Transport):
         return self._line if name == "line" else default
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Never waits: the line takes everything, and sends it byte by byte."""
-        if not self._closing:
+        """Never waits, unless it is held: the line takes everything, and sends it byte by byte."""
+        if self._closing:
+            return
+        if self._held is None:
             self._line.send(bytes(data), self._clock())
             self._arm(self._line.next_event())
+            return
+        self._held += bytes(data)
+        self._protocol.pause_writing()
+
+    def get_write_buffer_size(self) -> int:
+        """What is held."""
+        return len(self._held or b"")
+
+    def hold(self) -> None:
+        """As if flow control stopped the port: what is written waits."""
+        if self._held is None:
+            self._held = b""
+
+    def release(self) -> None:
+        """Let what waited leave now."""
+        held, self._held = self._held, None
+        if held and not self._closing:
+            self.write(held)
+            self._protocol.resume_writing()
 
     def is_closing(self) -> bool:
         return self._closing

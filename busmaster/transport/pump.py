@@ -8,7 +8,6 @@ user code runs in here.
 from __future__ import annotations
 
 import asyncio
-import select
 import time
 from collections.abc import Callable
 from math import inf
@@ -17,16 +16,26 @@ from typing import Any, Protocol, cast
 import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, Event, Polled
+from busmaster.arbiter.counters import DriverErrors
+from busmaster.arbiter.events import Completed, Event, Mark, Polled
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import LineDown
 from busmaster.transport.clock import clock_of
+from busmaster.transport.kernel import OpenPort, open_port
+
+STUCK_AFTER = 5.0
+"""Seconds after which output that has not left is discarded with its connection. Flow control, a busy adapter and a
+network that lost a segment let go within one or two; whatever holds it longer does not mend by itself, and a request
+that old may move a machine when nobody expects it any more."""
 
 
 class Tap(Protocol):
-    """Sees what passes (a capture). Must not block, nor raise."""
+    """Sees what passes (a capture). Must not block, nor raise.
+
+    `transmitted` hears of bytes when they have been handed to the port, with the time of that.
+    """
 
     def transmitted(self, now: float, data: bytes) -> None: ...
 
@@ -36,7 +45,10 @@ class Tap(Protocol):
 
 
 class Pump(asyncio.Protocol):
-    """Owns the arbiter of one line. `on_cycle` and `on_event` are the library's own and return at once."""
+    """Owns the arbiter of one line. `on_cycle` and `on_event` are the library's own and return at once.
+
+    `name` is how errors call the port.
+    """
 
     def __init__(
         self,
@@ -47,6 +59,7 @@ class Pump(asyncio.Protocol):
         on_written: Callable[[Transaction], None] = lambda _: None,
         paced: Callable[[asyncio.BaseTransport], bool] = lambda _: False,
         tap: Tap | None = None,
+        name: str = "the port",
     ) -> None:
         self.arbiter = arbiter
         self.clock: Callable[[], float] = time.monotonic
@@ -57,7 +70,12 @@ class Pump(asyncio.Protocol):
         self._paced = paced
         self._loop: asyncio.AbstractEventLoop | None = None
         self._transport: asyncio.Transport | None = None
-        self._input: Callable[[], bool] | None = None
+        self._name = name
+        self._port: OpenPort | None = None
+        self._written = -inf
+        self._paused = False
+        self._held_since = inf
+        self._gave_up = ""
         self._timer: asyncio.TimerHandle | None = None
         self._armed = inf
         self._run_out: anyio.Event | None = None
@@ -87,8 +105,12 @@ class Pump(asyncio.Protocol):
         data = arbiter.poll_transmit()
         if data is not None and self._transport is not None:
             self._transport.write(data)
+            self._written = now = self.clock()  # again: the process may have stood still before it got here
+            arbiter.transmitted(now)
             if self.tap is not None:
-                self.tap.transmitted(self.clock(), data)
+                self.tap.transmitted(now, data)
+            if self._paused:
+                self._check_output(now)
         while (event := arbiter.poll_event()) is not None:
             if type(event) is Completed:
                 self._resolve(event.transaction)
@@ -108,6 +130,14 @@ class Pump(asyncio.Protocol):
             self._run_out = anyio.Event()
             await self._run_out.wait()
 
+    def driver_errors(self) -> DriverErrors | None:
+        """What the driver of the port that is open has counted: the arbiter does not know of it."""
+        return None if self._port is None else self._port.errors()
+
+    def reset_driver_errors(self) -> None:
+        if self._port is not None:
+            self._port.reset()
+
     def stop(self) -> None:
         """No timer any more: the bus is closed."""
         if self._timer is not None:
@@ -119,7 +149,9 @@ class Pump(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
-        self._input = input_of(self._transport)
+        self._port = open_port(self._transport)
+        self._paused = False
+        self._held_since = inf
         self.arbiter.line_up(self.clock(), paced=self._paced(transport))
         self.turn()
 
@@ -127,13 +159,36 @@ class Pump(asyncio.Protocol):
         now = self.clock()
         if self.tap is not None:
             self.tap.received(now, data)
+        if self._held_since < inf:  # what was held may have left since: only then can this be its answer
+            self._check_output(now)
         self.arbiter.data_received(data, now)
         self.turn()
 
+    def byte_marked(self, byte: bytes, mark: Mark) -> None:
+        """The UART found this byte damaged."""
+        now = self.clock()
+        if self.tap is not None:
+            self.tap.received(now, byte)
+        self.arbiter.byte_marked(mark, now)
+        self.turn()
+
+    def pause_writing(self) -> None:
+        """The transport could not hand over all that was written: nothing runs out until it has."""
+        self._paused = True
+
+    def resume_writing(self) -> None:
+        """Now it has."""
+        self._paused = False
+        self._check_output(self.clock())
+        due = self.arbiter.poll_timeout()
+        if due < self._armed:
+            self._arm(due)
+
     def connection_lost(self, cause: Exception | None) -> None:
         self._transport = None
-        self._input = None
-        what = cause.what if isinstance(cause, LineDown) else str(cause or "it was closed")
+        self._port = None
+        what = self._gave_up or (cause.what if isinstance(cause, LineDown) else str(cause or "it was closed"))
+        self._gave_up = ""
         self.arbiter.line_down(what, self.clock())
         self.turn()
 
@@ -164,20 +219,32 @@ class Pump(asyncio.Protocol):
         self._timer = None
         self._armed = inf
         now = self.clock()
-        self.arbiter.handle_timeout(now, unread=self._input is not None and self._input())
+        unread = False
+        if self._port is not None and self.arbiter.line_due(now):
+            unread = self._port.unread()
+            self._check_output(now)
+        self.arbiter.handle_timeout(now, unread=unread)
         self.turn()
 
+    def _check_output(self, now: float) -> None:
+        """Tell the arbiter how much has not left yet. On a bus that closes, nothing waits for that any more."""
+        if self._port is None or self._run_out is not None:
+            return
+        count = self._port.unsent(now - self._written)
+        if count is None:
+            return
+        self.arbiter.unsent(count, now)
+        if not count:
+            self._held_since = inf
+        elif self._held_since == inf:
+            self._held_since = now
+        elif now - self._held_since >= STUCK_AFTER:
+            self._give_up(self._port)
 
-def input_of(transport: asyncio.BaseTransport) -> Callable[[], bool] | None:
-    """Tells whether bytes lie unread, without reading them; None where the transport has no descriptor.
-
-    A loop that was blocked may run a timer before it reads: a late reply would lie there, and the silence that R3
-    waits for would be a mistake.
-    """
-    for name in ("serial", "socket"):
-        port = transport.get_extra_info(name)
-        if port is not None:
-            poller = select.poll()
-            poller.register(port.fileno(), select.POLLIN)
-            return lambda: any(events & select.POLLIN for _, events in poller.poll(0))
-    return None
+    def _give_up(self, port: OpenPort) -> None:
+        """Take the line down, and with it what has not left. The port is opened again as after any loss."""
+        self._gave_up = f"nothing has left {self._name} for {STUCK_AFTER:g} s: {port.stuck_because}"
+        self._port = None
+        port.discard_unsent()
+        if self._transport is not None:
+            self._transport.abort()

@@ -9,6 +9,8 @@ from typing import cast
 
 from busmaster.errors import LineDown
 from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.identity import Identity
+from busmaster.transport.marks import taker_of_marked_bytes
 
 FIRST_DELAY = 0.1
 LONGEST_DELAY = 5.0
@@ -25,7 +27,10 @@ class Connection:
 
     Between attempts it waits `first_delay` seconds, doubled up to `longest_delay` and spread by a quarter (`jitter`
     is where that comes from), and begins anew after a connection that lasted longer than that. A device that comes
-    back is noticed at once. `on_failed` hears of each attempt in the background that failed.
+    back is noticed at once. Only the device of the first opening is opened again, whatever has its name meanwhile.
+
+    Whatever goes wrong in the background ends nothing: it is tried again. `on_failed` hears why, once until the
+    reason changes; a cause that has a cause of its own is a bug.
     """
 
     def __init__(
@@ -45,7 +50,9 @@ class Connection:
         self._longest_delay = longest_delay
         self._jitter = jitter or random.Random()
         self._link: _Link | None = None
+        self._device: Identity | None = None
         self._seen: Hashable | None = None
+        self._told: dict[str, str] = {}
         self._closing = asyncio.Event()
 
     @property
@@ -54,12 +61,18 @@ class Connection:
 
     async def open(self) -> None:
         """Open it once, now. Raises LineDown."""
-        self._seen = self.endpoint.identity()
+        self._came_back()
         link = _Link(self.endpoint.name, self._protocol, self._closing)
-        await self.endpoint.open(lambda: link)
+        transport = await self.endpoint.open(lambda: link, self._device)
+        self._device = transport.get_extra_info("identity")
         self._link = link
+        self._told.clear()
         if self._closing.is_set():
             await self.close()
+
+    def accept_device(self) -> None:
+        """Take whatever device has the port's name at the next opening, which comes soon."""
+        self._device = self._seen = None
 
     async def run(self) -> None:
         """Stay connected, opening as often as it takes, until `close` is called or this is cancelled."""
@@ -97,9 +110,8 @@ class Connection:
         if self._link is None:
             try:
                 await self.open()
-            except LineDown as cause:
-                if self._on_failed is not None:
-                    self._on_failed(cause)
+            except Exception as error:
+                self._tell("open", error)
         if self._link is None:
             return 0.0
         await self._link.lost.wait()
@@ -110,18 +122,48 @@ class Connection:
         """Wait that long, spread by the jitter. True, and earlier, if the device is seen to come back."""
         loop = asyncio.get_running_loop()
         until = loop.time() + delay * self._jitter.uniform(0.75, 1.25)
-        seen = self._seen
         while (left := until - loop.time()) > 0:
             try:
                 async with asyncio.timeout(min(left, LOOK_EVERY)):
                     await self._closing.wait()
                 return False
             except TimeoutError:
-                now = self.endpoint.identity()
-                if now is not None and now != seen:
+                if self._came_back():
                     return True
-                seen = now
         return False
+
+    def _came_back(self) -> bool:
+        """Whether a device has come since the last look."""
+        before = self._seen
+        try:
+            self._seen = self.endpoint.presence()
+        except Exception as error:
+            self._tell("look", error)
+        return self._seen is not None and self._seen != before
+
+    def _tell(self, doing: str, error: Exception) -> None:
+        """Say why this failed, unless it was for the same reason as the last time that this was tried."""
+        cause = self._cause(error)
+        if self._on_failed is None or self._told.get(doing) == str(cause):
+            return
+        self._told[doing] = str(cause)
+        try:
+            self._on_failed(cause)
+        except Exception as bug:
+            context = {"message": f"on_failed of {self.endpoint.name} failed", "exception": bug}
+            asyncio.get_running_loop().call_exception_handler(context)
+
+    def _cause(self, error: Exception) -> LineDown:
+        if isinstance(error, LineDown):
+            return error
+        if isinstance(error, OSError):
+            return LineDown(f"cannot open {self.endpoint.name}: {error.strerror or str(error) or type(error).__name__}")
+        cause = LineDown(
+            f"cannot open {self.endpoint.name}: {type(error).__name__}: {error}",
+            hint="this is a bug: please report it with what the log says",
+        )
+        cause.__cause__ = error
+        return cause
 
 
 class _Link(asyncio.Protocol):
@@ -134,6 +176,7 @@ class _Link(asyncio.Protocol):
         self._protocol = protocol
         self._closing = closing
         self.data_received = protocol.data_received  # type: ignore[method-assign]  # no step more on the hot path
+        self.byte_marked = taker_of_marked_bytes(protocol)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast("asyncio.Transport", transport)  # uvloop's are none by inheritance

@@ -1,7 +1,11 @@
 """A serial port, on pyserial and pyserial-asyncio with the latter's traps mended.
 
-What is mended, and why, stands at each method of `PortTransport`. Nothing that can block (opening, configuring,
-draining, closing) ever runs on the loop's thread: a driver may take seconds, or for ever.
+Inherited from pyserial is how a port is opened and configured, and from pyserial-asyncio the reader and writer on the
+loop, pausing and resuming, and the write buffer. Mended is all that costs time or hides something: a write leaves at
+once instead of a turn of the loop later; reading asks no select(), which fails above descriptor 1023; every loss is
+reported, once, and never from within a write; bytes with parity or framing errors come marked (pyserial switches the
+check off); and nothing that can block (opening, configuring, draining, closing) runs on the loop's thread: a driver may
+take seconds, or for ever. Why stands at each method of `PortTransport`.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ import os
 import termios
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import serial
@@ -24,8 +28,10 @@ from serial.rs485 import RS485Settings
 
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.profile import LineSettings
-from busmaster.transport import adapters
+from busmaster.transport import adapters, identity
 from busmaster.transport.aside import aside
+from busmaster.transport.identity import Identity, identify, is_pty, resolve
+from busmaster.transport.marks import ESCAPE, MarkingSerial, Unescape, stop_marking, taker_of_marked_bytes
 
 if TYPE_CHECKING:
 
@@ -34,12 +40,12 @@ if TYPE_CHECKING:
 
         _loop: asyncio.AbstractEventLoop
         _protocol: asyncio.Protocol
-        _serial: serial.Serial
+        _serial: MarkingSerial
         _closing: bool
         _write_buffer: list[bytes]
 
         def __init__(
-            self, loop: asyncio.AbstractEventLoop, protocol: asyncio.Protocol, serial_instance: serial.Serial
+            self, loop: asyncio.AbstractEventLoop, protocol: asyncio.Protocol, serial_instance: MarkingSerial
         ) -> None: ...
         def _ensure_writer(self) -> None: ...
         def _remove_writer(self) -> None: ...
@@ -55,15 +61,13 @@ CLOSE_DEADLINE = 0.5
 """Seconds for which `close` waits for the driver before it reports the port closed all the same."""
 READ_SIZE = 4096
 
-UNIX98_PTYS = range(136, 144)
-BSD_PTYS = 3
-"""The major device numbers of Linux's pseudo-terminals (Documentation/admin-guide/devices.txt)."""
-
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
     """A serial port of this machine, or a pty. Raises InvalidCommand for values that no port can have.
 
+    `path` is that of the device or of a symbolic link to it; or "usb:SERIAL", the USB adapter with this serial number
+    whatever its name is, or "usb:SERIAL:INTERFACE" where it has several ports.
     `rs485`: let the kernel drive the transmitter (RTS high while sending), True or pyserial's `RS485Settings` for
     other polarities and delays. `echo`: what is sent is received too. `low_latency`: set (True) or clear (False) the
     driver's flag, None leaves it. `receive_latency`: seconds that the adapter may hold bytes back (FTDI: its
@@ -88,6 +92,8 @@ class SerialPort:
     def __post_init__(self) -> None:
         if not self.path:
             raise InvalidCommand("a serial port needs a path, such as /dev/ttyUSB0")
+        if self.path == identity.USB:
+            raise InvalidCommand("a USB adapter is named by its serial number, such as usb:A500ABC")
         if not (math.isfinite(self.receive_latency) and self.receive_latency >= 0):
             raise InvalidCommand(f"receive_latency must be at least 0 s, not {self.receive_latency}")
         if self.rtscts and self.rs485:
@@ -102,27 +108,31 @@ class SerialPort:
     def settings(self) -> LineSettings:
         return LineSettings(self.baudrate, self.bytesize, self.parity, self.stopbits)
 
-    def identity(self) -> Hashable | None:
-        """Of the device that the path (perhaps a symlink) leads to now; None if it leads nowhere."""
+    def presence(self) -> Hashable | None:
+        """Of the node that the path (perhaps a symlink) leads to now; of all ports where it is a serial number."""
         try:
+            if self.path.startswith(identity.USB):
+                return tuple(sorted(os.listdir(identity.SYS / "class/tty")))
             status = os.stat(self.path)
         except OSError:
             return None
         return status.st_dev, status.st_ino, status.st_rdev, status.st_ctime_ns
 
-    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> PortTransport:
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> PortTransport:
         """Open and configure it in a thread. Raises LineDown, after OPEN_DEADLINE at the latest."""
-        opening = aside(functools.partial(_open, self), f"open {self.path}")
+        opening = aside(functools.partial(_open, self, only), f"open {self.path}")
         try:
             async with asyncio.timeout(OPEN_DEADLINE):
-                device, paced = await asyncio.wrap_future(opening)
+                device, paced, found = await asyncio.wrap_future(opening)
         except TimeoutError:
             opening.add_done_callback(_drop)
             raise LineDown(f"{self.path} did not open within {OPEN_DEADLINE:g} s", hint="replug the adapter") from None
         except asyncio.CancelledError:
             opening.add_done_callback(_drop)
             raise
-        transport = PortTransport(asyncio.get_running_loop(), protocol_factory(), device, self, paced)
+        transport = PortTransport(asyncio.get_running_loop(), protocol_factory(), device, self, paced, found)
         try:
             await asyncio.sleep(0)  # connection_made is called in between
         except BaseException:
@@ -132,19 +142,27 @@ class SerialPort:
 
 
 class PortTransport(_SerialTransport):
-    """pyserial-asyncio's transport, made to write at once, to report every loss and never to block or hang."""
+    """pyserial-asyncio's transport, made to write at once, to report every loss and never to block or hang.
+
+    A damaged byte goes to the protocol's `byte_marked(byte, mark)`, in order with `data_received`; to that itself
+    where the protocol has no such method.
+    """
 
     def __init__(
         self,
         loop: asyncio.AbstractEventLoop,
         protocol: asyncio.Protocol,
-        device: serial.Serial,
+        device: MarkingSerial,
         port: SerialPort,
         paced: bool,
+        found: Identity,
     ) -> None:
         self._fd = device.fileno()
+        self._escapes = Unescape()
+        self._byte_marked = taker_of_marked_bytes(protocol)
         self._port = port
         self._paced = paced
+        self._identity = found
         self._lost = False
         self._deadline: asyncio.TimerHandle | None = None
         device.is_open = False  # the base class sets timeouts, which would configure an open port anew, on the loop
@@ -153,8 +171,8 @@ class PortTransport(_SerialTransport):
         self.set_write_buffer_limits(high=0)  # whatever is buffered pauses the protocol: it has not left yet
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
-        """`serial` is pyserial's object, `paced` whether bytes leave at the baud rate."""
-        return {"serial": self._serial, "paced": self._paced}.get(name, default)
+        """`serial` is pyserial's object, `paced` whether bytes leave at the baud rate, `identity` the device's."""
+        return {"serial": self._serial, "paced": self._paced, "identity": self._identity}.get(name, default)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._port.name}{' closing' if self._closing else ''}>"
@@ -168,10 +186,19 @@ class PortTransport(_SerialTransport):
         except OSError as error:
             self._lose(error)
             return
-        if data:
-            self._protocol.data_received(data)
-        else:  # VMIN is 1, so nothing to read would be BlockingIOError: this is a hang-up
+        if not data:  # VMIN is 1, so nothing to read would be BlockingIOError: this is a hang-up
             self._lose(None)
+        elif (ESCAPE in data or self._escapes.begun) and self._serial.marks:
+            self._take_marked(data)
+        else:
+            self._protocol.data_received(data)
+
+    def _take_marked(self, data: bytes) -> None:
+        for piece, mark in self._escapes.take(data):
+            if mark is None:
+                self._protocol.data_received(piece)
+            else:
+                self._byte_marked(piece, mark)
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """At once if nothing is buffered: else the bytes would leave one turn of the loop later than their stamp."""
@@ -246,12 +273,6 @@ class PortTransport(_SerialTransport):
             self._protocol.connection_lost(cause)
 
 
-def is_pty(device: int | str) -> bool:
-    """By the device number of a descriptor or a path: a name can be a symlink to anything."""
-    major = os.major(os.stat(device).st_rdev)
-    return major in UNIX98_PTYS or major == BSD_PTYS
-
-
 def _names_pty(path: str) -> bool:
     """False also where nothing is there: opening it will say so."""
     try:
@@ -260,9 +281,11 @@ def _names_pty(path: str) -> bool:
         return False
 
 
-def _open(port: SerialPort) -> tuple[serial.Serial, bool]:
-    """Open and configure the device; also says whether it is paced. Blocks. Raises LineDown."""
-    device = serial.Serial()
+def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool, Identity]:
+    """Open and configure the device; also says whether it is paced, and which it is. Blocks. Raises LineDown."""
+    port = replace(port, path=resolve(port.path))
+    found = _found(port, only)
+    device = MarkingSerial()
     device.port = port.path
     device.baudrate, device.stopbits = port.baudrate, port.stopbits
     if not _names_pty(port.path):  # a pty stays at 8N1, and the C library calls a change that changes nothing an error
@@ -276,11 +299,26 @@ def _open(port: SerialPort) -> tuple[serial.Serial, bool]:
     except (OSError, ValueError, termios.error) as error:
         raise _refusal(port, error) from None
     try:
+        if not found.is_behind(device.fileno()):
+            raise LineDown(f"{port.path} became another device while it was opened", hint="try again")
         _equip(port, device)
-        return device, (not is_pty(device.fileno()) if port.paced is None else port.paced)
-    except BaseException:
+        return device, (not is_pty(device.fileno()) if port.paced is None else port.paced), found
+    except BaseException as error:
         _release(device, port.exclusive)
+        if isinstance(error, OSError | termios.error) and not isinstance(error, LineDown):
+            raise _refusal(port, error) from None
         raise
+
+
+def _found(port: SerialPort, only: Identity | None) -> Identity:
+    """Which device has the name now. Raises LineDown, before it is touched, where that is another than `only`."""
+    try:
+        found = identify(port.path)
+    except OSError as error:
+        raise _refusal(port, error) from None
+    if only is not None and not only.accepts(found):
+        raise LineDown(f"{port.path} is now {found}, the line was opened on {only}", hint=only.advice)
+    return found
 
 
 def _equip(port: SerialPort, device: serial.Serial) -> None:
@@ -339,10 +377,14 @@ def _code(error: Exception) -> int | None:
 
 
 def _release(device: serial.Serial, exclusive: bool) -> None:
-    """Discard what has not left, give both locks back (they would outlive us where a pty stays open), and close."""
+    """Discard what has not left, give back the locks (they would outlive us where a pty stays open), and close.
+
+    The flags are given back too, unless somebody else may be using the port with them.
+    """
     with contextlib.suppress(OSError, termios.error):
         termios.tcflush(device.fileno(), termios.TCOFLUSH)
     if exclusive:
+        stop_marking(device.fileno())
         with contextlib.suppress(OSError):
             fcntl.ioctl(device.fileno(), termios.TIOCNXCL)
         with contextlib.suppress(OSError):
@@ -351,8 +393,8 @@ def _release(device: serial.Serial, exclusive: bool) -> None:
         device.close()
 
 
-def _drop(opening: Future[tuple[serial.Serial, bool]]) -> None:
+def _drop(opening: Future[tuple[MarkingSerial, bool, Identity]]) -> None:
     """Nobody waited for this opening any more."""
     if not opening.cancelled() and opening.exception() is None:
-        device, _paced = opening.result()
+        device, *_ = opening.result()
         _release(device, True)

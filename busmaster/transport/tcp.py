@@ -12,6 +12,7 @@ from dataclasses import KW_ONLY, dataclass
 
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.profile import LineSettings
+from busmaster.transport.identity import Identity
 
 CONNECT_DEADLINE = 5.0
 """Seconds, name look-up included."""
@@ -61,12 +62,14 @@ class TcpPort:
         """For tau only: the framing is the server's business."""
         return None if self.baudrate is None else LineSettings(self.baudrate)
 
-    def identity(self) -> None:
+    def presence(self) -> None:
         """Whether a server is there again can only be found out by connecting."""
         return None
 
-    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> asyncio.Transport:
-        """Connect. Raises LineDown, after CONNECT_DEADLINE at the latest."""
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> asyncio.Transport:
+        """Connect; a server has no identity but its address. Raises LineDown, after CONNECT_DEADLINE at the latest."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(CONNECT_DEADLINE):

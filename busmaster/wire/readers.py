@@ -41,7 +41,7 @@ def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes]
     if not buffer.startswith(header):
         if header.startswith(buffer):
             return 0
-        raise FrameError(f"wrong echo: {buffer[:start].hex(' ')} in place of {header.hex(' ')}")
+        raise FrameError(f"wrong echo: {buffer[:start].hex(' ')} in place of {header.hex(' ')}", heard=buffer)
     etx = buffer.find(ETX, start, start + longest + 1)
     field = buffer[start : etx if etx > 0 else start + longest + 1]
     if field.translate(_PRINTABLE) != field:
@@ -76,12 +76,12 @@ class SingleLeg:
         self.request = request
         self.timing = timing
 
-    def reject(self, first: int) -> NoReturn:
-        """Raise what a first byte means that begins no answer: Refused, or FrameError."""
-        refusal = self.refusals.get(first)
+    def reject(self, heard: bytes) -> NoReturn:
+        """Raise what the first of these bytes means, which begins no answer: Refused, or FrameError."""
+        refusal = self.refusals.get(heard[0])
         if refusal is not None:
             raise refusal
-        raise FrameError(f"a reply cannot begin with {first:02x}")
+        raise FrameError(f"a reply cannot begin with {heard[0]:02x}", heard=heard)
 
 
 class TelegramReader(SingleLeg, Generic[T]):
@@ -90,7 +90,7 @@ class TelegramReader(SingleLeg, Generic[T]):
     A protocol sets the class attributes. `parse` makes the value of the data field, or raises FrameError.
     """
 
-    __slots__ = ("_buffer", "_header")
+    __slots__ = ("_buffer", "_header", "answers")
 
     check = staticmethod(xor)
     longest: ClassVar[int]
@@ -101,7 +101,12 @@ class TelegramReader(SingleLeg, Generic[T]):
         self.request = request
         self.timing = timing
         self._header = STX + echo
+        self.answers = (self._header,)
         self._buffer = b""
+
+    @property
+    def owed(self) -> Sequence[bytes]:
+        return self.answers
 
     def parse(self, field: bytes) -> T:
         raise NotImplementedError
@@ -111,7 +116,7 @@ class TelegramReader(SingleLeg, Generic[T]):
         if not buffer:
             return MORE
         if buffer[0] != _STX:
-            self.reject(buffer[0])
+            self.reject(buffer)
         header = self._header
         etx = find_etx(buffer, header, self.longest, self.check)
         if not etx:
@@ -129,12 +134,14 @@ class AcknowledgeReader(SingleLeg):
 
     sizes: ClassVar[Sizes] = Sizes(1, 1)
     starts: ClassVar[bytes] = ACK + NAK
+    answers: ClassVar[Sequence[bytes]] = (ACK,)
+    owed: ClassVar[Sequence[bytes]] = answers
 
     def feed(self, data: bytes) -> Need | Expect | Done[None]:
         if not data:
             return MORE
         if data[0] != ACK[0]:
-            self.reject(data[0])
+            self.reject(data)
         return Done(None, rest=data[1:])
 
     def expired(self, started: bool) -> NoReturn:

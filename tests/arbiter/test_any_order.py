@@ -196,7 +196,7 @@ class AnyOrder(RuleBasedStateMachine):
             assert self.arbiter.state is LineState.EXCHANGE
             self.asked = data
             self.asked_at = self.now
-            self.asked_until = self.now + len(data) * TAU + LATENESS
+            self.asked_until = self.now + len(data) * TAU + LATENESS + TAU
         while (event := self.arbiter.poll_event()) is not None:
             match event:
                 case Completed(transaction):

@@ -14,11 +14,12 @@ READ_2008 = "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74"
 REPLY_1234 = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"
 BAD_REPLY = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D3 02 6D"
 ACK, NAK = "06", "15"
+TAU = 10 / 9600
 
 
 def bench() -> Bench:
     made = Bench()
-    made.arbiter.byte_time = 10 / 9600
+    made.arbiter.byte_time = TAU
     return made
 
 
@@ -45,7 +46,7 @@ def test_the_window_of_a_request_behind_the_hosts_ack_starts_at_the_end_of_both(
     following = line.ask(node, msc.DataRead(2012), retries=0)
     line.sent()
     line.hear(ACK + REPLY_1234, after=0.05)
-    said = len(bytes.fromhex(line.sent())) * 10 / 9600
+    said = len(bytes.fromhex(line.sent())) * TAU
     window = msc.PROFILE.timings.read.window
     line.wait(said + window - 0.001)
     assert following.error is None
@@ -80,7 +81,7 @@ def test_a_device_that_naks_is_asked_three_times_more_and_then_refuses() -> None
     assert read.attempts == 1
 
 
-def test_r9_with_an_urgent_request_waiting_a_bad_packet_is_acked_away() -> None:
+def test_r9_with_an_urgent_request_waiting_a_bad_packet_is_acked_away_and_the_silence_kept() -> None:
     line = bench()
     node = line.node(1, msc.PROFILE)
     line.wait(1.0)
@@ -89,7 +90,9 @@ def test_r9_with_an_urgent_request_waiting_a_bad_packet_is_acked_away() -> None:
     line.sent()
     line.hear(ACK + BAD_REPLY, after=0.05)
     assert isinstance(read.error, GarbledReply)
-    assert line.sent().startswith(f"{ACK} 02 01 00 07"), "the urgent request is right behind the ACK"
+    assert line.sent() == ACK
+    assert line.until_sent() == pytest.approx(0.100 + TAU), "the packet has begun: no lateness"
+    assert line.sent().startswith("02 01 00 07"), "the urgent request"
     assert urgent.attempts == 1
 
 

@@ -12,7 +12,19 @@ from busmaster.errors import GarbledReply, LineNoisy, Refused
 from busmaster.exchange import ReplyTiming, Timings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
-from tests.arbiter.bench import ACK, ANOTHER_ELEMENT, FIVE, NAK, READ_1_OF_NODE_1, SEVEN, TAU, WRITE_5, Bench
+from tests.arbiter.bench import (
+    ACK,
+    ANOTHER_ELEMENT,
+    FIVE,
+    LATENESS,
+    NAK,
+    QUIET,
+    READ_1_OF_NODE_1,
+    SEVEN,
+    TAU,
+    WRITE_5,
+    Bench,
+)
 
 REQUEST = 8 * TAU
 
@@ -36,7 +48,7 @@ def test_r3_nothing_is_sent_before_lateness_has_passed() -> None:
     bench = Bench()
     bench.ask(bench.node())
     bench.sent()
-    assert bench.until_sent() == pytest.approx(REQUEST + 0.150)
+    assert bench.until_sent() == pytest.approx(REQUEST + LATENESS)
 
 
 def test_r3_nothing_is_sent_before_the_line_is_silent() -> None:
@@ -44,7 +56,7 @@ def test_r3_nothing_is_sent_before_the_line_is_silent() -> None:
     bench.ask(bench.node())
     bench.sent()
     bench.hear(FIVE, after=REQUEST + 0.145)
-    assert bench.until_sent() == pytest.approx(0.020)
+    assert bench.until_sent() == pytest.approx(QUIET)
 
 
 def test_r3_a_wrong_echo_settles_for_the_whole_lateness() -> None:
@@ -53,7 +65,7 @@ def test_r3_a_wrong_echo_settles_for_the_whole_lateness() -> None:
     bench.sent()
     bench.hear(ANOTHER_ELEMENT, after=REQUEST + 0.002)
     assert read.attempts == 1
-    assert bench.until_sent() == pytest.approx(0.148)
+    assert bench.until_sent() == pytest.approx(LATENESS - 0.002)
 
 
 def test_r3_bytes_after_a_reply_settle_but_the_value_stands() -> None:
@@ -65,7 +77,7 @@ def test_r3_bytes_after_a_reply_settle_but_the_value_stands() -> None:
     bench.hear(FIVE + "15", after=REQUEST + 0.002)
     assert read.value == 5.0
     assert bench.arbiter.state is LineState.SETTLING
-    assert bench.until_sent() == pytest.approx(0.148)
+    assert bench.until_sent() == pytest.approx(LATENESS - 0.002)
 
 
 def test_r3_strays_on_an_idle_line_settle_too() -> None:
@@ -74,7 +86,7 @@ def test_r3_strays_on_an_idle_line_settle_too() -> None:
     bench.hear("55")
     bench.ask(node)
     assert bench.sent() == ""
-    assert bench.until_sent() == pytest.approx(0.020)
+    assert bench.until_sent() == pytest.approx(QUIET)
     assert bench.arbiter.statistics(bench.now).stray_bytes == 1
 
 
@@ -112,7 +124,7 @@ def test_r3_after_opening_the_port_an_earlier_masters_reply_is_waited_out() -> N
     bench.ask(node)
     assert bench.sent() == ""
     bench.hear(SEVEN, after=0.1)
-    assert bench.until_sent() == pytest.approx(0.05)
+    assert bench.until_sent() == pytest.approx(LATENESS - 0.1)
 
 
 def test_r3_a_line_that_does_not_fall_silent_is_noisy_and_recovers_by_itself() -> None:
@@ -131,6 +143,7 @@ def test_r3_a_line_that_does_not_fall_silent_is_noisy_and_recovers_by_itself() -
     bench.wait(0.021)
     assert [e.change for e in bench.events if isinstance(e, LineChanged)] == [LineChange.NOISY, LineChange.QUIET]
     healed = bench.ask(node)
+    bench.checked()
     assert bench.sent() == READ_1_OF_NODE_1
     bench.hear(FIVE, after=0.003)
     assert healed.value == 5.0
@@ -153,7 +166,7 @@ def test_r7_a_nak_to_a_read_settles_and_is_confirmed_once() -> None:
     bench.sent()
     bench.hear(NAK, after=REQUEST + 0.002)
     assert not bench.ended(read)
-    assert bench.until_sent() == pytest.approx(0.148)
+    assert bench.until_sent() == pytest.approx(LATENESS - 0.002)
     bench.sent()
     bench.hear(NAK, after=REQUEST + 0.002)
     assert isinstance(read.error, Refused)
@@ -235,7 +248,7 @@ def test_r3_behind_a_slow_adapter_an_earlier_masters_reply_is_waited_out_for_as_
     read = bench.poll(bench.node(), 10.0, 1)
     bench.until_sent()
     assert read.running
-    assert bench.now - up == pytest.approx(0.150 + 0.016)
+    assert bench.now - up == pytest.approx(LATENESS + 0.016)
 
 
 def test_r3_noise_that_a_tolerant_profile_skips_is_no_silence() -> None:
@@ -245,7 +258,7 @@ def test_r3_noise_that_a_tolerant_profile_skips_is_no_silence() -> None:
     bench.ask(node)
     bench.sent()
     bench.hear("FF", after=REQUEST + 0.099)
-    assert bench.until_sent() == pytest.approx(0.020)
+    assert bench.until_sent() == pytest.approx(QUIET)
 
 
 def test_a_broadcast_whose_echo_never_came_leaves_nothing_to_be_taken_for_a_collision() -> None:

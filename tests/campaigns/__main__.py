@@ -25,8 +25,8 @@ EACH = 5000
 Pair = tuple[str, str]
 Found = Mapping[Pair, Totals]
 COLUMNS = (
-    *("transactions", "values", "writes", "failed", "cancelled"),
-    *("confused", "unseen", "unseen_writes", "unasked", "seconds", "recovery"),
+    *("transactions", "values", "writes", "good", "failed", "cancelled", "confused", "unseen", "heard_twice", "untrue"),
+    *("unseen_writes", "unasked", "seconds", "recovery", "worst"),
 )
 """Those of `Totals` that are shown for each protocol and mix."""
 
@@ -35,21 +35,22 @@ def main() -> int:
     """Exit status 1 if a promise was broken."""
     arguments = _parse()
     if arguments.replay is not None:
-        return _replay(arguments.replay, arguments.each)
+        return _replay(arguments.replay, arguments.each, arguments.strict)
     pairs = [(protocol, mix) for protocol in arguments.protocol for mix in arguments.mix]
     found: defaultdict[Pair, Totals] = defaultdict(Totals)
     begun, done = time.perf_counter(), 0
     with Pool(arguments.jobs) if arguments.jobs > 1 else nullcontext() as pool:
         for seed in count(arguments.seed):
-            hunts = [(protocol, mix, seed, arguments.each) for protocol, mix in pairs]
+            hunts = [(protocol, mix, seed, arguments.each, arguments.strict) for protocol, mix in pairs]
             for (protocol, mix), totals in map(_hunt, hunts) if pool is None else pool.imap_unordered(_hunt, hunts):
                 found[protocol, mix].add(totals)
                 done += totals.transactions
                 if totals.problems:
                     _say(f"{protocol}/{mix}/{seed}: {totals.problems[0]}")
-                    _say(f"  python -m tests.campaigns --replay '{protocol}/{mix}/{seed}' --each {arguments.each}")
+                    options = f"--each {arguments.each}{' --strict' * arguments.strict}"
+                    _say(f"  python -m tests.campaigns --replay '{protocol}/{mix}/{seed}' {options}")
             sys.stderr.write(f"seed {seed}: {done:,} transactions, {time.perf_counter() - begun:.0f} s\n")
-            if done >= arguments.transactions:
+            if seed - arguments.seed + 1 == arguments.seeds or (not arguments.seeds and done >= arguments.transactions):
                 break
     _report(found, f"seeds {arguments.seed} to {seed}", time.perf_counter() - begun)
     if arguments.beyond:
@@ -61,9 +62,11 @@ def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.campaigns", description=__doc__)
     parser.add_argument("--transactions", type=int, default=1_000_000, metavar="N", help="about so many")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="the first seed")
+    parser.add_argument("--seeds", type=int, default=0, metavar="N", help="so many seeds, however many transactions")
     parser.add_argument("--protocol", action="append", choices=list(KINDS), help="again for several; all by default")
     parser.add_argument("--mix", action="append", choices=list(MIXES), help="again for several")
     parser.add_argument("--beyond", action="store_true", help="the mixes beyond R3's assumption, not those inside it")
+    parser.add_argument("--strict", action="store_true", help="the strict level of R15")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
     parser.add_argument("--each", type=int, default=EACH, metavar="N", help="transactions of one hunt")
     parser.add_argument("--replay", metavar="PROTOCOL/MIX/SEED", help="one hunt again, with its transcript")
@@ -73,14 +76,14 @@ def _parse() -> argparse.Namespace:
     return arguments
 
 
-def _hunt(what: tuple[str, str, int, int]) -> tuple[Pair, Totals]:
-    protocol, mix, seed, transactions = what
-    return (protocol, mix), Hunt(protocol, mix, seed).run(transactions)
+def _hunt(what: tuple[str, str, int, int, bool]) -> tuple[Pair, Totals]:
+    protocol, mix, seed, transactions, strict = what
+    return (protocol, mix), Hunt(protocol, mix, seed, strict=strict).run(transactions)
 
 
-def _replay(name: str, transactions: int) -> int:
+def _replay(name: str, transactions: int, strict: bool) -> int:
     protocol, mix, seed = name.split("/")
-    totals = Hunt(protocol, mix, int(seed), _say).run(transactions)
+    totals = Hunt(protocol, mix, int(seed), _say, strict=strict).run(transactions)
     return 1 if totals.problems else 0
 
 
@@ -110,15 +113,18 @@ def _sum(many: Iterable[Totals]) -> Totals:
 
 
 def _report_beyond(found: Found) -> None:
-    """Wrong values and acknowledgements per million transactions, and what was noticed, as the README has it."""
+    """Wrong values and acknowledgements per million transactions, and what was noticed, as the README has it; then
+    writes that a drive heard twice, per million, right outcomes per thousand, and milliseconds of line time each."""
     protocols = sorted({protocol for protocol, _ in found})
-    _say(f"\n| what happens | {' | '.join(protocols)} | noticed |")
-    _say(f"| --- |{' ---: |' * (len(protocols) + 1)}")
+    _say(f"\n| what happens | {' | '.join(protocols)} | noticed | heard twice | good | ms each |")
+    _say(f"| --- |{' ---: |' * (len(protocols) + 4)}")
     for mix in dict.fromkeys(mix for _, mix in found):
         all_of_it = _sum(totals for pair, totals in found.items() if pair[1] == mix)
         cells = [_per_million(found[protocol, mix], found[protocol, mix].wrong) for protocol in protocols]
-        noticed = _per_million(all_of_it, all_of_it.bad_attempts)
-        _say(f"| {MIXES[mix].says} | {' | '.join(cells)} | {noticed} |")
+        cells += [_per_million(all_of_it, of) for of in (all_of_it.bad_attempts, all_of_it.heard_twice)]
+        cells += [f"{1000 * all_of_it.good / max(1, all_of_it.transactions):.0f}"]
+        cells += [f"{1000 * all_of_it.seconds / max(1, all_of_it.good):.1f}"]
+        _say(f"| {MIXES[mix].says} | {' | '.join(cells)} |")
 
 
 def _per_million(totals: Totals, count_of: int) -> str:

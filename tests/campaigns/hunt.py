@@ -22,10 +22,12 @@ from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo
 from busmaster.emulator.world import World
 from busmaster.exchange import Command
+from tests.campaigns.edges import EdgeLine, crowd
 from tests.campaigns.judge import Asked, BrokenRuleError, Judge, Totals
 from tests.campaigns.kinds import KINDS, elements_of
 from tests.campaigns.mixes import MIXES, PROMPT, Mix
-from tests.campaigns.witness import Ledger, WatchedLine
+from tests.campaigns.standing import StandingLine, StandingWorld
+from tests.campaigns.witness import Ledger
 
 LONGEST = 1800.0
 """Virtual seconds after which the faults heal, however few transactions there were."""
@@ -34,37 +36,37 @@ RECOVERY = 240.0
 PAUSE = 0.05
 """Seconds after which a client whose request failed at once asks again."""
 PERIODS = (0.1, 0.25, 0.5, 1.0)
+CONTROL = b"\x02\x03\x04\x06\x15"
+"""Checksums that look like something else: an ACK, a NAK, the beginning or the end of a frame."""
+SHORT = 10**8
+"""Numbers below it have eight digits as a rule: an even number of them, as a control character needs (HCP)."""
 
 
 class Hunt:
     """One seed of one protocol and mix: `run` it once. `record` gets the transcript, line by line."""
 
-    def __init__(self, protocol: str, mix: str, seed: int, record: Callable[[str], None] | None = None) -> None:
+    def __init__(
+        self,
+        protocol: str,
+        mix: str,
+        seed: int,
+        record: Callable[[str], None] | None = None,
+        *,
+        strict: bool = False,
+    ) -> None:
         self.kind = KINDS[protocol]
         self.mix: Mix = MIXES[mix]
         self.name = f"{protocol}/{mix}/{seed}"
         self.random = Random(self.name)
         self._record = record
         chance = self.random
-        ledger = Ledger(self.kind.modulus, self.kind.step, gaps=self.mix.gaps)
-        addresses = chance.sample(self.kind.addresses, min(len(self.kind.addresses), chance.randrange(1, 7)))
+        ledger = self._ledger()
+        nodes = chance.randrange(3, 8) if self.mix.equal else chance.randrange(1, 7)
+        addresses = chance.sample(self.kind.addresses, min(len(self.kind.addresses), nodes))
         self.devices = [self.kind.device(ledger, address) for address in addresses]
-        chunked = self.mix.chunks
-        self.line = WatchedLine(
-            ledger,
-            self.kind.profile.line,
-            self.devices,
-            chance=Random(f"{self.name} line"),
-            echo=self.mix.echo or (Echo() if chance.random() < 0.1 else None),
-            chunk=chance.randrange(1, 4) if chunked else 0,
-            latency=chance.choice((0.0, 0.0, 0.004)) if self.mix.latency is None else self.mix.latency,
-            repeats=self.kind.profile.listen is not None,
-            paced=chunked or chance.random() < 0.8,
-        )
+        self.line = self._line(ledger)
         self.line.record = record
-        self.world = World(
-            self.line, on_event=self._on_event, record=record, jitter=Random(f"{self.name} probes").random
-        )
+        self.world = self._world(strict)
         ledger.now = lambda: self.world.now
         self.judge = Judge(self.kind, self.mix, ledger, self.line, self.world.arbiter)
         self.ledger = ledger
@@ -72,10 +74,67 @@ class Hunt:
         broadcast = self.kind.profile.broadcast
         self.everybody = None if broadcast is None else self.world.node(self.kind.profile, broadcast)
         self.reads = [*self.kind.reads, *(self.kind.runs if self.mix.runs else ())]
+        if self.mix.equal:
+            self.reads = self.reads[:1]
         self.open: dict[Transaction, None] = {}
         self.polls: list[Poll] = []
         self._names = count(1)
         self._healed = False
+
+    def _ledger(self) -> Ledger:
+        kind, edges = self.kind, self.mix.edges
+        ledger = Ledger(kind.modulus, kind.step, gaps=self.mix.gaps)
+        if edges is not None and edges.sums:
+            ledger.modulus = min(kind.modulus, SHORT)
+            ledger.prefers = lambda *answer: kind.checksum(*answer) in CONTROL
+        return ledger
+
+    def _line(self, ledger: Ledger) -> EdgeLine:
+        chance, mix, chunked = self.random, self.mix, self.mix.chunks
+        chunk = chance.randrange(1, 4) if chunked else 0
+        echo = mix.echo or (Echo() if chance.random() < 0.1 else None)
+        latency = chance.choice((0.0, 0.0, 0.004)) if mix.latency is None else mix.latency
+        paced = chunked or chance.random() < 0.8
+        own = Random(f"{self.name} own")
+        behind_network = False
+        if mix.edges is not None or mix.stands is not None:
+            chunk = own.choice((0, 1, 3))
+            behind_network = own.random() < 0.5
+        if mix.edges is not None and mix.latency is None:
+            latency = own.choice((0.0, 0.016))
+        if mix.edges is not None and latency:
+            chunk = 1  # no byte is held for longer than that, whatever follows it
+        if mix.doubled or mix.stands is not None:  # where talkers collide, a line soon falls into step again
+            paced = own.random() < 1 / 3
+        if mix.stands is not None:
+            behind_network = behind_network or mix.stands.requests + mix.stands.replies > 0
+            latency = 0.0
+        line = (EdgeLine if mix.stands is None else StandingLine)(
+            ledger,
+            self.kind.profile.line,
+            self.devices,
+            edges=mix.edges,
+            kind=self.kind,
+            own=own,
+            chance=Random(f"{self.name} line"),
+            echo=echo,
+            chunk=chunk,
+            latency=latency,
+            repeats=self.kind.profile.listen is not None or mix.stands is not None,
+            paced=paced,
+        )
+        line.paced = paced and not behind_network
+        return line
+
+    def _world(self, strict: bool) -> World:
+        options: dict[str, Any] = {"on_event": self._on_event, "record": self._record, "strict": strict}
+        options["jitter"] = Random(f"{self.name} probes").random
+        if self.mix.stands is None:
+            return World(self.line, **options)
+        assert isinstance(self.line, StandingLine)
+        own = Random(f"{self.name} stands")
+        self.line.stand_still(self.mix.stands, own)
+        return StandingWorld(self.line, self.mix.stands, own, **options)
 
     @property
     def totals(self) -> Totals:
@@ -108,6 +167,8 @@ class Hunt:
         for device in self.devices:
             device.delay = slow
             self.kind.slow_down(device, slow)
+            if mix.edges is not None:
+                crowd(self.kind, device, mix.edges, slow)
             device.faults = mix.faults(mix.device, lateness)
         self.line.faults = mix.faults(mix.line, lateness)
         for _ in range(self.random.randrange(1, 4)):
@@ -119,6 +180,9 @@ class Hunt:
             self._again(mix.reconnects, self._lose_the_port)
         if mix.deaths:
             self._again(mix.deaths, self._kill)
+        if mix.doubled:
+            self.line.on_doubled = self.judge.doubled
+            self._again(mix.doubled, self.line.double_once)
 
     def _heal(self) -> None:
         """R11, R13: whatever happened, everything goes well again within a bound."""
@@ -126,6 +190,9 @@ class Hunt:
         self.note("all faults heal")
         self._healed = True
         self.line.faults = Faults()
+        self.line.edges = None
+        if isinstance(world, StandingWorld):
+            world.heal()
         self.line.restore(world.now)
         prompt = Delay(*PROMPT)
         for device in self.devices:
@@ -173,7 +240,7 @@ class Hunt:
         node = chance.choice(self.nodes)
         asked = Asked(client)
         options: dict[str, Any] = {}
-        if chance.random() < 0.25:
+        if chance.random() < self.mix.writes:
             command, node = self._write(node, asked, options)
         else:
             command = chance.choice(self.reads)

@@ -11,16 +11,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
-from busmaster.errors import BacklogFull, NotStarted, Refused
+from busmaster.errors import BacklogFull, NotStarted, Refused, WriteUnconfirmed
 from busmaster.exchange import Command
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import AUTO_START, RAM_NOT_RELIABLE, RUNNING, SYSTEM_RESET
 from tests.campaigns.kinds import Kind, echoed, elements_of
-from tests.campaigns.mixes import Mix
+from tests.campaigns.mixes import AT_MOST, Mix
 from tests.campaigns.witness import RECENT, ROUNDING, Ledger, WatchedLine, Written
 
 STATES = (RUNNING | AUTO_START, SYSTEM_RESET | RAM_NOT_RELIABLE)
@@ -45,12 +46,20 @@ class Totals:
     transactions: int = 0
     values: int = 0
     writes: int = 0
+    good: int = 0
+    """Values and acknowledgements that were right."""
     failed: int = 0
     cancelled: int = 0
     turned_away: int = 0
     confused: int = 0
     unseen: int = 0
     """Wrong values and acknowledgements that the documents' checksums let through."""
+    heard_twice: int = 0
+    """Writes that were sent once and carried out more than once: a drive that heard them twice. No master can help."""
+    untrue: int = 0
+    """Writes that were carried out, and ended with an error that says they were not."""
+    worst: int = 0
+    """The most wrong outcomes that one doubled reply has brought."""
     unseen_writes: int = 0
     """Writes of something that nobody had sent, likewise."""
     unasked: int = 0
@@ -71,8 +80,8 @@ class Totals:
 
     def add(self, other: Totals) -> None:
         for name, value in vars(other).items():
-            if name == "recovery":
-                self.recovery = max(self.recovery, value)
+            if name in ("recovery", "worst"):
+                setattr(self, name, max(getattr(self, name), value))
             else:
                 setattr(self, name, getattr(self, name) + value)
 
@@ -94,6 +103,7 @@ class Judge:
         self._left: list[tuple[Transaction, int]] = []
         self._demanded: set[Poll] = set()
         self._timing = kind.profile.timings
+        self._since_doubled = 0
         self._window = max(self._timing.read.window, self._timing.write.window)
         ledger.problem = self.problem
         line.on_request = self.request_leaves
@@ -108,7 +118,16 @@ class Judge:
         self.totals.problems.append(found)
         raise BrokenRuleError(found)
 
+    def count_problem(self, what: str) -> None:
+        """A rule was broken where it is counted how often: the hunt goes on, and the first one is told."""
+        if not self.totals.problems:
+            self.totals.problems.append(f"{self.now:.6f} {what}")
+
     # the line
+
+    def doubled(self) -> None:
+        """A reply is going to be said twice."""
+        self._since_doubled = 0
 
     def request_leaves(self, now: float) -> None:
         """R1, R3: whatever was caused before is over. An MSC repeats its packets by itself. A reply that noise cut
@@ -159,6 +178,7 @@ class Judge:
             right = self._is_state(transaction.command, value, address)
         if not right:
             self._wrong(transaction, f"{transaction.node.label}: {transaction.command} brought {value}")
+        self.totals.good += right
         self._check_times(transaction)
 
     def _is_right(self, number: float, address: int, element: int, started: float) -> bool:
@@ -172,10 +192,10 @@ class Judge:
 
     def _check_times(self, transaction: Transaction) -> None:
         """R2: a value's first byte came within the window, all of it within the bound of a leg."""
-        if self.line.repeats or self.line.echo is not None:
+        if self.line.repeats or self.line.echo is not None or self.mix.stands is not None:
             return
         spoken = next(self.line.during(transaction.started, transaction.last_byte))
-        due = spoken.asked_until + self._window + self.line.latency + ROUNDING
+        due = spoken.asked_until + self._window + self.line.latency + self.line.settings.byte_time + ROUNDING
         if transaction.first_byte > due:
             self.problem(f"R2: {transaction.command} accepted {transaction.first_byte - due:.6f} s after its window")
 
@@ -191,20 +211,36 @@ class Judge:
         what = f"{transaction.node.label}: {transaction.command}"
         if error is None and written.taken_at < transaction.started:
             self._wrong(transaction, f"{what} was acknowledged, but not taken")
-        elif not transaction.idempotent:
+        elif error is None:
+            self.totals.good += 1
+        elif written.taken and not isinstance(error, WriteUnconfirmed) and len(written.elements) == 1:
+            self._untrue(transaction, f"{what} was taken, and ended with {error!r}")
+        if not transaction.idempotent:
             sent_again = transaction.attempts - transaction.refusals
             if sent_again > 1:
                 self.problem(f"R7: {what} was sent {transaction.attempts} times unasked")
-            if written.taken > 1 or (written.taken and type(error) is Refused and len(written.elements) == 1):
-                what += f" was taken {written.taken} times and ended with {error!r}"
-                self._count_wrong(not self.ledger.damaged(transaction.queued, transaction.ended_at), what)
+            if written.taken > 1:
+                self._heard_twice(transaction, f"{what} was taken {written.taken} times and ended with {error!r}")
+
+    def _untrue(self, transaction: Transaction, what: str) -> None:
+        """R7: an attempt that may have been carried out leaves the write unconfirmed, whatever came later."""
+        self.totals.untrue += 1
+        if self.mix.beyond and not self.mix.in_step:
+            self._count_wrong(not self.ledger.damaged(transaction.queued, transaction.ended_at), what)
+        elif not self.ledger.damaged(transaction.queued, transaction.ended_at):
+            self.count_problem(f"R7: {what}")
+
+    def _heard_twice(self, transaction: Transaction, what: str) -> None:
+        self.totals.heard_twice += 1
+        if not self.mix.beyond and not self.ledger.damaged(transaction.queued, transaction.ended_at):
+            self.problem(f"R7: {what}")
 
     def _check_error(self, transaction: Transaction) -> None:
         error = transaction.error
         if isinstance(error, NotStarted | BacklogFull):
             self.problem(f"{transaction.command} was on the wire and ended with {error!r}")
             return
-        refused = isinstance(error, Refused) and not self.mix.refuses and not self.mix.beyond
+        refused = isinstance(error, Refused) and not self.mix.refuses and (self.mix.in_step or not self.mix.beyond)
         if refused and not self.ledger.damaged(transaction.started - RECENT, transaction.ended_at):
             self._count_wrong(True, f"{error}: nobody did")
 
@@ -217,19 +253,27 @@ class Judge:
         self._count_wrong(confused, what)
 
     def _count_wrong(self, confused: bool, what: str) -> None:
+        self._since_doubled += 1
+        if self.mix.doubled:
+            self.totals.worst = max(self.totals.worst, self._since_doubled)
         if not confused or (self.ledger.broken() and not self.mix.beyond):
             self.totals.unseen += 1
             return
         self.totals.confused += 1
         if not self.mix.beyond:
             self.problem(f"WRONG: {what}")
+        elif self.mix.in_step or (self.mix.doubled and self._since_doubled > AT_MOST):
+            self.count_problem(f"WRONG: {what}")
 
     def _check_wait(self, transaction: Transaction, asked: Asked) -> None:
-        """R9: an urgent read waits for the exchange on the wire and for what is ahead in its class."""
+        """R9: an urgent read waits for the exchange on the wire, for what is ahead in its class, and for the few that
+        may go before each of those (R15)."""
         ahead = transaction.exchanges_ahead
-        if transaction.priority is Priority.URGENT and not transaction.writes and ahead > 1 + asked.urgent_ahead:
+        most = 1 + MOST_BEFORE + (1 + MOST_BEFORE) * asked.urgent_ahead
+        if transaction.priority is Priority.URGENT and not transaction.writes and ahead > most:
             self.problem(f"R9: {ahead} exchanges went before an urgent one")
-        if transaction.started > transaction.start_by + ROUNDING:
+        late = self.mix.stands is not None and self.mix.stands.process  # it was told in time, and then stood still
+        if transaction.started > transaction.start_by + ROUNDING and not late:
             self.problem(f"R12: {transaction.command} was sent after its time")
 
     # callers who go away, polls, nodes

@@ -18,6 +18,7 @@ from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import make_device
+from busmaster.wire.checks import sum8, sum16, xor
 from tests.campaigns.witness import Ledger, Witness
 
 SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))
@@ -40,6 +41,8 @@ class Kind:
     """Of a number; the bool says whether it may be repeated, where the command can say so."""
     runs: Sequence[Command[Any]] = ()
     """Reads of several legs whose later legs carry no address."""
+    checksum: Callable[[int, int, int], int] = lambda node, element, number: number & 0xFF
+    """The last byte of what `node` answers to a read of `element` with `number`."""
 
     @property
     def lateness(self) -> float:
@@ -129,13 +132,47 @@ def _dc104_write(chance: Random, number: int, repeat: bool) -> Command[Any]:
     return dc104.Write(chance.randrange(1, 6), number)
 
 
+def _hcp_checksum(node: int, element: int, number: int) -> int:
+    return xor(b"%02d%d\x03" % (element, number))
+
+
+def _hcp2_checksum(node: int, element: int, number: int) -> int:
+    return xor(b"%02X%d\x03" % (element, number))
+
+
+def _msc_checksum(node: int, element: int, number: int) -> int:
+    return sum16(bytes((node, 10)) + b"DREAD," + number.to_bytes(4, "big")) & 0xFF
+
+
+def _dc104_checksum(node: int, element: int, number: int) -> int:
+    return sum8(bytes((element, number >> 8, number & 0xFF)))
+
+
 _MSC_READS: list[Command[Any]] = [msc.DataRead(2008 + MSC_STEP * place) for place in range(6)]
 _COMMS = (1, 2, 3, 4, 5, 99)
 KINDS = {
     kind.name: kind
     for kind in (
-        Kind("hcp", hcp.PROFILE, range(16), 10**9, 7_654_321, [hcp.Read(e) for e in _COMMS], _comms(hcp.Write)),
-        Kind("hcp2", hcp2.PROFILE, range(256), 10**9, 7_654_321, [hcp2.Read(e) for e in _COMMS], _comms(hcp2.Write)),
+        Kind(
+            "hcp",
+            hcp.PROFILE,
+            range(16),
+            10**9,
+            7_654_321,
+            [hcp.Read(e) for e in _COMMS],
+            _comms(hcp.Write),
+            checksum=_hcp_checksum,
+        ),
+        Kind(
+            "hcp2",
+            hcp2.PROFILE,
+            range(256),
+            10**9,
+            7_654_321,
+            [hcp2.Read(e) for e in _COMMS],
+            _comms(hcp2.Write),
+            checksum=_hcp2_checksum,
+        ),
         Kind(
             "msc",
             msc.PROFILE,
@@ -144,6 +181,7 @@ KINDS = {
             7_654_321,
             [*_MSC_READS, *_MSC_READS, msc.BlockRead(2008), msc.ReadFlag(5), msc.ReadFlag(6), msc.ReadStatus()],
             _msc_write,
+            checksum=_msc_checksum,
         ),
         Kind(
             "mentor",
@@ -155,6 +193,15 @@ KINDS = {
             _mentor_write,
             [mentor.ReadRun(1, 17, 4), mentor.ReadRun(1, 20, 3, -1), mentor.ReadRun(1, 17, 2, 0)],
         ),
-        Kind("dc104", dc104.PROFILE, [0], 2**16, 25_717, [dc104.Read(p) for p in (1, 2, 3, 6, 21)], _dc104_write),
+        Kind(
+            "dc104",
+            dc104.PROFILE,
+            [0],
+            2**16,
+            25_717,
+            [dc104.Read(p) for p in (1, 2, 3, 6, 21)],
+            _dc104_write,
+            checksum=_dc104_checksum,
+        ),
     )
 }

@@ -1,4 +1,4 @@
-"""What goes wrong in a campaign: mixes of faults, inside R3's assumption and beyond it."""
+"""What goes wrong in a campaign: mixes of faults, inside R3's assumption, inside R15's alone, and beyond both."""
 
 from __future__ import annotations
 
@@ -13,6 +13,44 @@ PROMPT = (0.0005, 0.005)
 """Seconds after which a device usually answers."""
 
 
+AT_MOST = 32
+"""Wrong values that one reply, doubled once, may bring on a line of equal reads (R15)."""
+
+
+@dataclass(frozen=True)
+class Standstill:
+    """What stands still now and then, for `shortest` to `longest` seconds, and loses nothing.
+
+    `requests` and `replies`: the network on either way, as a share of the frames. `process`: the process, between what
+    the arbiter says and the bytes leaving, and as often at any other moment. `held`: the driver keeps its output, and
+    can tell that it has not left. `within`: the share of these that begin inside of a frame.
+    """
+
+    requests: float = 0.0
+    replies: float = 0.0
+    process: float = 0.0
+    held: float = 0.0
+    within: float = 0.0
+    shortest: float = 0.005
+    longest: float = 2.0
+
+
+@dataclass(frozen=True)
+class Edges:
+    """What happens at the last moment that R3's assumption allows, within the last byte time of it.
+
+    Shares: of replies that begin just before their window or lateness is over (`late`), that pause just before their
+    byte gap is over (`pauses`), that get a noise byte in front of their checksum (`pushed`), of lone ACKs that are lost
+    (`acks_lost`). `sums`: replies whose checksum is a control character, an ACK's too, are frequent.
+    """
+
+    late: float = 0.15
+    pauses: float = 0.0
+    pushed: float = 0.0
+    acks_lost: float = 0.0
+    sums: bool = False
+
+
 @dataclass(frozen=True)
 class Mix:
     """`device` faults strike what devices hear and say, `line` faults every frame, the host's too.
@@ -20,7 +58,10 @@ class Mix:
     `slow` is the share of replies that take from `span[0]` to `span[1]` of the lateness of their protocol. `cancel` is
     the share of requests whose caller goes away; `reconnects` and `deaths` are mean seconds between losses of the port
     and of a device (0: never). `chunks`: bytes reach the host as they come, a few at a time. `overdue`: the mix is
-    beyond R3's assumption for what its faults do not say.
+    beyond R3's assumption for what its faults do not say. `in_step`: yet one request causes one reply at most, and the
+    channel keeps order, so that R15 still allows no wrong value. `equal`: all reads are of one element, so that every
+    answer can be taken for a neighbour's. `writes`: the share of requests that write. `doubled`: mean seconds between
+    single replies that are said twice; each may bring AT_MOST wrong values.
     """
 
     name: str
@@ -37,10 +78,17 @@ class Mix:
     latency: float | None = None
     runs: bool = False
     overdue: bool = False
+    in_step: bool = False
+    equal: bool = False
+    writes: float = 0.25
+    doubled: float = 0.0
+    stands: Standstill | None = None
+    edges: Edges | None = None
 
     @property
     def beyond(self) -> bool:
-        return self.overdue or bool(BEYOND_FAULTS & {*self.device, *self.line})
+        overdue = self.overdue or self.in_step or bool(self.doubled)
+        return overdue or bool(BEYOND_FAULTS & {*self.device, *self.line})
 
     @property
     def refuses(self) -> bool:
@@ -105,15 +153,117 @@ WITHIN = (
     ),
     Mix("reconnects", "the port is lost and found", {"lost": 0.02}, slow=0.2, reconnects=2.0, runs=True),
     Mix("everything", "all of it", EVERYTHING, {"flip": 0.01, "lost": 0.01}, latency=0.0, reconnects=20.0, deaths=20.0),
+    Mix("edges", "replies at the last moment", edges=Edges(), latency=0.0, writes=0.4, runs=True),
+    Mix("edges, held back", "likewise, behind an adapter of 16 ms", edges=Edges(), latency=0.016, writes=0.4),
+    Mix("edges, echo", "likewise, the adapter echoes", edges=Edges(), echo=Echo(0.001), writes=0.4, runs=True),
+    Mix("edges, pauses", "replies pause as long as they may", edges=Edges(0.05, 0.1, sums=True), writes=0.4),
+    Mix(
+        "edges, pushed",
+        "a noise byte before a checksum that is an ACK, with pauses",
+        edges=Edges(0.05, 0.1, 0.1, sums=True),
+        writes=0.4,
+    ),
+    Mix("edges, lost ACKs", "an ACK is lost, its packet comes last", edges=Edges(0.3, 0.0, 0.0, 0.1), writes=0.4),
+    Mix(
+        "edges, all",
+        "all of it, behind an adapter of 16 ms that echoes",
+        {"lost": 0.02, "flip": 0.02},
+        edges=Edges(0.1, 0.1, 0.05, 0.05, sums=True),
+        echo=Echo(),
+        latency=0.016,
+        writes=0.4,
+    ),
+)
+EITHER_WAY = Standstill(requests=0.01, replies=0.01)
+IN_STEP = (
+    Mix("network", "the network stands still, either way", stands=EITHER_WAY, in_step=True),
+    Mix("network, equal", "likewise, equal reads", stands=EITHER_WAY, in_step=True, equal=True, writes=0.02),
+    Mix("network, deaths", "likewise, devices die", stands=EITHER_WAY, in_step=True, deaths=5.0, equal=True),
+    Mix(
+        "network, refusals",
+        "likewise, devices refuse",
+        {"nak": 0.1},
+        stands=EITHER_WAY,
+        in_step=True,
+        equal=True,
+        writes=0.1,
+    ),
+    Mix(
+        "network, lost",
+        "likewise, requests and replies are lost",
+        {"lost": 0.02, "deaf": 0.02},
+        stands=EITHER_WAY,
+        in_step=True,
+        equal=True,
+        writes=0.1,
+    ),
+    Mix(
+        "network, reconnects",
+        "likewise, the port is lost and found",
+        stands=EITHER_WAY,
+        in_step=True,
+        equal=True,
+        reconnects=2.0,
+        writes=0.1,
+    ),
+    Mix("network, runs", "likewise, short commands", stands=EITHER_WAY, in_step=True, runs=True),
+    Mix(
+        "network, within",
+        "likewise, within frames",
+        stands=Standstill(requests=0.01, replies=0.01, within=0.7),
+        in_step=True,
+        equal=True,
+        writes=0.1,
+    ),
+    Mix("process", "the process stands still", stands=Standstill(process=0.01), in_step=True),
+    Mix(
+        "process, equal",
+        "likewise, equal reads",
+        stands=Standstill(process=0.01),
+        in_step=True,
+        equal=True,
+        writes=0.02,
+    ),
+    Mix("held", "the driver holds output", stands=Standstill(held=0.01, shortest=0.1, longest=0.8), in_step=True),
+    Mix(
+        "held, equal",
+        "likewise, equal reads",
+        stands=Standstill(held=0.01, shortest=0.1, longest=0.8),
+        in_step=True,
+        equal=True,
+        writes=0.02,
+    ),
+    Mix(
+        "held, within",
+        "likewise, within frames",
+        stands=Standstill(held=0.01, within=0.7, shortest=0.1, longest=0.8),
+        in_step=True,
+        equal=True,
+        writes=0.1,
+    ),
+    Mix(
+        "all stand still",
+        "network, process and driver, losses, deaths",
+        {"lost": 0.01, "deaf": 0.01},
+        stands=Standstill(0.01, 0.01, 0.005, 0.005),
+        in_step=True,
+        equal=True,
+        deaths=10.0,
+        reconnects=20.0,
+    ),
 )
 BEYOND = (
+    *IN_STEP,
+    Mix("doubled once", "one reply is said twice, on a line of equal reads", doubled=10.0, equal=True, writes=0.0),
     Mix("repeated", "a second reply, up to 300 ms after the first", {"repeated": 0.05}),
+    Mix("repeated rarely", "likewise, one in 3000", {"repeated": 0.00033}),
     Mix("overdue", "replies begin after up to three times the lateness", slow=0.05, span=(1.0, 3.0), overdue=True),
     Mix("forged", "a stray ACK, NAK or EOT before a reply", {"forged": 0.05}),
     Mix("duplicate", "two devices answer to one address", {"duplicate": 0.05}),
     Mix("double flips", "the same bit flipped in two bytes of a reply", {"unseen": 0.05}),
     Mix("double flips both ways", "or of a request", line={"unseen": 0.05}),
     Mix("heard twice", "a request is heard twice, and answered twice", line={"doubled": 0.05}, overdue=True),
+    Mix("heard twice rarely", "likewise, one in 3000", line={"doubled": 0.00033}, overdue=True),
     Mix("glued, delayed", "doubled replies that lie in an adapter", {"doubled": 0.1}, latency=0.004, overdue=True),
     Mix("cut", "requests are cut", line={"truncated": 0.05}, overdue=True),
     Mix("runs", "short commands, damaged requests", line={"flip": 0.05, "lost": 0.05}, runs=True, overdue=True),

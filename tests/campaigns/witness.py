@@ -20,6 +20,8 @@ from busmaster.emulator.oracle import Oracle
 REMEMBERED = 2048
 """Answers and writes that are kept: far more than can still be on their way, and fewer than the narrowest protocol has
 values."""
+PICKY = 24
+"""Numbers of which one is chosen where some are preferred, if there are enough."""
 HEARD = 4096
 ROUNDING = 1e-7
 RECENT = 2.0
@@ -83,6 +85,8 @@ class Ledger:
     """What devices said that nobody had asked, because of damage: one that missed the end of a request takes the
     beginning of the next one for it; a Mentor II that missed the request to another takes that one's ACK for its own
     short command. Then R3's assumption does not hold for a while."""
+    prefers: Callable[[int, int, int], bool] | None = None
+    """Whether a number makes an answer that is likely to be mistaken: of node, element and number."""
     last: Frame = NOTHING
     """The latest of all that devices who were asked are going to say."""
     _given: int = 0
@@ -96,8 +100,13 @@ class Ledger:
 
     def number(self) -> int:
         """One that was not used for long."""
+        return self._remember(self._next())
+
+    def _next(self) -> int:
         self._given += 1
-        number = self._given * self.step % self.modulus
+        return self._given * self.step % self.modulus
+
+    def _remember(self, number: int) -> int:
         self._old.append(number)
         if len(self._old) > REMEMBERED:
             old = self._old.popleft()
@@ -109,7 +118,13 @@ class Ledger:
         return self._answers.get(number)
 
     def answer(self, node: int, element: int) -> int:
-        number = self.number()
+        number = self._next()
+        if self.prefers is not None:
+            for _ in range(min(PICKY, self.modulus // REMEMBERED // 4)):
+                if self.prefers(node, element, number):
+                    break
+                number = self._next()
+        self._remember(number)
         self._answers[number] = Answer(node, element, self.now())
         return number
 
@@ -221,11 +236,18 @@ class WatchedLine(Line):
 
     def _say(self, talker: Device | None, start: float, data: bytes) -> None:
         if talker is not None:
-            asked = self.repeats or self._request.startswith(talker.routes)
-            end = start + len(data) * self.tau
-            if self.record is not None:
-                self.record(f"{self.ledger.now():.6f} {talker!r} says {data.hex(' ')} from {start:.6f} to {end:.6f}")
-            self.ledger.said(start, end, asked)
+            self.tell(talker, start, start + len(data) * self.tau, data)
+        self.put(talker, start, data)
+
+    def tell(self, talker: Device, start: float, end: float, data: bytes) -> None:
+        """Have the ledger know what a device is going to say."""
+        asked = self.repeats or self._request.startswith(talker.routes)
+        if self.record is not None:
+            self.record(f"{self.ledger.now():.6f} {talker!r} says {data.hex(' ')} from {start:.6f} to {end:.6f}")
+        self.ledger.said(start, end, asked)
+
+    def put(self, talker: Device | None, start: float, data: bytes) -> None:
+        """Put it on the wire, with the faults that strike there."""
         self._said = data
         super()._say(talker, start, data)
 

@@ -32,11 +32,13 @@ from busmaster.profile import LineSettings
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import find, kinds, make_device
 from busmaster.testing import run_in_virtual_time
+from busmaster.transport import identity
 from busmaster.transport.adapters import Finding
 from busmaster.transport.memory import MemoryPort
 from tests.cli.conftest import Command
 from tests.cli.conftest import Outcome as Ended
 from tests.transport.fakes import plugged
+from tests.transport.usb import UsbTree
 
 HCP2 = ("--protocol", "hcp2")
 
@@ -288,6 +290,26 @@ def test_a_pty_is_examined_and_the_status_is_0_if_all_is_well(busmaster: Command
     assert [line.split()[1] for line in done.lines if line[:4].strip()] == [
         *("port", "permission", "holders", "open", "driver", "rs485", "silence", "echo", "node", "windows")
     ]
+
+
+@pytest.mark.usefixtures("hasty")
+def test_an_adapter_is_examined_by_its_serial_number_and_by_its_path_that_name_is_recommended(
+    busmaster: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
+    usb = UsbTree(tmp_path / "sys")
+    with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
+        usb.plug(server.path, "A500ABC")
+        by_serial = busmaster("doctor", "usb:A500ABC", *HCP2, "--nodes", "1")
+        by_path = busmaster("doctor", server.path, *HCP2, "--nodes", "1")
+        value = busmaster("read", "usb:A500ABC", *HCP2, "--node", "1", "1")
+    absent = busmaster("doctor", "usb:A500XYZ")
+    assert (by_serial.status, by_path.status) == (0, 0)
+    assert f"ok    name        {server.path} is FTDI A500ABC, which usb:A500ABC finds again\n" in by_serial.out
+    assert "-> name it usb:A500ABC: " in by_path.out
+    assert (value.status, value.out) == (0, "1 0\n")
+    assert absent.status == 1
+    assert f"usb:A500XYZ is not plugged in: there is usb:A500ABC ({server.path})" in absent.out
 
 
 @pytest.mark.usefixtures("hasty")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import signal
 import sqlite3
 import subprocess
@@ -14,7 +15,10 @@ from pathlib import Path
 import pytest
 
 from busmaster.capture.pcapng import read_packets
-from busmaster.emulator.serve import TcpServer
+from busmaster.emulator.line import Line
+from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.registry import make_device
 from tests.cli.conftest import ROOT, Command, started
 
 PATIENCE = 20.0
@@ -172,9 +176,10 @@ def test_emulate_serves_a_file_where_run_looks_for_it(busmaster: Command, tmp_pa
 
 def test_emulate_puts_no_link_under_dev_and_goes_where_it_is_told(tmp_path: Path) -> None:
     path = tmp_path / "line.toml"
-    path.write_text(TEXT.replace("PORT", "/dev/ttyUSB99"))
-    with emulated(str(path), "--fault", "dead=1", "--paced") as (_, where):
-        assert where.startswith("/dev/pts/")
+    for port in ("/dev/ttyUSB99", "usb:A500ABC"):
+        path.write_text(TEXT.replace("PORT", port))
+        with emulated(str(path), "--fault", "dead=1", "--paced") as (_, where):
+            assert where.startswith("/dev/pts/")
     with emulated(str(path), "--tcp", "127.0.0.1:0") as (_, where):
         assert where.startswith("socket://127.0.0.1:")
 
@@ -195,6 +200,34 @@ def test_ctrl_c_ends_a_run_with_its_summary_and_everything_written(line: Path, t
     assert process.returncode == 130
     assert "Traceback" not in err
     assert err.splitlines()[-1].endswith(" written, 0 dropped")
+
+
+def test_r13_a_lost_port_and_why_it_does_not_come_back_are_told_on_standard_error(tmp_path: Path) -> None:
+    path, link = tmp_path / "line.toml", tmp_path / "tty"
+    path.write_text(TEXT.replace("PORT", str(link)))
+
+    def served() -> PtyServer:
+        devices = [make_device("hcp2", address) for address in (1, 2, 3)]
+        return serve_pty(Line(hcp2.PROFILE.line, devices, chance=random.Random(1), paced=False), link)
+
+    server = served()
+    with started("run", str(path), "--plain") as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.readline()
+        server.close()
+        told = [process.stderr.readline() for _ in range(2)]
+        with served():
+            told.append(process.stderr.readline())
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=PATIENCE)
+    assert told == [
+        f"busmaster: the line is down: {link} was lost: it hung up\n",
+        f"busmaster: cannot reconnect: {link} does not exist; plug it in, or see `python -m serial.tools.list_ports`\n",
+        "busmaster: the line is up\n",
+    ]
+    assert process.returncode == 130
+    assert "cannot reconnect" not in err
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager
 import anyio
 import pytest
 
+from busmaster.arbiter.counters import DriverErrors
 from busmaster.bus import Bus
 from busmaster.cli.arguments import View
 from busmaster.cli.messages import Action, Frame
@@ -134,3 +135,21 @@ async def test_a_watch_that_ends_too_early_says_why_nothing_was_asked_but_not_of
         bus.pump.data_received(b"?")
         watch.summarise()
         assert "nothing was asked" not in capfd.readouterr().err
+
+
+@pytest.mark.asyncio
+async def test_what_the_uart_found_wrong_ends_the_summary_if_there_was_anything(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = DriverErrors(0, 0, 0, 0, 0)
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, []))) as bus:
+        monkeypatch.setattr(bus.pump, "driver_errors", lambda: found)
+        watch = Watch(bus, "test", View())
+        watch.summarise()
+        assert "uart" not in capfd.readouterr().err
+        found = DriverErrors(framing=12, parity=0, breaks=1, overruns=0, buffer_overruns=2)
+        watch.summarise()
+        assert capfd.readouterr().err.splitlines()[-1] == (
+            "busmaster: uart: 12 framing errors, 1 break, 2 bytes lost in the driver; "
+            "`busmaster doctor` says what to look for"
+        )

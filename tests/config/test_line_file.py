@@ -55,6 +55,12 @@ def test_a_serial_port_is_as_the_protocol_wants_it_unless_the_file_says_otherwis
     assert parse(port + NODE).port == SerialPort("/dev/ttyS0", baudrate=19200, echo=True, receive_latency=0.001)
 
 
+def test_a_usb_adapter_is_named_by_its_serial_number() -> None:
+    wanted = SerialPort("usb:A500ABC", baudrate=57600)
+    assert parse(f'port = "usb:A500ABC"\n{NODE}').port == wanted
+    assert parse(f'[port]\npath = "usb:A500ABC"\n{NODE}').port == wanted
+
+
 def test_a_tcp_port_is_a_url_or_a_table() -> None:
     wanted = TcpPort("10.0.0.5", 4001, baudrate=57600)
     assert parse(f'port = "socket://10.0.0.5:4001?baudrate=57600"\n{NODE}').port == wanted

@@ -132,25 +132,6 @@ def test_whatever_it_hears_it_answers_after_a_pause(data: bytes, bytewise: bool)
     assert ask(line, read(1), 10.0) == "02 01 00 00 01"
 
 
-FRAMES = [read(1), read(0), write(1, 7), write(1, 0x02AA), "02", "55", "02 AA 01 AC", "02 02"]
-
-
-@given(st.lists(st.tuples(st.sampled_from(FRAMES), st.integers(0, 6)), max_size=6), st.sampled_from([0.001, 0.06]))
-@settings(max_examples=100)
-def test_taking_a_packet_in_one_piece_and_hearing_it_byte_by_byte_do_the_same(
-    frames: list[tuple[str, int]], apart: float
-) -> None:
-    whole, bytewise = EmulatedDc104(), EmulatedDc104()
-    for device in (whole, bytewise):
-        for number, (text, cut) in enumerate(frames):
-            frame = bytes.fromhex(text)[: cut or None]
-            now = number * apart
-            if device is bytewise or not (frame.startswith(device.routes) and device.take(frame, now)):
-                device.hear(frame, now)
-    assert whole.outbox == bytewise.outbox
-    assert whole.registers == bytewise.registers
-
-
 def test_a_disguised_reply_names_another_parameter_with_a_right_checksum() -> None:
     drive = EmulatedDc104()
     drive.registers[1] = 1234

@@ -194,22 +194,6 @@ def test_it_survives_any_bytes_and_then_answers(data: bytes, framing: object, by
     assert (ask(line, "04 31 31 02 30 31 05", 10) or ask(line, read(1, 1), 20)).startswith("02 30 31")
 
 
-FRAMES = [read(1, 1), read(1, 4), read(2, 4), write(1, 1, "14"), write(1, 1, "1,2"), write(2, 1, "3"), "07", "02", "30"]
-
-
-@given(st.lists(st.sampled_from(FRAMES), max_size=4), st.integers(0, 30))
-@settings(max_examples=150)
-def test_taking_a_frame_in_one_piece_and_hearing_it_byte_by_byte_do_the_same(frames: list[str], cut: int) -> None:
-    whole, bytewise = EmulatedMint(1), EmulatedMint(1)
-    for device in (whole, bytewise):
-        for frame in (bytes.fromhex(text)[:cut] for text in frames):
-            taken = device is whole and not device.attentive and frame.startswith(device.routes)
-            if not taken or not device.take(frame, 1.0):
-                device.hear(frame, 1.0)
-    assert whole.outbox == bytewise.outbox
-    assert whole.comms == bytewise.comms
-
-
 # The extended array
 
 

@@ -358,29 +358,6 @@ def test_whatever_it_hears_it_listens_again_when_time_has_passed(chunks: list[by
     assert ask(line, DREAD, 10.0).startswith(ACK)
 
 
-FRAMES = [DREAD, DWRITE, request(1, "RQSTAT"), request(2, "DREAD", 2008), REPLY, ACK, NAK, "02", DREAD[:-2] + "75"]
-
-
-@given(st.lists(st.tuples(st.sampled_from(FRAMES), st.integers(0, 30)), max_size=6), st.floats(0.01, 0.6))
-@settings(max_examples=150)
-def test_taking_a_packet_in_one_piece_and_hearing_it_byte_by_byte_do_the_same(
-    frames: list[tuple[str, int]], apart: float
-) -> None:
-    whole, bytewise = EmulatedMsc(1), EmulatedMsc(1)
-    for device in (whole, bytewise):
-        for number, (text, cut) in enumerate(frames):
-            frame = bytes.fromhex(text)[: cut or None]
-            now = 1.0 + number * apart
-            while now >= device.wakeup:
-                device.wake(device.wakeup)
-            taken = device is whole and frame.startswith(device.routes) and device.take(frame, now)
-            if not taken:
-                device.hear(frame, now)
-    assert whole.outbox == bytewise.outbox
-    assert (whole.attentive, whole.wakeup) == (bytewise.attentive, bytewise.wakeup)
-    assert whole.value(2008) == bytewise.value(2008)
-
-
 def test_a_disguised_packet_comes_from_another_unit_with_a_right_checksum() -> None:
     controller = EmulatedMsc(1)
     line = line_of(controller)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast
 
 import anyio.lowlevel
 
 from busmaster.bus import Bus
 from busmaster.exchange import Command, Timings
+from busmaster.merging import Merge
 from busmaster.node import Priority
 from busmaster.profile import Profile
 
@@ -24,6 +26,9 @@ class FakeNode:
         self.profile = profile
         self.address = address
         self.label = profile.label(address)
+
+    def merge_reads(self, merge: Merge) -> None:
+        self.profile = replace(self.profile, merge=merge)
 
     async def request(
         self,

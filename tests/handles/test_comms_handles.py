@@ -152,9 +152,9 @@ def test_axes_and_io_are_the_same_points_as_their_names(line: CommsArray) -> Non
 @pytest.mark.parametrize("number", [-1, 8])
 def test_there_are_8_axes_and_8_analogue_channels(line: CommsArray, number: int) -> None:
     controller = Hcp2Controller(line.bus, 5)
-    with pytest.raises(InvalidCommand, match="use 0 to 7"):
+    with pytest.raises(InvalidCommand, match="must be 0 to 7"):
         controller.axis(number)
-    with pytest.raises(InvalidCommand, match="use 0 to 7"):
+    with pytest.raises(InvalidCommand, match="must be 0 to 7"):
         controller.io.adc(number)
 
 

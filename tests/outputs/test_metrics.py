@@ -10,6 +10,7 @@ from importlib.util import find_spec
 
 import pytest
 
+from busmaster.arbiter.counters import DriverErrors
 from busmaster.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.errors import NoReply
@@ -79,6 +80,25 @@ async def test_a_scrape_has_the_counts_of_nodes_groups_line_and_outputs() -> Non
     assert 0 < of(metrics, "line_utilisation_ratio") <= 1
     assert of(metrics, "output_dropped_total", output="sqlite") == 2
     assert of(metrics, "output_up", output="sqlite") == 0
+
+
+@pytest.mark.asyncio
+async def test_a_scrape_has_the_drivers_counts_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: DriverErrors | None = None
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [])))
+    monkeypatch.setattr(bus.pump, "driver_errors", lambda: found)
+    output = MetricsOutput("metrics", MetricsSettings(port=0), bus)
+    async with bus:
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        without = await asyncio.to_thread(scraped, output.port)
+        found = DriverErrors(framing=1, parity=2, breaks=3, overruns=4, buffer_overruns=5)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, 5)
+    assert of(without, "line_damaged_total") == of(without, "line_breaks_total") == 0
+    assert not any(name.startswith("busmaster_driver") for name, _ in without)
+    names = ("framing", "parity", "breaks", "overruns", "buffer_overruns")
+    assert [of(metrics, f"driver_{name}_total") for name in names] == [1, 2, 3, 4, 5]
 
 
 @pytest.mark.asyncio

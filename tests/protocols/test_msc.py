@@ -19,6 +19,7 @@ from busmaster.protocols.msc.codec import (
     ClearFlag,
     DataRead,
     DataWrite,
+    Merging,
     PickedData,
     PickedFlags,
     ProgramStatus,
@@ -26,7 +27,6 @@ from busmaster.protocols.msc.codec import (
     ReadFlags,
     ReadStatus,
     SetFlag,
-    merging,
 )
 from busmaster.protocols.msc.exchange import packet
 from tests.protocols.asking import vectors
@@ -185,7 +185,7 @@ def test_the_line_and_the_units_are_the_documents() -> None:
 
 
 def merge(commands: Sequence[Command[Any]], **options: Any) -> Sequence[Batch]:
-    return merging(**options)(commands)
+    return Merging(**options)(commands)
 
 
 def served(batch: Batch, unit: int, reply: bytes) -> dict[int, Any]:
@@ -214,7 +214,7 @@ def test_no_block_runs_beyond_the_last_address() -> None:
 def test_values_are_not_merged_while_the_address_step_is_unknown() -> None:
     assert merge([DataRead(2000), DataRead(2004)]) == []
     with pytest.raises(InvalidCommand):
-        merging(address_step=0)
+        Merging(address_step=0)
 
 
 def test_flags_are_read_at_once_where_the_controller_can() -> None:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import os
 import select
+import socket
+import struct
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -16,6 +20,10 @@ from busmaster.transport.serial_port import PortTransport, SerialPort
 PATIENCE = 2.0
 VIRTUAL_PATIENCE = 1000.0
 """Seconds after which something that should happen has not."""
+SO_ATTACH_FILTER, SO_DETACH_FILTER = 26, 27
+BPF_RETURN = 6
+"""Linux: asm/socket.h, linux/bpf_common.h."""
+SPARE_NUMBERS = 32
 
 
 class Recorder(asyncio.Protocol):
@@ -76,6 +84,7 @@ class FarEnd:
     def __init__(self) -> None:
         self.fd, slave = os.openpty()
         self.path = os.ttyname(slave)
+        self.number = int(self.path.rpartition("/")[2])
         os.close(slave)
         os.set_blocking(self.fd, False)
 
@@ -118,6 +127,18 @@ def plugged(link: Path | None = None) -> Iterator[FarEnd]:
             link.unlink()
 
 
+@contextlib.contextmanager
+def standing_still(sock: socket.socket) -> Iterator[None]:
+    """A network path on which nothing reaches this end meanwhile: a socket filter drops it, unacknowledged."""
+    nothing = ctypes.create_string_buffer(struct.pack("HBBI", BPF_RETURN, 0, 0, 0))
+    program = struct.pack("HL" if struct.calcsize("P") == 4 else "HxxxxxxQ", 1, ctypes.addressof(nothing))
+    sock.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, program)
+    try:
+        yield
+    finally:
+        sock.setsockopt(socket.SOL_SOCKET, SO_DETACH_FILTER, 0)
+
+
 async def opened(path: str, **options: Any) -> tuple[PortTransport, Recorder]:
     """The serial port at `path`, open, and what hears it."""
     recorder = Recorder()
@@ -129,3 +150,34 @@ async def closed(transport: PortTransport, recorder: Recorder) -> None:
     """Close it, and wait until it is."""
     transport.close()
     await recorder.lost()
+
+
+@contextlib.contextmanager
+def plugged_high() -> Iterator[FarEnd]:
+    """A pty whose number no other process gets when it is gone: the lowest is given, and many lower ones are free."""
+    ends = sorted((FarEnd() for _ in range(SPARE_NUMBERS)), key=lambda end: end.number)
+    for end in ends[:-1]:
+        end.unplug()
+    try:
+        yield ends[-1]
+    finally:
+        ends[-1].unplug()
+
+
+@contextlib.contextmanager
+def with_the_number_of(gone: FarEnd) -> Iterator[FarEnd]:
+    """Another pty that has the number of one that is gone; the lower ones are taken meanwhile, if they were free."""
+    lower: list[FarEnd] = []
+    deadline = time.monotonic() + PATIENCE
+    while (far_end := FarEnd()).path != gone.path:
+        assert time.monotonic() < deadline, f"{gone.path} was not given again"
+        if far_end.number < gone.number:
+            lower.append(far_end)
+        else:  # it is still being closed
+            far_end.unplug()
+            time.sleep(0.001)
+    try:
+        yield far_end
+    finally:
+        for end in (far_end, *lower):
+            end.unplug()

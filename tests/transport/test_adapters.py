@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.transport import adapters
+from busmaster.transport import adapters, identity
 from busmaster.transport.adapters import (
     Finding,
     Holder,
@@ -24,6 +24,7 @@ from busmaster.transport.adapters import (
     rs485_mode,
 )
 from tests.transport.fakes import FarEnd, plugged
+from tests.transport.usb import UsbTree
 
 
 @pytest.fixture
@@ -33,13 +34,14 @@ def far_end() -> Iterator[FarEnd]:
 
 
 @pytest.fixture
-def sysfs(tmp_path: Path, far_end: FarEnd) -> Path:
+def sysfs(tmp_path: Path, far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A /sys in which the pty is an FTDI adapter with its timer at 16 ms."""
     device = tmp_path / "sys/class/tty" / os.path.basename(far_end.path) / "device"
     device.mkdir(parents=True)
     (device / "latency_timer").write_text("16\n")
     (tmp_path / "drivers/ftdi_sio").mkdir(parents=True)
     (device / "driver").symlink_to(tmp_path / "drivers/ftdi_sio")
+    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
     return tmp_path / "sys"
 
 
@@ -63,7 +65,7 @@ def test_a_port_in_order_has_nothing_against_it(far_end: FarEnd) -> None:
 
 
 def test_every_fault_comes_with_what_to_do(tmp_path: Path, far_end: FarEnd, sysfs: Path, process: int) -> None:
-    found = inspect(far_end.path, sys=sysfs)
+    found = inspect(far_end.path)
     assert topics(found) == {"port": True, "permission": True, "holders": False, "driver": True, "latency": False}
     assert all(finding.advice for finding in found if not finding.ok)
     text = "\n".join(finding.what for finding in found)
@@ -75,8 +77,9 @@ def test_every_fault_comes_with_what_to_do(tmp_path: Path, far_end: FarEnd, sysf
 def test_a_quick_adapter_is_in_order(far_end: FarEnd, sysfs: Path) -> None:
     timer = sysfs / "class/tty" / os.path.basename(far_end.path) / "device/latency_timer"
     timer.write_text("1\n")
-    assert latency_timer(far_end.path, sys=sysfs) == 1
-    assert topics(inspect(far_end.path, sys=sysfs))["latency"]
+    assert latency_timer(far_end.path) == 1
+    assert topics(inspect(far_end.path))["latency"]
+    timer.unlink()
     assert latency_timer(far_end.path) is None
 
 
@@ -160,3 +163,45 @@ def test_a_pty_has_no_low_latency_flag_and_a_driver_tells_its_own(
     for flag in (0, 1 << 13):
         monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings, flag=flag: settings.__setitem__(4, flag))
         assert low_latency(far_end.fd) is bool(flag)
+
+
+# -- a name that lasts -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def usb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UsbTree:
+    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
+    monkeypatch.setattr(identity, "LINKS", tmp_path / "serial")
+    return UsbTree(tmp_path / "sys")
+
+
+def name_of(port: str) -> Finding:
+    (finding,) = [finding for finding in inspect(port) if finding.topic == "name"]
+    assert finding.ok
+    return finding
+
+
+def test_the_name_to_use_for_an_adapter_is_said_unless_it_is_used(usb: UsbTree, far_end: FarEnd) -> None:
+    usb.plug(far_end.path, "A500ABC")
+    finding = name_of(far_end.path)
+    assert finding.what == f"{far_end.path} is FTDI A500ABC"
+    assert finding.advice == f"name it usb:A500ABC: {far_end.path} goes to whichever adapter is found first"
+    finding = name_of("usb:A500ABC")
+    assert finding.what == f"{far_end.path} is FTDI A500ABC, which usb:A500ABC finds again"
+    assert not finding.advice
+
+
+def test_an_adapter_without_a_serial_number_goes_by_its_place(usb: UsbTree, far_end: FarEnd, tmp_path: Path) -> None:
+    usb.plug(far_end.path, place="1-1.2")
+    assert name_of(far_end.path).advice == "it has no serial number: leave it in this USB port"
+    link = tmp_path / "serial/by-path/pci-0000:00:14.0-usb-0:1.2:1.0-port0"
+    link.parent.mkdir(parents=True)
+    link.symlink_to(far_end.path)
+    assert name_of(far_end.path).advice.startswith(f"name it {link}: ")
+    assert not name_of(str(link)).advice
+
+
+def test_a_serial_number_that_is_not_there_is_all_that_is_said(usb: UsbTree) -> None:
+    (finding,) = inspect("usb:A500ABC")
+    assert not finding.ok
+    assert finding.what == "usb:A500ABC is not plugged in: there is no USB serial port at all"

@@ -16,6 +16,7 @@ from busmaster.profile import LineSettings
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport import reconnect
 from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.identity import Identity
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -38,10 +39,14 @@ async def kept(endpoint: Endpoint, recorder: Recorder, **options: Any) -> AsyncI
 class Wire:
     """A transport without anything behind it, nor asyncio's class (as uvloop's). `stuck`: never closes."""
 
-    def __init__(self, protocol: asyncio.Protocol, stuck: bool) -> None:
+    def __init__(self, told: Told, protocol: asyncio.Protocol, stuck: bool) -> None:
+        self.told = told
         self.protocol = protocol
         self.stuck = stuck
         self.aborted = False
+
+    def get_extra_info(self, name: str) -> Any:
+        return self.told.device if name == "identity" else None
 
     def close(self) -> None:
         if not self.stuck:
@@ -69,16 +74,24 @@ class Told:
         self.stuck = stuck
         self.attempts: list[float] = []
         self.wires: list[Wire] = []
-        self.device: Hashable | None = None
+        self.seen: Hashable | None = None
+        self.device: Identity | None = None
+        self.asked_for: list[Identity | None] = []
+        self.errors: list[Exception] = []
 
-    def identity(self) -> Hashable | None:
-        return self.device
+    def presence(self) -> Hashable | None:
+        return self.seen
 
-    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> asyncio.Transport:
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> asyncio.Transport:
         self.attempts.append(asyncio.get_running_loop().time())
+        self.asked_for.append(only)
+        if self.errors:
+            raise self.errors.pop(0)
         if len(self.attempts) <= self.failures:
             raise LineDown("told does not exist")
-        wire = Wire(protocol_factory(), self.stuck)
+        wire = Wire(self, protocol_factory(), self.stuck)
         self.wires.append(wire)
         transport = cast("asyncio.Transport", wire)
         wire.protocol.connection_made(transport)
@@ -113,13 +126,13 @@ class Even(random.Random):
         return 1.0
 
 
-def test_attempts_back_off_by_doubling_up_to_the_longest_delay_and_are_reported() -> None:
+def test_attempts_back_off_by_doubling_up_to_the_longest_delay_and_their_reason_is_told_once() -> None:
     async def fail() -> None:
         told, recorder, causes = Told(failures=5), Recorder(), list[LineDown]()
         async with kept(told, recorder, on_failed=causes.append, first_delay=1.0, longest_delay=4.0, jitter=Even()):
             await recorder.connected()
         assert told.pauses == pytest.approx([1, 2, 4, 4, 4])
-        assert [cause.what for cause in causes] == ["told does not exist"] * 5
+        assert [cause.what for cause in causes] == ["told does not exist"]
 
     run_in_virtual_time(fail())
 
@@ -157,9 +170,102 @@ def test_a_device_that_is_seen_to_return_is_opened_at_once_and_the_delays_begin_
         async with kept(told, recorder, first_delay=1.0, longest_delay=100.0, jitter=Even()):
             await asyncio.sleep(9.0)
             assert len(told.attempts) == 4
-            told.device = "back"
+            told.seen = "back"
             await recorder.connected()
         assert told.attempts == pytest.approx([0, 1, 3, 7, 9, 10], abs=reconnect.LOOK_EVERY)
+
+    run_in_virtual_time(replug())
+
+
+# -- never ending ----------------------------------------------------------------------------------------------------
+
+
+def test_r13_no_exception_ends_the_reconnecting_and_each_reason_is_told() -> None:
+    async def fail() -> None:
+        told, recorder, causes = Told(), Recorder(), list[LineDown]()
+        bug = ValueError("odd")
+        told.errors = [OSError(5, "Input/output error"), OSError(5, "Input/output error"), bug, bug, KeyError("k")]
+        told.errors += [LineDown("in use by ModemManager"), TimeoutError(), OSError(5, "Input/output error")]
+        async with kept(told, recorder, on_failed=causes.append):
+            await recorder.connected()
+        assert [cause.what for cause in causes] == [
+            "cannot open told: Input/output error",
+            "cannot open told: ValueError: odd",
+            "cannot open told: KeyError: 'k'",
+            "in use by ModemManager",
+            "cannot open told: TimeoutError",
+            "cannot open told: Input/output error",
+        ]
+        assert causes[1].__cause__ is bug
+        assert [cause.__cause__ is None for cause in causes] == [True, False, False, True, True, True]
+        assert causes[1].hint == "this is a bug: please report it with what the log says"
+
+    run_in_virtual_time(fail())
+
+
+def test_r13_looking_for_the_device_may_fail_too_and_is_told_once_beside_the_attempts() -> None:
+    class Blind(Told):
+        def presence(self) -> Hashable | None:
+            raise OSError(13, "Permission denied")
+
+    async def fail() -> None:
+        told, recorder, causes = Blind(failures=5), Recorder(), list[LineDown]()
+        async with kept(told, recorder, on_failed=causes.append, first_delay=1.0):
+            await recorder.connected()
+        assert [cause.what for cause in causes] == ["cannot open told: Permission denied", "told does not exist"]
+
+    run_in_virtual_time(fail())
+
+
+def test_r13_a_reason_is_told_again_after_it_was_open_in_between() -> None:
+    async def fail() -> None:
+        told, recorder, causes = Told(failures=2), Recorder(), list[LineDown]()
+        async with kept(told, recorder, on_failed=causes.append):
+            await recorder.connected()
+            told.failures = len(told.attempts) + 2
+            told.wires[-1].lose(None)
+            await recorder.connected(2)
+        assert [cause.what for cause in causes] == ["told does not exist"] * 2
+
+    run_in_virtual_time(fail())
+
+
+def test_r13_an_owner_that_fails_when_it_is_told_ends_nothing_either() -> None:
+    async def fail() -> None:
+        def refuse(cause: LineDown) -> None:
+            raise RuntimeError("no ears")
+
+        said: list[str] = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: said.append(context["message"]))
+        told, recorder = Told(failures=3), Recorder()
+        async with kept(told, recorder, on_failed=refuse):
+            await recorder.connected()
+        assert said == ["on_failed of told failed"]
+
+    run_in_virtual_time(fail())
+
+
+def test_r13_the_device_that_was_opened_first_is_the_only_one_asked_for_until_another_is_accepted() -> None:
+    class Device:
+        advice = ""
+
+        def accepts(self, found: Identity) -> bool:
+            return found is self
+
+        def is_behind(self, descriptor: int) -> bool:
+            return True
+
+    async def replug() -> None:
+        told, recorder = Told(), Recorder()
+        told.device = first = Device()
+        async with kept(told, recorder) as connection:
+            for n in range(1, 4):
+                await recorder.connected(n)
+                if n == 2:
+                    connection.accept_device()
+                told.wires[-1].lose(None)
+            await recorder.connected(4)
+        assert told.asked_for == [None, first, None, first]
 
     run_in_virtual_time(replug())
 

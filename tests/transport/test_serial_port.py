@@ -51,14 +51,14 @@ def test_values_that_no_port_can_have_are_refused_when_it_is_built(options: dict
         SerialPort(**values)
 
 
-def test_a_link_has_the_identity_of_what_it_leads_to_now(far_end: FarEnd, tmp_path: Path) -> None:
+def test_a_link_shows_what_it_leads_to_now(far_end: FarEnd, tmp_path: Path) -> None:
     port = SerialPort(str(tmp_path / "line"), baudrate=57600)
-    assert port.identity() is None
+    assert port.presence() is None
     with plugged(tmp_path / "line") as other:
-        seen = port.identity()
-        assert seen == SerialPort(other.path, baudrate=57600).identity()
-        assert seen != SerialPort(far_end.path, baudrate=57600).identity()
-    assert port.identity() is None
+        seen = port.presence()
+        assert seen == SerialPort(other.path, baudrate=57600).presence()
+        assert seen != SerialPort(far_end.path, baudrate=57600).presence()
+    assert port.presence() is None
 
 
 @pytest.mark.asyncio

@@ -10,14 +10,16 @@ from ctypes import c_float
 from dataclasses import dataclass, field
 from typing import ClassVar, NoReturn
 
+from busmaster.arguments import whole_number
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.exchange import ReplyTiming, Sizes, Timings
 from busmaster.profile import LineSettings
-from busmaster.wire.integers import whole_number
 from busmaster.wire.numbers import LONGEST_LIST, LONGEST_NUMBER, format_list, format_number, parse_number
 from busmaster.wire.readers import NAK, AcknowledgeReader, TelegramReader, telegram_sizes
 
 LINE = LineSettings(57600)
+CHECKED = (1, 2, 3, 4, 5, 6, 7, 99)
+"""Elements that every controller has, the cheap reads that tell one answer from another (R15)."""
 TIMINGS = Timings.uniform(ReplyTiming(nominal=0.05, window=0.1, lateness=0.15, byte_gap=0.02))
 """Both documents: "normally within 50ms", but other work "could delay the reply by 100mS"."""
 
@@ -101,14 +103,14 @@ class WritingMany(AcknowledgeReader):
 
     __slots__ = ()
 
-    def reject(self, first: int) -> NoReturn:
-        if first == NAK[0]:
+    def reject(self, heard: bytes) -> NoReturn:
+        if heard[0] == NAK[0]:
             raise Refused(
                 "refused; the values before the one refused may be stored",
                 confirm=False,
                 hint="read the elements back; check that each exists, is writable and within its limits",
             )
-        super().reject(first)
+        super().reject(heard)
 
 
 def telegrams(values: Sequence[float]) -> Iterator[tuple[int, tuple[float, ...]]]:

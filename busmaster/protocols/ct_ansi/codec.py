@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import ClassVar
 
+from busmaster.arguments import whole_number
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import FrameError, ReplyTiming, Sizes, Timings
 from busmaster.profile import LineSettings, Profile
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.mentor.codec import Broadcast, ParameterReading, Writing, read_request, reset
 from busmaster.wire.checks import bcc
-from busmaster.wire.integers import whole_number
 from busmaster.wire.readers import ETX, STX, telegram_sizes
 
 LONGEST_DATA = 12
@@ -123,4 +123,5 @@ PROFILE = Profile(
     line=LineSettings(9600, bytesize=7, parity="E"),
     timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.15, lateness=0.3, byte_gap=0.05)),
     probe=Read(1, 17),
+    checks=tuple(Read(1, number) for number in range(17, 22)),
 )

@@ -9,13 +9,14 @@ The checksum is the sum, modulo 256, of all bytes between STX and itself ("Readi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from busmaster.arguments import whole_number
 from busmaster.exchange import MORE, Done, FrameError, Need, ReplyTiming, Sizes, Timings, no_reply
 from busmaster.profile import LineSettings, Profile
 from busmaster.wire.checks import sum8
-from busmaster.wire.integers import whole_number
 from busmaster.wire.readers import NAK, STX, AcknowledgeReader, SingleLeg
 
 READ = 0xAA
@@ -32,7 +33,7 @@ def packet(*between: int) -> bytes:
 class Reading(SingleLeg):
     """One attempt to read: five bytes that name the parameter, or a lone NAK."""
 
-    __slots__ = ("_buffer", "_parameter")
+    __slots__ = ("_buffer", "_parameter", "answers")
 
     length: ClassVar[int] = 5
     sizes: ClassVar[Sizes] = Sizes(length, length)
@@ -42,19 +43,24 @@ class Reading(SingleLeg):
         super().__init__(packet(READ, parameter), timing)
         self._parameter = parameter
         self._buffer = b""
+        self.answers = (STX + bytes((parameter,)),)
+
+    @property
+    def owed(self) -> Sequence[bytes]:
+        return self.answers
 
     def feed(self, data: bytes, /) -> Need | Done[int]:
         buffer = self._buffer = self._buffer + data
         if not buffer:
             return MORE
         if buffer[0] != STX[0]:
-            self.reject(buffer[0])
+            self.reject(buffer)
         if len(buffer) < self.length:
             return MORE
         _, parameter, high, low, check = buffer[: self.length]
         rest = buffer[self.length :]
         if parameter != self._parameter:
-            raise FrameError(f"wrong echo: parameter {parameter} in place of {self._parameter}")
+            raise FrameError(f"wrong echo: parameter {parameter} in place of {self._parameter}", heard=buffer)
         if check != sum8(bytes((parameter, high, low))):
             raise FrameError("bad checksum", whole=not rest)
         return Done(high << 8 | low, rest=rest)
@@ -132,5 +138,6 @@ PROFILE = Profile(
     line=LineSettings(19200),
     timings=Timings(_READ_TIMING, _WRITE_TIMING, packet=_READ_TIMING),
     probe=Read(1),
+    checks=tuple(Read(parameter) for parameter in range(1, 9)),
 )
 """The document gives no times. A write is answered when it is completed, EEPROM included: hence its longer window."""

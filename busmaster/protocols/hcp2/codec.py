@@ -14,7 +14,16 @@ from typing import ClassVar
 
 from busmaster.exchange import Timings
 from busmaster.profile import Profile
-from busmaster.protocols._comms.codec import LINE, TIMINGS, ReadElement, Reading, WriteElements, Writing, WritingMany
+from busmaster.protocols._comms.codec import (
+    CHECKED,
+    LINE,
+    TIMINGS,
+    ReadElement,
+    Reading,
+    WriteElements,
+    Writing,
+    WritingMany,
+)
 from busmaster.wire.checks import xor
 from busmaster.wire.readers import BEL, ENQ, ETX
 
@@ -58,4 +67,5 @@ PROFILE = Profile(
     line=LINE,
     timings=TIMINGS,
     probe=Read(1),
+    checks=tuple(Read(element) for element in CHECKED),
 )

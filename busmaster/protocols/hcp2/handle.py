@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from busmaster.errors import InvalidCommand
+from busmaster.arguments import whole_number
 from busmaster.points import Point
 from busmaster.profile import Profile
 from busmaster.protocols._comms.handle import CommsHandle, Named
@@ -53,19 +53,15 @@ class Io:
 
     def adc(self, channel: int) -> Point[float]:
         """An analogue input. Raises InvalidCommand unless `channel` is 0 to 7."""
-        if channel not in range(comms_array.ANALOG_INPUTS):
-            raise InvalidCommand(f"there is no analogue channel {channel!r}: use 0 to 7")
-        return self.named(comms_array.ANALOG[channel])
+        return self.named(comms_array.ANALOG[whole_number(channel, 0, comms_array.ANALOG_INPUTS - 1, "a channel")])
 
 
 class Axis:
     """The points of one axis, by the names of the document."""
 
     def __init__(self, controller: Hcp2Controller, number: int) -> None:
-        if number not in range(comms_array.AXES):
-            raise InvalidCommand(f"there is no axis {number!r}: use 0 to 7")
         self.controller = controller
-        self.number = number
+        self.number = whole_number(number, 0, comms_array.AXES - 1, "an axis")
 
     def __repr__(self) -> str:
         return f"<Axis {self.number} of {self.controller.node.label}>"

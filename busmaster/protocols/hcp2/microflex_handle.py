@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 
 import anyio
 
+from busmaster.arguments import seconds
 from busmaster.errors import BusClosed, BusError, VerifyFailed, WriteUnconfirmed
 from busmaster.node import Node, Priority
 from busmaster.profile import Profile
@@ -92,6 +93,7 @@ class MicroFlexDrive(CommsHandle):
         Raises VerifyFailed, naming the cause that the status word gives, if it is not enabled `within` so many
         seconds: an axis error, or the hardware enable input. Superseded if a `disable` overtook it.
         """
+        within = seconds(within, f"{self.node.label}: within")
         await self._command(CommandWord.ENABLE)
         return await self._await_enabled(True, within, Priority.COMMAND)
 
@@ -102,6 +104,7 @@ class MicroFlexDrive(CommsHandle):
         under way will not enable it again. Raises VerifyFailed if it is still enabled after `within` seconds.
         A cancelled caller's disable is not sent: shield it where it must go out.
         """
+        within = seconds(within, f"{self.node.label}: within")
         _disables[self.node] = _disables.get(self.node, 0) + 1
         await self._command(_NOTHING, Priority.URGENT)
         return await self._await_enabled(False, within, Priority.URGENT)

@@ -16,11 +16,11 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, ClassVar, NoReturn, TypeVar
 
+from busmaster.arguments import whole_number
 from busmaster.errors import InvalidCommand, NoSuchParameter, Refused
 from busmaster.exchange import Command, Done, Expect, FrameError, Leg, Need, ReplyTiming, Sizes, Timings
 from busmaster.profile import Batch, LineSettings, Profile
 from busmaster.wire.checks import bcc
-from busmaster.wire.integers import whole_number
 from busmaster.wire.readers import (
     ACK,
     ENQ,
@@ -199,7 +199,7 @@ class Reading(ParameterReading[int]):
 class RunReading:
     """One attempt to read a run: a leg for each parameter."""
 
-    __slots__ = ("_leg", "_next", "_short", "_values", "later", "request", "timing")
+    __slots__ = ("_leg", "_next", "_short", "_values", "answers", "later", "request", "timing")
 
     reading: ClassVar[type[ParameterReading[Any]]] = Reading
     """What reads each leg."""
@@ -216,7 +216,13 @@ class RunReading:
         self._short = _SHORT_COMMANDS[run.step]
         self._next = [b"%02d%02d" % (run.menu, number) for number in reversed(numbers[1:])]
         self._leg = self.reading(self.request, echo, timing)
+        self.answers = tuple(STX + b"%02d%02d" % (run.menu, number) for number in numbers)
         self._values: list[Any] = []
+
+    @property
+    def owed(self) -> Sequence[bytes]:
+        """The parameter asked for last: the next ones take a word from the host."""
+        return self._leg.answers
 
     def feed(self, data: bytes) -> Need | Expect | Done[tuple[Any, ...]]:
         step = self._leg.feed(data)
@@ -254,6 +260,8 @@ class Broadcast(SingleLeg):
     sizes: ClassVar[Sizes] = Sizes(0, 0)
     starts: ClassVar[bytes] = b""
     answered: ClassVar[bool] = False
+    answers: ClassVar[Sequence[bytes]] = ()
+    owed: ClassVar[Sequence[bytes]] = ()
 
     def __init__(self, request: bytes, timing: ReplyTiming) -> None:
         super().__init__(request, replace(timing, turnaround=max(timing.turnaround, timing.nominal)))
@@ -308,6 +316,7 @@ PROFILE = Profile(
     line=LineSettings(9600, bytesize=7, parity="E"),
     timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.15, lateness=0.3, byte_gap=0.05)),
     probe=Read(1, 17),
+    checks=tuple(Read(1, number) for number in range(17, 22)),
 )
 CHAINED = replace(PROFILE, merge=merge_runs)
 """For lines on which short commands are safe: poll groups read neighbours as runs."""

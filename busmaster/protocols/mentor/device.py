@@ -158,10 +158,11 @@ class EmulatedMentor(Device):
             self._answer_read(known, now)
         else:
             plain = frame.translate(SEVEN_BITS)
-            if not _is_read(plain) and not _is_write(plain):
+            reads = _is_read(plain)
+            if not reads and not _is_write(plain):
                 return False
             self._parity = frame[0] != EOT
-            if plain[-1] == ENQ and self._is_mine(plain):
+            if reads and self._is_mine(plain):
                 self._known_reads[frame] = int(plain[TEXT_AT:-1])
             self._handle(plain, now)
         self.attentive = self._last is not None

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
+from busmaster.arguments import whole_number
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command, Timings
 from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _BEYOND_ANY_FORM = 1e9
+MOST_DECIMALS = 9
 FORM = "a parameter such as 1.17, 15.60:wide, 1.17:hires, or 1.17:20 for a run of 20"
 
 
@@ -35,7 +37,8 @@ class MentorDrive(Handle):
 
     The line carries whole numbers. `decimals` says of how many digits a parameter's last ones are decimals: its values
     are then in its own unit, rounded to that; without an entry a value is the number on the line. `chained` lets poll
-    groups read neighbouring parameters as runs: see `read_run` for when that is safe.
+    groups read neighbouring parameters of this drive as runs, whichever handle they are from: see `read_run` for when
+    that is safe. The first handle of a drive says so, or none.
     """
 
     profile: ClassVar[Profile] = mentor.PROFILE
@@ -53,7 +56,10 @@ class MentorDrive(Handle):
         self.node: Node = bus.node(
             mentor.CHAINED if chained else mentor.PROFILE, address, timings=timings, retries=retries
         )
-        self._decimals = {parse_parameter(text): digits for text, digits in (decimals or {}).items()}
+        self._decimals = {
+            parse_parameter(text): whole_number(digits, 0, MOST_DECIMALS, f"the decimals of {text}")
+            for text, digits in (decimals or {}).items()
+        }
         if address and (address < 10 or address % 10 == 0):
             warnings.warn(
                 f"mentor: address {address} means a group to later Control Techniques products: "

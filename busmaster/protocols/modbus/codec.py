@@ -17,10 +17,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, TypeVar
 
+from busmaster.arguments import whole_number
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.exchange import MORE, Done, FrameError, Leg, ReplyTiming, Sizes, Step, Timings, no_reply
 from busmaster.profile import LineSettings, Profile
-from busmaster.wire.integers import whole_number
 
 T = TypeVar("T")
 
@@ -84,6 +84,7 @@ class Conversation(Generic[T]):
         "_refusal",
         "_size",
         "answered",
+        "answers",
         "request",
         "sizes",
         "starts",
@@ -99,6 +100,7 @@ class Conversation(Generic[T]):
         self.request = with_crc(body)
         self.answered = body[0] != BROADCAST
         self.timing = timing if self.answered else replace(timing, turnaround=max(timing.turnaround, timing.nominal))
+        self.answers = (header,) if self.answered else ()
         self.starts = header[:1] if self.answered else b""
         self._header = header
         self._refusal = bytes((body[0], body[1] | REFUSED))
@@ -107,13 +109,19 @@ class Conversation(Generic[T]):
         self._decode = decode
         self._buffer = b""
 
+    @property
+    def owed(self) -> Sequence[bytes]:
+        return self.answers
+
     def feed(self, data: bytes, /) -> Step[T]:
         buffer = self._buffer = self._buffer + data
         header, size = self._header, self._size
         if buffer.startswith(self._refusal):
             return self._refused(buffer)
         if not buffer.startswith(header) and not header.startswith(buffer):
-            raise FrameError(f"wrong echo: {buffer[: len(header)].hex(' ')} in place of {header.hex(' ')}")
+            raise FrameError(
+                f"wrong echo: {buffer[: len(header)].hex(' ')} in place of {header.hex(' ')}", heard=buffer
+            )
         if len(buffer) < size:
             return MORE
         if with_crc(buffer[: size - 2]) != buffer[:size]:
@@ -290,5 +298,6 @@ PROFILE = Profile(
     line=LineSettings(19200, parity="E"),
     timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.2, lateness=0.4, byte_gap=0.02, turnaround=SILENCE)),
     probe=ReadRegisters(0),
+    checks=tuple(ReadRegisters(0, count) for count in range(1, 5)),
     broadcast=BROADCAST,
 )

@@ -7,8 +7,8 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from busmaster.arguments import whole_number
 from busmaster.errors import InvalidCommand
-from busmaster.wire.integers import whole_number
 
 FORMS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
 """Each kind of number, as `struct` has it."""

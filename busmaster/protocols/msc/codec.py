@@ -14,11 +14,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from busmaster.arguments import whole_number
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Command, FrameError, ReplyTiming, Timings
 from busmaster.profile import Batch, LineSettings, Profile
 from busmaster.protocols.msc.exchange import UNITS, PacketExchange, Reply, StalePacketListener, packet
-from busmaster.wire.integers import whole_number
 from busmaster.wire.readers import ACK
 
 T = TypeVar("T")
@@ -232,27 +232,28 @@ class PickedFlags(_Reading):
         return _ask(address, timings, b"RFLAGS,", b"", FLAGS // 8, pick)
 
 
-Merge = Callable[[Sequence[Command[Any]]], Sequence[Batch]]
-
-
-def merging(*, address_step: int | None = None, all_flags: bool = False) -> Merge:
+@dataclass(frozen=True, slots=True)
+class Merging:
     """A Profile's `merge`: neighbouring DREADs as one BREAD, RFLAGs as one RFLAGS.
 
     `address_step` is what the address grows by from one value to the next; without it no DREADs are merged.
     `all_flags` says that the controller knows RFLAGS (MSC-850/32, MSC-250). Raises InvalidCommand for a step of 0,
     or one so large that no block has room.
     """
-    if address_step is not None:
-        whole_number(address_step, 1, HIGHEST_ADDRESS // BLOCK, "address_step")
 
-    def merge(commands: Sequence[Command[Any]]) -> Sequence[Batch]:
-        batches = [] if address_step is None else _data_batches(commands, address_step)
+    address_step: int | None = None
+    all_flags: bool = False
+
+    def __post_init__(self) -> None:
+        if self.address_step is not None:
+            whole_number(self.address_step, 1, HIGHEST_ADDRESS // BLOCK, "address_step")
+
+    def __call__(self, commands: Sequence[Command[Any]]) -> Sequence[Batch]:
+        batches = [] if self.address_step is None else _data_batches(commands, self.address_step)
         flags = {i: command.flag for i, command in enumerate(commands) if isinstance(command, ReadFlag)}
-        if all_flags and len(flags) > 1:
+        if self.all_flags and len(flags) > 1:
             batches.append(Batch(PickedFlags(tuple(flags.values())), tuple(flags)))
         return batches
-
-    return merge
 
 
 def _data_batches(commands: Sequence[Command[Any]], step: int) -> list[Batch]:
@@ -322,6 +323,7 @@ PROFILE = Profile(
     line=LineSettings(9600),
     timings=Timings(read=_FIRST, write=_FIRST, packet=ReplyTiming(0.5, 1.0, 1.0, 0.1)),
     probe=ReadStatus(),
+    checks=(ReadStatus(), ReadFlag(0)),
     exchange_limit=2.0,
     listen=StalePacketListener,
 )

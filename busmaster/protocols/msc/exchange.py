@@ -99,6 +99,12 @@ class Reply:
         right_length = payload == self.payload if self.shortest is None else payload >= self.shortest
         return right_length and whole[1] == self.unit and whole.startswith(self.name, HEADER)
 
+    @property
+    def header(self) -> bytes:
+        """What every such packet begins with: unit, length and command name tell it from all other replies."""
+        length = len(self.name) + self.payload
+        return STX + bytes((self.unit, *length.to_bytes(2, "big"), 0, 0)) + self.name
+
     def payload_of(self, whole: bytes) -> bytes:
         return whole[HEADER + len(self.name) : -2]
 
@@ -120,6 +126,7 @@ class PacketExchange(Generic[T]):
         "_reply",
         "_resends",
         "_stale",
+        "answers",
         "closing",
         "later",
         "request",
@@ -134,6 +141,7 @@ class PacketExchange(Generic[T]):
         self.timing = timings.write if reply is None else timings.read
         self.later: Sequence[Leg] = () if reply is None else (Leg(timings.packet, Sizes(reply.size, LONGEST_PACKET)),)
         self.closing = 0 if reply is None else len(ACK)
+        self.answers = (ACK,) if reply is None else (reply.header,)
         self._packet_timing = timings.packet
         self._reply = reply
         self._decode = decode
@@ -141,6 +149,11 @@ class PacketExchange(Generic[T]):
         self._acked = self._lost = False
         self._resends = self._naks = self._stale = 0
         self._failure: FrameError | Refused = no_reply()
+
+    @property
+    def owed(self) -> Sequence[bytes]:
+        """An ACK, and the packet behind it."""
+        return self.answers if self._acked or self._reply is None else (ACK, *self.answers)
 
     def feed(self, data: bytes, /) -> Step[T]:
         buffer = self._buffer

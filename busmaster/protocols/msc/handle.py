@@ -11,7 +11,7 @@ from busmaster.exchange import Command, Timings
 from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
 from busmaster.node import Node, Priority
 from busmaster.points import Point
-from busmaster.profile import Batch, Profile
+from busmaster.profile import Profile
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.blocks import Count, Part, Progress, place, reads, reads_back, writes
 from busmaster.protocols.msc.codec import (
@@ -21,12 +21,12 @@ from busmaster.protocols.msc.codec import (
     ClearFlag,
     DataRead,
     DataWrite,
+    Merging,
     ProgramStatus,
     ReadFlag,
     ReadFlags,
     ReadStatus,
     SetFlag,
-    merging,
 )
 
 if TYPE_CHECKING:
@@ -48,7 +48,8 @@ class MscController(Handle):
 
     `symbols` is the data table of the program's listing. `address_step` is what the address grows by from one value to
     the next; the document does not say, so give it or let `find_address_step` find it: until then no more than one
-    block of 32 values is transferred at once. Models "MSC-250" and "MSC-850/32" send all flags in one exchange.
+    block of 32 values is transferred at once. Models "MSC-250" and "MSC-850/32" send all flags in one exchange. All
+    handles of a unit know its step and its model; `symbols` are each handle's own.
     """
 
     profile: ClassVar[Profile] = msc.PROFILE
@@ -64,16 +65,24 @@ class MscController(Handle):
         timings: Timings | None = None,
         retries: int | None = None,
     ) -> None:
-        merging(address_step=address_step)
-        self.address_step = address_step
         self.model = model
         self.symbols = dict(symbols or {})
         for name, symbol in self.symbols.items():
             DataRead(symbol)
             if not name or name in self.items() or name.isdigit() or set(name) & set(":=, "):
                 raise InvalidCommand(f"{name!r} cannot be the name of a symbol")
-        profile = replace(self.profile, merge=self._merge)
+        known = Merging(address_step, model in MODELS_WITH_RFLAGS)
+        profile = self.profile if known == Merging() else replace(self.profile, merge=known)
         self.node: Node = bus.node(profile, address, timings=timings, retries=retries)
+
+    @property
+    def address_step(self) -> int | None:
+        """What the address grows by from one value to the next, for every handle of this unit; None: not known yet."""
+        return self._merging.address_step
+
+    @address_step.setter
+    def address_step(self, step: int) -> None:
+        self.node.merge_reads(replace(self._merging, address_step=step))
 
     # points
 
@@ -265,8 +274,9 @@ class MscController(Handle):
                 f"{self.node.label}: the values from {address} on do not tell the address step: "
                 "point at some that differ, or give address_step"
             )
-        self.address_step = 4 if bytewise else 1
-        return self.address_step
+        step = 4 if bytewise else 1
+        self.address_step = step
+        return step
 
     # flags and status
 
@@ -284,7 +294,7 @@ class MscController(Handle):
 
     async def flags(self, *, priority: Priority | None = None) -> frozenset[int]:
         """The flags that are on: in one exchange where the model can, else in 256."""
-        if self.model in MODELS_WITH_RFLAGS:
+        if self._merging.all_flags:
             return await self.node.request(ReadFlags(), priority=priority)
         return frozenset([flag for flag in range(FLAGS) if await self.flag(flag, priority=priority)])
 
@@ -294,9 +304,11 @@ class MscController(Handle):
 
     # inside
 
-    def _merge(self, commands: Sequence[Command[Any]]) -> Sequence[Batch]:
-        """By what is known when a poll group asks: the step may have been found since."""
-        return merging(address_step=self.address_step, all_flags=self.model in MODELS_WITH_RFLAGS)(commands)
+    @property
+    def _merging(self) -> Merging:
+        """What is known of the unit, whichever of its handles was told."""
+        merge = self.node.profile.merge
+        return merge if isinstance(merge, Merging) else Merging()
 
     async def _read_part(self, part: Part, **options: Any) -> tuple[int, ...]:
         step = self.address_step

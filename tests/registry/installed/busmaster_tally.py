@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from busmaster import InvalidCommand, Point, Refused
+from busmaster.arguments import whole_number
 from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.oracle import Oracle
@@ -21,7 +22,6 @@ from busmaster.exchange import MORE, Command, Done, FrameError, Need, ReplyTimin
 from busmaster.handle import Handle, unknown_item
 from busmaster.profile import LineSettings, Profile
 from busmaster.registry import NodeKind, Option, Protocol, everywhere
-from busmaster.wire.integers import whole_number
 from busmaster.wire.readers import SingleLeg
 
 CR = b"\r"
@@ -34,6 +34,7 @@ class Talk(SingleLeg):
         super().__init__(request.encode() + CR, timing)
         self.header = header.encode()
         self.starts = self.header[:1] + b"-"
+        self.answers = self.owed = (self.header,)
         self.length = len(header) + digits + 1
         self.sizes = Sizes(self.length, self.length)
         self.heard = b""
@@ -44,7 +45,7 @@ class Talk(SingleLeg):
             raise Refused
         if not self.heard.startswith(self.header) and not self.header.startswith(self.heard):
             if self.heard != b"-":
-                raise FrameError("wrong echo")
+                raise FrameError("wrong echo", heard=self.heard)
             return MORE
         if len(self.heard) < self.length:
             return MORE

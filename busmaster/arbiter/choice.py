@@ -1,0 +1,205 @@
+"""What goes next, where answers could be taken for one another (R15).
+
+Most of the time nothing is owed, and the first that waits goes. Otherwise it goes only if its answer cannot be one
+that is owed; else another of its class whose answer cannot, or a *check*: a read whose right answer proves that the
+line is in step. An urgent write is never held back; its answer may then be doubted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from math import inf
+from typing import Any, TypeAlias
+
+from busmaster.arbiter.dispatcher import Dispatcher
+from busmaster.arbiter.health import DOWN, UP, NodeRecord
+from busmaster.arbiter.in_step import LONGEST_ALIKE, InStep
+from busmaster.arbiter.transaction import URGENT, Transaction
+from busmaster.errors import NoReply
+from busmaster.exchange import Command, Exchange
+
+MOST_BEFORE = 3
+"""Exchanges that may go before one that is held back; then it goes, and its answer is doubted (R9 counts them)."""
+
+Chosen: TypeAlias = tuple[Transaction, Exchange[Any]]
+
+
+class Choice:
+    """Chooses for one line, from what its dispatcher has waiting, by what `in_step` says is owed."""
+
+    def __init__(self, dispatcher: Dispatcher, in_step: InStep) -> None:
+        self._dispatcher = dispatcher
+        self._in_step = in_step
+        self._gone_before = 0
+        self._check: Transaction | None = None
+        self._silent_checks: set[NodeRecord] = set()
+        """The nodes that did not answer a check since something is held back."""
+
+    def next(self, now: float, silent: float) -> Chosen | float | None:
+        """The transaction to be sent now, with its exchange. None if none waits; a time if none may go before it.
+
+        `silent`: for so many seconds nothing has come, so that an answer too many would have shown.
+        """
+        first = self._open_next(now)
+        if first is None:
+            return None
+        in_step = self._in_step
+        answers = first[1].answers
+        if answers == in_step.last and not first[1].later:
+            in_step.alike = 0 if silent > first[1].timing.window else in_step.alike + 1
+            if in_step.alike >= LONGEST_ALIKE or in_step.alert:
+                return self._carefully(first, now)
+        elif in_step.alert:
+            return self._carefully(first, now)
+        else:
+            in_step.alike = 0
+        in_step.before, in_step.last = in_step.last, answers
+        return first
+
+    def _open_next(self, now: float) -> Chosen | None:
+        dispatcher = self._dispatcher
+        while (transaction := dispatcher.next(now)) is not None:
+            node = transaction.node
+            try:
+                exchange = transaction.command.open(node.address, node.timings)
+                if exchange.answers is not None:  # a protocol may lack it: found out here, it fails this one alone
+                    return transaction, exchange
+            except Exception as bug:
+                dispatcher.unsendable(transaction, bug, now)
+        return None
+
+    def _carefully(self, first: Chosen, now: float) -> Chosen | float:
+        """As `next`, where something is owed or doubted, or too many answers were alike."""
+        in_step = self._in_step
+        in_step.lapse(now)
+        chosen: Chosen | float = first
+        transaction, exchange = first
+        answers = exchange.answers
+        if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
+            pass
+        elif in_step.clashes(answers):
+            chosen = self._instead_of(first, now)
+        elif in_step.alike >= LONGEST_ALIKE:
+            chosen = self._another(first, now, lambda other: other == answers) or first
+            if chosen is first and (check := self._ask_check(now, lambda other: other == answers)) is not None:
+                chosen = check
+            in_step.alike = 0
+        elif in_step.doubts(now) and answers == in_step.last:
+            chosen = self._another(first, now, lambda other: other == answers) or first
+        if chosen is first:
+            self._gone_before = 0
+            self._silent_checks.clear()
+            self._check = None
+        if isinstance(chosen, float):
+            self._dispatcher.backlog.restore(transaction)
+        else:
+            if chosen[0] is not transaction:
+                self._dispatcher.backlog.restore(transaction)
+            if chosen[1].answers != in_step.last:
+                in_step.alike = 0
+            in_step.before, in_step.last = in_step.last, chosen[1].answers
+        return chosen
+
+    def _instead_of(self, first: Chosen, now: float) -> Chosen | float:
+        """What goes in place of one whose answer could be one that is owed."""
+        in_step, answers = self._in_step, first[1].answers
+        if first[0].probe and (other := self._other_probe(first[0])) is not None:
+            return other
+        if self._gone_before >= MOST_BEFORE:
+            return first
+        owing = {node for node in in_step.owing(answers) if node.health is UP}
+        other = None
+        if self._gone_before < MOST_BEFORE - 1:
+            of = first[0].node if first[0].node in owing else None  # only its own answer proves that it owes no more
+            other = self._another(first, now, in_step.clashes, of)
+        if other is None:
+            ends = in_step.ends(answers)
+            if ends < inf:
+                return ends
+            other = self._ask_check(now, in_step.clashes, owing)
+        if other is not None:
+            self._gone_before += 1
+            return other
+        if not self._silent_checks:
+            over = in_step.over(answers)
+            if now < over:
+                return over
+            in_step.forgive(answers)
+        return first
+
+    def _other_probe(self, probe: Transaction) -> Chosen | None:
+        """The same dead node asked for something that is not owed."""
+        node = probe.node
+        for command in checks_of(node):
+            exchange = command.open(node.address, node.timings)
+            if not self._in_step.clashes(exchange.answers):
+                probe.command = command
+                return probe, exchange
+        return None
+
+    def _another(
+        self, first: Chosen, now: float, unfit: Callable[[Sequence[bytes]], bool], of: NodeRecord | None = None
+    ) -> Chosen | None:
+        """One of the same class, `of` this node if one is given. No read overtakes a write to its node, and no write
+        anything that is for its node."""
+        opened: list[Exchange[Any]] = []
+        passed = {first[0].node}
+        written = {first[0].node} if first[0].writes else set()
+
+        def suits(other: Transaction) -> bool:
+            in_order = other.node not in (passed if other.writes else written)
+            if in_order and of in (None, other.node) and self._dispatcher.may_go(other, now):
+                exchange = _opened(other)
+                if exchange is not None and exchange.answered and not unfit(exchange.answers):
+                    opened.append(exchange)
+                    return True
+            passed.add(other.node)
+            if other.writes:
+                written.add(other.node)
+            return False
+
+        transaction = self._dispatcher.backlog.pick(first[0].priority, suits)
+        return None if transaction is None else (transaction, opened[0])
+
+    def _ask_check(
+        self, now: float, unfit: Callable[[Sequence[bytes]], bool], owing: Iterable[NodeRecord] = ()
+    ) -> Chosen | None:
+        """A read whose answer is fit to prove something: of a node that owes, if it answers; else of one that does."""
+        check = self._check
+        if check is not None and isinstance(check.error, NoReply):
+            self._silent_checks.add(check.node)
+        for node in (*owing, *self._those_who_answer(now)):
+            if node in self._silent_checks:
+                continue
+            for command in checks_of(node):
+                exchange = command.open(node.address, node.timings)
+                if not unfit(exchange.answers):
+                    self._check = self._dispatcher.check(node, command, now)
+                    return self._check, exchange
+        return None
+
+    def _those_who_answer(self, now: float) -> Iterator[NodeRecord]:
+        nodes = [
+            node
+            for node in self._dispatcher.nodes
+            if node.address != node.profile.broadcast and node.suspended_until <= now
+        ]
+        yield from (node for node in nodes if node.health is UP)
+        yield from (node for node in nodes if node.health is not UP and node.health is not DOWN)
+        yield from (node for node in nodes if node.health is DOWN)
+
+
+def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:
+    """Cheap reads of a node: those that it has answered, then those of its protocol that it has not refused."""
+    yield from node.answered.values()
+    for command in node.profile.checks:
+        if command not in node.refused:
+            yield command
+
+
+def _opened(transaction: Transaction) -> Exchange[Any] | None:
+    """None where its protocol cannot encode it: that is told when its turn has come."""
+    try:
+        return transaction.command.open(transaction.node.address, transaction.node.timings)
+    except Exception:
+        return None

@@ -1,0 +1,224 @@
+"""R15, in step: which replies are owed, and which answers could be theirs.
+
+Replies carry neither an address nor a number. A reply that was never heard may still come, however long the lateness
+is over: a network or a stopped process can hold it. While it is owed, an answer that it could be is not believed.
+
+A *debt* is one such reply: what it would begin with (its key), whose it is, and until when it could be on time. What
+came in place of a whole reply leaves one with the key ANY_BYTE: its tail, a lone byte, could look like an ACK.
+
+A debt is paid
+- by its own reply, heard while nothing was asked or in place of another;
+- by a right answer of the same node to something else: a node answers in the order in which it was asked;
+- once its lateness is over, and where its node has been silent since, by a right answer of any node to something else:
+  a channel keeps the order. It stays for as long as its node could still take: what was held up together is let go
+  together, and the slower node answers last. Then an answer like it is doubted for three times its lateness;
+- by LAPSE seconds.
+
+What nobody owed and yet came, though it looks like a reply, was said twice. Then answers like those heard lately are
+doubted for a while, and neighbours that could be confused are not asked one after the other where there is a choice.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from math import inf
+
+from busmaster.arbiter.health import UP, NodeRecord
+
+ANY_BYTE = b""
+"""The key of a debt that any lone byte could pay."""
+LAPSE = 10.0
+"""Seconds after its request in which a reply is owed: TCP gives up on most paths that stand still for longer."""
+DOUBTED_LATENESSES = 3.0
+"""For how many latenesses an answer like one that was believed to be overtaken is doubted."""
+DOUBT_PERIOD = 30.0
+"""Seconds after something was said twice in which answers like those heard lately are doubted."""
+SAID_MEMORY = 0.5
+"""Seconds for which what was said may be said again."""
+LONGEST_ALIKE = 32
+"""Answers alike, without a pause in which one too many would show, after which an unlike one is asked."""
+MOST_DEBTS = 400
+"""More unheard replies than fit into LAPSE at any window that is in use; the oldest goes."""
+
+
+@dataclass(slots=True)
+class Debt:
+    """A reply that may still come. `node` is None where it cannot be told whose it is."""
+
+    key: bytes
+    node: NodeRecord | None
+    asked: float
+    over: float
+    """From then on, it is later than its node's lateness allows."""
+    silent: bool = False
+    """Its node was asked again, and was silent."""
+    until: float = inf
+    """It is owed until then: a right answer of another node was heard."""
+
+
+class InStep:
+    """What is owed on one line, and how far its answers can be trusted. Times are in seconds, on the caller's clock."""
+
+    __slots__ = ("_doubt_until", "_doubted", "_said", "alert", "alike", "before", "debts", "last")
+
+    def __init__(self) -> None:
+        self.alert = False
+        """There is something to be careful of: nothing else here matters while this is False."""
+        self.debts: list[Debt] = []
+        self.last: Sequence[bytes] = ()
+        """What would answer the exchange that was begun last."""
+        self.before: Sequence[bytes] = ()
+        """What would answer the one before that."""
+        self.alike = 0
+        """Exchanges in a row, before the last, whose answers are like its."""
+        self._doubted: list[tuple[bytes, float]] = []
+        self._said: deque[tuple[Sequence[bytes], float]] = deque(maxlen=256)
+        self._doubt_until = -inf
+
+    # what is owed
+
+    def owe(
+        self, keys: Iterable[bytes], node: NodeRecord | None, asked: float, over: float, silent: bool = False
+    ) -> None:
+        """Replies that begin with these keys were not heard. `silent`: nor was anything else of that node."""
+        if silent:
+            for debt in self.debts:
+                debt.silent = debt.silent or debt.node is node
+        self.debts += [Debt(key, node, asked, over) for key in keys]
+        del self.debts[:-MOST_DEBTS]
+        self.alert = True
+
+    def lapse(self, now: float) -> None:
+        """Forget what has been owed for too long, and stop being careful where nothing is left to be careful of."""
+        gone = [debt for debt in self.debts if debt.until <= now]
+        self._doubted += [(debt.key, debt.until + DOUBTED_LATENESSES * (debt.over - debt.asked)) for debt in gone]
+        self.debts = [debt for debt in self.debts if now < min(debt.until, debt.asked + LAPSE)]
+        self._doubted = [entry for entry in self._doubted if entry[1] > now]
+        self.alert = bool(self.debts or self._doubted or self._doubt_until > now)
+
+    def clashes(self, answers: Sequence[bytes]) -> bool:
+        """Whether an answer that begins with one of these keys could be a reply that is owed."""
+        return any(_could_be(debt, answers) for debt in self.debts)
+
+    def over(self, answers: Sequence[bytes]) -> float:
+        """When all that is owed and could look so is later than its node's lateness allows."""
+        return max((min(debt.over, debt.until) for debt in self.debts if _could_be(debt, answers)), default=-inf)
+
+    def owing(self, answers: Sequence[bytes]) -> Iterator[NodeRecord]:
+        """The nodes that owe what could look so, and have not been silent since."""
+        return (d.node for d in self.debts if d.node is not None and not d.silent and _could_be(d, answers))
+
+    def ends(self, answers: Sequence[bytes]) -> float:
+        """When all of what is owed and could look so is owed no more, by what was heard of others; inf if not known."""
+        return max((debt.until for debt in self.debts if _could_be(debt, answers)), default=-inf)
+
+    def forgive(self, answers: Sequence[bytes]) -> None:
+        """There is no unlike exchange to ask: R3's assumption must do, and doubt."""
+        forgiven = [debt for debt in self.debts if _could_be(debt, answers)]
+        self._doubted += [(debt.key, debt.asked + LAPSE) for debt in forgiven]
+        self.debts = [debt for debt in self.debts if not _could_be(debt, answers)]
+
+    def doubtful_answer(self, answers: Sequence[bytes]) -> None:
+        """An answer came that was the oldest debt of its kind, or the answer: one of the two is still owed."""
+        for place, debt in enumerate(self.debts):
+            if _could_be(debt, answers):
+                del self.debts[place]
+                return
+
+    def answered(self, node: NodeRecord, asked: float, now: float, patience: float) -> None:
+        """A right answer came that could be nobody else's, to what `node` was asked at `asked`.
+
+        `patience` is how long a reply is taken to need, in seconds, of a node whose replies were never timed.
+        """
+        self.debts = [debt for debt in self.debts if debt.node is not node]
+        for debt in self.debts:
+            if debt.over <= asked and debt.until == inf and _is_silent(debt):
+                debt.until = now + (0.0 if debt.node is None else debt.node.latest(patience))
+
+    def heard(self, run: bytes, now: float) -> NodeRecord | None:
+        """Take all that came up to a silence, unasked or in place of a reply. Returns who owed it, if that is known.
+
+        What nobody owed, though it is like the last answers, was said twice. Of what is no lone answer, a part may
+        be still to come: a byte of any kind.
+        """
+        payers: list[Debt] = []
+        rest = run
+        while (debt := self._owed_byte(rest)) is not None:
+            payers.append(debt)
+            self._pay(debt)
+            rest = rest[1:]
+        for debt in [debt for debt in self.debts if len(debt.key) > 1]:
+            place = rest.find(debt.key)
+            if place >= 0:
+                payers.append(debt)
+                self._pay(debt)
+                rest = rest[:place] + rest[place + len(debt.key) :]
+        if payers and not rest:
+            return payers[0].node
+        if not payers and any(until > now and _is(run, key) for key, until in self._doubted):
+            self._doubted = [entry for entry in self._doubted if not _is(run, entry[0])]
+        elif not payers and any(_is(run, key) for key in (*self.last, *self.before)):
+            self._doubt_until = now + DOUBT_PERIOD
+            self.alert = True
+        else:
+            self.owe((ANY_BYTE,), None, now, now)
+        return payers[0].node if payers else None
+
+    def _owed_byte(self, run: bytes) -> Debt | None:
+        """The debt that the first byte pays: one that is alone, or before more of its kind, or before an owed reply."""
+        more = run[1:]
+        if (
+            more
+            and more != run[:1] * len(more)
+            and not any(len(d.key) > 1 and more.startswith(d.key) for d in self.debts)
+        ):
+            return None
+        return next((debt for debt in self.debts if debt.key and debt.key == run[:1]), None)
+
+    def _pay(self, paid: Debt) -> None:
+        """One of several nodes may have paid with the same words: which is not known, so the rest are nobody's."""
+        self.debts.remove(paid)
+        for debt in self.debts:
+            if debt.key == paid.key and debt.node is not paid.node:
+                debt.node = None
+
+    # how far an answer can be trusted
+
+    def said(self, answers: Sequence[bytes], now: float) -> None:
+        """A right answer was delivered; in case it is said again."""
+        if now < self._doubt_until:
+            self._said.append((answers, now))
+
+    def doubts(self, now: float) -> bool:
+        """Something was said twice lately."""
+        return now < self._doubt_until
+
+    def is_doubtful(self, answers: Sequence[bytes], now: float) -> bool:
+        """An answer like this may be one that was overtaken, or one that is said twice."""
+        if any(until > now and key in answers for key, until in self._doubted):
+            return True
+        if now >= self._doubt_until:
+            return False
+        for said, when in reversed(self._said):
+            if now - when > SAID_MEMORY:
+                return False
+            if any(key in answers for key in said):
+                return True
+        return False
+
+
+def _could_be(debt: Debt, answers: Sequence[bytes]) -> bool:
+    """The reply that is owed could be taken for one of these answers."""
+    return debt.key in answers if debt.key else any(len(key) == 1 for key in answers)
+
+
+def _is_silent(debt: Debt) -> bool:
+    """Its node does not answer, as far as is known: another's answer must do. One that does is asked itself."""
+    return debt.silent or debt.node is None or debt.node.health is not UP
+
+
+def _is(run: bytes, key: bytes) -> bool:
+    """These bytes are replies of that key: they begin with it, or are nothing else, where it is one byte."""
+    return run == key * len(run) if len(key) == 1 else bool(key) and run.startswith(key)

@@ -1,0 +1,495 @@
+"""The one place where the state of a line changes.
+
+Theory of operation
+-------------------
+One half-duplex line, many nodes, anonymous replies. The arbiter keeps one exchange on the line at most (R1), and
+between exchanges it makes sure that no byte of an earlier one can still come (R3). It is told the time with every
+call; it sends nothing itself: the owner pumps `poll_transmit`, then `poll_event`, then arms a timer for
+`poll_timeout`. Calls that come early or twice change nothing.
+
+The line is in one of five states; `_line_due` is when the state ends by itself.
+
+=========  =====================  =======================  ==========================  ====================
+state      data received          its deadline             line_up / line_down         submit, poll due
+=========  =====================  =======================  ==========================  ====================
+OFFLINE    counted, dropped       never                    up: SETTLING                fails with LineDown
+READY      stray: SETTLING        never                    down: OFFLINE               EXCHANGE
+HOLDOFF    stray: SETTLING        READY                    down: OFFLINE, all fail     waits
+EXCHANGE   read: stays, or ends   window or gap is over:   down: OFFLINE, all fail     waits
+           in READY, HOLDOFF      failed (SETTLING), next
+           or SETTLING            leg, or done (broadcast)
+SETTLING   stray: silence starts  READY                    down: OFFLINE, all fail     waits (NOISY: fails)
+           again; 1 s of it:
+           NOISY, all fail
+=========  =====================  =======================  ==========================  ====================
+
+READY never lasts while something waits: whatever leads to READY starts the next transaction in the same call.
+An exchange ends in READY or HOLDOFF only when its outcome is certain: a reply that matches, with nothing behind it, or
+a NAK to a write. Everything else settles: until silence and past the lateness (leg.py has the times), or until silence
+alone where the reply is known to have begun.
+
+Time starts when bytes have left. `poll_transmit` hands them over; `transmitted` says when the port had taken them, and
+`unsent`, asked for when a deadline of the line falls due, how many have not left yet: until then, nothing runs out.
+
+What goes next is chosen in choice.py, by what is owed (in_step.py). What becomes of a failed attempt is dispatcher.py's
+business.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+from typing import Any, cast
+
+from busmaster.arbiter.choice import Choice
+from busmaster.arbiter.counters import LineCounters
+from busmaster.arbiter.deadlines import Deadlines
+from busmaster.arbiter.dispatcher import Dispatcher
+from busmaster.arbiter.echo import Echo
+from busmaster.arbiter.events import Event, LineChange, LineChanged, Mark, Strayed
+from busmaster.arbiter.health import DOWN
+from busmaster.arbiter.in_step import InStep
+from busmaster.arbiter.leg import Leg
+from busmaster.arbiter.on_wire import OnWire
+from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
+from busmaster.arbiter.strays import LOOK_SLACK, QUIET, Strays
+from busmaster.arbiter.trust import Trust
+from busmaster.errors import BusError, LineDown, LineNoisy, Refused
+from busmaster.exchange import NO_REPLY, Done, FrameError, ReplyTiming
+
+UNKNOWN_LATENESS = 0.150
+"""Assumed of an earlier master's nodes while none is known."""
+
+
+class LineMachine:
+    """What the line does, and what comes of it. Its commands are the `Arbiter`'s, which is made of it."""
+
+    def __init__(
+        self,
+        byte_time: float,
+        *,
+        now: float = 0.0,
+        echo: bool = False,
+        receive_latency: float = 0.0,
+        capacity: int = 1000,
+        jitter: Callable[[], float] = lambda: 0.5,
+        strict: bool = False,
+    ) -> None:
+        self.state = OFFLINE
+        self.noisy = False
+        self._echo = Echo(echo)
+        self._deadlines = Deadlines()
+        self._counters = LineCounters(now)
+        self.dispatcher = Dispatcher(self._deadlines, self._counters, now, capacity, jitter)
+        self.dispatcher.fault = self._offline
+        self._events = self.dispatcher.events
+        self._cause = "not open yet"
+        self._closed = False
+        # the exchange on the wire
+        self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency, byte_time)
+        self._wire = OnWire(self._leg, self._echo, self._deadlines, self.dispatcher.urgent_waits)
+        self._in_step = InStep()
+        self._choice = Choice(self.dispatcher, self._in_step)
+        self._trust = Trust(self._in_step, strict)
+        # the line
+        self._strays = Strays(self._events, self._counters)
+        self._up_at = -inf
+        self._quarantine = -inf
+        self._silent_at = -inf
+
+    @property
+    def byte_time(self) -> float:
+        """tau: seconds per byte of this line."""
+        return self._leg.byte_time
+
+    @byte_time.setter
+    def byte_time(self, seconds: float) -> None:
+        self._leg.byte_time = seconds
+
+    # inputs
+
+    def line_up(self, now: float, *, paced: bool = False) -> None:
+        """The port is open. What an earlier master asked may still be answered: settle first.
+
+        `paced`: bytes leave at the baud rate, so that an earlier reply cannot be one (R4).
+        """
+        if self.state is not OFFLINE or self._closed:
+            return
+        self._wire.paced = paced
+        self.dispatcher.fault = None
+        self._events.append(LineChanged(LineChange.UP))
+        lateness = max((node.lateness for node in self.dispatcher.nodes), default=UNKNOWN_LATENESS)
+        self._up_at = now
+        self._quarantine = now + lateness + self._leg.latency + self.byte_time
+        self._settle(now)
+
+    def line_down(self, cause: str, now: float) -> None:
+        """The port is gone: everything fails at once (R13)."""
+        if self.state is OFFLINE:
+            return
+        self._counters.losses += 1
+        self._cause = cause
+        self._events.append(LineChanged(LineChange.DOWN, cause))
+        if not self._closed:
+            self.dispatcher.fault = self._offline
+        self._go_offline(now)
+        self.dispatcher.fail_all(now)
+
+    def data_received(self, data: bytes, now: float) -> None:
+        if self._echo.owed:
+            data = self._strip_echo(data, now)
+            if not data:
+                return
+        if self.state is not EXCHANGE:
+            self._stray(data, now)
+        elif self._trust.held is not None:  # two answers where one is due: neither is believed
+            self._disbelieve("two answers came", Done(None, data, self._trust.held.send), now)
+        elif self._leg.begun or (data := self._begin_reply(data, now)):
+            self._strays.last_byte = now
+            self._take(data, now)
+
+    def byte_marked(self, mark: Mark, now: float) -> None:
+        """The UART says that a byte came damaged, or a break: whatever it was, it is nobody's answer."""
+        if mark is Mark.BREAK:
+            self._counters.breaks += 1
+        else:
+            self._counters.damaged += 1
+        self._strays.last_byte = now
+        self._echo.forget()
+        if self.state is EXCHANGE:
+            self._leg.begun = True
+            self._attempt_failed(FrameError(f"{mark.value} in the reply, says the port"), now)
+        else:
+            self._stray(b"\0", now)
+
+    def transmitted(self, now: float) -> None:
+        """The port has taken only now what `poll_transmit` gave: whoever held the process up meanwhile."""
+        said_at = self._wire.output.said_at
+        late = self._wire.output.taken(now)
+        if late:
+            self._deadlines.line += late
+            if self.state is SETTLING:
+                self._silent_at += late
+            transaction = self._wire.transaction
+            if late > LOOK_SLACK and transaction is not None and transaction.started == said_at:
+                transaction.started = now
+
+    def line_due(self, now: float) -> bool:
+        """A deadline of the line falls due: `unsent` is to be told first, where it is known."""
+        return now >= self._deadlines.line
+
+    def unsent(self, count: int, now: float) -> None:
+        """So many of the bytes said have not left: until they have, nothing runs out, nothing else is said and nothing
+        is their answer. Told again, then, before the bytes that come."""
+        again = self._wire.output.unsent(count, now)
+        if again is not None:
+            self._deadlines.line = self._due_anew(now) if again == inf else again
+
+    def _due_anew(self, now: float) -> float:
+        """The deadline of the line, from the end of what has only just left."""
+        if self.state is EXCHANGE:
+            return self._wire.due_anew(now)
+        if self.state is SETTLING:
+            self._settle(now)
+            return self._deadlines.line
+        return now + self._leg.timing.turnaround if self.state is HOLDOFF else inf
+
+    def handle_timeout(self, now: float, *, unread: bool = False) -> None:
+        """`unread`: bytes have come that were not handed over yet, so the silence of the line is not known."""
+        deadlines = self._deadlines
+        if now >= deadlines.schedule:
+            self.dispatcher.release_polls(now)
+        if now >= deadlines.expiry:
+            self.dispatcher.expire(now)
+        if now >= deadlines.health:
+            self._enter(self.state, now)
+            self.dispatcher.probe(now, self.state is READY)
+        if now >= deadlines.line and not unread:
+            if self.state is EXCHANGE:
+                if self._trust.held is None:
+                    self._take(None, now)
+                else:
+                    self._complete(self._trust.held, now)
+            elif self.state is SETTLING and now < self._silent_at:
+                deadlines.line = self._strays.look_before(self._silent_at, now)
+            else:
+                self._free(now)
+        elif self.state is READY:
+            self._advance(now)
+
+    # outputs, pumped in this order
+
+    def poll_transmit(self) -> bytes | None:
+        return self._wire.output.take() or None
+
+    def poll_event(self) -> Event | None:
+        if self.dispatcher.unnoted:
+            self.dispatcher.note_successes()
+        return self._events.popleft() if self._events else None
+
+    def poll_timeout(self) -> float:
+        return self._deadlines.earliest()
+
+    # one exchange
+
+    def _advance(self, now: float) -> bool:
+        """Start the next transaction, right behind our own last byte. False if none waits."""
+        if now < self._quarantine:
+            self._settle(now)
+            return True
+        chosen = self._choice.next(now, now - self._strays.last_byte - self._leg.latency)
+        if chosen is None:
+            return False
+        if type(chosen) is not tuple:
+            self._quarantine = cast("float", chosen)
+            self._settle(now)
+            return True
+        transaction, exchange = chosen
+        self.dispatcher.started(transaction, now)
+        if self.state is not EXCHANGE:
+            self._enter(EXCHANGE, now)
+        self._wire.begin(transaction, exchange, now)
+        if self._strays.watching:
+            self._strays.looked(now, self._deadlines.line)
+        return True
+
+    def _begin_reply(self, data: bytes, now: float) -> bytes:
+        """The first bytes of a leg: returns those that may be its reply."""
+        exchange = self._wire.exchange
+        if now < self._leg.taint_until or self._wire.output.held:
+            self._counters.tainted += 1
+            self._strays.last_byte = now
+            self._attempt_failed(FrameError("bytes came before the request was out", heard=data), now)
+            return b""
+        if exchange is not None and not exchange.answered:
+            self._strays.note(data, now, self._leg.quiet())
+            self._wire.strayed = True
+            return b""
+        kept = self._wire.begin_reply(data, now)
+        self._counters.noise_bytes += len(data) - len(kept)
+        self._strays.last_byte = now
+        return kept
+
+    def _take(self, data: bytes | None, now: float) -> None:
+        """Hand the reader these bytes, or the news (None) that none came in time, and do what it makes of them."""
+        no_reply = data is None and not self._leg.begun
+        try:
+            step = self._wire.read(data, now)
+        except FrameError as error:
+            self._attempt_failed(error, now, no_reply=no_reply)
+        except Refused as refusal:
+            self._refused(refusal, now)
+        except Exception as bug:
+            self._attempt_failed(FrameError(f"a bug in the protocol's reader: {bug!r}"), now, bug=bug)
+        else:
+            if type(step) is Done:
+                self._complete(step, now)
+            elif self._leg.begun:
+                self._deadlines.line = self._leg.gap_over(now)
+
+    def _complete(self, step: Done[Any], now: float) -> None:
+        """A value: the line is free when the closing ACK has left and the node has let go of the line."""
+        transaction, exchange = self._wire.transaction, self._wire.exchange
+        assert transaction is not None
+        assert exchange is not None
+        answered, leg = exchange.answered, self._leg
+        if answered:
+            leg.answered()
+            if self._in_step.alert or step.rest:
+                verdict = self._trust.weigh(self._wire, step, now)
+                if isinstance(verdict, str):
+                    self._disbelieve(verdict, step, now)
+                    return
+                if verdict is not None:
+                    self._deadlines.line = verdict
+                    return
+            transaction.node.note_reply(exchange.answers, transaction.command, leg.begun_at - leg.end)
+        if step.send:
+            self._wire.say(step.send, now)
+        self._end_exchange()
+        self.dispatcher.succeeded(transaction, step.value, now)
+        if step.rest:
+            self._strays.note(step.rest, now, self._leg.quiet())
+        if step.rest or self._wire.strayed or (self._echo.owed and not answered):
+            self._settle(now)
+            return
+        self._strays.answered()
+        self._release(self._leg.timing.turnaround if answered else 0.0, now)
+
+    def _disbelieve(self, what: str, step: Done[Any], now: float) -> None:
+        self._counters.doubted += 1
+        if step.rest:
+            self._strays.note(step.rest, now, self._leg.quiet())
+        self._attempt_failed(FrameError(what, send=step.send), now, doubted=True)
+
+    def _attempt_failed(
+        self,
+        error: FrameError,
+        now: float,
+        no_reply: bool = False,
+        doubted: bool = False,
+        bug: Exception | None = None,
+    ) -> None:
+        transaction, leg, strays = self._wire.transaction, self._leg, self._strays
+        assert transaction is not None
+        what = error.what
+        if no_reply:
+            strays.unanswered(transaction.node, leg.end, leg.timing.lateness)
+            if what == NO_REPLY:
+                what = f"no reply within {leg.timing.window * 1000:g} ms"
+            if self._echo.owed:
+                what += ", and no echo of the request: if the adapter has none, leave echo out"
+        elif error.heard:
+            strays.blame(now)
+            strays.run[:] = error.heard
+        spared = error.whole and not self._in_step.debts
+        self._trust.owe(self._wire, heard=not no_reply, whole=error.whole)
+        if error.send:
+            self._wire.say(error.send, now)
+        self._end_exchange(failed=True)
+        if bug is None:
+            self.dispatcher.attempt_failed(transaction, no_reply, what, now, doubted)
+        else:
+            self.dispatcher.broken(transaction, bug, now)
+        self._settle(now, begun=spared)
+
+    def _refused(self, refusal: Refused, now: float) -> None:
+        """A NAK to a write is certain; a NAK to a read may be noise before the true reply (R7).
+
+        While something is owed, no refusal is certain: it may be an earlier request's (R15).
+        """
+        transaction = self._wire.transaction
+        assert transaction is not None
+        certain = not self._in_step.debts
+        if not certain:
+            self._trust.owe(self._wire, heard=False)
+        confirmed = transaction.refusals > 0
+        transaction.last_byte = now
+        self._end_exchange()
+        self.dispatcher.refused(transaction, refusal, certain, now)
+        if transaction.writes and certain:
+            self._release(self._leg.timing.turnaround, now)
+        else:
+            self._settle(now, begun=confirmed and certain)
+
+    def _end_exchange(self, failed: bool = False) -> None:
+        self._wire.end(failed)
+        self._trust.held = None
+        self._counters.exchanges += 1
+
+    # the line between exchanges
+
+    def _release(self, hold: float, now: float) -> None:
+        """The outcome was certain: the next request may follow `hold` seconds behind our own last byte."""
+        if self._closed:
+            self._go_offline(now)
+        elif hold or not self._advance(now):
+            free = max(now, self._leg.out) + hold
+            held = free > now
+            self._enter(HOLDOFF if held else READY, now)
+            self._deadlines.line = free if held else inf
+
+    def _settle(self, now: float, begun: bool = False) -> None:
+        """Discard until it has been silent long enough, and nothing can come any more (R3).
+
+        `begun`: the reply to the last request is known to have begun, so that silence is enough.
+        """
+        if self._closed:
+            self._go_offline(now)
+            return
+        if self.state is not SETTLING:
+            self._counters.settles += 1
+            self._enter(SETTLING, now)
+        self._echo.forget()
+        silent = max(self._strays.last_byte + self._leg.quiet(), self._quarantine, now)
+        self._silent_at = silent if begun else max(silent, self._leg.past())
+        self._deadlines.line = self._strays.look_before(self._silent_at, now)
+
+    def _free(self, now: float) -> None:
+        """A holdoff or a settle is over."""
+        if self.state is SETTLING:
+            self._leg.settled()
+            self._hear_out(self._strays.silent(), now)
+            if self._answer_stray(self._strays.reply_to_silence(), now):
+                return
+            if self.noisy:
+                self.noisy = False
+                self.dispatcher.fault = None
+                self._events.append(LineChanged(LineChange.QUIET))
+        self._enter(READY, now)
+        self._deadlines.line = self._strays.look_before(inf, now)
+        self._advance(now)
+
+    def _stray(self, data: bytes, now: float) -> None:
+        """Bytes that nobody asked for."""
+        strays = self._strays
+        strays.note(data, now, self._leg.quiet())
+        self._leg.strayed(now)
+        if self.state is OFFLINE:
+            return
+        self._settle(now)
+        if not self.noisy:
+            self._answer_stray(strays.reply_to(data), now)
+        if strays.babbling(now) and not self.noisy:
+            self.noisy = True
+            self._counters.noisy += 1
+            self._events.append(LineChanged(LineChange.NOISY))
+            self.dispatcher.fault = lambda: LineNoisy("the line has not been silent for a second")
+            self.dispatcher.fail_all(now)
+
+    def _hear_out(self, run: bytes, now: float) -> None:
+        """The line is silent, and this came before: whoever said it, and owed it, is alive (R11, R15)."""
+        node = self._in_step.heard(run, now) if run else None
+        if node is not None and node.health is DOWN:
+            self.dispatcher.probes.alive(node, now)
+
+    def _answer_stray(self, send: bytes, now: float) -> bool:
+        """True if an answer was owed: then the line settles again."""
+        if send:
+            self._wire.say(send, now)
+            self._settle(now)
+        return bool(send)
+
+    def _strip_echo(self, data: bytes, now: float) -> bytes:
+        """Take the echo of what was sent off the front, byte for byte; a mismatch is a collision."""
+        rest = self._echo.strip(data)
+        if rest is None:
+            self._counters.collisions += 1
+            self._events.append(Strayed(data, collision=True))
+            self._strays.last_byte = now
+            if self.state is EXCHANGE:
+                what = "the echo differs from what was sent: a collision, or an adapter without echo"
+                self._attempt_failed(FrameError(what), now)
+            else:
+                self._settle(now)
+            return b""
+        if not self._echo.owed and self.state is EXCHANGE and not self._leg.begun:
+            due = self._leg.echoed(now)
+            answered = self._wire.exchange is not None and self._wire.exchange.answered
+            self._deadlines.line = due if answered else now + self._leg.timing.turnaround
+        return rest
+
+    def _go_offline(self, now: float) -> None:
+        """Whatever is on the wire is cut off."""
+        transaction = self._wire.transaction
+        self._enter(OFFLINE, now)
+        self.noisy = False
+        self._deadlines.line = inf
+        if transaction is not None:
+            self._wire.output.discard()
+        self._echo.forget()
+        self._strays.answered()
+        self._strays.silent()
+        if transaction is not None:
+            self._trust.owe(self._wire, heard=True)
+            self._end_exchange(failed=True)
+            self.dispatcher.cut_off(transaction, self._offline(), now)
+
+    def _enter(self, state: LineState, now: float) -> None:
+        spent = self._counters.spend(self.state, now)
+        if self.state is READY:
+            self.dispatcher.probes.budget.idle(spent, over=state is not READY)
+        self.state = state
+
+    def _offline(self) -> BusError:
+        return LineDown(f"the line is down: {self._cause}")

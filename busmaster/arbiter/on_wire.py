@@ -1,0 +1,110 @@
+"""The exchange on the wire: its legs, its reader, and what it leaves owed. The line's states are line_machine.py's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+from typing import Any, cast
+
+from busmaster.arbiter.deadlines import Deadlines
+from busmaster.arbiter.echo import Echo
+from busmaster.arbiter.leg import Leg
+from busmaster.arbiter.output import Output
+from busmaster.arbiter.transaction import Transaction
+from busmaster.exchange import Abandonable, Exchange, Expect, ReplyTiming, Step
+
+
+class OnWire:
+    """Of one line. `transaction` and `exchange` are None while nothing is asked; `leg` and `output` outlive them."""
+
+    __slots__ = ("_deadlines", "_echo", "_urgent_waits", "exchange", "leg", "output", "paced", "strayed", "transaction")
+
+    def __init__(self, leg: Leg, echo: Echo, deadlines: Deadlines, urgent_waits: Callable[[], bool]) -> None:
+        self.transaction: Transaction | None = None
+        self.exchange: Exchange[Any] | None = None
+        self.leg = leg
+        self.output = Output(leg, echo)
+        self.paced = False
+        """Bytes leave at the baud rate (R4)."""
+        self.strayed = False
+        """Bytes came though no answer was due (a broadcast's)."""
+        self._echo = echo
+        self._deadlines = deadlines
+        self._urgent_waits = urgent_waits
+
+    def begin(self, transaction: Transaction, exchange: Exchange[Any], now: float) -> None:
+        """Say its request, and set the deadline of its first leg."""
+        self.transaction = transaction
+        self.exchange = exchange
+        self.strayed = False
+        self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, now)
+        if not exchange.answered:
+            self._deadlines.line = self.leg.end + exchange.timing.turnaround
+
+    def begin_reply(self, data: bytes, now: float) -> bytes:
+        """Note that its reply begins with these bytes; returns them, without the noise that the profile tolerates."""
+        transaction, exchange, leg = self.transaction, self.exchange, self.leg
+        assert transaction is not None
+        assert exchange is not None
+        if transaction.node.profile.noise_tolerant:
+            data = data.lstrip(bytes(set(data) - set(exchange.starts)))
+            if not data:
+                return data
+        leg.begun = True
+        leg.begun_at = now
+        if transaction.first_byte == -inf:
+            transaction.first_byte = now
+        if now > leg.late_after:
+            transaction.late = True
+        return data
+
+    def read(self, data: bytes | None, now: float) -> Step[Any]:
+        """Hand the reader these bytes, or the news (None) that none came in time; go from leg to leg as it says.
+
+        Raises what the reader raises.
+        """
+        exchange = self.exchange
+        assert exchange is not None
+        step = exchange.expired(self.leg.begun) if data is None else exchange.feed(data)
+        while type(step) is Expect:
+            self._next_leg(step, now)
+            step = exchange.feed(b"")
+        return step
+
+    def say(self, send: bytes, now: float) -> None:
+        """Say what closes an exchange, or answers a stray packet."""
+        self.output.add(send, now)
+        self.leg.say(len(send), now)
+
+    def end(self, failed: bool) -> None:
+        """Nothing is asked any more; after a failure its node may go on by itself."""
+        if failed and self.exchange is not None:
+            self.leg.give_up(self.exchange.later)
+        self.transaction = None
+        self.exchange = None
+
+    def due_anew(self, now: float) -> float:
+        """The deadline of the leg, where what was said has left only now."""
+        leg, exchange = self.leg, self.exchange
+        if leg.begun:
+            return leg.gap_over(now)
+        answered = exchange is not None and exchange.answered
+        return now + (leg.timing.window + leg.latency if answered else leg.timing.turnaround)
+
+    def _begin_leg(self, timing: ReplyTiming, longest: int, send: bytes, now: float) -> None:
+        """Say `send`; its reply must begin within the window, and end within the bound of R2."""
+        said = len(send)
+        self._deadlines.line = self.leg.begin(timing, said, longest, now)
+        if send:
+            self.output.add(send, now)
+            if self.paced and not self._echo.declared:
+                self.leg.taint(said, now)
+
+    def _next_leg(self, step: Expect, now: float) -> None:
+        """Raises FrameError instead, where a repeat would hold the line past its limit or an urgent command (R9)."""
+        transaction = self.transaction
+        assert transaction is not None
+        limit = transaction.node.profile.exchange_limit
+        if step.send and limit is not None and (now - transaction.started > limit or self._urgent_waits()):
+            raise cast("Abandonable", self.exchange).abandon()
+        self._begin_leg(step.timing, step.sizes.longest, step.send, now)

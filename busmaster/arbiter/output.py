@@ -1,0 +1,62 @@
+"""What the host says: gathered until the port takes it, and when it has left."""
+
+from __future__ import annotations
+
+from math import inf
+
+from busmaster.arbiter.echo import Echo
+from busmaster.arbiter.leg import Leg
+
+HELD_LOOK = 0.002
+"""Seconds after which a port that holds what was said is asked again."""
+
+
+class Output:
+    """The bytes to be sent on one line, and the times of its leg that follow from when they leave."""
+
+    __slots__ = ("_bytes", "_echo", "_leg", "held", "said_at")
+
+    def __init__(self, leg: Leg, echo: Echo) -> None:
+        self._bytes = b""
+        self._leg = leg
+        self._echo = echo
+        self.held = False
+        """The port had not sent all of it when it was asked last."""
+        self.said_at = -inf
+        """The time from which the leg of what was said last is reckoned."""
+
+    def add(self, data: bytes, now: float) -> None:
+        """Say this next."""
+        self._bytes += data
+        self.said_at = now
+        self._echo.sent(data)
+
+    def take(self) -> bytes:
+        """Hand over what is to be sent."""
+        data, self._bytes = self._bytes, b""
+        return data
+
+    def discard(self) -> None:
+        """What has not been handed over is not said, and what the port holds goes with it."""
+        self._bytes = b""
+        self.held = False
+
+    def taken(self, now: float) -> float:
+        """The port has it only now: its leg begins so many seconds later."""
+        late = now - self.said_at
+        if late <= 0:
+            return 0.0
+        self.said_at = now
+        self._leg.shift(late)
+        return late
+
+    def unsent(self, count: int, now: float) -> float | None:
+        """So many bytes have not left. Returns when to ask again; None if all have, inf if they have just left."""
+        if count:
+            self.held = True
+            return now + max(count * self._leg.byte_time, HELD_LOOK)
+        if not self.held:
+            return None
+        self.held = False
+        self._leg.shift(max(0.0, now - self._leg.out))
+        return inf

@@ -1,0 +1,56 @@
+"""Whether an answer is believed, and what an attempt that ends leaves owed (R15)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from busmaster.arbiter.in_step import ANY_BYTE, InStep
+from busmaster.arbiter.on_wire import OnWire
+from busmaster.exchange import Done
+
+
+class Trust:
+    """Of one line. `strict`: a doubtful answer is held until another could have come, not delivered at once."""
+
+    __slots__ = ("_in_step", "_strict", "held")
+
+    def __init__(self, in_step: InStep, strict: bool) -> None:
+        self._in_step = in_step
+        self._strict = strict
+        self.held: Done[Any] | None = None
+        """An answer that is delivered only if no other comes meanwhile."""
+
+    def weigh(self, wire: OnWire, step: Done[Any], now: float) -> str | float | None:
+        """Weigh an answer: None if it is believed, else why not; or until when it is `held`."""
+        transaction, exchange, leg = wire.transaction, wire.exchange, wire.leg
+        assert transaction is not None
+        assert exchange is not None
+        in_step, answers = self._in_step, exchange.answers
+        held, self.held = self.held is not None, None
+        if any(step.rest.startswith(key) for key in answers):
+            return "two answers came"
+        if in_step.clashes(answers):
+            in_step.doubtful_answer(answers)
+            return "its answer may be an earlier request's, whose own never came"
+        if in_step.is_doubtful(answers, now) and not held:
+            latest = leg.end + transaction.node.latest(leg.timing.nominal) + leg.latency
+            if step.rest or leg.begun_at > latest:
+                return "its answer may be another's, said late or twice"
+            if self._strict or in_step.doubts(now):
+                self.held = step
+                return max(now, latest) + 2 * leg.byte_time
+        in_step.answered(transaction.node, transaction.started, now, leg.timing.nominal)
+        in_step.said(answers, now)
+        return None
+
+    def owe(self, wire: OnWire, *, heard: bool, whole: bool = False) -> None:
+        """An attempt ends: its reply may still come. What was `heard` was not it, and may have been a part of it; a
+        `whole` one lacks nothing but what noise may have pushed out at its end."""
+        exchange, transaction = wire.exchange, wire.transaction
+        assert transaction is not None
+        assert exchange is not None
+        keys = () if whole else tuple(exchange.owed)
+        if heard:
+            keys += (ANY_BYTE,)
+        if exchange.answered:
+            self._in_step.owe(keys, transaction.node, wire.leg.end, wire.leg.past(), not heard)

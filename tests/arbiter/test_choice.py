@@ -1,0 +1,289 @@
+"""What goes next while something is owed, and when too much was alike (R15, R7, R9)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from busmaster.arbiter.health import Health
+from busmaster.arbiter.in_step import LONGEST_ALIKE
+from busmaster.arbiter.transaction import Priority
+from busmaster.errors import WriteUnconfirmed
+from busmaster.protocols.hcp2 import codec as hcp2
+from tests.arbiter.bench import ACK, NAK, TAU, WRITE_5, Bench, lost, reply_of, request_of, up
+
+REQUEST = 8 * TAU
+URGENT, COMMAND, POLL, BACKGROUND = Priority
+WRITE_0 = "07 30 31 02 30 31 30 03 31"
+WRITE_5_OF_2 = "07 30 32 02 30 31 35 03 37"
+
+
+def write(value: int = 5, *, idempotent: bool = False) -> hcp2.Write:
+    return hcp2.Write(1, (value,), idempotent=idempotent)
+
+
+def checks(bench: Bench) -> int:
+    return bench.arbiter.statistics(bench.now).checks
+
+
+# the order of what waits
+
+
+def test_r15_a_read_never_overtakes_a_write_to_its_node() -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, other, write(5))
+    bench.hear("FF")
+    asked = bench.ask(node, write(5))
+    behind, beside = bench.ask(node, hcp2.Read(3)), bench.ask(other, hcp2.Read(4))
+    bench.until_sent()
+    assert bench.answer() == request_of(4, 2)
+    assert bench.answer() == WRITE_5
+    assert bench.answer() == request_of(3)
+    assert (asked.error, beside.value, behind.value) == (None, 5.0, 5.0)
+
+
+def test_r15_a_write_overtakes_nothing_that_is_for_its_node() -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, other)
+    bench.hear("FF")
+    read, asked = bench.ask(node), bench.ask(node, write(5))
+    bench.ask(other, hcp2.Read(4))
+    bench.until_sent()
+    assert bench.answer() == request_of(4, 2)
+    assert bench.answer() == request_of(1)
+    assert bench.answer() == WRITE_5
+    assert (read.value, asked.error) == (5.0, None)
+
+
+def test_r15_a_lower_class_never_goes_first() -> None:
+    """A check does, for it is quick and sure; what waits behind its class is neither."""
+    bench = Bench()
+    node = up(bench)
+    lost(bench, node)
+    bench.hear("FF")
+    bench.ask(node)
+    bench.ask(node, hcp2.Read(3), priority=POLL)
+    bench.until_sent()
+    assert [bench.answer() for _ in range(3)] == [request_of(2), request_of(1), request_of(3)]
+
+
+def test_r12_what_has_waited_too_long_is_not_picked_either() -> None:
+    bench = Bench()
+    node = up(bench)
+    lost(bench, node)
+    bench.hear("FF")
+    bench.ask(node)
+    late = bench.ask(node, hcp2.Read(3), start_by=bench.now + 0.010)
+    bench.until_sent()
+    assert bench.answer() == request_of(2)
+    assert late.attempts == 0
+
+
+# checks
+
+
+def test_r15_a_check_asks_a_node_that_answers_and_what_it_has_answered() -> None:
+    bench = Bench()
+    node, other = bench.node(1), up(bench, 2)
+    bench.served(bench.ask(other, hcp2.Read(200)))
+    lost(bench, node)
+    bench.ask(node)
+    assert bench.sent() == request_of(200, 2)
+
+
+def test_r15_a_check_is_not_asked_of_a_node_that_is_suspended() -> None:
+    bench = Bench()
+    node, other = bench.node(1), up(bench, 2)
+    lost(bench, node)
+    bench.arbiter.dispatcher.suspend(other, bench.now + 10.0)
+    bench.ask(node)
+    assert bench.sent() == request_of(2, 1)
+
+
+def test_r15_a_check_that_is_refused_is_an_answer_and_another_is_asked_from_then_on() -> None:
+    bench = Bench()
+    node = up(bench)
+    lost(bench, node, write(5))
+    node.answered.clear()
+    first = bench.ask(node, write(0))
+    assert bench.sent() == request_of(1)
+    bench.hear(NAK, after=0.002)
+    bench.served(first)
+    assert node.health is not Health.DOWN
+    bench.wait(11.0)
+    node.answered.clear()
+    lost(bench, node, write(5))
+    bench.ask(node, write(0))
+    assert bench.sent() == request_of(2)
+
+
+def test_r15_nobody_waits_for_a_check_and_nothing_counts_it() -> None:
+    bench = Bench()
+    node = up(bench)
+    lost(bench, node)
+    bench.events.clear()
+    read = bench.ask(node)
+    counted = (node.counters.failed, node.counters.unheard)
+    assert bench.answer() == request_of(2)
+    bench.answer()
+    assert [bench.ended(read), len(bench.events)] == [1, 1]
+    assert (node.counters.failed, node.counters.unheard) == counted
+    assert bench.arbiter.statistics(bench.now).waits[BACKGROUND].count == 0
+
+
+def test_r15_where_nothing_can_be_asked_that_is_unlike_the_line_settles_and_goes_on() -> None:
+    bench = Bench()
+    node = bench.node(profile=replace(hcp2.PROFILE, checks=()))
+    lost(bench, node)
+    read = bench.ask(node, retries=0)
+    if not bench.asked:
+        bench.until_sent()
+    assert bench.sent() == request_of(1)
+    bench.answer(7)
+    assert read.value == 7.0
+
+
+def test_r15_probes_that_can_only_ask_one_thing_find_a_node_that_is_back() -> None:
+    bench = Bench()
+    node = bench.node(profile=replace(hcp2.PROFILE, checks=()))
+    lost(bench, node)
+    for _ in range(4):
+        bench.until_sent()
+        assert bench.sent() == request_of(1)
+        bench.wait(0.2)
+    bench.until_sent()
+    bench.answer()
+    assert node.health is Health.UP
+
+
+# urgent writes
+
+
+def test_r15_an_urgent_write_is_sent_at_once_and_repeated_behind_a_check_where_it_may_be() -> None:
+    """`disable()` right after an unanswered write: the ACK may be that write's."""
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, other, write(5))
+    disable = bench.ask(node, write(0, idempotent=True), priority=URGENT, retries=2)
+    assert bench.sent() == WRITE_0
+    bench.hear(ACK, after=REQUEST + 0.004)
+    assert not bench.ended(disable)
+    bench.until_sent()
+    assert bench.answer() in (request_of(1), request_of(2)), "a check"
+    bench.until_sent()
+    while (sent := bench.answer()) != WRITE_0:
+        assert sent
+        bench.until_sent()
+    assert (bench.ended(disable), disable.error) == (1, None)
+
+
+def test_r15_an_urgent_write_that_may_not_be_repeated_is_unconfirmed_after_an_ack_that_could_be_anothers() -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, other, write(5))
+    disable = bench.ask(node, write(0), priority=URGENT)
+    assert bench.sent() == WRITE_0
+    bench.hear(ACK, after=REQUEST + 0.004)
+    assert isinstance(disable.error, WriteUnconfirmed)
+    assert disable.attempts == 1
+
+
+def test_r15_an_urgent_write_is_sent_as_soon_as_the_line_has_settled() -> None:
+    bench = Bench()
+    node = up(bench)
+    bench.ask(node, write(5))
+    bench.sent()
+    bench.ask(node, write(0, idempotent=True), priority=URGENT)
+    assert bench.until_sent() == pytest.approx(9 * TAU + 0.150 + TAU)
+    assert bench.sent() == WRITE_0
+
+
+def test_r15_an_ack_that_is_late_confirms_no_urgent_write_however_often_it_is_asked() -> None:
+    """One ACK was lost; whatever is said of it, one write more is ACKed than was believed."""
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, other, write(5))
+    stop = bench.ask(node, write(0), priority=URGENT)
+    bench.sent()
+    bench.hear(ACK, after=0.001)
+    again = bench.ask(node, write(0), priority=URGENT)
+    bench.until_sent()
+    assert bench.sent() == WRITE_0
+    bench.hear(ACK, after=0.001)
+    assert isinstance(stop.error, WriteUnconfirmed)
+    assert isinstance(again.error, WriteUnconfirmed)
+
+
+# one answer like another
+
+
+def saturated(bench: Bench, count: int, *, pause: float = 0.0) -> list[str]:
+    """What goes out while that many equal reads are answered."""
+    node = up(bench)
+    wanted = [bench.ask(node) for _ in range(2)]
+    sent = []
+    while len(wanted) < count:
+        sent.append(bench.answer())
+        if pause:
+            bench.until_ready()
+            bench.wait(pause)
+        wanted.append(bench.ask(node))
+    return sent
+
+
+def test_r15_after_32_answers_alike_without_a_pause_an_unlike_one_is_asked() -> None:
+    """One doubled reply would leave every later value wrong, with nothing owed and no stray byte to be seen."""
+    sent = saturated(Bench(), 4 * LONGEST_ALIKE)
+    unlike = [place for place, request in enumerate(sent) if request != request_of(1)]
+    assert unlike
+    assert unlike[0] <= LONGEST_ALIKE
+    assert {later - earlier for earlier, later in pairwise(unlike)} == {LONGEST_ALIKE + 1}
+
+
+def test_r15_a_pause_longer_than_the_window_needs_no_check() -> None:
+    """In it one reply too many would have shown."""
+    bench = Bench()
+    node = up(bench)
+    for _ in range(3 * LONGEST_ALIKE):
+        bench.wait(0.110)
+        bench.ask(node)
+        assert bench.answer() == request_of(1)
+    assert checks(bench) == 0
+
+
+def test_r15_pauses_shorter_than_the_window_are_no_proof() -> None:
+    bench = Bench()
+    node = up(bench)
+    for _ in range(LONGEST_ALIKE + 2):
+        bench.wait(0.080)
+        read = bench.ask(node)
+        bench.served(read)
+    assert checks(bench) == 1
+
+
+def test_r15_after_one_doubled_reply_among_equal_reads_at_most_32_values_are_another_requests() -> None:
+    """Every reply comes at once; the first is said twice, so that each later one answers the request before its own."""
+    bench = Bench()
+    node = up(bench)
+    waiting = [bench.ask(node) for _ in range(3)]
+    on_the_way = [reply_of(1, 0)]
+    values: list[tuple[float, int]] = []
+    count = 0
+    while count < 200:
+        if request := bench.sent():
+            count += 1
+            on_the_way.append(reply_of(int(bytes.fromhex(request)[4:6], 16), count))
+            waiting.append(bench.ask(node))
+        if on_the_way:
+            bench.hear(on_the_way.pop(0), after=0.004)
+        else:
+            bench.to(bench.arbiter.poll_timeout())
+        values += [(read.value, count) for read in waiting if bench.ended(read) and read.value is not None]
+        waiting = [read for read in waiting if not bench.ended(read)]
+    wrong = [pair for pair in values if pair[0] != pair[1]]
+    assert 0 < len(wrong) <= LONGEST_ALIKE
+    assert len(values) > 120

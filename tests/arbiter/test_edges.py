@@ -1,0 +1,313 @@
+"""When the last byte of what was said can have been received: R3's edges, each row of the table in leg.py."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from busmaster.arbiter.state import LineState
+from busmaster.errors import NoReply
+from busmaster.exchange import ReplyTiming, Timings
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
+from tests.arbiter.bench import ACK, FIVE, LATENESS, QUIET, SEVEN, TAU, WRITE_5, Bench, up
+
+REQUEST = 8 * TAU
+JUST = 1e-6
+READ_2008 = "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74"
+REPLY_1234 = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"
+MSC_TAU = 10 / 9600
+MSC_REQUEST = 16 * MSC_TAU
+
+
+# a request, one leg
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.016])
+@pytest.mark.parametrize("inside", [0.0001, 0.001])
+def test_r3_a_start_bit_within_the_lateness_is_heard_a_byte_time_later_and_is_nobody_elses(
+    inside: float, latency: float
+) -> None:
+    bench = Bench(latency=latency)
+    node = up(bench)
+    first, second = bench.ask(node, retries=0), bench.ask(node, hcp2.Read(1), retries=0)
+    bench.sent()
+    bench.hear(FIVE, after=REQUEST + 0.150 - inside + TAU + latency)
+    assert isinstance(first.error, NoReply)
+    assert bench.sent() == "", "it is on its way until then"
+    bench.until_sent()
+    bench.hear(SEVEN, after=0.004)
+    assert second.value == 7.0
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.016])
+def test_r3_a_line_that_stays_silent_is_free_one_byte_time_past_lateness_and_latency(latency: float) -> None:
+    bench = Bench(latency=latency)
+    bench.ask(bench.node())
+    bench.sent()
+    assert bench.until_sent() == pytest.approx(REQUEST + 0.150 + latency + TAU)
+
+
+def test_r3_on_a_slow_line_a_byte_time_is_two_milliseconds() -> None:
+    """Mentor II at 4800 baud, where a reply one millisecond within its lateness was given to the next request."""
+    bench = Bench()
+    bench.arbiter.byte_time = tau = 10 / 4800
+    drive = bench.node(12, mentor.PROFILE)
+    bench.wait(1.0)
+    first, second = (bench.ask(drive, mentor.Read(1, 17), retries=0) for _ in range(2))
+    said = len(bytes.fromhex(bench.sent())) * tau
+    reply = "02 30 31 31 37 2D 30 34 37 36 03"
+    reply = f"{reply} {checksum(reply):02X}"
+    bench.hear(reply, after=said + 0.300 - 0.001 + tau)
+    assert isinstance(first.error, NoReply)
+    assert second.attempts == 0
+    bench.until_ready()
+    assert second.value is None
+
+
+def checksum(telegram: str) -> int:
+    """Mentor II: of all behind STX; below 20 hex one more 20."""
+    check = 0
+    for byte in bytes.fromhex(telegram)[1:]:
+        check ^= byte
+    return check + 0x20 if check < 0x20 else check
+
+
+# the silence
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.016])
+def test_r3_a_pause_within_a_frame_is_no_silence_however_long_an_adapter_holds_bytes(latency: float) -> None:
+    """Its last byte, 06, would confirm another node's write."""
+    bench = Bench(latency=latency)
+    node, other = up(bench), up(bench, 2)
+    bench.ask(other, retries=0)
+    write = bench.ask(node, hcp2.Write(1, (5,)))
+    bench.sent()
+    bench.hear("02 30 31 31 35", after=REQUEST + 0.149 + latency)
+    bench.hear("03", after=0.020 + latency + TAU - JUST)
+    assert bench.sent() == ""
+    bench.hear("06", after=0.020 + latency + TAU - JUST)
+    assert bench.sent() == ""
+    assert write.attempts == 0
+    assert bench.until_sent() == pytest.approx(0.020 + latency + TAU)
+
+
+def test_r3_the_silence_is_at_least_twenty_milliseconds_and_the_byte_gap_if_that_is_longer() -> None:
+    for gap, silence in ((0.005, 0.020), (0.050, 0.050)):
+        bench = Bench()
+        timing = ReplyTiming(0.05, 0.1, 0.1, gap)
+        bench.ask(bench.node(timings=Timings.uniform(timing)), hcp2.Read(1), retries=0)
+        bench.hear("02 30", after=REQUEST + 0.099)
+        last = bench.now
+        bench.until_ready()
+        assert bench.now - last == pytest.approx(silence + TAU)
+
+
+def test_r2_a_byte_gap_bounds_the_pause_to_the_next_start_bit_which_is_heard_a_byte_time_later() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node())
+    bench.hear("02 30 31", after=REQUEST + 0.003)
+    bench.hear("35 03 37", after=0.020 + TAU - JUST)
+    assert read.value == 5.0
+
+
+# the exemption of a whole frame
+
+
+@pytest.mark.parametrize("pause", [TAU, 0.004, 0.020])
+def test_r3_noise_before_a_checksum_makes_no_frame_whole_enough_to_release_the_line(pause: float) -> None:
+    """`02 30 31 31 35 03 06` with 41 before its last byte: that byte would confirm another node's write."""
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    bench.ask(other, retries=0)
+    write = bench.ask(node, hcp2.Write(1, (5,)))
+    bench.sent()
+    bench.hear("02 30 31 31 35 03 41", after=REQUEST + 0.003)
+    assert bench.sent() == ""
+    bench.hear("06", after=pause)
+    assert bench.sent() == ""
+    assert write.attempts == 0
+    bench.until_sent()
+    while bench.sent() != WRITE_5:
+        bench.answer()
+        bench.until_sent()
+    bench.hear(ACK, after=0.004)
+    assert (bench.ended(write), write.error) == (1, None)
+
+
+def test_r3_a_whole_frame_with_a_bad_checksum_is_spared_the_lateness() -> None:
+    bench = Bench()
+    bench.ask(up(bench))
+    bench.sent()
+    bench.hear("02 30 31 31 35 03 41", after=REQUEST + 0.003)
+    assert bench.until_sent() == pytest.approx(QUIET)
+
+
+def test_r15_while_something_is_owed_no_frame_is_spared_the_lateness() -> None:
+    """It may be the owed one, and its own still to come."""
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    bench.ask(other, retries=0)
+    bench.sent()
+    bench.until_ready()
+    bench.ask(node, hcp2.Read(3))
+    bench.sent()
+    bench.hear("02 30 33 31 35 03 41", after=REQUEST + 0.003)
+    assert bench.until_sent() == pytest.approx(LATENESS - 0.003)
+
+
+# noise on an unpaced port
+
+
+def test_r3_noise_before_a_request_is_out_does_not_bring_its_lateness_forward() -> None:
+    bench = Bench()
+    bench.ask(bench.node())
+    bench.sent()
+    bench.hear("FF")
+    assert bench.until_sent() == pytest.approx(REQUEST + LATENESS)
+
+
+# MSC: an ACK, then a packet, then the host's ACK
+
+
+def msc_line(packet: float = 1.0) -> tuple[Bench, Timings]:
+    """A line at 9600 baud, and timings with that lateness of packets."""
+    bench = Bench()
+    bench.arbiter.byte_time = MSC_TAU
+    timings = msc.PROFILE.timings
+    return bench, replace(timings, packet=replace(timings.packet, lateness=packet))
+
+
+@pytest.mark.parametrize("packet", [1.0, 1.5])
+def test_r3_behind_an_ack_the_packets_lateness_counts_from_that_acks_end(packet: float) -> None:
+    bench, timings = msc_line(packet)
+    node = bench.node(1, msc.PROFILE, timings)
+    bench.wait(2.0)
+    bench.ask(node, msc.DataRead(2008))
+    bench.sent()
+    bench.hear(ACK, after=MSC_REQUEST + 0.4)
+    acked = bench.now
+    bench.until_sent()
+    assert bench.sent() == ACK, "whatever comes now is acknowledged already"
+    bench.until_sent()
+    assert bench.now - acked == pytest.approx(packet + MSC_TAU)
+
+
+@pytest.mark.parametrize("packet", [1.0, 1.5])
+def test_r3_where_the_ack_was_lost_its_packet_is_waited_for_from_the_requests_end(packet: float) -> None:
+    bench, timings = msc_line(packet)
+    node = bench.node(1, msc.PROFILE, timings)
+    bench.wait(2.0)
+    bench.ask(node, msc.DataRead(2008))
+    bench.sent()
+    assert bench.until_sent() == pytest.approx(MSC_REQUEST + packet + MSC_TAU)
+
+
+def test_r3_a_stray_byte_may_have_been_the_lost_ack_and_its_packet_is_waited_for_anew() -> None:
+    bench, timings = msc_line()
+    node = bench.node(1, msc.PROFILE, timings)
+    bench.wait(2.0)
+    bench.ask(node, msc.DataRead(2008))
+    bench.sent()
+    bench.hear("00", after=MSC_REQUEST + 0.8)
+    assert bench.until_sent() == pytest.approx(1.0 + MSC_TAU)
+
+
+def test_r3_noise_does_not_use_up_the_knowledge_that_a_packet_follows_its_ack() -> None:
+    """Noise at 0.6 s, the late ACK at 0.95 s, the packet 0.99 s after it: 18 bytes, and the line is not free before."""
+    bench, timings = msc_line()
+    node = bench.node(1, msc.PROFILE, timings)
+    bench.wait(2.0)
+    bench.ask(node, msc.DataRead(2008), retries=0)
+    bench.ask(node, msc.DataRead(2012))
+    bench.sent()
+    bench.hear("00", after=MSC_REQUEST + 0.6)
+    bench.hear(ACK, after=0.35)
+    bench.wait(0.99)
+    assert bench.sent() == ""
+    bench.hear(REPLY_1234)
+    assert bench.sent() == ACK
+
+
+def test_r3_a_request_behind_two_acks_that_are_still_being_said_is_out_behind_both() -> None:
+    """MSC: ACK for a stale packet, ACK for another, then the request: its window counts from the end of all three."""
+    bench, timings = msc_line()
+    node = bench.node(1, msc.PROFILE, timings)
+    bench.wait(2.0)
+    bench.arbiter.byte_time = slow = 0.100
+    bench.hear(REPLY_1234)
+    bench.hear(REPLY_1234)
+    assert bench.sent() == f"{ACK} {ACK}"
+    heard = bench.now
+    read = bench.ask(node, msc.DataRead(2008), retries=0)
+    while not read.attempts:
+        bench.to(bench.arbiter.poll_timeout())
+    out = max(heard + 2 * slow, bench.now) + 16 * slow
+    bench.to(out + 0.499)
+    assert not bench.ended(read)
+    bench.wait(0.002)
+    assert isinstance(read.error, NoReply)
+
+
+def test_a_closing_ack_is_over_when_it_is_out() -> None:
+    bench, timings = msc_line()
+    node = bench.node(1, msc.PROFILE, timings)
+    bench.wait(2.0)
+    bench.ask(node, msc.DataRead(2008))
+    bench.sent()
+    bench.hear(ACK + REPLY_1234, after=MSC_REQUEST + 0.05)
+    assert bench.sent() == ACK
+    assert bench.arbiter.state is LineState.HOLDOFF
+    acked = bench.now
+    bench.until_ready()
+    assert bench.now - acked == pytest.approx(MSC_TAU)
+
+
+# echo, and broadcasts
+
+
+def test_r3_on_an_echoing_port_the_lateness_counts_from_the_last_byte_of_the_echo() -> None:
+    bench = Bench(echo=True)
+    bench.ask(bench.node())
+    bench.hear(bench.sent(), after=0.030)
+    assert bench.until_sent() == pytest.approx(LATENESS)
+
+
+@pytest.mark.parametrize("inside", [0.0001, 0.001])
+def test_r3_on_an_echoing_port_a_reply_at_its_last_moment_is_nobody_elses(inside: float) -> None:
+    bench = Bench(echo=True)
+    node = bench.node()
+    first, second = bench.ask(node, retries=0), bench.ask(node, retries=0)
+    bench.hear(bench.sent(), after=0.030)
+    bench.hear(FIVE, after=LATENESS - inside)
+    assert isinstance(first.error, NoReply)
+    assert second.attempts == 0
+    bench.until_sent()
+    assert second.value is None
+
+
+def test_a_broadcast_is_over_when_it_is_out_and_the_turnaround_later() -> None:
+    bench = Bench()
+    everybody, drive = bench.node(0, mentor.PROFILE), bench.node(12, mentor.PROFILE)
+    bench.wait(1.0)
+    bench.ask(everybody, mentor.Write(1, 17, 100))
+    bench.ask(drive, mentor.Read(1, 17))
+    said = len(bytes.fromhex(bench.sent())) * TAU
+    turnaround = mentor.Write(1, 17, 100).open(0, mentor.PROFILE.timings).timing.turnaround
+    assert turnaround > 0
+    assert bench.until_sent() == pytest.approx(said + turnaround)
+
+
+def test_r1_what_is_said_behind_an_ack_is_reckoned_from_the_end_of_both() -> None:
+    bench, timings = msc_line()
+    node = bench.node(1, msc.PROFILE, timings)
+    bench.wait(2.0)
+    bench.ask(node, msc.DataRead(2008))
+    bench.ask(node, msc.DataRead(2008))
+    assert bench.sent() == READ_2008
+    bench.hear(ACK + REPLY_1234, after=MSC_REQUEST + 0.05)
+    assert bench.sent() == f"{ACK} {READ_2008}"
+    assert bench.until_sent() == pytest.approx(17 * MSC_TAU + 1.0 + MSC_TAU)

@@ -1,0 +1,350 @@
+"""Which replies are owed, what pays for them, and what goes meanwhile (R15)."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.errors import GarbledReply, NoReply, Refused, WriteUnconfirmed
+from busmaster.protocols.hcp2 import codec as hcp2
+from tests.arbiter.bench import ACK, NAK, TAU, WRITE_5, Bench, lost, reply_of, request_of, up
+
+REQUEST = 8 * TAU
+URGENT, COMMAND, POLL, BACKGROUND = Priority
+
+
+def write_of(value: int, node: int = 1) -> str:
+    return hcp2.Write(1, (value,)).open(node, hcp2.PROFILE.timings).request.hex(" ").upper()
+
+
+def write(value: int = 5, *, idempotent: bool = False) -> hcp2.Write:
+    return hcp2.Write(1, (value,), idempotent=idempotent)
+
+
+def checks(bench: Bench) -> int:
+    return bench.arbiter.statistics(bench.now).checks
+
+
+def doubted(bench: Bench) -> int:
+    return bench.arbiter.statistics(bench.now).doubted
+
+
+def confirmed_behind_checks(bench: Bench, asked: Transaction, request: str) -> None:
+    """The write is sent when checks have proved that the line is in step, and its ACK is its own."""
+    bench.until_sent()
+    assert bench.sent() != request, "nothing is proved yet"
+    while bench.asked != request:
+        assert not bench.ended(asked)
+        bench.answer()
+        bench.until_sent()
+        bench.sent()
+    bench.answer()
+    assert (bench.ended(asked), asked.error) == (1, None)
+
+
+# what is owed is not believed
+
+
+def test_r15_a_reply_that_comes_long_after_its_lateness_is_never_taken_for_the_next_one() -> None:
+    bench = Bench()
+    node = up(bench)
+    lost(bench, node)
+    following = bench.ask(node)
+    assert bench.sent() == request_of(2), "a check: its answer cannot be the one that is owed"
+    bench.hear(reply_of(1, 55), after=0.002)
+    assert following.value is None
+    bench.until_sent()
+    assert bench.sent() == request_of(1)
+    bench.answer(7)
+    assert following.value == 7.0
+
+
+def test_r15_what_waits_anyway_goes_first_if_it_proves_as_much_as_a_check() -> None:
+    """Noise makes them wait for the line together."""
+    bench = Bench()
+    node = up(bench)
+    lost(bench, node)
+    bench.hear("FF")
+    same, unlike = bench.ask(node), bench.ask(node, hcp2.Read(3))
+    bench.until_sent()
+    assert bench.sent() == request_of(3)
+    bench.answer(33)
+    assert bench.sent() == request_of(1)
+    bench.answer(11)
+    assert (unlike.value, same.value, checks(bench)) == (33.0, 11.0, 0)
+
+
+def test_r15_a_retry_waits_for_what_waits_in_its_class_and_for_no_check() -> None:
+    bench = Bench()
+    node = up(bench)
+    read, other = bench.ask(node), bench.ask(node, hcp2.Read(2))
+    bench.sent()
+    bench.until_sent()
+    assert bench.sent() == request_of(2)
+    bench.answer()
+    assert bench.sent() == request_of(1)
+    bench.answer(7)
+    assert (read.value, other.value, checks(bench)) == (7.0, 5.0, 0)
+
+
+def test_r15_a_read_is_the_check_after_an_unanswered_write() -> None:
+    bench = Bench()
+    node = up(bench)
+    lost(bench, node, write(5))
+    following = bench.ask(node, write(6))
+    assert bench.sent() == request_of(1), "a read that it has answered before"
+    bench.hear(ACK, after=0.002)
+    assert following.error is None, "the first write's ACK is nobody's"
+    confirmed_behind_checks(bench, following, write_of(6))
+
+
+def test_r15_a_retry_owes_to_itself() -> None:
+    """The ACK of the first attempt says nothing of the second, which a drive may have refused since."""
+    bench = Bench()
+    node = up(bench)
+    again = bench.ask(node, write(5), idempotent=True, retries=1)
+    assert bench.sent() == WRITE_5
+    assert bench.until_sent() > 0.150
+    assert bench.sent() == request_of(1)
+    bench.hear(ACK, after=0.002)
+    assert not bench.ended(again)
+    confirmed_behind_checks(bench, again, WRITE_5)
+
+
+# what pays
+
+
+@pytest.mark.parametrize("delay", [0.102, 0.149])
+def test_r15_a_debt_is_paid_by_its_own_reply_as_a_stray(delay: float) -> None:
+    bench = Bench()
+    node = up(bench)
+    bench.ask(node, retries=0)
+    bench.sent()
+    bench.hear(reply_of(1, 5), after=REQUEST + delay)
+    bench.until_ready()
+    bench.ask(node)
+    assert bench.sent() == request_of(1)
+    assert checks(bench) == 0
+
+
+def test_r15_a_debt_is_paid_by_its_own_reply_on_an_idle_line_however_late() -> None:
+    bench = Bench()
+    node = up(bench)
+    lost(bench, node)
+    bench.hear(reply_of(1, 5), after=3.0)
+    bench.until_ready()
+    bench.ask(node)
+    assert bench.sent() == request_of(1)
+
+
+@pytest.mark.parametrize("bytewise", [False, True])
+def test_r15_a_debt_is_paid_by_its_own_reply_in_place_of_another(bytewise: bool) -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, node)
+    third = bench.ask(other, hcp2.Read(3), retries=0)
+    bench.sent()
+    (bench.hear_bytewise if bytewise else bench.hear)(reply_of(1, 55), 0.002)
+    assert isinstance(third.error, GarbledReply)
+    bench.until_ready()
+    before = checks(bench)
+    read = bench.ask(node)
+    assert bench.sent() == request_of(1), "element 3 is owed now, and nothing else"
+    assert checks(bench) == before
+    bench.answer(7)
+    assert read.value == 7.0
+
+
+def test_r15_a_wrong_echo_that_is_not_whole_yet_pays_nothing_before_the_silence() -> None:
+    """Its first bytes come; the rest is held up. An urgent read goes no sooner than the silence after the last one."""
+    bench = Bench()
+    node = up(bench)
+    lost(bench, node)
+    bench.ask(node, hcp2.Read(3), retries=0)
+    bench.sent()
+    bench.hear("02 30 31", after=0.100)
+    bench.ask(node, priority=URGENT)
+    assert bench.sent() == ""
+    bench.hear("35 03 37", after=0.040)
+    assert bench.sent() == ""
+    assert bench.until_sent() == pytest.approx(0.020 + TAU)
+    assert bench.sent() == request_of(1)
+
+
+def test_r15_a_debt_is_paid_by_the_owing_nodes_answer_to_something_else() -> None:
+    """A node answers in the order in which it was asked."""
+    bench = Bench()
+    node = up(bench)
+    lost(bench, node)
+    bench.served(bench.ask(node, hcp2.Read(3)))
+    before = checks(bench)
+    read = bench.ask(node)
+    assert bench.sent() == request_of(1)
+    bench.answer(7)
+    assert (read.value, checks(bench)) == (7.0, before)
+
+
+def test_r15_a_debt_is_paid_by_any_nodes_answer_once_its_lateness_is_over() -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, node)
+    bench.served(bench.ask(other, hcp2.Read(3)))
+    read = bench.ask(node)
+    assert bench.sent() == request_of(1)
+    bench.answer(7)
+    assert (read.value, checks(bench)) == (7.0, 0)
+
+
+def test_r15_a_debt_lapses_ten_seconds_after_its_request() -> None:
+    for waited, due in ((9.7, request_of(2)), (10.1, request_of(1))):
+        bench = Bench()
+        node = up(bench)
+        lost(bench, node)
+        bench.wait(waited - 0.151)
+        bench.ask(node)
+        assert bench.sent() == due
+
+
+def test_r15_what_is_owed_outlives_a_lost_port() -> None:
+    """The bytes lie in the network, or in the adapter, and come when the port is back."""
+    bench = Bench()
+    node = up(bench)
+    bench.ask(node)
+    bench.sent()
+    bench.arbiter.line_down("unplugged", bench.now)
+    bench.arbiter.line_up(bench.now + 1.0)
+    bench.to(bench.now + 1.0)
+    read = bench.ask(node)
+    bench.until_sent()
+    assert bench.sent() == request_of(2)
+    bench.hear(reply_of(1, 55), after=0.002)
+    bench.until_sent()
+    assert bench.sent() == request_of(1)
+    bench.answer(7)
+    assert read.value == 7.0
+
+
+# a debt that another node's answer paid
+
+
+def overtaken(bench: Bench) -> tuple[str, str]:
+    """Two nodes that are UP; the first owes element 1, and the other's answer has paid: the channel keeps order."""
+    node, other = up(bench), up(bench, 2)
+    lost(bench, node)
+    bench.served(bench.ask(other, hcp2.Read(3)))
+    return request_of(1), request_of(1, 2)
+
+
+def test_r15_after_another_node_has_paid_a_like_answer_that_is_slower_than_ever_is_not_believed() -> None:
+    bench = Bench()
+    overtaken(bench)
+    node = bench.arbiter.dispatcher.nodes[0]
+    read = bench.ask(node)
+    assert bench.sent() == request_of(1)
+    bench.hear(reply_of(1, 55), after=REQUEST + 0.012)
+    assert (read.value, doubted(bench)) == (None, 1)
+
+
+def test_r15_after_another_node_has_paid_a_prompt_answer_is_believed() -> None:
+    bench = Bench()
+    overtaken(bench)
+    read = bench.ask(bench.arbiter.dispatcher.nodes[0])
+    bench.sent()
+    bench.hear(reply_of(1, 7), after=REQUEST + 0.004)
+    assert (read.value, doubted(bench)) == (7.0, 0)
+
+
+def test_r15_the_doubt_is_over_after_three_times_the_lateness() -> None:
+    bench = Bench()
+    overtaken(bench)
+    bench.wait(3 * 0.152)
+    read = bench.ask(bench.arbiter.dispatcher.nodes[0])
+    bench.sent()
+    bench.hear(reply_of(1, 7), after=REQUEST + 0.040)
+    assert (read.value, doubted(bench)) == (7.0, 0)
+
+
+def test_r15_of_two_answers_in_one_chunk_where_one_may_be_another_nodes_neither_is_believed() -> None:
+    bench = Bench()
+    overtaken(bench)
+    read = bench.ask(bench.arbiter.dispatcher.nodes[0])
+    bench.sent()
+    bench.hear(reply_of(1, 55) + reply_of(1, 7), after=REQUEST + 0.003)
+    assert (read.value, doubted(bench)) == (None, 1)
+
+
+def test_r15_strictly_a_doubtful_answer_is_held_until_another_would_have_come() -> None:
+    bench = Bench(strict=True)
+    overtaken(bench)
+    read = bench.ask(bench.arbiter.dispatcher.nodes[0])
+    bench.sent()
+    asked = bench.now
+    bench.hear(reply_of(1, 7), after=REQUEST + 0.002)
+    assert not bench.ended(read)
+    bench.to(asked + REQUEST + 1.25 * 0.004 + 0.001 + 2 * TAU + 0.001)
+    assert (read.value, bench.ended(read)) == (7.0, 1)
+
+
+def test_r15_strictly_a_second_answer_takes_the_first_one_with_it() -> None:
+    bench = Bench(strict=True)
+    overtaken(bench)
+    read = bench.ask(bench.arbiter.dispatcher.nodes[0])
+    bench.sent()
+    bench.hear(reply_of(1, 55), after=REQUEST + 0.002)
+    bench.hear(reply_of(1, 7), after=0.001)
+    assert (read.value, doubted(bench)) == (None, 1)
+
+
+# acknowledgements and refusals are the same from everybody
+
+
+def test_r15_a_refusal_is_not_certain_while_something_is_owed() -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, other, write(5))
+    refused = bench.ask(node, hcp2.Read(3), retries=0)
+    assert bench.sent() == request_of(3)
+    bench.hear(NAK, after=0.002)
+    assert not isinstance(refused.error, Refused)
+
+
+def test_r15_a_write_is_not_refused_by_what_may_be_another_nodes_nak() -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, other)
+    asked = bench.ask(node, write(5))
+    assert bench.sent() == WRITE_5, "an ACK is not what is owed"
+    bench.hear(NAK, after=0.002)
+    assert isinstance(asked.error, WriteUnconfirmed)
+
+
+@pytest.mark.parametrize("heard", ["02 30 32 35", "FF", "02 30 31 31 35 03 41"])
+def test_r15_the_tail_of_a_garbled_reply_never_confirms_a_write(heard: str) -> None:
+    """Its checksum may be 06, and held up until the write is on the wire."""
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    bench.ask(other, retries=0)
+    bench.sent()
+    bench.hear(heard, after=0.003)
+    asked = bench.ask(node, write(5))
+    bench.until_sent()
+    assert bench.sent() != WRITE_5
+    bench.hear(ACK, after=0.002)
+    assert not bench.ended(asked)
+    confirmed_behind_checks(bench, asked, WRITE_5)
+
+
+def test_r15_an_unanswered_check_costs_the_first_one_no_more_than_its_lateness() -> None:
+    """With nothing that proves anything the line settles as in R3, and then goes on."""
+    bench = Bench()
+    node = up(bench)
+    read = bench.ask(node, retries=1)
+    start = bench.now
+    asked = []
+    while not bench.ended(read):
+        bench.until_sent()
+        asked.append(bench.sent())
+        bench.wait(0.101 + REQUEST)
+    assert asked == [request_of(1), request_of(2), request_of(1)]
+    assert isinstance(read.error, NoReply)
+    assert bench.now - start < 3 * (REQUEST + 0.150 + TAU) + 0.01

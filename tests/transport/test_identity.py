@@ -1,0 +1,231 @@
+"""Which device stands behind a name: USB adapters in a made /sys, and real pseudo-terminals."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from busmaster.errors import LineDown
+from busmaster.transport import identity
+from busmaster.transport.identity import Identity, identify, lasting_name, resolve, usb_devices
+from tests.transport.fakes import FarEnd, plugged, plugged_high, with_the_number_of
+from tests.transport.usb import UsbTree
+
+CH340 = "1a86:7523"
+
+
+@pytest.fixture
+def usb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UsbTree:
+    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
+    monkeypatch.setattr(identity, "LINKS", tmp_path / "links")
+    return UsbTree(tmp_path / "sys")
+
+
+@pytest.fixture
+def one() -> Iterator[FarEnd]:
+    with plugged() as end:
+        yield end
+
+
+@pytest.fixture
+def two() -> Iterator[FarEnd]:
+    with plugged() as end:
+        yield end
+
+
+# -- USB adapters ----------------------------------------------------------------------------------------------------
+
+
+def test_an_adapter_with_a_serial_number_is_known_by_it_wherever_it_is_plugged_in(
+    usb: UsbTree, one: FarEnd, two: FarEnd
+) -> None:
+    usb.plug(one.path, "A500ABC", place="1-1.1")
+    known = identify(one.path)
+    assert str(known) == "FTDI A500ABC"
+    usb.unplug(one.path)
+    usb.plug(two.path, "A500ABC", place="1-1.2")
+    assert known.accepts(identify(two.path))
+
+
+def test_another_serial_number_interface_or_port_of_an_interface_is_another_device(usb: UsbTree) -> None:
+    with plugged() as a, plugged() as b, plugged() as c, plugged() as d:
+        usb.plug(a.path, "A500ABC", place="1-1")
+        usb.plug(b.path, "A500XYZ", place="1-2")
+        usb.plug(c.path, "A500ABC", place="1-1", interface=1)
+        usb.plug(d.path, "A500ABC", place="1-1", interface=1, number=1)
+        known = [identify(end.path) for end in (a, b, c, d)]
+        assert [str(one) for one in known] == [
+            "FTDI A500ABC",
+            "FTDI A500XYZ",
+            "FTDI A500ABC interface 1",
+            "FTDI A500ABC interface 1 port 1",
+        ]
+        assert all(one.accepts(other) is (one is other) for one in known for other in known)
+
+
+def test_an_adapter_without_a_serial_number_is_known_by_where_it_is_plugged_in(
+    usb: UsbTree, one: FarEnd, two: FarEnd
+) -> None:
+    usb.plug(one.path, place="1-1.1", maker="QinHeng", kind=CH340)
+    usb.plug(two.path, place="1-1.2", maker="QinHeng", kind=CH340)
+    known, other = identify(one.path), identify(two.path)
+    assert (str(known), str(other)) == ("QinHeng at USB port 1-1.1", "QinHeng at USB port 1-1.2")
+    assert not known.accepts(other)
+    usb.unplug(one.path)
+    usb.unplug(two.path)
+    usb.plug(two.path, place="1-1.1")
+    assert not known.accepts(identify(two.path)), "another kind of adapter"
+    usb.unplug(two.path)
+    usb.plug(one.path, place="1-1.3", maker="QinHeng", kind=CH340)
+    assert not known.accepts(identify(one.path)), "elsewhere"
+
+
+def test_adapters_that_have_all_the_same_serial_number_are_known_by_where_they_are(
+    usb: UsbTree, one: FarEnd, two: FarEnd
+) -> None:
+    usb.plug(one.path, "0001", place="1-1")
+    alone = identify(one.path)
+    usb.plug(two.path, "0001", place="1-2")
+    first, second = identify(one.path), identify(two.path)
+    assert str(second) == "FTDI 0001 at USB port 1-2"
+    assert not alone.accepts(second)
+    assert alone.accepts(first)
+    usb.unplug(one.path)
+    assert not first.accepts(identify(two.path)), "the other is away for the moment"
+    assert second.accepts(identify(two.path))
+
+
+def test_a_port_that_the_kernel_does_not_describe_has_just_gone(usb: UsbTree, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(OSError, match="No such device") as caught:
+        identify(os.devnull)
+    assert caught.value.errno == errno.ENODEV
+    monkeypatch.setattr(identity, "SYS", usb.root / "none")
+    known = identify(os.devnull)
+    assert str(known) == f"{os.devnull} (1:3)"
+    assert known.accepts(identify(os.devnull))
+    assert not known.accepts(identify("/dev/zero"))
+    with open(os.devnull, "rb") as null, open("/dev/zero", "rb") as zero:
+        assert known.is_behind(null.fileno())
+        assert not known.is_behind(zero.fileno())
+
+
+# -- names by serial number ------------------------------------------------------------------------------------------
+
+
+def test_a_serial_number_is_resolved_to_the_path_that_its_adapter_has_now(
+    usb: UsbTree, one: FarEnd, two: FarEnd
+) -> None:
+    usb.plug(one.path, "A500ABC", place="1-1")
+    usb.plug(two.path, "34:85:18:AC", place="1-2", interface=2)
+    assert resolve("usb:A500ABC") == resolve("usb:A500ABC:0") == one.path
+    assert resolve("usb:34:85:18:AC") == resolve("usb:34:85:18:AC:2") == two.path
+    assert resolve("/dev/anything") == "/dev/anything"
+
+
+def test_a_serial_number_that_is_not_there_says_what_is(usb: UsbTree, one: FarEnd, two: FarEnd) -> None:
+    with pytest.raises(LineDown, match="usb:A500ABC is not plugged in: there is no USB serial port at all; plug it in"):
+        resolve("usb:A500ABC")
+    usb.plug(one.path, "A500XYZ", place="1-1")
+    usb.plug(two.path, place="1-2")
+    for name in ("usb:A500ABC", "usb:A500XYZ:1", "usb:A500XYZ:x", "usb:A500"):
+        with pytest.raises(LineDown, match=f"{name} is not plugged in: there is ") as caught:
+            resolve(name)
+        assert f"usb:A500XYZ ({one.path})" in caught.value.what
+        assert f"one without a lasting name ({two.path})" in caught.value.what
+
+
+def test_an_adapter_with_several_interfaces_wants_one_of_them_named(usb: UsbTree, one: FarEnd, two: FarEnd) -> None:
+    usb.plug(one.path, "A500ABC", interface=0)
+    usb.plug(two.path, "A500ABC", interface=1)
+    with pytest.raises(LineDown, match=r"usb:A500ABC could be any of usb:A500ABC:[01] .*, usb:A500ABC:[01] ") as caught:
+        resolve("usb:A500ABC")
+    assert f"usb:A500ABC:0 ({one.path})" in caught.value.what
+    assert resolve("usb:A500ABC:1") == two.path
+
+
+def test_the_lasting_name_is_the_serial_number_or_else_the_link_that_udev_keeps(
+    usb: UsbTree, one: FarEnd, two: FarEnd, tmp_path: Path
+) -> None:
+    for folder, end in (("by-path", one), ("by-id", two)):
+        (tmp_path / "links" / folder).mkdir(parents=True)
+        (tmp_path / "links" / folder / "it").symlink_to(end.path)
+
+    def name_of(end: FarEnd) -> str:
+        return lasting_name(next(device for device in usb_devices() if device.path == end.path))
+
+    usb.plug(one.path, place="1-1")
+    usb.plug(two.path, "A500ABC", place="1-2", number=0)
+    assert (name_of(one), name_of(two)) == (f"{tmp_path}/links/by-path/it", "usb:A500ABC")
+    usb.unplug(one.path)
+    usb.plug(one.path, "A500ABC", place="1-2", number=1)
+    assert name_of(two) == f"{tmp_path}/links/by-id/it"
+    assert name_of(one) == ""
+
+
+# -- pseudo-terminals ------------------------------------------------------------------------------------------------
+
+
+def test_a_pseudo_terminal_stays_the_same_whatever_is_done_to_it(one: FarEnd, two: FarEnd) -> None:
+    known = identify(one.path)
+    descriptor = os.open(one.path, os.O_RDWR | os.O_NOCTTY)
+    os.write(descriptor, b"x")
+    os.chmod(one.path, 0o666)
+    os.chown(one.path, os.getuid(), os.getgid())
+    assert known.is_behind(descriptor)
+    os.close(descriptor)
+    assert known.accepts(identify(one.path))
+    assert not known.accepts(identify(two.path))
+
+
+def with_reused_number(check: Callable[[Identity, FarEnd], None], link: Path | None = None) -> None:
+    """Check what was known of a pseudo-terminal against another one that got its number."""
+    with plugged_high() as end:
+        if link is not None:
+            link.symlink_to(end.path)
+        known = identify(end.path if link is None else str(link))
+        end.unplug()
+        with with_the_number_of(end) as heir:
+            check(known, heir)
+
+
+def test_the_number_of_a_pseudo_terminal_does_not_make_it_the_same() -> None:
+    def check(known: Identity, heir: FarEnd) -> None:
+        other = identify(heir.path)
+        assert not known.accepts(other)
+        assert str(known).startswith("the pseudo-terminal made at 20")
+
+    with_reused_number(check)
+
+
+def test_a_link_left_behind_is_not_followed_to_a_number_reused_but_one_made_anew_is(tmp_path: Path) -> None:
+    link = tmp_path / "line"
+
+    def check(known: Identity, heir: FarEnd) -> None:
+        assert not known.accepts(identify(str(link)))
+        link.unlink()
+        link.symlink_to(heir.path)
+        assert known.accepts(identify(str(link)))
+        assert not known.accepts(identify(heir.path)), "by its own path"
+
+    with_reused_number(check, link)
+
+
+def test_a_link_to_a_link_is_followed_when_either_is_made_anew(tmp_path: Path, one: FarEnd, two: FarEnd) -> None:
+    (tmp_path / "outer").symlink_to("inner")
+    (tmp_path / "inner").symlink_to(one.path)
+    known = identify(str(tmp_path / "outer"))
+    (tmp_path / "inner").unlink()
+    (tmp_path / "inner").symlink_to(two.path)
+    assert known.accepts(identify(str(tmp_path / "outer")))
+
+
+def test_devices_of_different_kinds_are_never_the_same(usb: UsbTree, one: FarEnd, two: FarEnd) -> None:
+    usb.plug(one.path, "A500ABC")
+    (usb.root / "dev/char/1:3").touch()
+    known = [identify(path) for path in (one.path, two.path, os.devnull)]
+    assert all(one.accepts(other) is (one is other) for one in known for other in known)
+    assert all(one.advice for one in known)

@@ -1,0 +1,349 @@
+"""Requests that do not leave when they are written: the process stands still, or the port holds them back."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import termios
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from busmaster import Bus, Hcp2Controller, LineDown, MemoryPort, NoReply, SerialPort, TcpPort, WriteUnconfirmed
+from busmaster.arbiter.events import LineChange, LineChanged
+from busmaster.emulator.device import Delay
+from busmaster.emulator.line import Line
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.registry import make_device
+from busmaster.testing.virtual_time import run_in_virtual_time
+from busmaster.transport import pump as pump_module
+from busmaster.transport.memory import MemoryTransport
+from busmaster.transport.pump import STUCK_AFTER, Pump
+from tests.transport.fakes import FarEnd, plugged, standing_still
+from tests.transport.test_marks import reply
+
+WINDOW = hcp2.PROFILE.timings.read.window
+LATENESS = hcp2.PROFILE.timings.read.lateness
+
+
+def line(delay: float = 0.002) -> Line:
+    devices = [make_device("hcp2", address, delay=Delay(delay)) for address in (1, 2)]
+    return Line(hcp2.PROFILE.line, devices, paced=True)
+
+
+def transport_of(bus: Bus) -> MemoryTransport:
+    transport = bus.pump._transport
+    assert isinstance(transport, MemoryTransport)
+    return transport
+
+
+# -- what the pump tells ---------------------------------------------------------------------------------------------
+
+
+class Ledger:
+    """Notes what happens in which order; stands for the port, the arbiter and the tap."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+        self.notes: list[tuple[Any, ...]] = []
+        self.has = 0
+        self.is_due = False
+
+    # the port
+
+    def write(self, data: bytes) -> None:
+        self.time += 0.3  # as if the process stood still on the way
+        self.notes.append(("written", data))
+
+    def get_extra_info(self, _name: str, default: Any = None) -> Any:
+        return default
+
+    def get_write_buffer_size(self) -> int:
+        return self.has
+
+    def discard_unsent(self) -> None:
+        self.notes.append(("discarded",))
+
+    def abort(self) -> None:
+        self.notes.append(("aborted",))
+
+    # the arbiter
+
+    out: bytes | None = None
+    state = None
+
+    def poll_transmit(self) -> bytes | None:
+        data, self.out = self.out, None
+        return data
+
+    def poll_event(self) -> None:
+        return None
+
+    def poll_timeout(self) -> float:
+        return float("inf")
+
+    def line_up(self, now: float, *, paced: bool) -> None: ...
+
+    def line_due(self, _now: float) -> bool:
+        return self.is_due
+
+    def unsent(self, count: int, now: float) -> None:
+        self.notes.append(("unsent", count, now))
+
+    def handle_timeout(self, now: float, *, unread: bool) -> None:
+        self.notes.append(("timeout", now, unread))
+
+    # both
+
+    def transmitted(self, now: float, data: bytes | None = None) -> None:
+        self.notes.append(("transmitted", now) if data is None else ("tapped", now, data))
+
+
+@pytest.fixture
+def ledger() -> Ledger:
+    return Ledger()
+
+
+def pump_on(ledger: Any) -> Pump:
+    pump = Pump(ledger, on_cycle=lambda _: None, on_event=lambda _: None, tap=ledger)
+    pump.clock = lambda: ledger.time
+    pump.connection_made(ledger)
+    return pump
+
+
+def test_a_request_counts_as_sent_when_the_write_has_returned(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    ledger.out = b"05\x05"
+    pump.turn()
+    assert ledger.notes == [("written", b"05\x05"), ("transmitted", 0.3), ("tapped", 0.3, b"05\x05")]
+
+
+def test_what_has_not_left_is_asked_for_only_when_a_deadline_of_the_line_is_due(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    pump._on_time()
+    ledger.is_due, ledger.has = True, 2
+    pump._on_time()
+    ledger.has = 0
+    pump._on_time()
+    timeout = ("timeout", 0.0, False)
+    assert ledger.notes == [timeout, ("unsent", 2, 0.0), timeout, ("unsent", 0, 0.0), timeout]
+
+
+def test_a_write_that_the_port_did_not_take_is_told_at_once_and_so_is_its_leaving(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    ledger.out, ledger.has = b"05\x05", 3
+    pump.pause_writing()
+    pump.turn()
+    ledger.has, ledger.time = 0, 1.0
+    pump.resume_writing()
+    assert ledger.notes[1:] == [
+        ("transmitted", 0.3),
+        ("tapped", 0.3, b"05\x05"),
+        ("unsent", 3, 0.3),
+        ("unsent", 0, 1.0),
+    ]
+
+
+def test_output_that_is_given_up_is_discarded_before_its_transport_is_aborted(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    assert pump._port is not None
+    pump._port.discard_unsent = ledger.discard_unsent  # type: ignore[method-assign]
+    ledger.is_due, ledger.has = True, 2
+    pump._on_time()
+    ledger.time = STUCK_AFTER - 0.1
+    pump._on_time()
+    assert ("aborted",) not in ledger.notes
+    ledger.time = STUCK_AFTER
+    pump._on_time()
+    assert ledger.notes[-3:] == [("discarded",), ("aborted",), ("timeout", STUCK_AFTER, False)]
+
+
+# -- a port that holds its output ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("held", [0.005, 0.090, 0.140, 0.4, 2.0])
+def test_a_request_held_back_is_waited_for_and_nothing_else_is_sent_meanwhile(held: float) -> None:
+    async def main() -> None:
+        async with Bus(MemoryPort(line(0.090))) as bus:
+            first, second = Hcp2Controller(bus, 1), Hcp2Controller(bus, 2)
+            await first.write(1, 11)
+            await second.write(1, 22)
+            transport_of(bus).hold()
+            began = bus.now()
+            reading = asyncio.gather(first.read(1, retries=0), second.read(1, retries=0))
+            await asyncio.sleep(held)
+            assert transport_of(bus).get_write_buffer_size() == len(hcp2.Read(1).open(1, first.node.timings).request)
+            transport_of(bus).release()
+            assert tuple(await reading) == (11, 22)
+            assert held + 0.18 < bus.now() - began < held + 0.3
+            assert first.node.statistics().no_reply == 0
+
+    run_in_virtual_time(main())
+
+
+def test_a_window_runs_from_when_the_request_has_left() -> None:
+    async def main() -> None:
+        async with Bus(MemoryPort(line())) as bus:
+            absent = Hcp2Controller(bus, 9)
+            await Hcp2Controller(bus, 1).read(1)
+            transport_of(bus).hold()
+            began = bus.now()
+            reading = asyncio.ensure_future(absent.read(1, retries=0))
+            await asyncio.sleep(0.3)
+            assert not reading.done()
+            transport_of(bus).release()
+            with pytest.raises(NoReply):
+                await reading
+            assert bus.now() - began == pytest.approx(0.3 + WINDOW, abs=0.01)
+
+    run_in_virtual_time(main())
+
+
+def test_output_that_never_leaves_takes_the_line_down_and_is_discarded() -> None:
+    async def main() -> None:
+        emulated = line()
+        async with Bus(MemoryPort(emulated)) as bus:
+            axis = Hcp2Controller(bus, 1)
+            await axis.write(1, 5)
+            events = bus.events()
+            transport_of(bus).hold()
+            began = bus.now()
+            with pytest.raises(WriteUnconfirmed, match=r"nothing has left the emulated line for 5 s: the port"):
+                await axis.write(1, 6)
+            assert STUCK_AFTER < bus.now() - began < STUCK_AFTER + 0.2
+            changes = [await anext(events) for _ in range(2)]
+            assert [change.change for change in changes if isinstance(change, LineChanged)] == [
+                LineChange.DOWN,
+                LineChange.UP,
+            ]
+            assert await axis.read(1) == 5
+
+    run_in_virtual_time(main())
+
+
+def test_closing_does_not_wait_for_output_that_is_held() -> None:
+    async def main() -> None:
+        async with Bus(MemoryPort(line())) as bus:
+            axis = Hcp2Controller(bus, 1)
+            await axis.read(1)
+            transport_of(bus).hold()
+            writing = asyncio.ensure_future(axis.write(1, 6))
+            await asyncio.sleep(0.5)
+            began = bus.now()
+        assert bus.now() - began < WINDOW + LATENESS
+        with pytest.raises(WriteUnconfirmed):
+            await writing
+
+    run_in_virtual_time(main())
+
+
+# -- on real ports ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def far_end() -> Iterator[FarEnd]:
+    with plugged() as end:
+        yield end
+
+
+@pytest.mark.asyncio
+async def test_a_tty_stopped_for_longer_than_any_window_delays_its_replies_and_mixes_none(far_end: FarEnd) -> None:
+    async def said() -> bytes:
+        while not (data := await asyncio.to_thread(far_end.read, 0.05)):
+            pass
+        return data
+
+    async with Bus(SerialPort(far_end.path, baudrate=57600)) as bus:
+        axis = Hcp2Controller(bus, 1)
+        transport: Any = bus.pump._transport
+        termios.tcflow(transport._fd, termios.TCOOFF)
+        readings = [asyncio.ensure_future(axis.read(1, retries=0)) for _ in range(3)]
+        while transport.get_write_buffer_size() == 0:  # noqa: ASYNC110  # the line settles first
+            await asyncio.sleep(0.001)
+        requested = transport.get_write_buffer_size()
+        await asyncio.sleep(LATENESS + WINDOW)
+        assert transport.get_write_buffer_size() == requested
+        termios.tcflow(transport._fd, termios.TCOON)
+        for value in (1, 2, 3):
+            assert len(await said()) == requested
+            far_end.write(reply(value))
+        assert await asyncio.gather(*readings) == [1, 2, 3]
+
+
+@pytest.mark.asyncio
+async def test_a_tty_stopped_for_good_takes_the_line_down_in_words(
+    far_end: FarEnd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pump_module, "STUCK_AFTER", 0.1)
+    async with Bus(SerialPort(far_end.path, baudrate=57600)) as bus:
+        axis = Hcp2Controller(bus, 1)
+        transport: Any = bus.pump._transport
+        termios.tcflow(transport._fd, termios.TCOOFF)
+        with pytest.raises(
+            LineDown,
+            match=f"nothing has left {far_end.path} for 0.1 s: flow control holds it or the adapter is stuck; "
+            "check CTS, replug",
+        ):
+            await axis.read(1, retries=0)
+        while bus.pump._transport in (None, transport):  # noqa: ASYNC110  # reopened by itself
+            await asyncio.sleep(0.001)
+        assert far_end.read(patience=0.01) == b""
+
+
+class Server:
+    """A serial device server and the node behind it: each request of the same length is answered by a count."""
+
+    def __init__(self) -> None:
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.listener.setblocking(False)
+        self.port = self.listener.getsockname()[1]
+        self.connection = socket.socket()
+
+    async def answer(self) -> None:
+        loop = asyncio.get_running_loop()
+        self.connection.close()
+        self.connection, _ = await loop.sock_accept(self.listener)
+        value = 0
+        while data := await loop.sock_recv(self.connection, 100):
+            for _ in range(data.count(b"\x05")):
+                value += 1
+                await loop.sock_sendall(self.connection, reply(value))
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    made = Server()
+    yield made
+    made.connection.close()
+    made.listener.close()
+
+
+@pytest.mark.asyncio
+async def test_a_network_that_stands_still_delays_its_replies_and_mixes_none(server: Server) -> None:
+    serving = asyncio.ensure_future(server.answer())
+    async with Bus(TcpPort("127.0.0.1", server.port, baudrate=57600)) as bus:
+        axis = Hcp2Controller(bus, 1)
+        assert [await axis.read(1) for _ in range(3)] == [1, 2, 3]
+        with standing_still(server.connection):
+            readings = [asyncio.ensure_future(axis.read(1, retries=0)) for _ in range(3)]
+            await asyncio.sleep(LATENESS + 2 * WINDOW)
+        assert await asyncio.gather(*readings) == [4, 5, 6]
+    serving.cancel()
+
+
+@pytest.mark.asyncio
+async def test_a_network_that_stands_still_for_good_takes_the_line_down_in_words(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pump_module, "STUCK_AFTER", 0.1)
+    serving = asyncio.ensure_future(server.answer())
+    async with Bus(TcpPort("127.0.0.1", server.port, baudrate=57600)) as bus:
+        axis = Hcp2Controller(bus, 1)
+        assert await axis.read(1) == 1
+        with (
+            standing_still(server.connection),
+            pytest.raises(LineDown, match=f"nothing has left 127.0.0.1:{server.port} for 0.1 s: the network or the s"),
+        ):
+            await axis.read(1, retries=0)
+    serving.cancel()
