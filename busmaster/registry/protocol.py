@@ -88,7 +88,7 @@ class NodeKind:
     whole_numbers: Callable[[str], bool] = nowhere
     """Whether the line carries whole numbers for an item: a value scaled by LINE.toml is then rounded to one."""
     takes_decimals: bool = False
-    """Its handle has an argument `decimals`, digits by item, and scales by it; LINE.toml leaves it to that."""
+    """Its handle has an argument `decimals`, digits by item, and scales or rounds by it: LINE.toml does not."""
     capture_id: int = 0
     """What the header of a captured frame calls it beside its name, for the dissector. 0: by its name alone."""
     protocol: Protocol = field(init=False, repr=False)

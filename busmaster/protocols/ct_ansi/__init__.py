@@ -17,6 +17,7 @@ PROTOCOL = Protocol(
             device_of("busmaster.protocols.ct_ansi.device"),
             items="1.21 (menu and parameter), 1.21:8 (8 parameters from there on)",
             read_options=(CHAIN,),
+            takes_decimals=True,
             capture_id=8,
         ),
     ),
