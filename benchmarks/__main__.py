@@ -25,6 +25,7 @@ SCENARIOS = (
     "codecs",
     "simulation",
     "peers",
+    "loop_stalls",
 )
 
 

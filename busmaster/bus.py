@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 import warnings
-from collections.abc import Coroutine, Iterable, Sequence
+from collections.abc import Coroutine, Generator, Iterable, Sequence
 from dataclasses import replace
 from math import inf
 from threading import current_thread, get_ident
@@ -13,21 +13,22 @@ from types import TracebackType
 from typing import Any
 
 import anyio
+import anyio._backends._asyncio  # now, not when a line runs: it takes 30 ms
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import Event, NodeChanged, PortFailed, Strayed
 from busmaster.arbiter.health import Health
-from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.schedule import SLICE, Poll
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.arguments import seconds, whole_number
 from busmaster.errors import BusClosed, InvalidCommand, LineDown
 from busmaster.exchange import Timings
 from busmaster.logbook import Logbook
-from busmaster.merging import Merge
+from busmaster.merging import Merge, at_once
 from busmaster.node import Node, checked_priority, checked_retries
-from busmaster.planning import Plan, PlannedGroup, Read, bounds, plan
+from busmaster.planning import Plan, PlannedGroup, Read, bounds, plan_steps
 from busmaster.points import Point
 from busmaster.polling import PollGroup, Sample, Stream
 from busmaster.profile import LineSettings, Profile
@@ -72,6 +73,7 @@ class Bus:
         )
         self.pump = Pump(
             self._arbiter,
+            on_sample=lambda poll, transaction: poll.waiter.sampled(transaction),
             on_cycle=lambda poll: poll.waiter.cycle_finished(),
             on_event=self._on_event,
             on_written=lambda transaction: self.touched(transaction, transaction.ended_at),
@@ -80,8 +82,10 @@ class Bus:
             name=endpoint.name,
         )
         self._nodes: dict[tuple[str, int], Node] = {}
-        self._groups: list[PollGroup] = []
+        self._groups: dict[str, PollGroup] = {}
         self._touched: dict[object, float] = {}
+        self.last_touched = -inf
+        """When the last write to anything ended."""
         self._streams: list[Stream[Event]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._connection: Connection | None = None
@@ -117,7 +121,7 @@ class Bus:
         """Waiting callers get BusClosed at once; the exchange on the wire may end, within its own window."""
         self.check_loop()
         self._closed = True
-        for group in list(self._groups):
+        for group in self.groups:
             group.close()
         self._arbiter.close(self.now())
         self.pump.turn()
@@ -183,7 +187,7 @@ class Bus:
 
     @property
     def groups(self) -> tuple[PollGroup, ...]:
-        return tuple(self._groups)
+        return tuple(self._groups.values())
 
     def poll_group(
         self,
@@ -200,6 +204,7 @@ class Bus:
         `phase` (seconds, below the period) places the group on the grid; without it, it is placed where it meets the
         other groups least. `merge`: cheaper exchanges to opt in to, such as `protocols.mentor.merge_runs`, beside
         those that the nodes' profiles have; they are taken where they save line time, and no longer once refused.
+        Hundreds of points or groups are worked out in slices while the line goes on, and start some milliseconds later.
         Raises InvalidCommand for a name that is in use, and for times and priorities that are none.
         """
         self.check_loop()
@@ -209,23 +214,30 @@ class Bus:
         if phase is not None:
             phase = seconds(phase, f"poll group {name!r}: a phase")
         priority = checked_priority(priority)
-        if any(group.name == name for group in self._groups):
+        if name in self._groups:
             raise InvalidCommand(f"there is a poll group {name!r} already")
-        for other in self._groups:
-            other.weigh()
         group = PollGroup(self, name, period, points, phase=phase, priority=priority, merge=merge)
         self._arbiter.add_poll(group.poll, self.now())
-        self._groups.append(group)
+        self._groups[name] = group
         self.pump.turn()
         return group
 
     def remove_group(self, group: PollGroup) -> None:
         """What `PollGroup.close` does: its polls end, and what they have on the wire goes unheard."""
         self.check_loop()
-        if group in self._groups:
-            self._groups.remove(group)
+        if self._groups.get(group.name) is group:
+            del self._groups[group.name]
             self._arbiter.remove_poll(group.poll, self.now())
             self.pump.turn()
+
+    def prepare(self, poll: Poll) -> None:
+        """Do what a poll group's new preparation says, while the line goes on."""
+        self._arbiter.dispatcher.prepare_poll(poll, self.now())
+        self.pump.turn()
+
+    def failed_choice(self, group: str, error: Exception) -> None:
+        """Log that a group's exchanges could not be chosen."""
+        self._logbook.failed_choice(group, error)
 
     def demand(self, poll: Poll) -> None:
         """What `PollGroup.demand` does."""
@@ -241,21 +253,29 @@ class Bus:
 
     def latest(self, point: Point[Any]) -> Sample | None:
         """The youngest good sample of this point in any group, unless a write has made it stale."""
-        samples = [g.latest[point] for g in self._groups if g.latest is not None and point in g.latest]
-        touched = self.touched_at(point)
-        fresh = [s for s in samples if s.error is None and s.started is not None and s.started >= touched]
-        return max(fresh, key=lambda sample: sample.finished, default=None)
+        youngest = None
+        for group in self._groups.values():
+            sample = None if group.latest is None else group.latest.samples.get(point)
+            if sample is None or sample.error is not None or sample.started is None:
+                continue
+            if (youngest is None or sample.finished > youngest.finished) and not self.is_stale(point, sample.started):
+                youngest = sample
+        return youngest
 
     def touched(self, write: Transaction, when: float) -> None:
         """A write is over: what was asked before is not newer than what it changed."""
-        if write.node.address == write.node.profile.broadcast:
-            self._touched |= dict.fromkeys(self._nodes.values(), when)
-        self._touched[write.touches] = when
+        node = write.node
+        if isinstance(node.waiter, Node):
+            node.waiter.touched = when
+        if node.address == node.profile.broadcast:
+            for other in self._nodes.values():
+                other.touched = self._touched[other] = when
+        self._touched[write.touches] = self.last_touched = when
 
-    def touched_at(self, point: Point[Any]) -> float:
-        """When the last write to the point's quantity, or to all of its node, ended; -inf if none has."""
+    def is_stale(self, point: Point[Any], started: float) -> bool:
+        """Whether a write to the point's quantity, or to all of its node, has ended since its read was started."""
         touched = self._touched
-        return max(touched.get(point.quantity, -inf), touched.get(point.node, -inf)) if touched else -inf
+        return max(touched.get(point.quantity, -inf), touched.get(point.node, -inf)) > started
 
     # looking
 
@@ -282,40 +302,55 @@ class Bus:
         self.check_loop()
         self._arbiter.reset_statistics(self.now())
         self.pump.reset_driver_errors()
-        for group in self._groups:
+        for group in self._groups.values():
             group.reset_statistics()
 
     def plan(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-        """What becomes of the groups that run, and of `more`, by the reply times measured so far."""
+        """What becomes of the groups that run, and of `more`, by the reply times measured so far.
+
+        It is reckoned at once: with hundreds of points that takes some ten milliseconds, in which no line of this
+        loop goes on. While a line runs, await `plan_in_steps`.
+        """
         self.check_loop()
-        groups = [*(group.planned() for group in self._groups), *more]
-        latency = self.endpoint.receive_latency
-        return plan(
-            groups, line=self._settings(), receive_latency=latency, others=self._asked(), could_merge=could_merge
-        )
+        return at_once(self._planning(more, could_merge))
+
+    async def plan_in_steps(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
+        """Like `plan`, in steps of less than a millisecond between which exchanges go on."""
+        self.check_loop()
+        steps = self._planning(more, could_merge)
+        done = 0
+        while True:
+            try:
+                done += next(steps)
+            except StopIteration as end:
+                plan: Plan = end.value
+                return plan
+            if done >= SLICE:
+                done = 0
+                await asyncio.sleep(0)
 
     def worst_case_wait(self, priority: Priority = Priority.COMMAND) -> float:
         """How long, in seconds, a request of this class, made now, waits at the most until it is sent (R9).
 
         It reckons with what is polled, what waits already, every node's probe, and each kind of command that was
-        asked so far; with nodes that are dead, late or trickling; not with a line that is never silent.
+        asked or polled so far; with nodes that are dead, late or trickling; not with a line that is never silent.
         """
         self.check_loop()
         priority = checked_priority(priority)
         backlog = self._arbiter.dispatcher.backlog
-        polled = [(poll, t) for poll in self._arbiter.dispatcher.schedule.polls for t in poll.results]
-        low = sum(poll.priority is Priority.BACKGROUND for poll, _ in polled)
+        polls = self._arbiter.dispatcher.schedule.polls
+        polled = sum(len(poll.results) for poll in polls)
+        low = sum(len(poll.results) for poll in polls if poll.priority is Priority.BACKGROUND)
         probed = any(node.health is not Health.UP for node in self._nodes.values())
-        reads = [(node.planned(), t.command) for _, t in polled if isinstance(node := t.node.waiter, Node)]
         bound = bounds(
-            (*reads, *self._asked()),
+            self._asked(),
             self.byte_time,
             self.endpoint.receive_latency,
-            polls=1 + max(len(polled) - low, backlog.waiting(Priority.POLL)),
+            polls=1 + max(polled - low, backlog.waiting(Priority.POLL)),
             background=probed + max(low, backlog.waiting(Priority.BACKGROUND)),
         )
         parked = sum(write.phase is Phase.PARKED for node in self._nodes.values() for write in node.record.writes)
-        longest = max((poll.patience for poll, _ in polled), default=1.0)
+        longest = max((poll.patience for poll in polls if poll.results), default=1.0)
         return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 
     def events(self) -> Stream[Event]:
@@ -384,8 +419,30 @@ class Bus:
         return next((node.profile.line for node in self._nodes.values()), LineSettings(9600))
 
     def _asked(self) -> list[Read]:
-        """Every kind of command that was asked of every node."""
-        return [(node.planned(), command) for node in self._nodes.values() for command in node.kinds.values()]
+        """Every kind of command that was asked of a node, once for all nodes with the same timings."""
+        nodes = self._nodes.values()
+        asked = {
+            (id(node.record.profile), id(node.record.timings), kind): (node, command)
+            for node in nodes
+            for kind, command in node.kinds.items()
+        }
+        return [(node.planned(), command) for node, command in asked.values()]
+
+    def _planning(self, more: Sequence[PlannedGroup], could_merge: Sequence[Merge]) -> Generator[int, None, Plan]:
+        groups = []
+        for group in self.groups:
+            groups.append(group.planned())
+            yield len(groups[-1].reads)
+        latency = self.endpoint.receive_latency
+        return (
+            yield from plan_steps(
+                [*groups, *more],
+                line=self._settings(),
+                receive_latency=latency,
+                others=self._asked(),
+                could_merge=could_merge,
+            )
+        )
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
         """A task of the bus's own: a task group would tie entering and leaving the bus to one task."""

@@ -185,7 +185,7 @@ class Exchange(Protocol[T_co]):
         ...
 
     @property
-    def answers(self) -> Sequence[bytes]:
+    def answers(self) -> tuple[bytes, ...]:
         """What its good replies begin with, or are where they are one byte: one for each reply that decides.
 
         Two exchanges that share one could be taken for each other (R15). Empty for a broadcast.
@@ -193,7 +193,7 @@ class Exchange(Protocol[T_co]):
         ...
 
     @property
-    def owed(self) -> Sequence[bytes]:
+    def owed(self) -> tuple[bytes, ...]:
         """What its node may still say if the attempt ends now, unheard: of the same kind as `answers` (R15)."""
         ...
 

@@ -48,6 +48,10 @@ class Logbook:
         """A user's on_return hook raised."""
         logger.error("%s: the on_return hook of %s failed", self._name, label, exc_info=error)
 
+    def failed_choice(self, group: str, error: Exception) -> None:
+        """A merge raised, or a protocol could not say what an exchange costs."""
+        logger.error("%s: the exchanges of poll group %r could not be chosen", self._name, group, exc_info=error)
+
     def _write(self, key: Hashable, level: int, text: str, now: float, bug: BaseException | None = None) -> None:
         last, more = self._written.get(key, (-PAUSE, 0))
         if now - last < PAUSE:

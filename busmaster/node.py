@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Hashable
 from dataclasses import replace
 from math import inf
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -36,8 +36,10 @@ class Node:
         self.record = record
         self.timings = record.timings
         """As they were asked for: its record's lateness may have been raised since."""
-        self.kinds: dict[type, Command[Any]] = {}
+        self.kinds: dict[Hashable, Command[Any]] = {}
         """Of each kind of command that was asked of it, the first: the worst case reckons with them."""
+        self.touched = -inf
+        """When the last write to it, or to one of its points, ended."""
         self.returning = asyncio.Lock()
         """Held while its hook runs."""
         self._on_return: Callable[[Node], Awaitable[None]] | None = None

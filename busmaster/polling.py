@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from math import inf
@@ -13,11 +13,11 @@ from busmaster.arbiter.schedule import Poll, line_time, set_members
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import BusClosed, GarbledReply, InvalidCommand, Refused
 from busmaster.exchange import Command
-from busmaster.merging import Merge, Served, cheapest
-from busmaster.planning import PlannedGroup
+from busmaster.merging import WEIGHING, Merge, Served, cheapest
+from busmaster.planning import PlannedGroup, shape
 from busmaster.points import Point
 from busmaster.profile import Batch
-from busmaster.samples import GroupStatistics, Quality, Sample, Snapshot, Stream, Tally
+from busmaster.samples import NO_SAMPLES, GroupStatistics, Quality, Sample, Snapshot, Stream, Tally
 
 if TYPE_CHECKING:
     from busmaster.bus import Bus
@@ -33,13 +33,25 @@ WEIGHED_AGAIN = 8
 class _Read(NamedTuple):
     """One exchange of a group: the points that it serves, each with its place in a batch's value (None: all of it).
 
-    `bytes_time` is what its bytes take, `legs` how often a reply is waited for.
+    `bytes_time` is what its bytes take on the line up to the end of its reply, `unwaited` with what is behind it,
+    `legs` how often a reply is waited for, and `guess` what it takes as a whole while the node's reply time is
+    unknown. `blank` has all points of the group, in their order.
     """
 
+    node: Node
     served: Served
     points: tuple[tuple[Point[Any], int | None], ...]
     bytes_time: float
+    unwaited: float
     legs: int
+    guess: float
+    blank: dict[Point[Any], Any]
+
+    @property
+    def line_time(self) -> float:
+        """Seconds of the line that it takes, by the node's reply time as measured so far."""
+        wait = self.node.record.reply_time
+        return self.guess if wait is None else self.unwaited + self.legs * wait
 
 
 class PollGroup:
@@ -64,15 +76,20 @@ class PollGroup:
         self._refused: set[tuple[Node, Command[Any]]] = set()
         self._poll = Poll(name, period, phase=phase)
         self._poll.waiter = self
-        self._points: tuple[Point[Any], ...] = ()
-        self._reads: dict[Transaction, _Read] = {}
+        self._points: dict[Point[Any], None] = {}
         self._consumers: list[Stream[Snapshot]] = []
         self._tally = Tally(self._poll)
-        self._set_points(points)
+        # the cycle that runs
+        self._cycle = 0
+        self._samples: dict[Point[Any], Sample] = {}
+        self._qualities: dict[Quality, int] = {}
+        self._line_time = 0.0
+        self._refusals: list[_Read] = []
+        self.add(*points)
 
     @property
     def points(self) -> tuple[Point[Any], ...]:
-        return self._points
+        return tuple(self._points)
 
     @property
     def period(self) -> float:
@@ -88,12 +105,30 @@ class PollGroup:
         return self._poll.paused
 
     def add(self, *points: Point[Any]) -> None:
-        """From the next cycle on. Points that it has already are left alone."""
-        self._set_points((*self._points, *points))
+        """Read these too, from the next cycle on; with hundreds of points, some milliseconds later.
+
+        Points that it has already are left alone. Raises InvalidCommand for a point of another bus, and for one of the
+        address at which all nodes listen and none answers.
+        """
+        self._bus.check_loop()
+        fresh = [point for point in dict.fromkeys(points) if point not in self._points]
+        for point in fresh:
+            node = point.node
+            if node.bus is not self._bus:
+                raise InvalidCommand(f"poll group {self.name!r}: {point.key} belongs to another bus")
+            if node.address == node.profile.broadcast:
+                raise InvalidCommand(
+                    f"poll group {self.name!r}: nobody answers a read of {point.key}, which is for all"
+                )
+        self._points.update(dict.fromkeys(fresh))
+        self._choose()
 
     def remove(self, *points: Point[Any]) -> None:
-        """From the next cycle on."""
-        self._set_points(point for point in self._points if point not in points)
+        """Read these no more, from the next cycle on; with hundreds of points, some milliseconds later."""
+        self._bus.check_loop()
+        for point in points:
+            self._points.pop(point, None)
+        self._choose()
 
     def pause(self) -> None:
         """No cycle starts, and none is counted missed, until `resume`."""
@@ -148,21 +183,37 @@ class PollGroup:
         merges = [self._sound(merge) for merge in self._merge]
         return PlannedGroup(self.name, self._poll.period, reads, self._poll.phase, self._priority, merges)
 
+    def sampled(self, transaction: Transaction) -> None:
+        """One exchange of the cycle is over: make its samples. Runs in the pump: no user code but decoders."""
+        read: _Read = transaction.waiter
+        if self._cycle != self._poll.cycles:
+            self._cycle = self._poll.cycles
+            self._samples = read.blank.copy()
+            self._qualities = NO_SAMPLES.copy()
+            self._line_time = 0.0
+            self._refusals = []
+        self._line_time += read.line_time
+        if transaction.error is None:
+            _measure(transaction, read)
+        elif read.served.batch and isinstance(transaction.error, Refused):
+            self._refusals.append(read)
+        for point, place in read.points:
+            sample = self._sample(point, place, transaction)
+            self._samples[point] = sample
+            self._qualities[sample.quality] += 1
+
     def cycle_finished(self) -> None:
-        """The arbiter has run a cycle: make its snapshot and hand it round. Runs in the pump: no user code."""
+        """All exchanges of a cycle are over: hand its snapshot round. Runs in the pump: no user code."""
         poll = self._poll
-        if self._fall_back():
+        if poll.fresh is None:
+            poll.cost = self._line_time
+        if self._refusals:
+            self._fall_back()
             return
-        samples: dict[Point[Any], Sample] = {}
-        for transaction in poll.results:
-            read = self._reads[transaction]
-            if transaction.error is None:
-                _measure(transaction, read)
-            for point, place in read.points:
-                samples[point] = self._sample(point, place, transaction)
-        self._tally.note(poll)
+        self._age()
+        self._tally.note(poll, self._qualities)
         started = poll.started if poll.started > -inf else None
-        snapshot = Snapshot(self.name, poll.cycles, poll.due, started, poll.finished, poll.missed, samples)
+        snapshot = Snapshot(self.name, poll.cycles, poll.due, started, poll.finished, poll.missed, self._samples)
         self.latest = snapshot
         for consumer in self._consumers:
             consumer.put(snapshot)
@@ -175,56 +226,92 @@ class PollGroup:
         quality = Quality.BAD
         if error is None:
             quality = Quality.LATE if transaction.late else Quality.GOOD
-            if transaction.started < self._bus.touched_at(point):
+            if point.node.touched > transaction.started and self._bus.is_stale(point, transaction.started):
                 quality = Quality.STALE
             try:
                 value = point.value_of(transaction.value if place is None else transaction.value[place])
             except GarbledReply as bad:
                 error, quality = bad, Quality.BAD
-        self._tally.samples[quality] += 1
         timeline = transaction.timeline()
         return Sample(value, error, self._poll.due, timeline.started, transaction.ended_at, quality, timeline)
 
+    def _age(self) -> None:
+        """Mark the samples that were read before a write to their point that ended meanwhile."""
+        if self._bus.last_touched <= self._poll.started:
+            return
+        for point, sample in self._samples.items():
+            fine = sample.quality in (Quality.GOOD, Quality.LATE)
+            if not fine or sample.started is None or point.node.touched <= sample.started:
+                continue
+            if self._bus.is_stale(point, sample.started):
+                self._qualities[sample.quality] -= 1
+                self._qualities[Quality.STALE] += 1
+                self._samples[point] = sample._replace(quality=Quality.STALE)
+
     # which exchanges bring the values
 
-    def _set_points(self, points: Iterable[Point[Any]]) -> None:
-        self._bus.check_loop()
-        unique = tuple(dict.fromkeys(points))
-        for point in unique:
-            if point.node.bus is not self._bus:
-                raise InvalidCommand(f"poll group {self.name!r}: {point.key} belongs to another bus")
-        self._points = unique
-        self._choose()
-
     def _choose(self) -> None:
+        """Choose the exchanges anew: a piece at a time, so that the line goes on (see Schedule.prepare)."""
+        self._poll.preparation = self._choosing()
+        self._bus.prepare(self._poll)
+
+    def _choosing(self) -> Iterator[int]:
+        """Give the poll its transactions and its cost, if they are other ones than it has."""
+        for merged in (True, False):
+            try:
+                reads = yield from self._reads(merged)
+                break
+            except Exception as bug:  # a merge may be the application's own
+                self._bus.failed_choice(self.name, bug)
+        else:
+            return
+        poll = self._poll
+        asked = poll.results if poll.fresh is None else poll.fresh
+        if [transaction.waiter.points for transaction in asked] == [read.points for read in reads]:
+            return
+        fresh = []
+        for read in reads:
+            fresh.append(Transaction(read.node.record, read.served.command, waiter=read))
+            read.blank.update((point, None) for point, _ in read.points)
+            yield 5
+        set_members(poll, fresh, self._priority)
+        poll.cost = sum(read.line_time for read in reads)
+
+    def _reads(self, merged: bool) -> Generator[int, None, list[_Read]]:
         """Two points with one command behind them cost one exchange, and merges are taken where they are cheaper."""
         behind: dict[Node, dict[Command[Any], list[Point[Any]]]] = {}
-        for point in self._points:
+        for point in tuple(self._points):
             behind.setdefault(point.node, {}).setdefault(point.command, []).append(point)
-        reads = [read for node, wanted in behind.items() for read in self._reads_of(node, wanted)]
-        asked = self._poll.fresh if self._poll.fresh is not None else self._poll.results
-        if [self._reads[t].points for t in asked] == [read.points for _, read in reads]:
-            return
-        fresh = {Transaction(node.record, read.served.command): read for node, read in reads}
-        self._reads = {t: self._reads[t] for t in self._poll.results} | fresh
-        set_members(self._poll, fresh, self._priority)
-        self.weigh()
+            yield 2
+        reads: list[_Read] = []
+        blank: dict[Point[Any], Any] = {}
+        for node, wanted in behind.items():
+            merges = (*self._merge, node.profile.merge) if node.profile.merge else self._merge
+            sound = [self._sound(merge, node) for merge in merges] if merged else []
+            cost = partial(node.planned().line_time, byte_time=self._bus.byte_time)
+            points = tuple(wanted.values())
+            for served in (yield from cheapest(tuple(wanted), sound, cost)):
+                serves = tuple(
+                    (point, place if served.batch else None)
+                    for place, index in enumerate(served.serves)
+                    for point in points[index]
+                )
+                reads.append(self._read(node, served, serves, blank))
+                yield WEIGHING
+        return reads
 
-    def _reads_of(self, node: Node, wanted: dict[Command[Any], list[Point[Any]]]) -> Iterator[tuple[Node, _Read]]:
-        merges = (*self._merge, node.profile.merge) if node.profile.merge else self._merge
-        planned, byte_time = node.planned(), self._bus.byte_time
-        points = tuple(wanted.values())
-        sound = [self._sound(merge, node) for merge in merges]
-        for served in cheapest(tuple(wanted), sound, partial(planned.line_time, byte_time=byte_time)):
-            serves = tuple(
-                (point, place if served.batch else None)
-                for place, index in enumerate(served.serves)
-                for point in points[index]
-            )
-            exchange = planned.open(served.command)
-            after = exchange.closing * byte_time + exchange.timing.turnaround
-            bytes_time = line_time(exchange, byte_time, 0.0) - after
-            yield node, _Read(served, serves, bytes_time, 1 + len(exchange.later))
+    def _read(
+        self,
+        node: Node,
+        served: Served,
+        points: tuple[tuple[Point[Any], int | None], ...],
+        blank: dict[Point[Any], Any],
+    ) -> _Read:
+        exchange, byte_time = node.planned().open(served.command), self._bus.byte_time
+        node.kinds.setdefault((type(served.command), *shape(exchange)), served.command)
+        unwaited, guess = line_time(exchange, byte_time, 0.0), line_time(exchange, byte_time)
+        bytes_time = unwaited - exchange.closing * byte_time - exchange.timing.turnaround
+        return _Read(node, served, points, bytes_time, unwaited, 1 + len(exchange.later), guess, blank)
 
     def _sound(self, merge: Merge, node: Node | None = None) -> Merge:
         """The same merge without what this node (or any, if None) has refused."""
@@ -235,26 +322,11 @@ class PollGroup:
 
         return sound if refused else merge
 
-    def _fall_back(self) -> bool:
+    def _fall_back(self) -> None:
         """A batch that was refused says nothing of its commands: they are asked at once, one by one."""
-        refused = {
-            (point.node, self._reads[t].served.command)
-            for t in self._poll.results
-            if isinstance(t.error, Refused) and self._reads[t].served.batch
-            for point, _ in self._reads[t].points
-        }
-        if not refused:
-            return False
-        self._refused |= refused
+        self._refused |= {(read.node, read.served.command) for read in self._refusals}
         self._choose()
         self._bus.demand(self._poll)
-        return True
-
-    def weigh(self) -> None:
-        """Tell the schedule what a cycle takes, by the reply times measured so far."""
-        asked = self._poll.fresh if self._poll.fresh is not None else self._poll.results
-        byte_time = self._bus.byte_time
-        self._poll.cost = sum(self._reads[t].points[0][0].node.planned().line_time(t.command, byte_time) for t in asked)
 
 
 def _measure(transaction: Transaction, read: _Read) -> None:

@@ -32,6 +32,10 @@ class Quality(enum.Enum):
     BAD = "bad"
 
 
+NO_SAMPLES = dict.fromkeys(Quality, 0)
+"""To be copied: a count of each quality."""
+
+
 class Sample(NamedTuple):
     """One point's outcome in one cycle. Times are the bus's clock (`bus.now()`), in seconds."""
 
@@ -107,10 +111,15 @@ class Tally:
         self.exchanges_ahead = 0
         self.settling_ahead = 0.0
         self.cycle_time = Histogram()
-        self.samples = dict.fromkeys(Quality, 0)
+        self.samples = NO_SAMPLES.copy()
 
-    def note(self, poll: Poll) -> None:
-        """A cycle is over. What its first exchange waited for is what the cycle waited for."""
+    def note(self, poll: Poll, qualities: Mapping[Quality, int]) -> None:
+        """A cycle is over, with so many samples of each quality.
+
+        What its first exchange waited for is what the cycle waited for.
+        """
+        for quality, number in qualities.items():
+            self.samples[quality] += number
         begun = poll.started if poll.started > -inf else poll.due
         if self.first is None:
             self.first = begun

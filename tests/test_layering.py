@@ -25,7 +25,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "wire": {"wire"} | BASE,
     "arbiter": {"arbiter"} | BASE,
     "merging": BASE,
-    "planning": {"arbiter.schedule", "merging"} | BASE,
+    "planning": {"planning", "arbiter.schedule", "merging"} | BASE,
     "transport": {"transport", "arbiter"} | BASE,
     "transport.memory": {"transport", "arbiter", "emulator.line"} | BASE,
     **dict.fromkeys(HOLDINGS, HOLDINGS | RUNNING | BASE),

@@ -9,7 +9,7 @@ import hypothesis.strategies as st
 from hypothesis import given, settings
 
 from busmaster.exchange import Command
-from busmaster.merging import Merge, cheapest
+from busmaster.merging import Merge, at_once, cheapest
 from busmaster.planning import PlannedNode
 from busmaster.profile import Batch
 from busmaster.protocols.mentor import codec as mentor
@@ -24,7 +24,7 @@ def cost_of(node: PlannedNode) -> Callable[[Command[Any]], float]:
 
 
 def names(commands: Sequence[Command[Any]], *merges: Merge, node: PlannedNode) -> list[str]:
-    return [str(served.command) for served in cheapest(commands, merges, cost_of(node))]
+    return [str(served.command) for served in at_once(cheapest(commands, merges, cost_of(node)))]
 
 
 MENTOR = PlannedNode(mentor.PROFILE, 1, reply_time=0.01)
@@ -40,7 +40,7 @@ def test_neighbouring_parameters_become_a_run_and_the_rest_stays_single() -> Non
 
 
 def test_a_run_saves_nine_bytes_for_each_parameter_but_the_first() -> None:
-    run = cheapest(READS[:3], [mentor.merge_runs], cost_of(MENTOR))[0]
+    run = at_once(cheapest(READS[:3], [mentor.merge_runs], cost_of(MENTOR)))[0]
     assert run.serves == (0, 1, 2)
     assert run.batch
     assert abs(run.saved - 2 * 9 * TAU_9600) < 1e-9
@@ -52,7 +52,7 @@ def test_a_block_of_32_is_read_only_where_it_takes_less_time_than_the_values_tha
 
     def exchanges(count: int, reply_time: float) -> int:
         node = PlannedNode(msc.PROFILE, 1, reply_time=reply_time)
-        return len(cheapest([msc.DataRead(2000 + 4 * n) for n in range(count)], [merge], cost_of(node)))
+        return len(at_once(cheapest([msc.DataRead(2000 + 4 * n) for n in range(count)], [merge], cost_of(node))))
 
     assert [exchanges(count, 0.005) for count in (2, 3, 4, 32)] == [2, 3, 1, 1]
     assert exchanges(2, 0.1) == 1
@@ -69,13 +69,13 @@ def pairs(commands: Sequence[Command[Any]]) -> list[Batch]:
 def test_the_greatest_saving_goes_first_and_nothing_is_read_twice() -> None:
     costs: dict[Command[Any], float] = {pair(0, 1).command: 1.5, pair(1, 2).command: 1.1, pair(2, 3).command: 1.2}
     commands = [msc.DataRead(n) for n in range(4)]
-    served = cheapest(commands, [pairs], lambda command: costs.get(command, 1.0))
+    served = at_once(cheapest(commands, [pairs], lambda command: costs.get(command, 1.0)))
     assert [s.serves for s in served] == [(0,), (1, 2), (3,)]
 
 
 def test_a_batch_that_saves_nothing_is_left() -> None:
     commands = [msc.DataRead(0), msc.DataRead(1)]
-    served = cheapest(commands, [pairs], lambda command: 1.0 if command in commands else 2.0)
+    served = at_once(cheapest(commands, [pairs], lambda command: 1.0 if command in commands else 2.0))
     assert [s.batch for s in served] == [False, False]
 
 
@@ -86,7 +86,7 @@ def test_every_command_is_served_exactly_once_and_never_at_a_greater_cost(
 ) -> None:
     commands = [mentor.Read(menu, number) for menu, number in wanted]
     node = PlannedNode(mentor.PROFILE, 1, reply_time=reply_time)
-    served = cheapest(commands, [mentor.merge_runs], cost_of(node))
+    served = at_once(cheapest(commands, [mentor.merge_runs], cost_of(node)))
     assert sorted(index for s in served for index in s.serves) == list(range(len(commands)))
     single = sum(node.line_time(command, TAU_9600) for command in commands)
     total = sum(node.line_time(s.command, TAU_9600) for s in served)

@@ -19,10 +19,10 @@ from busmaster.arbiter.backlog import Backlog
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.endings import make_error, name_error, not_started
-from busmaster.arbiter.events import Completed, Event, LatenessLowered, NodeChanged, Polled
+from busmaster.arbiter.events import Completed, Event, LatenessLowered, NodeChanged, Polled, Sampled
 from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
 from busmaster.arbiter.probes import Probes
-from busmaster.arbiter.schedule import Poll, Schedule, begin_cycle
+from busmaster.arbiter.schedule import Poll, Schedule
 from busmaster.arbiter.state import SETTLING
 from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
 from busmaster.errors import (
@@ -174,7 +174,7 @@ class Dispatcher:
             node.last_reply = now
             if node.health is not UP:
                 self._heard(node, now)
-            if now > node.lateness_until:
+            if node.lateness_until < inf:
                 self._lower_lateness(transaction, now)
             if transaction.paid:
                 self.probes.budget.refund(transaction.paid - (now - transaction.started))
@@ -285,25 +285,26 @@ class Dispatcher:
         for transaction in poll.results:
             self.cancel(transaction, now)
 
-    def release_polls(self, now: float) -> None:
-        for poll in self.schedule.release(now):
-            self._start_cycle(poll, now)
+    def prepare_poll(self, poll: Poll, now: float) -> None:
+        """Do its new `preparation`, a slice at a time."""
+        self.schedule.prepare(poll, now)
         self._deadlines.schedule = self.schedule.next_due()
 
     def demand(self, poll: Poll, now: float) -> None:
         """Run one cycle now, off the grid. The running one serves, if there is one."""
-        if poll.active and not poll.running:
-            poll.due = now
-            self._start_cycle(poll, now)
+        self.schedule.demand(poll)
+        self.release_polls(now)
 
-    def _start_cycle(self, poll: Poll, now: float) -> None:
-        for transaction in begin_cycle(poll, now):
+    def release_polls(self, now: float) -> None:
+        """Start what is due, a bounded piece of it: the deadline has passed already while there is more."""
+        for transaction in self.schedule.begin(now):
             self._waits(transaction)
             error = self._reason_to_park(transaction, now)
             if error is None:
                 self.backlog.push(transaction)
             else:
                 self._end(transaction, now, error)
+        self._deadlines.schedule = self.schedule.next_due()
 
     def _reason_to_park(self, transaction: Transaction, now: float) -> BusError | None:
         node = transaction.node
@@ -366,11 +367,11 @@ class Dispatcher:
         return error is None
 
     def _lower_lateness(self, transaction: Transaction, now: float) -> None:
-        """An hour has passed since its lateness was raised: back to what it was, unless this reply was late too."""
+        """Back to what it was, when an hour of prompt replies has passed since its lateness was raised."""
         node = transaction.node
         if transaction.late:
             node.lateness_until = now + health.CALM_LATENESS
-        else:
+        elif now > node.lateness_until:
             node.restore_lateness()
             self.events.append(LatenessLowered(node, node.lateness))
 
@@ -455,6 +456,8 @@ class Dispatcher:
             transaction.node.counters.unheard += transaction.attempts > 0
         poll = transaction.poll
         if poll is not None:
+            if poll.waiter is not None and poll.active:
+                self.events.append(Sampled(poll, transaction))
             poll.remaining -= 1
             if not poll.remaining and poll.active:
                 poll.finished = now

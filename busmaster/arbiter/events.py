@@ -23,6 +23,14 @@ class Completed:
 
 
 @dataclass(slots=True)
+class Sampled:
+    """One exchange of a poll's cycle is over; told where the poll has a `waiter`, so that it need not wait for all."""
+
+    poll: Poll
+    transaction: Transaction
+
+
+@dataclass(slots=True)
 class Polled:
     """A cycle of a poll is over: its transactions hold the values or errors until the next cycle starts."""
 
@@ -101,5 +109,5 @@ class Strayed:
 
 
 Event: TypeAlias = (
-    Completed | Polled | NodeChanged | LatenessRaised | LatenessLowered | LineChanged | PortFailed | Strayed
+    Completed | Sampled | Polled | NodeChanged | LatenessRaised | LatenessLowered | LineChanged | PortFailed | Strayed
 )

@@ -6,6 +6,7 @@ import struct
 import sys
 from array import array
 from collections import Counter
+from functools import cache
 
 BATCH = 256
 """Times that are kept as they came until they are sorted into buckets, all at once."""
@@ -23,7 +24,7 @@ class Histogram:
 
     def __init__(self) -> None:
         self._new: list[float] = []
-        self._counts: Counter[int] = Counter()
+        self._counts: dict[int, int] = {}
         self._total = 0.0
         self._highest = 0.0
 
@@ -35,7 +36,7 @@ class Histogram:
 
     @property
     def count(self) -> int:
-        return self._sorted().total()
+        return sum(self._sorted().values())
 
     @property
     def total(self) -> float:
@@ -66,19 +67,22 @@ class Histogram:
         """(upper edge in seconds, count) of every bucket in use, ascending."""
         return [(_upper_edge(bucket), count) for bucket, count in sorted(self._sorted().items())]
 
-    def _sorted(self) -> Counter[int]:
+    def _sorted(self) -> dict[int, int]:
         if self._new:
             self._sort_in()
         return self._counts
 
     def _sort_in(self) -> None:
         new = self._new
-        self._counts.update(array("H", array("d", new).tobytes())[_UPPER])
+        counts = self._counts
+        for bucket, count in Counter(array("H", array("d", new).tobytes())[_UPPER]).items():
+            counts[bucket] = counts.get(bucket, 0) + count
         self._total += sum(new)
         self._highest = max(self._highest, *new)
         new.clear()
 
 
+@cache
 def _upper_edge(bucket: int) -> float:
     edge: float = struct.unpack(">d", (bucket + 1).to_bytes(2, "big") + bytes(6))[0]
     return edge

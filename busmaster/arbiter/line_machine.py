@@ -242,7 +242,7 @@ class LineMachine:
             return False
         if type(chosen) is not tuple:
             self._quarantine = cast("float", chosen)
-            self._settle(now)
+            self._settle(now, begun=True)
             return True
         transaction, exchange = chosen
         self.dispatcher.started(transaction, now)
@@ -464,6 +464,7 @@ class LineMachine:
                 self._settle(now)
             return b""
         if not self._echo.owed and self.state is EXCHANGE and not self._leg.begun:
+            self._wire.output.held = False  # it is heard, so it has left
             due = self._leg.echoed(now)
             answered = self._wire.exchange is not None and self._wire.exchange.answered
             self._deadlines.line = due if answered else now + self._leg.timing.turnaround

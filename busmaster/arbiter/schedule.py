@@ -1,14 +1,21 @@
-"""Polls on a fixed grid (R10), and the line time that an exchange takes."""
+"""Polls on a fixed grid (R10), and the line time that an exchange takes.
+
+No call does more than a bounded amount of work, however many polls there are and however much they read: the loop
+that owns the line is never held up. What is left over is due at once, so that the owner calls again when it has seen
+to the line.
+"""
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import count
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from itertools import count, islice
 from math import ceil, floor, inf
 from typing import Any
 
 from busmaster.arbiter.histogram import Histogram
+from busmaster.arbiter.phases import STRIDE, quietest_offset
 from busmaster.arbiter.transaction import BACKGROUND, POLL, Priority, Transaction
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Exchange
@@ -17,11 +24,10 @@ LONGEST_PATIENCE = 10.0
 """Seconds after which a poll's cycle goes before those that came later, however long its period is."""
 FILL = 0.9
 """Cycles are spread over this share of the time when phases are chosen: the rest is left for what varies."""
-KINKS = 2000
-"""Bounds the work of choosing one phase: some 2000 of them cost a millisecond."""
-MEETINGS = 8
-"""Two polls whose cycles take longer than so many common divisors of their periods meet anyway."""
-ROUNDING = 1e-7
+SLICE = 128
+"""Units of work, each of about a microsecond, that are done in one call for polls that cannot start yet."""
+AT_ONCE = 32
+"""Cycles, and exchanges of cycles, that are started in one call."""
 
 
 def line_time(exchange: Exchange[Any], byte_time: float, reply_time: float | None = None) -> float:
@@ -46,7 +52,9 @@ class Poll:
     """Transactions that are run once a period, on the grid base + k x period.
 
     `cost` is the line time of one cycle in seconds, for the choice of phases. `results` are its transactions: they
-    hold the outcome of the last cycle until the next one starts. A poll that was removed is not added again.
+    hold the outcome of the last cycle until the next one starts. `preparation`, if there is one, is work that gives it
+    its transactions and its cost: each step yields how many units it took, of about a microsecond. A poll that was
+    removed is not added again.
     """
 
     __slots__ = (
@@ -65,11 +73,14 @@ class Poll:
         "paused",
         "period",
         "phase",
+        "placed",
+        "preparation",
         "priority",
         "remaining",
         "results",
         "started",
         "waiter",
+        "wanted",
     )
 
     def __init__(self, name: str, period: float, *, phase: float | None = None, cost: float = 0.0) -> None:
@@ -85,12 +96,15 @@ class Poll:
         self.priority = POLL
         self.results: Sequence[Transaction] = ()
         self.fresh: Sequence[Transaction] | None = None
+        self.preparation: Iterator[int] | None = None
         self.waiter: Any = None
         self.base = 0.0
         self.number = 0
         self.due = inf
         self.active = False
+        self.placed = False
         self.paused = False
+        self.wanted = False
         self.remaining = 0
         self.started = self.finished = -inf
         self.cycles = 0
@@ -109,12 +123,19 @@ class Schedule:
     """All polls of a line and when each is due next."""
 
     def __init__(self) -> None:
+        self.polls: dict[Poll, None] = {}
         self._heap: list[tuple[float, int, Poll]] = []
         self._order = count()
         self._epoch = inf
-        self._place_at = inf
-        self._unplaced: list[Poll] = []
-        self.polls: list[Poll] = []
+        # what cannot start yet
+        self._work_at = inf
+        self._preparing: deque[Poll] = deque()
+        self._unplaced: list[tuple[float, int, Poll]] = []
+        self._placing: tuple[Poll, float, Generator[int, None, float]] | None = None
+        # what starts
+        self._demanded: deque[Poll] = deque()
+        self._cycles: deque[tuple[Poll, Iterator[Transaction]]] = deque()
+        self._left_over_at = inf
 
     def add(self, poll: Poll, now: float) -> None:
         """A poll without a phase gets one when it is first due: those added together are placed jointly.
@@ -125,71 +146,180 @@ class Schedule:
             raise InvalidCommand(f"poll group {poll.name!r} is or was running: make a new one")
         self._epoch = min(self._epoch, now)
         poll.active = True
-        self.polls.append(poll)
-        if poll.phase is None:
-            self._unplaced.append(poll)
-            self._place_at = now
-        else:
-            self._start(poll, self._epoch + poll.phase, now)
+        self.polls[poll] = None
+        self.prepare(poll, now)
+
+    def prepare(self, poll: Poll, now: float) -> None:
+        """Do its preparation: as far as one slice of work goes at once, where no other work waits."""
+        if not poll.active:
+            return
+        if poll.preparation is None:
+            self._prepared(poll, now)
+            return
+        left = 0 if self.unplaced() else SLICE
+        if poll not in self._preparing:
+            self._preparing.append(poll)
+        while self._preparing and left > 0:
+            left -= self._prepare(now)
+        self._work_at = now if self.unplaced() else inf
 
     def remove(self, poll: Poll) -> None:
+        """What is planned for it is left out when its turn comes."""
         if poll.active:
             poll.active = False
-            self.polls.remove(poll)
-            self._unplaced = [other for other in self._unplaced if other is not poll]
-            self._heap = [entry for entry in self._heap if entry[2] is not poll]
-            heapq.heapify(self._heap)
+            poll.preparation = None
+            del self.polls[poll]
+            if len(self._heap) > 2 * len(self.polls) + AT_ONCE:
+                self._heap = [entry for entry in self._heap if entry[2].active]
+                heapq.heapify(self._heap)
+            if not self.unplaced():
+                self._work_at = inf
+
+    def demand(self, poll: Poll) -> None:
+        """One cycle off the grid, with the next call of `begin`; of a poll that is being prepared, after that."""
+        if poll.preparation is not None:
+            poll.wanted = True
+        else:
+            self._demanded.append(poll)
 
     def next_due(self) -> float:
-        due = self._heap[0][0] if self._heap else inf
-        return min(due, self._place_at) if self._unplaced else due
+        heap = self._heap
+        while heap and not heap[0][2].active:
+            heapq.heappop(heap)
+        return min(heap[0][0] if heap else inf, self._work_at, self._left_over_at)
+
+    def begin(self, now: float) -> list[Transaction]:
+        """The transactions, ready to be queued, of cycles that start now: at most AT_ONCE of them."""
+        due = self.release(now)
+        while self._demanded:
+            poll = self._demanded.popleft()
+            if poll.active and not poll.running and poll not in due:
+                poll.due = now
+                due.append(poll)
+        self._cycles.extend((poll, begin_cycle(poll, now)) for poll in due)
+        begun: list[Transaction] = []
+        while self._cycles and len(begun) < AT_ONCE:
+            poll, cycle = self._cycles[0]
+            fresh = list(islice(cycle, AT_ONCE - len(begun))) if poll.active else []
+            begun += fresh
+            if not fresh:
+                self._cycles.popleft()
+        self._left_over_at = now if self._cycles else inf
+        return begun
 
     def release(self, now: float) -> list[Poll]:
         """The polls whose cycle starts now, each with `due` set. Cycles that could not start are counted missed."""
-        if self._unplaced and self._place_at <= now:
-            self._place(now)
+        if self._work_at <= now:
+            self.work(now)
         starting: list[Poll] = []
         heap = self._heap
-        while heap and heap[0][0] <= now:
+        for _ in range(AT_ONCE):
+            if not heap or heap[0][0] > now:
+                break
             poll = heap[0][2]
-            behind = floor((now - poll.base) / poll.period) - poll.number
-            if poll.base + (poll.number + max(behind, 0) + 1) * poll.period <= now:
-                behind = max(behind, 0) + 1  # rounding
-            if behind > 0:
-                poll.number += behind
-                poll.missed += 0 if poll.paused else behind
-            due = poll.next_due()
-            poll.number += 1
-            heapq.heapreplace(heap, (poll.next_due(), next(self._order), poll))
-            if poll.paused:
-                continue
-            if poll.remaining:
-                poll.missed += 1
-                continue
-            poll.due = due
-            starting.append(poll)
+            if not poll.active:
+                heapq.heappop(heap)
+            elif self._starts(poll, now):
+                starting.append(poll)
         return starting
 
-    def _place(self, now: float) -> None:
-        """Short periods first: what is left free then repeats, and longer periods find it."""
-        placed = [poll for poll in self.polls if poll not in self._unplaced]
-        load = sum(poll.cost / poll.period for poll in self.polls)
-        for poll in sorted(self._unplaced, key=lambda poll: poll.period):
-            base = now + quietest_offset(poll, placed, now, FILL / load if load else 1.0)
+    def _starts(self, poll: Poll, now: float) -> bool:
+        """The first of the heap is due: put it back where it is due next."""
+        behind = floor((now - poll.base) / poll.period) - poll.number
+        if poll.base + (poll.number + max(behind, 0) + 1) * poll.period <= now:
+            behind = max(behind, 0) + 1  # rounding
+        if behind > 0:
+            poll.number += behind
+            poll.missed += 0 if poll.paused else behind
+        due = poll.next_due()
+        poll.number += 1
+        heapq.heapreplace(self._heap, (poll.next_due(), next(self._order), poll))
+        if poll.paused:
+            return False
+        if poll.remaining:
+            poll.missed += 1
+            return False
+        poll.due = due
+        return True
+
+    # what cannot start yet
+
+    def work(self, now: float) -> None:
+        """One slice. Short periods are placed first: what is left free then repeats, and longer periods find it."""
+        left = SLICE
+        while left > 0 and self.unplaced():
+            left -= self._prepare(now) if self._preparing else self._place(now)
+        if not self.unplaced():
+            self._work_at = inf
+
+    def unplaced(self) -> bool:
+        """Whether some poll cannot start yet: it is prepared, or placed, by further calls of `work` or `release`."""
+        while self._preparing and not self._preparing[0].active:
+            self._preparing.popleft()
+        while self._unplaced and not self._unplaced[0][2].active:
+            heapq.heappop(self._unplaced)
+        if self._placing is not None and not self._placing[0].active:
+            self._placing = None
+        return bool(self._preparing or self._unplaced) or self._placing is not None
+
+    def _prepare(self, now: float) -> int:
+        """One step; the units that it took."""
+        poll = self._preparing[0]
+        units = None if poll.preparation is None else next(poll.preparation, None)
+        if units is not None:
+            return units
+        self._preparing.popleft()
+        poll.preparation = None
+        self._prepared(poll, now)
+        return 1
+
+    def _prepared(self, poll: Poll, now: float) -> None:
+        if poll.phase is not None and not poll.placed:
+            self._start(poll, self._epoch + poll.phase, now)
+        elif not poll.placed:
+            heapq.heappush(self._unplaced, (poll.period, next(self._order), poll))
+            self._work_at = now
+        if poll.wanted:
+            poll.wanted = False
+            self._demanded.append(poll)
+
+    def _place(self, now: float) -> int:
+        """One step; the units that it took."""
+        if self._placing is None:
+            poll = heapq.heappop(self._unplaced)[2]
+            self._placing = poll, now, self._search(poll, now)
+        poll, since, search = self._placing
+        try:
+            return next(search)
+        except StopIteration as found:
+            base = since + found.value
             poll.phase = (base - self._epoch) % poll.period
-            placed.append(poll)
             self._start(poll, base, now)
-        self._unplaced.clear()
+            self._placing = None
+            return 1
+
+    def _search(self, poll: Poll, now: float) -> Generator[int, None, float]:
+        """Where it meets those that have their place, if all spread over the time that there is."""
+        load = 0.0
+        others = []
+        for number, other in enumerate(tuple(self.polls), 1):
+            load += other.cost / other.period
+            if other.placed:
+                others.append(other)
+            if number % STRIDE == 0:
+                yield STRIDE
+        return (yield from quietest_offset(poll, others, now, FILL / load if load else 1.0))
 
     def _start(self, poll: Poll, base: float, now: float) -> None:
         """Its grid begins with the first time from now on."""
+        poll.placed = True
         poll.base = base + ceil((now - base) / poll.period) * poll.period
         poll.number = 0
         heapq.heappush(self._heap, (poll.base, next(self._order), poll))
 
 
-def begin_cycle(poll: Poll, now: float) -> list[Transaction]:
-    """Make the poll's transactions fresh; returns them, ready to be queued.
+def begin_cycle(poll: Poll, now: float) -> Iterator[Transaction]:
+    """Start a cycle of the poll: its transactions, each made fresh when it is taken, ready to be queued.
 
     A node that was never heard is read in BACKGROUND, so that absent nodes hold up nobody when a line starts.
     """
@@ -198,13 +328,17 @@ def begin_cycle(poll: Poll, now: float) -> list[Transaction]:
     poll.remaining = len(poll.results)
     poll.started = -inf
     poll.cycles += 1
+    return _made_fresh(poll, now)
+
+
+def _made_fresh(poll: Poll, now: float) -> Iterator[Transaction]:
     deadline = poll.due + poll.patience
     for transaction in poll.results:
         transaction.reset()
         transaction.queued = now
         transaction.deadline = deadline
         transaction.priority = poll.priority if transaction.node.last_reply > -inf else BACKGROUND
-    return list(poll.results)
+        yield transaction
 
 
 def set_members(poll: Poll, members: Iterable[Transaction], priority: Priority = POLL) -> None:
@@ -216,69 +350,4 @@ def set_members(poll: Poll, members: Iterable[Transaction], priority: Priority =
     poll.priority = priority
 
 
-def quietest_offset(poll: Poll, others: Sequence[Poll], now: float, stretch: float = 1.0) -> float:
-    """Seconds from `now`, below the period, at which this poll's cycles meet the others' least.
-
-    All costs are multiplied by `stretch`. The time in which two polls want the line at once is a function of their
-    offset modulo the common divisor of their periods, made of straight pieces; the least sum of all of them lies at
-    one of the kinks. Among equals the earliest wins. The search ends early where there would be too many kinks.
-    """
-    own = min(poll.cost * stretch, poll.period)
-    pairs = []
-    for other in others:
-        step = common_divisor(poll.period, other.period)
-        length = min(other.cost * stretch, other.period)
-        if own + length < MEETINGS * step:
-            pairs.append(((other.base - now) % step, length, step, step / other.period))
-    if not pairs:
-        return 0.0
-    affordable = KINKS / 4 - sum((own + length) / step + 1 for _, length, step, _ in pairs)
-    reach = affordable / sum(1 / step for _, _, step, _ in pairs)
-    reach = min(poll.period, max(reach, min(step for _, _, step, _ in pairs)))
-    best, least = 0.0, inf
-    overlap = slope = at = 0.0
-    for x, bend in sorted(_kinks(pairs, own, reach)):
-        overlap += slope * (x - at)
-        slope += bend
-        at = x
-        if 0 <= x < reach and overlap < least - ROUNDING:
-            best, least = x, overlap
-    return best
-
-
-def _kinks(
-    pairs: Iterable[tuple[float, float, float, float]], own: float, reach: float
-) -> Iterator[tuple[float, float]]:
-    """Where the sum of overlaps changes its slope, from before 0 up to `reach`, and by how much."""
-    yield 0.0, 0.0
-    for begin, length, step, weight in pairs:
-        shorter = min(own, length)
-        first = begin - own - step * floor((begin + length) / step)
-        for k in range(ceil((reach - first) / step)):
-            start = first + k * step
-            end = start + own + length
-            yield start, weight
-            yield start + shorter, -weight
-            yield end - shorter, -weight
-            yield end, weight
-
-
-def common_divisor(first: float, second: float) -> float:
-    """The greatest time of which both periods are multiples, within a ten-thousandth of the shorter one."""
-    first, second = max(first, second), min(first, second)
-    least = 1e-4 * second
-    while second > least:
-        first, second = second, abs(first - second * round(first / second))
-    return first
-
-
-__all__ = [
-    "Poll",
-    "Priority",
-    "Schedule",
-    "begin_cycle",
-    "common_divisor",
-    "line_time",
-    "quietest_offset",
-    "set_members",
-]
+__all__ = ["Poll", "Priority", "Schedule", "begin_cycle", "line_time", "set_members"]

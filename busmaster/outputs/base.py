@@ -19,17 +19,20 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Generic, NamedTuple, TypeAlias, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar
 
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.settings import Settings
-from busmaster.polling import Snapshot
+from busmaster.points import Point
+from busmaster.polling import Sample, Snapshot
 
 Formatted = TypeVar("Formatted")
 
 TICK = 0.05
 PAUSE = 0.0002
 """Seconds for which the thread lets go of the interpreter after each cycle that it has formatted."""
+PIECE = 100
+"""Values of one cycle after which it does so too."""
 BATCH = 2_000
 """Values that are written at once."""
 FIRST_RETRY, LAST_RETRY = 0.5, 10.0
@@ -245,6 +248,14 @@ class BatchOutput(Output, Generic[Formatted]):
                     self.up()
         finally:
             self.shut()
+
+    def unhurried(self, snapshot: Snapshot) -> Iterator[tuple[Point[Any], Sample]]:
+        """Its points and samples; the thread lets go of the interpreter after each PIECE, so that a cycle of hundreds
+        of points keeps the line's loop no longer than one of a few."""
+        for number, item in enumerate(snapshot.samples.items(), 1):
+            yield item
+            if number % PIECE == 0 and not self._stop.is_set():
+                time.sleep(PAUSE)
 
     def _fill(self) -> bool:
         """Format what waits, up to a batch; the batch that could not be written first."""

@@ -85,7 +85,7 @@ class CsvOutput(FileOutput):
                 sample.quality.value,
                 sample.error.what if sample.error else "",
             )
-            for point, sample in item.samples.items()
+            for point, sample in self.unhurried(item)
         )
 
 

@@ -80,7 +80,7 @@ class SqliteOutput(BatchOutput[Rows]):
                 sample.quality.value,
                 sample.error.what if sample.error else None,
             )
-            for point, sample in item.samples.items()
+            for point, sample in self.unhurried(item)
         ]
         return Rows(samples, None)
 

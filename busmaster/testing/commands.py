@@ -71,6 +71,18 @@ def _check_announcements(command: Command[Any], exchange: Exchange[Any]) -> Iter
             yield f"{command!r} announces a reply of typically {sizes.typical} and at most {sizes.longest} bytes"
     if not exchange.answered and not command.writes:
         yield f"{command!r} is a read that is not answered"
+    yield from _check_keys(command, exchange)
+
+
+def _check_keys(command: Command[Any], exchange: Exchange[Any]) -> Iterator[str]:
+    """What replies begin with is compared, and remembered by: a tuple, and no empty key, for that fits every byte."""
+    for name in ("answers", "owed"):
+        keys: object = getattr(exchange, name, None)
+        if not isinstance(keys, tuple) or not all(isinstance(key, bytes) and key for key in keys):
+            yield f"{command!r}: {name} is a tuple of what its replies begin with, not {keys!r}"
+        elif bool(keys) is not exchange.answered:
+            why = "is answered, and does not say by what" if exchange.answered else "is not answered, and says by what"
+            yield f"{command!r} {why}: {name} is {keys!r}"
 
 
 def check_invalid(builders: Iterable[Callable[[], object]]) -> Iterator[str]:
@@ -84,6 +96,19 @@ def check_invalid(builders: Iterable[Callable[[], object]]) -> Iterator[str]:
             yield f"invalid[{number}] raises {error!r} in place of InvalidCommand"
         else:
             yield f"invalid[{number}] builds {built!r} in place of raising InvalidCommand"
+
+
+def check_checks(profile: Profile) -> Iterator[str]:
+    """Reads of which no two answers could be taken for each other."""
+    seen: dict[bytes, Command[Any]] = {}
+    for check in profile.checks:
+        if check.writes:
+            yield f"the check {check!r} writes"
+            continue
+        for key in check.open(profile.addresses[0], profile.timings).answers:
+            if key in seen:
+                yield f"the checks {seen[key]!r} and {check!r} have answers that begin alike: {key.hex(' ')}"
+            seen[key] = check
 
 
 def check_addresses(profile: Profile) -> Iterator[str]:

@@ -22,6 +22,8 @@ derives what the arbiter relies on (`busmaster.exchange`), and raises `NotConfor
 - any bytes at all end in a value, FrameError or Refused, and every exchange has an end; the profile's listener, if it
   has one, takes any bytes too;
 - what follows a reply is handed back; sizes, legs, starts and closing bytes are as announced;
+- so are `answers` and `owed` (R15): good replies begin so, and commands whose good replies could be exchanged share
+  one; the profile's `checks` are reads, and share none;
 - commands are immutable, hashable values with a text; bad arguments raise InvalidCommand (`invalid`);
 - every attempt sends the same bytes, and no two addresses do;
 - what is written to an emulated `device` is read back (`round_trips`).
@@ -38,8 +40,9 @@ from typing import Any
 from busmaster.errors import Refused
 from busmaster.exchange import Command, Done, Exchange, FrameError, Listener
 from busmaster.profile import Profile
+from busmaster.testing.answers import check_exchangeable, check_good_reply
 from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen
-from busmaster.testing.commands import check_addresses, check_command, check_invalid
+from busmaster.testing.commands import check_addresses, check_checks, check_command, check_invalid
 from busmaster.testing.damage import MANY_BYTES, bytewise, flips, garbage_chunks, splits
 from busmaster.testing.listening import Ending, Listening
 
@@ -71,7 +74,7 @@ def check_protocol(
     kit = _Kit(profile, list(cases), names, list(unseen), Random(seed))
     if not kit.cases:
         raise NotConformant(profile.name, ["there is no case"])
-    findings = [*check_addresses(profile), *check_invalid(invalid)]
+    findings = [*check_addresses(profile), *check_checks(profile), *check_invalid(invalid)]
     for case in kit.cases:
         findings += check_command(case.command, case.address, profile.timings)
         trouble = list(kit.check_reply(case))
@@ -81,6 +84,7 @@ def check_protocol(
             trouble += islice(kit.check_garbage(case, garbage), FINDINGS_EACH)
         findings += trouble
     findings += kit.check_replies_to_others()
+    findings += kit.check_exchangeable()
     findings += kit.check_foreign(foreign)
     findings += kit.check_exemptions()
     for trip in round_trips:
@@ -162,6 +166,8 @@ class _Kit:
                 yield f"{case}: a leg of {len(leg)} bytes is longer than the {size.longest} announced"
         if len(ending.send) != exchange.closing:
             yield f"{case}: closes with {len(ending.send)} bytes, not with the {exchange.closing} announced"
+        fresh = case.command.open(case.address, self.profile.timings)
+        yield from (f"{case}: {what}" for what in check_good_reply(fresh, self.turns(case)))
 
     # what the line makes of a reply
 
@@ -262,8 +268,19 @@ class _Kit:
                     why = f"the reply to {other}"
                     yield from self._check_not_accepted(mine.command, mine.address, heard, good, why)
 
+    def check_exchangeable(self) -> Iterator[str]:
+        """Each reply in place of every other, refusals aside."""
+        good = [case for case in self.cases if self._first_turn(case)]
+        for mine in good:
+            for other in good:
+                exchanged = self.hear(mine, *other.legs).ending
+                if other is not mine and exchanged is not None and exchanged.delivered:
+                    asked, answered = (case.command.open(case.address, self.profile.timings) for case in (mine, other))
+                    if what := check_exchangeable(asked, answered):
+                        yield f"{mine}: {what}, and takes the reply to {other}"
+
     def _first_turn(self, case: Case) -> bytes:
-        """Empty for a refusal, and where something had to be repeated: such a case does not show what a reply is."""
+        """Empty for a broadcast, a refusal, and where something had to be repeated: that shows not what a reply is."""
         listening = self.hear(case, *case.legs)
         repeated = len(b"".join(listening.said)) != sum(leg.sent for leg in listening.exchange.later)
         return b"" if repeated or case.raises is not None else b"".join(self.turns(case)[0])

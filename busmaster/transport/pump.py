@@ -17,7 +17,7 @@ import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import DriverErrors
-from busmaster.arbiter.events import Completed, Event, Mark, Polled
+from busmaster.arbiter.events import Completed, Event, Mark, Polled, Sampled
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Transaction
@@ -45,7 +45,7 @@ class Tap(Protocol):
 
 
 class Pump(asyncio.Protocol):
-    """Owns the arbiter of one line. `on_cycle` and `on_event` are the library's own and return at once.
+    """Owns the arbiter of one line. `on_sample`, `on_cycle` and `on_event` are the library's own and return at once.
 
     `name` is how errors call the port.
     """
@@ -54,6 +54,7 @@ class Pump(asyncio.Protocol):
         self,
         arbiter: Arbiter,
         *,
+        on_sample: Callable[[Poll, Transaction], None],
         on_cycle: Callable[[Poll], None],
         on_event: Callable[[Event], None],
         on_written: Callable[[Transaction], None] = lambda _: None,
@@ -64,6 +65,7 @@ class Pump(asyncio.Protocol):
         self.arbiter = arbiter
         self.clock: Callable[[], float] = time.monotonic
         self.tap = tap
+        self._on_sample = on_sample
         self._on_cycle = on_cycle
         self._on_event = on_event
         self._on_written = on_written
@@ -114,6 +116,8 @@ class Pump(asyncio.Protocol):
         while (event := arbiter.poll_event()) is not None:
             if type(event) is Completed:
                 self._resolve(event.transaction)
+            elif type(event) is Sampled:
+                self._on_sample(event.poll, event.transaction)
             elif type(event) is Polled:
                 self._on_cycle(event.poll)
             else:

@@ -105,7 +105,7 @@ class TelegramReader(SingleLeg, Generic[T]):
         self._buffer = b""
 
     @property
-    def owed(self) -> Sequence[bytes]:
+    def owed(self) -> tuple[bytes, ...]:
         return self.answers
 
     def parse(self, field: bytes) -> T:
@@ -134,8 +134,8 @@ class AcknowledgeReader(SingleLeg):
 
     sizes: ClassVar[Sizes] = Sizes(1, 1)
     starts: ClassVar[bytes] = ACK + NAK
-    answers: ClassVar[Sequence[bytes]] = (ACK,)
-    owed: ClassVar[Sequence[bytes]] = answers
+    answers: ClassVar[tuple[bytes, ...]] = (ACK,)
+    owed: ClassVar[tuple[bytes, ...]] = answers
 
     def feed(self, data: bytes) -> Need | Expect | Done[None]:
         if not data:

@@ -125,11 +125,11 @@ class Bench:
         assert self.arbiter.statistics(self.now).checks == self.checks, f"not a check: {self.sent()}"
         return self.answer(99)
 
-    def served(self, transaction: Transaction) -> Transaction:
+    def served(self, transaction: Transaction, after: float = 0.004) -> Transaction:
         """The node answers whatever is asked until this has ended."""
         while not self.ended(transaction):
             self.until_sent()
-            self.answer()
+            self.answer(after=after)
         return transaction
 
     def to(self, time: float) -> None:
@@ -199,9 +199,7 @@ def dead(bench: Bench) -> NodeRecord:
 def up(bench: Bench, address: int = 1) -> NodeRecord:
     """A node that is UP: it has answered a read of element 1 after 4 ms."""
     record = bench.node(address)
-    bench.ask(record)
-    bench.until_sent()
-    bench.answer(after=8 * TAU + 0.004)
+    bench.served(bench.ask(record), after=8 * TAU + 0.004)
     bench.until_ready()
     assert record.health is Health.UP
     return record

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import hypothesis.strategies as st
+import pytest
 from hypothesis import given, settings
 
-from busmaster.arbiter.backlog import SHARE, SLACK, Backlog
+from busmaster.arbiter.backlog import LOOKED_AT, SHARE, SLACK, Backlog
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -185,3 +186,77 @@ def test_nothing_is_lost_nor_served_twice(operations: list[tuple[str, Priority]]
             backlog.promote(inside[-1], priority)
         assert len(backlog) == len(inside)
     assert sorted(map(id, backlog.drain())) == sorted(map(id, inside))
+
+
+# what goes before the first one (R15)
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(Priority), st.integers(0, 5)), min_size=1, max_size=40),
+    st.integers(0, 39),
+)
+@settings(deadline=None)
+def test_r15_what_is_put_back_is_the_next_to_go_and_its_class_keeps_its_turn(
+    entries: list[tuple[Priority, int]], when: int
+) -> None:
+    """As if nobody had looked."""
+    plain, looked = Backlog(), Backlog()
+    for backlog in (plain, looked):
+        for place, (priority, deadline) in enumerate(entries):
+            transaction = waiting(priority, float(deadline))
+            transaction.touches = place
+            backlog.push(transaction)
+    for step in range(len(entries)):
+        if step == when:
+            first = looked.pop()
+            assert first is not None
+            looked.restore(first)
+            assert len(looked) == len(entries) - step
+        expected, served = plain.pop(), looked.pop()
+        assert expected is not None
+        assert served is not None
+        assert expected.touches == served.touches
+        expected.phase = served.phase = Phase.ON_WIRE
+    assert looked.pop() is None
+
+
+@pytest.mark.parametrize("priority", Priority)
+def test_r15_the_first_that_suits_is_picked_and_the_others_keep_their_places(priority: Priority) -> None:
+    backlog = Backlog()
+    entries = [waiting(priority) for _ in range(5)]
+    for transaction in entries:
+        backlog.push(transaction)
+    picked = backlog.pick(priority, lambda transaction: transaction in entries[2:4])
+    assert picked is entries[2]
+    assert len(backlog) == backlog.waiting(priority) == 4
+    assert [backlog.pop() for _ in range(4)] == [entries[0], entries[1], entries[3], entries[4]]
+
+
+@pytest.mark.parametrize("priority", Priority)
+def test_r15_only_the_first_few_are_looked_at(priority: Priority) -> None:
+    """Equal polls by the hundred must not be searched for an unlike one at every exchange."""
+    backlog = Backlog()
+    for _ in range(LOOKED_AT + 1):
+        backlog.push(waiting(priority))
+    last = waiting(priority, 2.0)
+    backlog.push(last)
+    seen = []
+
+    def suits(transaction: Transaction) -> bool:
+        seen.append(transaction)
+        return transaction is last
+
+    assert backlog.pick(priority, suits) is None
+    assert len(seen) == LOOKED_AT
+    assert len(backlog) == LOOKED_AT + 2
+
+
+@pytest.mark.parametrize("priority", Priority)
+def test_r15_what_has_ended_is_not_picked(priority: Priority) -> None:
+    backlog = Backlog()
+    entries = [waiting(priority) for _ in range(3)]
+    for transaction in entries:
+        backlog.push(transaction)
+    backlog.discard(entries[0], Phase.ENDED)
+    assert backlog.pick(priority, lambda _: True) is entries[1]
+    assert [backlog.pop(), backlog.pop()] == [entries[2], None]

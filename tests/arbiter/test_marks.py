@@ -84,6 +84,7 @@ def test_r15_what_followed_a_marked_byte_never_confirms_a_write() -> None:
     asked = bench.ask(node, hcp2.Write(1, (5,)))
     bench.until_sent()
     assert bench.answer() in (request_of(1), request_of(1, 2), request_of(2), request_of(2, 2)), "a check"
+    bench.until_sent()
     assert bench.sent() == WRITE_5
     bench.hear(ACK, after=0.004)
     assert asked.error is None

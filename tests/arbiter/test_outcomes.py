@@ -11,6 +11,7 @@ from busmaster.arbiter.health import CALM_LATENESS, Health, NodeRecord
 from busmaster.arbiter.transaction import Priority
 from busmaster.errors import BusError, GarbledReply, NoReply, Refused, Superseded, WriteUnconfirmed
 from busmaster.exchange import Timings
+from busmaster.protocols._comms.codec import Reading, Writing
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import ACK, FIVE, LATENESS, NAK, QUIET, READ_1_OF_NODE_1, TAU, WRITE_5, Bench, request_of, up
 
@@ -118,7 +119,7 @@ def test_r7_the_first_refusal_of_a_read_settles_for_the_lateness_and_the_second_
 # a bug in a protocol's reader
 
 
-class Buggy(hcp2.Reading):
+class Buggy(Reading):
     """Cannot read a 5."""
 
     def parse(self, field: bytes) -> float:
@@ -128,12 +129,12 @@ class Buggy(hcp2.Reading):
 
 
 class BuggyRead(hcp2.Read):
-    def open(self, address: int, timings: Timings) -> hcp2.Reading:
+    def open(self, address: int, timings: Timings) -> Reading:
         sound = super().open(address, timings)
         return Buggy(sound.request, b"%02X" % self.element, timings.read)
 
 
-class BuggyWriting(hcp2.Writing):
+class BuggyWriting(Writing):
     def feed(self, data: bytes) -> Any:
         raise KeyError("boom")
 

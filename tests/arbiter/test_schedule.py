@@ -12,21 +12,23 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given, settings
 
+import busmaster.arbiter.phases as phases_module
 import busmaster.arbiter.schedule as schedule_module
 from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.phases import KINKS, STRIDE, common_divisor, quietest_offset
 from busmaster.arbiter.schedule import (
-    KINKS,
+    AT_ONCE,
     LONGEST_PATIENCE,
+    SLICE,
     Poll,
     Schedule,
     begin_cycle,
-    common_divisor,
     line_time,
-    quietest_offset,
     set_members,
 )
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import InvalidCommand
+from busmaster.merging import at_once
 from busmaster.profile import LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
@@ -110,7 +112,7 @@ def test_a_paused_poll_neither_starts_nor_misses_and_resumes_on_the_grid() -> No
 def test_a_removed_poll_is_not_due_again_and_cannot_come_back() -> None:
     poll, other = Poll("a", 0.1, phase=0.0), Poll("b", 0.3, phase=0.0)
     schedule = running(poll, other)
-    begin_cycle(poll, 0.0)
+    list(begin_cycle(poll, 0.0))
     schedule.remove(poll)
     assert {name for _, name in released(schedule, 1.0)} == {"b"}
     with pytest.raises(InvalidCommand, match="make a new one"):
@@ -141,7 +143,7 @@ def test_a_cycle_begins_with_fresh_transactions_that_want_to_be_done_within_the_
     poll = Poll("a", 0.5, phase=0.0)
     set_members(poll, members(1, 2), Priority.POLL)
     running(poll).release(0.0)
-    cycle = begin_cycle(poll, 0.001)
+    cycle = list(begin_cycle(poll, 0.001))
     assert [(t.queued, t.deadline) for t in cycle] == [(0.001, 0.5)] * 2
     assert poll.remaining == 2
 
@@ -150,7 +152,7 @@ def test_r9_a_slow_poll_waits_no_longer_for_later_fast_ones_than_its_patience() 
     poll = Poll("hourly", 3600.0, phase=0.0)
     set_members(poll, members(1))
     running(poll).release(0.0)
-    assert begin_cycle(poll, 0.0)[0].deadline == LONGEST_PATIENCE
+    assert next(begin_cycle(poll, 0.0)).deadline == LONGEST_PATIENCE
 
 
 def test_r11_a_node_that_was_never_heard_is_read_in_background() -> None:
@@ -166,10 +168,10 @@ def test_new_members_are_asked_from_the_next_cycle_on() -> None:
     poll = Poll("a", 0.5, phase=0.0)
     old, new = members(1, 2)
     set_members(poll, [old])
-    begin_cycle(poll, 0.0)
+    list(begin_cycle(poll, 0.0))
     set_members(poll, [new])
     assert list(poll.results) == [old]
-    assert begin_cycle(poll, 0.5) == [new]
+    assert list(begin_cycle(poll, 0.5)) == [new]
 
 
 # phases
@@ -215,13 +217,13 @@ def test_a_long_cycle_meets_as_little_as_can_be() -> None:
     polls = [Poll("fast", 0.05, phase=0.0, cost=0.01), Poll("slow", 2.0, phase=0.0, cost=0.4)]
     schedule = running(*polls)
     schedule.release(0.0)
-    assert 0.4 <= quietest_offset(Poll("another", 2.0, cost=0.4), polls, 0.0) <= 1.6
+    assert 0.4 <= at_once(quietest_offset(Poll("another", 2.0, cost=0.4), polls, 0.0)) <= 1.6
 
 
 def test_choosing_a_phase_among_many_polls_looks_at_a_bounded_number_of_kinks(monkeypatch: pytest.MonkeyPatch) -> None:
     """The 60th group costs the running line a few milliseconds, however its period relates to the others'."""
     looked_at = most = 0
-    kinks = schedule_module._kinks
+    kinks = phases_module._kinks
 
     def counted(*arguments: Any) -> Iterator[tuple[float, float]]:
         nonlocal looked_at
@@ -229,14 +231,14 @@ def test_choosing_a_phase_among_many_polls_looks_at_a_bounded_number_of_kinks(mo
             looked_at += 1
             yield kink
 
-    monkeypatch.setattr(schedule_module, "_kinks", counted)
+    monkeypatch.setattr(phases_module, "_kinks", counted)
     chance = random.Random(3)
     for period in (0.25, 10.0, 0.007, 3600.0, 0.333):
         others = [Poll(str(n), chance.choice([0.1, 0.25, 0.3, 1.0, 60.0]), cost=0.005) for n in range(59)]
         for other in others:
             other.base = chance.uniform(0.0, other.period)
         looked_at = 0
-        offset = quietest_offset(Poll("sixtieth", period, cost=0.005), others, 0.0)
+        offset = at_once(quietest_offset(Poll("sixtieth", period, cost=0.005), others, 0.0))
         most = max(most, looked_at)
         assert 0 <= offset < period
     assert 0 < most <= 2 * KINKS
@@ -262,7 +264,7 @@ def test_no_offset_is_quieter_than_the_one_chosen(others: list[tuple[float, floa
         polls.append(Poll(str(n), other_period, cost=min(cost, other_period)))
         polls[-1].base = phase * other_period
     poll = Poll("new", period, cost=0.01)
-    offset = quietest_offset(poll, polls, 0.0)
+    offset = at_once(quietest_offset(poll, polls, 0.0))
     chosen = overlap(poll, offset, polls, 2.0)
     tried = [overlap(poll, n / 40 * period, polls, 2.0) for n in range(40)]
     assert chosen <= min(tried) + 1e-6
@@ -304,3 +306,162 @@ def test_r10_an_owner_who_was_late_starts_a_poll_once_even_if_the_clock_stands_o
     assert starting == [poll]
     assert poll.missed == cycles
     assert poll.next_due() > poll.base + cycles * period
+
+
+# nothing holds the loop up
+
+
+def counted_kinks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Counts, in its first item, the kinks that are looked at."""
+    looked_at = [0]
+    kinks = phases_module._kinks
+
+    def counted(*arguments: Any) -> Iterator[tuple[float, float]]:
+        for kink in kinks(*arguments):
+            looked_at[0] += 1
+            yield kink
+
+    monkeypatch.setattr(phases_module, "_kinks", counted)
+    return looked_at
+
+
+def two_hundred() -> list[Poll]:
+    periods = (0.25, 0.5, 1.0, 2.0, 0.1, 0.3, 0.7, 5.0)
+    return [Poll(str(n), periods[n % len(periods)], cost=0.001) for n in range(200)]
+
+
+def place_all(schedule: Schedule, now: float = 0.0) -> int:
+    """Until every poll has its place; the number of calls that it took."""
+    calls = 0
+    while schedule.unplaced():
+        assert schedule.next_due() <= now
+        schedule.release(now)
+        calls += 1
+    return calls
+
+
+def test_placing_two_hundred_polls_takes_many_calls_of_a_slice_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_at = counted_kinks(monkeypatch)
+    polls = two_hundred()
+    schedule = running(*polls)
+    slices = []
+    while schedule.unplaced():
+        before = looked_at[0]
+        schedule.release(0.0)
+        slices.append(looked_at[0] - before)
+    assert len(slices) > 100
+    assert max(slices) <= SLICE + STRIDE
+    assert all(poll.placed for poll in polls)
+
+
+def test_phases_do_not_depend_on_how_the_work_was_cut_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    cut, whole = two_hundred(), two_hundred()
+    place_all(running(*cut))
+    monkeypatch.setattr(schedule_module, "SLICE", 10**9)
+    assert place_all(running(*whole)) == 1
+    assert [poll.phase for poll in cut] == [poll.phase for poll in whole]
+
+
+def test_a_preparation_is_done_a_slice_at_a_time_and_then_the_poll_is_placed() -> None:
+    done = [0]
+
+    def work() -> Iterator[int]:
+        for _ in range(100):
+            done[0] += 10
+            yield 10
+
+    poll = Poll("large", 1.0)
+    poll.preparation = work()
+    schedule = running(poll)
+    steps = [done[0]]
+    while schedule.unplaced():
+        schedule.release(0.0)
+        steps.append(done[0])
+    assert steps[-1] == 1000
+    assert max(b - a for a, b in pairwise([0, *steps])) <= SLICE + 10
+    assert poll.placed
+
+
+def test_a_small_preparation_is_done_at_once_unless_other_work_waits() -> None:
+    schedule = Schedule()
+    done = []
+
+    def work(name: str) -> Iterator[int]:
+        done.append(name)
+        yield 1
+
+    for name in ("first", "second"):
+        poll = Poll(name, 1.0)
+        poll.preparation = work(name)
+        schedule.add(poll, 0.0)
+    assert done == ["first"]
+    place_all(schedule)
+    assert done == ["first", "second"]
+
+
+@pytest.mark.parametrize("calls", [0, 1, 2, 30])
+def test_polls_that_are_removed_while_they_are_placed_leave_nothing(calls: int) -> None:
+    stays, polls = Poll("stays", 0.4, phase=0.1), two_hundred()
+    for poll in polls[::2]:
+        poll.preparation = iter([10] * 30)
+    schedule = running(stays, *polls)
+    for _ in range(calls):
+        schedule.release(0.0)
+    for poll in polls:
+        schedule.remove(poll)
+    assert not schedule.unplaced()
+    assert schedule.next_due() == pytest.approx(0.1)
+    assert {name for _, name in released(schedule, 10.0)} == {"stays"}
+
+
+def test_a_large_cycle_is_started_so_many_exchanges_at_a_time() -> None:
+    poll = Poll("large", 10.0, phase=0.0)
+    large = members(*range(1, 201))
+    set_members(poll, large)
+    schedule = running(poll)
+    begun: list[Transaction] = []
+    while schedule.next_due() <= 0.0:
+        piece = schedule.begin(0.0)
+        assert len(piece) <= AT_ONCE
+        assert poll.running
+        begun += piece
+    assert begun == large
+    assert schedule.next_due() == pytest.approx(10.0)
+
+
+def test_a_poll_that_is_removed_while_its_cycle_starts_queues_no_more() -> None:
+    poll = Poll("large", 10.0, phase=0.0)
+    set_members(poll, members(*range(1, 201)))
+    schedule = running(poll)
+    assert len(schedule.begin(0.0)) == AT_ONCE
+    schedule.remove(poll)
+    assert schedule.begin(0.0) == []
+    assert schedule.next_due() == inf
+
+
+def test_polls_that_are_all_due_at_once_start_a_number_at_a_time_and_none_is_missed() -> None:
+    polls = [Poll(str(n), 1.0, phase=0.0) for n in range(200)]
+    schedule = running(*polls)
+    started = []
+    while schedule.next_due() <= 0.0:
+        piece = schedule.release(0.0)
+        assert len(piece) <= AT_ONCE
+        started += piece
+    assert started == polls
+    assert not any(poll.missed for poll in polls)
+
+
+def test_a_demand_waits_until_the_poll_is_prepared() -> None:
+    poll = Poll("large", 10.0, phase=5.0)
+    [member] = members(1)
+
+    def work() -> Iterator[int]:
+        yield 2 * SLICE
+        set_members(poll, [member])
+
+    poll.preparation = work()
+    schedule = running(poll)
+    schedule.demand(poll)
+    assert schedule.begin(0.0) == [member]
+    assert poll.due == 0.0
+    assert schedule.next_due() == pytest.approx(5.0)

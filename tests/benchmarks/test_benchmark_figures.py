@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from dataclasses import replace
 
 import pytest
@@ -13,6 +14,7 @@ from benchmarks.asks import hcp2_asks, msc_asks, wire_time
 from benchmarks.harness import Claim, Options, Table, Timings, quantile
 from benchmarks.late_replies import LATE
 from benchmarks.lines import Kind, Lines
+from benchmarks.loop_stalls import Hold, Watch
 from benchmarks.masters import Ask, Bare, Master, Ours, Streams
 from benchmarks.simulation import Simulation
 from benchmarks.trials import ours_in_virtual_time
@@ -51,6 +53,32 @@ def test_the_table_of_the_other_end_is_what_our_reader_takes_for_the_value(profi
         while not isinstance(step, Done):
             step = exchange.feed(b"")
         assert (step.value, step.send, step.rest) == (ask.value, ask.closing, b"")
+
+
+def test_a_hold_of_the_loop_is_seen_and_what_the_collector_took_is_told_apart() -> None:
+    watch = Watch()
+
+    async def run() -> tuple[Hold, Hold]:
+        await asyncio.sleep(0)
+        watch.take()
+        until = time.thread_time() + 0.005
+        while time.thread_time() < until:
+            pass
+        await asyncio.sleep(0)
+        held = watch.take()
+        watch.collects("start", {})
+        until = time.thread_time() + 0.005
+        while time.thread_time() < until:
+            pass
+        watch.collects("stop", {})
+        await asyncio.sleep(0)
+        return held, watch.take()
+
+    with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner:
+        held, collected = runner.run(run())
+    assert held.own >= 5.0
+    assert collected.cpu >= 5.0
+    assert collected.own <= collected.cpu - 5.0
 
 
 def test_a_wrong_value_is_counted() -> None:

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from busmaster.arbiter.in_step import InStep
 from tests.campaigns.__main__ import main
 from tests.campaigns.hunt import Hunt
 from tests.campaigns.judge import Totals
 from tests.campaigns.kinds import KINDS
-from tests.campaigns.mixes import BEYOND, WITHIN
+from tests.campaigns.mixes import BEYOND, IN_STEP, WITHIN
 
 EACH = 700
 """Transactions of one hunt."""
@@ -51,16 +52,27 @@ def test_what_the_faults_do_shows(protocol: str) -> None:
 
 
 @EVERY_PROTOCOL
-def test_beyond_the_assumption_the_oracle_sees_what_is_wrong(protocol: str) -> None:
+def test_beyond_the_assumption_the_oracle_sees_what_is_wrong(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def wrong(mix: str) -> Totals:
         total = Totals()
-        for seed in range(1, 4):
+        for seed in range(1, 7):
             total.add(Hunt(protocol, mix, seed).run(1000))
         assert not total.problems
         return total
 
-    assert wrong("overdue").confused > 0
     assert wrong("double flips").unseen > 0
+    monkeypatch.setattr(InStep, "owe", lambda in_step, *debt: None)
+    assert wrong("overdue").confused > 0
+
+
+@EVERY_PROTOCOL
+@pytest.mark.parametrize("mix", [mix.name for mix in IN_STEP])
+def test_r15_whatever_stands_still_nothing_is_wrong_or_lost_and_everything_heals(protocol: str, mix: str) -> None:
+    hunt = Hunt(protocol, mix, 1)
+    totals = hunt.run(EACH)
+    check(totals, hunt)
+    assert totals.wrong == totals.lost == 0
+    assert totals.transactions >= EACH
 
 
 @pytest.mark.parametrize("mix", [mix.name for mix in BEYOND])

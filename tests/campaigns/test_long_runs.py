@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from busmaster.arbiter.in_step import LONGEST_ALIKE
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.planning import Plan, PlannedGroup, PlannedNode, plan
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -94,8 +95,9 @@ def test_the_plan_of_a_schedule_that_fits_is_what_comes_of_it(groups: list[tuple
     assert line.world.arbiter.statistics(line.now).utilisation == pytest.approx(prediction.utilisation, abs=0.02)
     for group in prediction.groups:
         cycles = [done - due for due, _, done in line.cycles[group.name] if due > since]
-        assert sum(cycles) / len(cycles) == pytest.approx(group.cycle, rel=0.03)
-        assert max(cycles) <= 1.2 * group.longest_cycle
+        checked = 1 + 1 / LONGEST_ALIKE if group.name == "only" else 1.0  # its reads are alike
+        assert sum(cycles) / len(cycles) == pytest.approx(group.cycle * checked, rel=0.03)
+        assert max(cycles) <= 1.2 * group.longest_cycle + (LONGEST if checked > 1 else 0.0)
         assert max(cycles) <= group.worst_cycle
     assert [poll.missed for poll in line.polls] == missed
 

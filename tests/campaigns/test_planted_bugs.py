@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.transaction import Transaction
 from busmaster.exchange import FrameError
@@ -35,8 +36,10 @@ def caught(protocol: str, mix: str) -> Totals:
 
 @pytest.fixture(autouse=True)
 def wrong_values_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """R1 and R3 are checked at each request too: that would end the hunt before harm is done."""
+    """R1 and R3 are checked at each request too: that would end the hunt before harm is done. And R15 would prevent
+    the harm: what is owed is known whatever the bug."""
     monkeypatch.setattr(Judge, "request_leaves", lambda judge, now: None)
+    monkeypatch.setattr(InStep, "owe", lambda in_step, *debt: None)
 
 
 def excusing(feed: Callable[..., Any]) -> Callable[..., Any]:
@@ -71,10 +74,10 @@ def test_a_cancellation_that_clears_the_exchange_is_caught(protocol: str, monkey
 
     def cancel(arbiter: Arbiter, transaction: Transaction, now: float) -> None:
         right(arbiter, transaction, now)
-        if arbiter._transaction is transaction:
+        if arbiter._wire.transaction is transaction:
             arbiter._end_exchange()
             arbiter.dispatcher._end(transaction, now)
-            arbiter._release(now, 0.0, now)
+            arbiter._release(0.0, now)
 
     monkeypatch.setattr(Arbiter, "cancel", cancel)
     assert "WRONG" in caught(protocol, "cancelled").problems[0]
@@ -105,3 +108,9 @@ def test_without_r3_a_request_that_leaves_too_early_is_caught_before_it_does_har
     monkeypatch.undo()
     monkeypatch.setattr(Leg, "past", lambda leg: leg.end)
     assert "R3" in Hunt(protocol, "late", 1).run(EACH).problems[0]
+
+
+@EVERY_PROTOCOL
+def test_a_debt_that_is_forgotten_is_caught(protocol: str) -> None:
+    """R15 removed; R3's assumption does not hold behind this network."""
+    assert "WRONG" in caught(protocol, "network, equal").problems[0]

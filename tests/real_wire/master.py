@@ -92,8 +92,8 @@ class StoppingPort:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._port, name)
 
-    async def open(self, protocol_factory: Callable[[], asyncio.Protocol]) -> asyncio.Transport:
-        transport = await self._port.open(protocol_factory)
+    async def open(self, protocol_factory: Callable[[], asyncio.Protocol], *whose: Any) -> asyncio.Transport:
+        transport = await self._port.open(protocol_factory, *whose)
         write = transport.write
 
         def stop_and_write(data: bytes) -> None:

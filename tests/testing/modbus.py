@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
+
+import pytest
 
 from busmaster.emulator.device import Device
 from busmaster.errors import InvalidCommand, Refused
@@ -22,7 +24,7 @@ from busmaster.exchange import (
     no_reply,
 )
 from busmaster.profile import LineSettings, Profile
-from busmaster.testing import Case
+from busmaster.testing import Case, NotConformant, check_protocol
 
 READ, WRITE, EXCEPTION = 3, 6, 0x80
 
@@ -52,7 +54,16 @@ class Asking:
         self.request = request
         self.timing = timing
         self.starts = request[:1]
+        self.answers: tuple[bytes, ...] = (self.header(),)
         self.buffer = b""
+
+    def header(self) -> bytes:
+        """What its good reply begins with: unit, function, and how many bytes."""
+        return self.request[:2] + b"\x02"
+
+    @property
+    def owed(self) -> tuple[bytes, ...]:
+        return self.answers
 
     def size(self) -> int:
         return 7
@@ -93,6 +104,9 @@ class Telling(Asking):
     """A write: the reply is the request."""
 
     sizes = Sizes(8, 8)
+
+    def header(self) -> bytes:
+        return self.request[:6]
 
     def size(self) -> int:
         return 8
@@ -153,6 +167,7 @@ MODBUS = Profile(
     line=LineSettings(19200, parity="E"),
     timings=Timings.uniform(ReplyTiming(0.05, 0.1, 0.2, 0.02)),
     probe=ReadRegister(0),
+    checks=(ReadRegister(0),),
 )
 REPLY = bytes.fromhex("11 03 02 02 2b 38 f8")
 OTHER_UNIT = checked(0x12, READ, 2, 2, 0x2B)
@@ -188,3 +203,15 @@ class Registers(Device):
 
     def hear_byte(self, byte: int, now: float) -> None:
         raise NotImplementedError
+
+
+def find(*cases: Case, profile: Profile = MODBUS, **options: Any) -> str:
+    """All findings, which there must be."""
+    with pytest.raises(NotConformant) as error:
+        check_protocol(profile, cases or CASES, **{"names": named, **options})
+    assert error.value.findings
+    return str(error.value)
+
+
+def reading_with(exchange: type[Asking], **changes: Any) -> Case:
+    return replace(READING, command=ReadRegister(7, exchange), **changes)

@@ -23,8 +23,7 @@ from busmaster.exchange import (
     Timings,
     no_reply,
 )
-from busmaster.profile import Profile
-from busmaster.testing import Case, Foreign, NotConformant, RoundTrip, Unseen, answers_of, check_protocol
+from busmaster.testing import Foreign, NotConformant, RoundTrip, Unseen, answers_of, check_protocol
 from tests.testing.modbus import (
     CASES,
     MODBUS,
@@ -35,7 +34,9 @@ from tests.testing.modbus import (
     Registers,
     WriteRegister,
     checked,
+    find,
     named,
+    reading_with,
 )
 
 
@@ -64,18 +65,6 @@ def test_a_kit_without_cases_has_shown_nothing() -> None:
 
 
 # planted bugs in a reader
-
-
-def find(*cases: Case, profile: Profile = MODBUS, **options: Any) -> str:
-    """All findings, which there must be."""
-    with pytest.raises(NotConformant) as error:
-        check_protocol(profile, cases or CASES, **{"names": named, **options})
-    assert error.value.findings
-    return str(error.value)
-
-
-def reading_with(exchange: type[Asking], **changes: Any) -> Case:
-    return replace(READING, command=ReadRegister(7, exchange), **changes)
 
 
 class CheckingNoUnit(Asking):

@@ -9,7 +9,6 @@ The checksum is the sum, modulo 256, of all bytes between STX and itself ("Readi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -46,7 +45,7 @@ class Reading(SingleLeg):
         self.answers = (STX + bytes((parameter,)),)
 
     @property
-    def owed(self) -> Sequence[bytes]:
+    def owed(self) -> tuple[bytes, ...]:
         return self.answers
 
     def feed(self, data: bytes, /) -> Need | Done[int]:

@@ -220,7 +220,7 @@ class RunReading:
         self._values: list[Any] = []
 
     @property
-    def owed(self) -> Sequence[bytes]:
+    def owed(self) -> tuple[bytes, ...]:
         """The parameter asked for last: the next ones take a word from the host."""
         return self._leg.answers
 
@@ -260,8 +260,8 @@ class Broadcast(SingleLeg):
     sizes: ClassVar[Sizes] = Sizes(0, 0)
     starts: ClassVar[bytes] = b""
     answered: ClassVar[bool] = False
-    answers: ClassVar[Sequence[bytes]] = ()
-    owed: ClassVar[Sequence[bytes]] = ()
+    answers: ClassVar[tuple[bytes, ...]] = ()
+    owed: ClassVar[tuple[bytes, ...]] = ()
 
     def __init__(self, request: bytes, timing: ReplyTiming) -> None:
         super().__init__(request, replace(timing, turnaround=max(timing.turnaround, timing.nominal)))

@@ -110,7 +110,7 @@ class Conversation(Generic[T]):
         self._buffer = b""
 
     @property
-    def owed(self) -> Sequence[bytes]:
+    def owed(self) -> tuple[bytes, ...]:
         return self.answers
 
     def feed(self, data: bytes, /) -> Step[T]:

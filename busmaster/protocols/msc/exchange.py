@@ -151,7 +151,7 @@ class PacketExchange(Generic[T]):
         self._failure: FrameError | Refused = no_reply()
 
     @property
-    def owed(self) -> Sequence[bytes]:
+    def owed(self) -> tuple[bytes, ...]:
         """An ACK, and the packet behind it."""
         return self.answers if self._acked or self._reply is None else (ACK, *self.answers)
 

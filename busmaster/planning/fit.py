@@ -3,59 +3,32 @@
 `plan` says how busy the line will be, how long each group's cycle takes, which group will miss cycles and what would
 fit, and how long anybody can wait in the worst case. Reply times are measured or declared; where neither is known,
 half of the nominal one is assumed. All times are in seconds.
-
-The worst case is that of R9: every exchange lasts as long as an exchange can, and whatever may go first goes first. It
-holds while each request causes at most one reply (R3), be it one that trickles in byte by byte; on a line that is
-never silent nobody waits longer either, but fails with LineNoisy.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from math import ceil, floor, inf, log10
-from typing import Any, TypeAlias
+from typing import Any
 
-from busmaster.arbiter.schedule import Poll, Priority, Schedule, line_time
-from busmaster.exchange import Command, Exchange, Timings
-from busmaster.merging import Merge, Served, cheapest
-from busmaster.profile import LineSettings, Profile
+from busmaster.arbiter.schedule import SLICE, Poll, Priority, Schedule, line_time
+from busmaster.exchange import Command
+from busmaster.merging import WEIGHING, Merge, Served, at_once, cheapest
+from busmaster.planning.worst_case import SHARE, Bounds, PlannedNode, Read, bound_steps, unanswered
+from busmaster.profile import LineSettings
 
-SHARE = 7
-"""Exchanges of higher classes after which a lower class that waits gets a slot (R9)."""
-QUIET = 0.020
-"""The least silence that ends a settle (R3)."""
-NOISY_AFTER = 1.0
-"""Without such a silence for so long, the line is NOISY and whoever waits fails (R3)."""
 COMFORT = 0.9
 """The share of the line that a schedule may take: the rest is for commands, retries and probes."""
 BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 HORIZON = 10
 """Periods of the slowest group over which the timetable is played through, at most TIMETABLE exchanges."""
 TIMETABLE = 20_000
-
-
-@dataclass(frozen=True, slots=True)
-class PlannedNode:
-    """A node as the planner sees it. `reply_time`: seconds from a request to its reply, if known or measured."""
-
-    profile: Profile
-    address: int
-    timings: Timings | None = None
-    reply_time: float | None = None
-
-    def open(self, command: Command[Any]) -> Exchange[Any]:
-        return command.open(self.address, self.timings or self.profile.timings)
-
-    def line_time(self, command: Command[Any], byte_time: float) -> float:
-        """Seconds of the line that one undisturbed attempt takes."""
-        return line_time(self.open(command), byte_time, self.reply_time)
-
-
-Read: TypeAlias = tuple[PlannedNode, Command[Any]]
+PIECE = 32
+"""Exchanges of the timetable that are played at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,79 +44,6 @@ class PlannedGroup:
     phase: float | None = None
     priority: Priority = Priority.POLL
     merge: Sequence[Merge] = ()
-
-
-# the worst case
-
-
-def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: float = 0.0) -> float:
-    """Seconds for which one attempt can keep the line from others, its settle included, if nothing is repeated in it.
-
-    The H of R9: each leg's request, its window (or lateness) and its longest reply; then the silence after the last
-    byte, which a reply that trickles in puts off.
-    """
-    before = worst = 0.0
-    legs = [(len(exchange.request), exchange.timing, exchange.sizes)]
-    legs += ((leg.sent, leg.timing, leg.sizes) for leg in exchange.later)
-    for sent, timing, sizes in legs:
-        said = before + sent * byte_time + receive_latency
-        whole = timing.window + timing.byte_gap + sizes.longest * byte_time
-        quiet = max(QUIET, timing.byte_gap)
-        trickle = min(sizes.longest * quiet, NOISY_AFTER + quiet)
-        worst = max(worst, said + max(whole, timing.lateness) + trickle + quiet)
-        before = said + whole
-    return worst + exchange.closing * byte_time + exchange.timing.turnaround
-
-
-def _unanswered(exchange: Exchange[Any], byte_time: float) -> float:
-    """Likewise, if no byte of a reply comes."""
-    return len(exchange.request) * byte_time + max(exchange.timing.lateness, exchange.timing.turnaround)
-
-
-@dataclass(frozen=True, slots=True)
-class Bounds:
-    """How long a request of each class can wait until it is sent (R9), with so many exchanges polled on the line.
-
-    `hold` is the longest hold of one exchange, `urgent_hold` the longest while an urgent request waits: then nothing
-    is repeated within an exchange. Those of COMMAND and below hold as long as URGENT is rare.
-    """
-
-    hold: float
-    urgent_hold: float
-    polls: int = 0
-    background: int = 0
-    patience: float = 1.0
-    """The longest time, in seconds, for which a poll lets later ones with a shorter period pass."""
-
-    def wait(self, priority: Priority, *, ahead: int = 0, patience: float | None = None) -> float:
-        """`ahead`: how many of URGENT or COMMAND wait already."""
-        if priority is Priority.URGENT:
-            return self.urgent_hold * (1 + ahead)
-        if priority is Priority.COMMAND:
-            return self.hold * (1 + ahead + ceil((ahead + 1) / SHARE))
-        turns = SHARE + 1
-        if priority is Priority.BACKGROUND or self.background:
-            turns *= 2
-        rivals = self.background if priority is Priority.BACKGROUND else self.polls
-        return (self.patience if patience is None else patience) + turns * max(1, rivals) * self.hold
-
-
-def bounds(
-    reads: Iterable[Read], byte_time: float, receive_latency: float = 0.0, *, polls: int = 0, background: int = 0
-) -> Bounds:
-    """The bounds for a line on which nothing else is asked than these, and every node's probe."""
-    asked = set(reads)
-    asked |= {(node, node.profile.probe) for node, _ in asked if node.address != node.profile.broadcast}
-    holds = [(longest_hold(node.open(c), byte_time, receive_latency), node.profile.exchange_limit) for node, c in asked]
-    return Bounds(
-        hold=max((hold + (limit or 0.0) for hold, limit in holds), default=0.0),
-        urgent_hold=max((hold for hold, _ in holds), default=0.0),
-        polls=polls,
-        background=background,
-    )
-
-
-# the plan
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,21 +129,42 @@ def plan(
     `others` may be asked beside them: the worst case reckons with those, and with every node's probe. `could_merge`
     are merges to be weighed that no group opts in to. Raises InvalidCommand for a period or phase that cannot be.
     """
-    drafts = [_Draft(group, line.byte_time) for group in groups]
+    steps = plan_steps(groups, line=line, receive_latency=receive_latency, others=others, could_merge=could_merge)
+    return at_once(steps)
+
+
+def plan_steps(
+    groups: Iterable[PlannedGroup],
+    *,
+    line: LineSettings,
+    receive_latency: float = 0.0,
+    others: Iterable[Read] = (),
+    could_merge: Sequence[Merge] = (),
+) -> Generator[int, None, Plan]:
+    """Do what `plan` does in steps: each yields how many units of work it took, of about a microsecond."""
+    drafts: list[_Draft] = []
+    for group in groups:
+        drafts.append(_Draft(group, line.byte_time))
+        yield from drafts[-1].weigh()
     asked = [(node, served.command) for draft in drafts for node, served in draft.exchanges]
     low = sum(len(draft.costs) for draft in drafts if draft.group.priority is Priority.BACKGROUND)
     polls = sum(len(draft.costs) for draft in drafts) - low
-    bound = bounds((*asked, *others), line.byte_time, receive_latency, polls=polls, background=low)
+    bound = yield from bound_steps((*asked, *others), line.byte_time, receive_latency, polls, low)
     utilisation = sum(draft.utilisation for draft in drafts)
-    _play(drafts)
+    yield from _play(drafts)
+    planned = []
+    for draft in drafts:
+        yield from draft.weigh_further(could_merge)
+        planned.append(draft.planned(utilisation, bound))
+        yield WEIGHING
     return Plan(
         line=line,
         utilisation=utilisation,
-        groups=tuple(draft.planned(utilisation, bound, could_merge) for draft in drafts),
+        groups=tuple(planned),
         typical_wait=max((cost for draft in drafts for cost in draft.costs), default=0.0),
-        dead_wait=max((_unanswered(node.open(c), line.byte_time) + receive_latency for node, c in asked), default=0.0),
+        dead_wait=max((draft.unanswered + receive_latency for draft in drafts if draft.costs), default=0.0),
         worst_waits={priority: bound.wait(priority) for priority in Priority},
-        fitting_baudrate=_fitting_baudrate(drafts, line) if utilisation > COMFORT else None,
+        fitting_baudrate=(yield from _fitting_baudrate(drafts, line)) if utilisation > COMFORT else None,
     )
 
 
@@ -253,9 +174,11 @@ class _Draft:
     def __init__(self, group: PlannedGroup, byte_time: float) -> None:
         self.group = group
         self.byte_time = byte_time
-        self.exchanges = list(_exchanges(group, group.merge, byte_time))
-        self.costs = [node.line_time(served.command, byte_time) for node, served in self.exchanges]
-        self.poll = Poll(group.name, group.period, phase=group.phase, cost=sum(self.costs))
+        self.exchanges: list[tuple[PlannedNode, Served]] = []
+        self.costs: list[float] = []
+        self.unanswered = 0.0
+        self.could_save = 0.0
+        self.poll = Poll(group.name, group.period, phase=group.phase)
         self.poll.waiter = self
         self.finished = 0
         self.total = self.longest = 0.0
@@ -269,12 +192,29 @@ class _Draft:
         self.total += seconds
         self.longest = max(self.longest, seconds)
 
-    def planned(self, utilisation: float, bound: Bounds, could_merge: Sequence[Merge]) -> GroupPlan:
+    def weigh(self) -> Generator[int, None, None]:
+        """Choose its exchanges, and reckon what each takes."""
+        self.exchanges = yield from _exchanges(self.group, self.group.merge, self.byte_time)
+        for node, served in self.exchanges:
+            exchange = node.open(served.command)
+            self.costs.append(line_time(exchange, self.byte_time, node.reply_time))
+            self.unanswered = max(self.unanswered, unanswered(exchange, self.byte_time))
+            yield WEIGHING
+        self.poll.cost = sum(self.costs)
+
+    def weigh_further(self, could_merge: Sequence[Merge]) -> Generator[int, None, None]:
+        """Reckon what merges would save that nobody opted in to."""
+        if could_merge:
+            merge = (*self.group.merge, *could_merge)
+            further = _Draft(replace(self.group, merge=merge), self.byte_time)
+            yield from further.weigh()
+            self.could_save = max(0.0, self.poll.cost - further.poll.cost)
+
+    def planned(self, utilisation: float, bound: Bounds) -> GroupPlan:
         group, cost = self.group, self.poll.cost
         missed = self.poll.missed / (self.poll.missed + max(1, self.finished))
         left = COMFORT - (utilisation - self.utilisation)
         wait = bound.wait(group.priority, patience=self.poll.patience)
-        further = _exchanges(group, (*group.merge, *could_merge), self.byte_time)
         return GroupPlan(
             name=group.name,
             period=group.period,
@@ -293,43 +233,60 @@ class _Draft:
                 if s.batch
             ),
             fitting_period=_rounded_up(cost / left) if utilisation > COMFORT and left > 0 else None,
-            could_save=max(0.0, cost - sum(node.line_time(s.command, self.byte_time) for node, s in further)),
+            could_save=self.could_save,
         )
 
 
-def _exchanges(group: PlannedGroup, merges: Sequence[Merge], byte_time: float) -> Iterator[tuple[PlannedNode, Served]]:
+def _exchanges(
+    group: PlannedGroup, merges: Sequence[Merge], byte_time: float
+) -> Generator[int, None, list[tuple[PlannedNode, Served]]]:
     """Node by node, each command once."""
     commands: dict[PlannedNode, dict[Command[Any], None]] = {}
     for node, command in group.reads:
         commands.setdefault(node, {})[command] = None
+        yield 8
+    exchanges = []
     for node, wanted in commands.items():
         own = () if node.profile.merge is None else (node.profile.merge,)
-        for served in cheapest(tuple(wanted), (*own, *merges), partial(node.line_time, byte_time=byte_time)):
-            yield node, served
+        cost = partial(node.line_time, byte_time=byte_time)
+        chosen = yield from cheapest(tuple(wanted), (*own, *merges), cost)
+        exchanges += [(node, served) for served in chosen]
+    return exchanges
 
 
-def _play(drafts: Sequence[_Draft]) -> None:
+def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
     """The timetable, if every exchange takes its line time: earliest deadline first, and BACKGROUND as R9 has it."""
     schedule, order = Schedule(), count()
     for draft in drafts:
         schedule.add(draft.poll, 0.0)
+        yield WEIGHING
+    while schedule.unplaced():
+        schedule.work(0.0)
+        yield SLICE
     waiting: list[tuple[float, int, float, _Draft]] = []
     background: list[tuple[float, int, float, _Draft]] = []
 
-    def release(now: float) -> None:
-        for poll in schedule.release(now):
-            draft: _Draft = poll.waiter
-            queue = background if draft.group.priority is Priority.BACKGROUND else waiting
-            poll.remaining = len(draft.costs)
-            for cost in draft.costs:
-                heapq.heappush(queue, (poll.due + poll.patience, next(order), cost, draft))
+    def release(now: float) -> Generator[int, None, float]:
+        """Have what is due wait; returns when more will be."""
+        while (due := schedule.next_due()) <= now:
+            for poll in schedule.release(now):
+                draft: _Draft = poll.waiter
+                yield 4 + len(draft.costs)
+                queue = background if draft.group.priority is Priority.BACKGROUND else waiting
+                poll.remaining = len(draft.costs)
+                for cost in draft.costs:
+                    heapq.heappush(queue, (poll.due + poll.patience, next(order), cost, draft))
+        return due
 
     end = HORIZON * max((draft.group.period for draft in drafts), default=0.0)
-    now, streak = 0.0, 0
-    for _ in range(TIMETABLE):
+    now = due = 0.0
+    streak = 0
+    for number in range(TIMETABLE):
+        if number % PIECE == 0:
+            yield 2 * PIECE
         if not waiting and not background:
-            now = max(now, schedule.next_due())
-            release(now)
+            now = max(now, due)
+            due = yield from release(now)
         if now >= end:
             break
         if background and (streak >= SHARE or not waiting):
@@ -341,7 +298,8 @@ def _play(drafts: Sequence[_Draft]) -> None:
         else:
             continue
         now += cost
-        release(now)
+        if now >= due:
+            due = yield from release(now)
         draft.poll.remaining -= 1
         if not draft.poll.remaining:
             draft.note_cycle(now - draft.poll.due)
@@ -350,11 +308,16 @@ def _play(drafts: Sequence[_Draft]) -> None:
 # what would fit
 
 
-def _fitting_baudrate(drafts: Sequence[_Draft], line: LineSettings) -> int | None:
+def _fitting_baudrate(drafts: Sequence[_Draft], line: LineSettings) -> Generator[int, None, int | None]:
     for baudrate in BAUDRATES:
         if baudrate > line.baudrate:
             byte_time = replace(line, baudrate=baudrate).byte_time
-            if sum(_Draft(draft.group, byte_time).utilisation for draft in drafts) <= COMFORT:
+            utilisation = 0.0
+            for draft in drafts:
+                faster = _Draft(draft.group, byte_time)
+                yield from faster.weigh()
+                utilisation += faster.utilisation
+            if utilisation <= COMFORT:
                 return baudrate
     return None
 

@@ -1,0 +1,33 @@
+"""Does a schedule fit a line, and how long can anybody wait on it? Pure arithmetic; see `plan` and `bounds`."""
+
+from busmaster.planning.fit import BAUDRATES, GroupPlan, MergedReads, Plan, PlannedGroup, plan, plan_steps
+from busmaster.planning.worst_case import (
+    NOISY_AFTER,
+    QUIET,
+    SHARE,
+    Bounds,
+    PlannedNode,
+    Read,
+    bounds,
+    longest_hold,
+    shape,
+)
+
+__all__ = [
+    "BAUDRATES",
+    "NOISY_AFTER",
+    "QUIET",
+    "SHARE",
+    "Bounds",
+    "GroupPlan",
+    "MergedReads",
+    "Plan",
+    "PlannedGroup",
+    "PlannedNode",
+    "Read",
+    "bounds",
+    "longest_hold",
+    "plan",
+    "plan_steps",
+    "shape",
+]

@@ -1,0 +1,105 @@
+"""The conformance kit: what replies begin with is said rightly, or found (R15)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from busmaster.exchange import Done, ReplyTiming
+from busmaster.testing import Case
+from tests.testing.modbus import (
+    CASES,
+    MODBUS,
+    REPLY,
+    Asking,
+    ReadRegister,
+    Telling,
+    WriteRegister,
+    checked,
+    find,
+    reading_with,
+)
+
+
+class AnsweredByAList(Asking):
+    def __init__(self, request: bytes, timing: ReplyTiming) -> None:
+        super().__init__(request, timing)
+        self.answers = [b"\x11\x03\x02"]  # type: ignore[assignment]  # a bug that a type checker would see
+
+
+class AnsweredByAnything(Asking):
+    def header(self) -> bytes:
+        return b""
+
+
+class AnsweredBySomethingElse(Asking):
+    def header(self) -> bytes:
+        return b"\x11\x04"
+
+
+class AnsweredByTwo(Asking):
+    def __init__(self, request: bytes, timing: ReplyTiming) -> None:
+        super().__init__(request, timing)
+        self.answers = (self.header(), b"\x11\x04")
+
+
+class SilentAboutItsAnswers(Asking):
+    def __init__(self, request: bytes, timing: ReplyTiming) -> None:
+        super().__init__(request, timing)
+        self.answers = ()
+
+
+class OwedNothingOfTheKind(Asking):
+    @property
+    def owed(self) -> tuple[bytes, ...]:
+        return (b"\x11\x04",)
+
+
+class AnsweredWhole(Asking):
+    """As if the value told one answer from another: what is owed by register 9 could be register 7's."""
+
+    def header(self) -> bytes:
+        return REPLY if self.request[3] == 7 else checked(17, 3, 2, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("exchange", "finding"),
+    [
+        (AnsweredByAList, "answers is a tuple of what its replies begin with, not \\["),
+        (AnsweredByAnything, r"answers is a tuple .* not \(b'',\)"),
+        (AnsweredBySomethingElse, "the good reply 11 03 .* begins with none of its answers 11 04"),
+        (AnsweredByTwo, "no leg of its good reply begins with its answer 11 04"),
+        (SilentAboutItsAnswers, "is answered, and does not say by what"),
+        (OwedNothingOfTheKind, "11 03 02 02 2b 38 f8 may come and is not owed: 11 04"),
+    ],
+)
+def test_what_a_reader_says_wrongly_of_its_answers_is_found(exchange: type[Asking], finding: str) -> None:
+    assert re.search(finding, find(reading_with(exchange), CASES[1]))
+
+
+def test_commands_whose_replies_could_be_exchanged_and_that_share_no_answer_are_found() -> None:
+    zero = checked(17, 3, 2, 0, 0)
+    other = Case(ReadRegister(9, AnsweredWhole), 17, [zero], 0)
+    assert "has the answers 11 03 02 02 2b 38 f8, and none that is owed by another: 11 03 02 00 00" in find(
+        reading_with(AnsweredWhole), other
+    )
+
+
+def test_a_broadcast_that_says_by_what_it_is_answered_is_found() -> None:
+    class Broadcasting(Telling):
+        answered = False
+
+        def expired(self, started: bool, /) -> Done[Any]:
+            return Done(None)
+
+    case = Case(WriteRegister(7, 3, Broadcasting), 17, [])
+    assert "is not answered, and says by what: answers is (b'" in find(case)
+
+
+def test_checks_that_write_or_prove_nothing_are_found() -> None:
+    assert "the check WriteRegister" in find(profile=replace(MODBUS, checks=(WriteRegister(0, 0),)))
+    alike = replace(MODBUS, checks=(ReadRegister(0), ReadRegister(1)))
+    assert "have answers that begin alike: 01 03 02" in find(profile=alike)
