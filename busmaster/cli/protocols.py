@@ -47,7 +47,7 @@ class Offer(NamedTuple):
     kinds: tuple[str, ...]
 
     def parameter(self) -> click.Option:
-        """As click has it."""
+        """Return it as click has it."""
         flag = f"--{self.option.name.replace('_', '-')}"
         text = f"{', '.join(self.kinds)}: {self.option.help}."
         match self.option.kind:
@@ -60,13 +60,14 @@ class Offer(NamedTuple):
 
 
 def offers(options_of: Callable[[NodeKind], Iterable[Option]]) -> list[Offer]:
-    """Those options of all kinds of nodes that the command line has, each once."""
-    holders: dict[Option, list[str]] = {}
+    """Those options of all kinds of nodes that the command line has, each name once."""
+    found: dict[str, Offer] = {}
     for kind in kinds().values():
         for option in options_of(kind):
             if option.help:
-                holders.setdefault(option, []).append(kind.name)
-    return [Offer(option, tuple(names)) for option, names in holders.items()]
+                known = found.get(option.name, Offer(option, ()))
+                found[option.name] = known._replace(kinds=(*known.kinds, kind.name))
+    return list(found.values())
 
 
 def handle_options() -> list[Offer]:

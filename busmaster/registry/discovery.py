@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from busmaster.errors import InvalidCommand
-from busmaster.registry.protocol import NodeKind, Protocol
+from busmaster.registry.protocol import NodeKind, Option, Protocol
 
 if TYPE_CHECKING:
     from busmaster.emulator.device import Delay, Device
@@ -85,7 +85,21 @@ def _loaded(entry: EntryPoint, known: list[Protocol]) -> Protocol:
         raise TypeError(f"{entry.value} is no Protocol")
     _check_unique("name", lambda kind: kind.name, protocol, known)
     _check_unique("capture id", lambda kind: kind.capture_id, protocol, known)
+    _check_options(protocol, known)
     return protocol
+
+
+def _check_options(protocol: Protocol, known: list[Protocol]) -> None:
+    """An option may be one of several protocols, but then it is written in one way."""
+    taken = {option.name: option.kind for other in known for kind in other.kinds for option in _options(kind)}
+    for kind in protocol.kinds:
+        for option in _options(kind):
+            if taken.get(option.name, option.kind) != option.kind:
+                raise InvalidCommand(f"the option {option.name} is a {taken[option.name]} of other protocols")
+
+
+def _options(kind: NodeKind) -> tuple[Option, ...]:
+    return kind.options + kind.read_options
 
 
 def _check_unique(what: str, value: Callable[[NodeKind], object], protocol: Protocol, known: list[Protocol]) -> None:

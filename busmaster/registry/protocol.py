@@ -148,9 +148,14 @@ class Protocol:
         if kind is None:
             raise InvalidCommand(f"{self.name} has no command {name!r}: use {', '.join(self.commands)}")
         arguments = {key: _frozen(value) for key, value in written.items() if key != "command"}
+        for part in dataclasses.fields(kind):  # type: ignore[arg-type]  # every command is a dataclass
+            if isinstance(part.default, bool) and not isinstance(arguments.get(part.name, False), bool):
+                raise InvalidCommand(f"{self.name}: {name}: {part.name} is true or false, not {arguments[part.name]!r}")
         try:
             return kind(**arguments)
-        except TypeError as error:
+        except InvalidCommand:
+            raise
+        except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
             raise InvalidCommand(f"{self.name}: {name}: {error}") from None
 
 

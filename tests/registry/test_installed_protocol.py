@@ -172,8 +172,12 @@ def test_a_package_whose_protocol_cannot_be_used_is_told_and_the_others_are_ther
     with pytest.warns(UserWarning, match="of busmaster-broken cannot be used") as told:
         found = protocols()
     causes = [str(warning.message) for warning in told]
-    assert len(causes) == 3
-    for cause, text in zip(causes, ("busmaster_missing", "is no Protocol", "name hcp is taken"), strict=True):
+    assert len(causes) == 4
+    for cause, text in zip(
+        causes,
+        ("busmaster_missing", "is no Protocol", "name hcp is taken", "option address_step is a whole"),
+        strict=True,
+    ):
         assert text in cause
     assert len(found) == len({protocol.name for protocol in found}) >= 5
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import inspect
 import json
 import subprocess
@@ -9,10 +11,12 @@ import sys
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from busmaster.emulator.device import Delay
-from busmaster.errors import InvalidCommand
-from busmaster.exchange import Command
+from busmaster.errors import InvalidCommand, Refused
+from busmaster.exchange import Command, FrameError
 from busmaster.protocols.ct_ansi import codec as ct_ansi
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
@@ -125,6 +129,30 @@ def test_a_command_is_written_down_and_read_back(name: str, command: Command[Any
 def test_what_was_written_down_is_checked_again(written: dict[str, object], complaint: str) -> None:
     with pytest.raises(InvalidCommand, match=complaint):
         find("hcp").protocol.read_back(written)
+
+
+TEXTS = st.text(max_size=5) | st.sampled_from(["holding", "coil", "1", "a"])
+SCALARS = st.none() | st.booleans() | st.integers(-3, 300) | st.integers() | st.floats() | TEXTS
+VALUES = st.recursive(SCALARS, lambda some: st.lists(some, max_size=33) | st.dictionaries(TEXTS, some, max_size=2))
+
+
+@every_protocol
+@given(st.data())
+def test_whatever_a_stranger_writes_down_is_a_command_that_can_be_sent_or_invalid(
+    protocol: Protocol, data: st.DataObject
+) -> None:
+    name = data.draw(st.sampled_from(list(protocol.commands)))
+    names = [part.name for part in dataclasses.fields(protocol.commands[name])]  # type: ignore[arg-type]  # each is one
+    arguments = data.draw(st.fixed_dictionaries({}, optional=dict.fromkeys(names, VALUES)))
+    try:
+        command = protocol.read_back({**arguments, "command": name})
+    except InvalidCommand:
+        return
+    exchange = command.open(protocol.profile.addresses[0], protocol.profile.timings)
+    assert hash(command) == hash(protocol.read_back(protocol.write_down(command)))
+    assert str(command)
+    with contextlib.suppress(Refused, FrameError):
+        exchange.feed(bytes(300))
 
 
 def test_a_command_of_another_protocol_is_not_written_down() -> None:

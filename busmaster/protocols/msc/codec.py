@@ -204,6 +204,10 @@ class PickedData(_Reading, _AtAddress):
 
     places: tuple[int, ...]
 
+    def __post_init__(self) -> None:
+        _AtAddress.__post_init__(self)
+        object.__setattr__(self, "places", tuple(whole_number(place, 0, BLOCK - 1, "a place") for place in self.places))
+
     def __str__(self) -> str:
         return f"read {len(self.places)} of the {BLOCK} values from data {self.address}"
 
@@ -220,6 +224,9 @@ class PickedFlags(_Reading):
     """Some of the flags of one RFLAGS: what several RFLAGs would have read."""
 
     flags: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "flags", tuple(whole_number(flag, 0, FLAGS - 1, "a flag") for flag in self.flags))
 
     def __str__(self) -> str:
         return f"read {len(self.flags)} of all flags"
