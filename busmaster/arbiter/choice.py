@@ -13,9 +13,8 @@ from typing import Any, TypeAlias
 
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import DOWN, UP, NodeRecord
-from busmaster.arbiter.in_step import LONGEST_ALIKE, InStep
+from busmaster.arbiter.in_step import LONGEST_ALIKE, SILENT, InStep
 from busmaster.arbiter.transaction import URGENT, Transaction
-from busmaster.errors import NoReply
 from busmaster.exchange import Command, Exchange
 
 MOST_BEFORE = 3
@@ -31,9 +30,6 @@ class Choice:
         self._dispatcher = dispatcher
         self._in_step = in_step
         self._gone_before = 0
-        self._check: Transaction | None = None
-        self._silent_checks: set[NodeRecord] = set()
-        """The nodes that did not answer a check since something is held back."""
 
     def next(self, now: float, silent: float) -> Chosen | float | None:
         """The transaction to be sent now, with its exchange. None if none waits; a time if none may go before it.
@@ -80,16 +76,13 @@ class Choice:
         elif in_step.clashes(answers):
             chosen = self._instead_of(first, now)
         elif in_step.alike >= LONGEST_ALIKE:
-            chosen = self._another(first, now, lambda other: other == answers) or first
-            if chosen is first and (check := self._ask_check(now, lambda other: other == answers)) is not None:
-                chosen = check
+            unlike = self._another(first, now, answers.__eq__)
+            chosen = unlike or self._ask_check(self._whom_to_ask(now)[0], now, answers.__eq__) or first
             in_step.alike = 0
         elif in_step.doubts(now) and answers == in_step.last:
-            chosen = self._another(first, now, lambda other: other == answers) or first
+            chosen = self._another(first, now, answers.__eq__) or first
         if chosen is first:
             self._gone_before = 0
-            self._silent_checks.clear()
-            self._check = None
         if isinstance(chosen, float):
             self._dispatcher.backlog.restore(transaction)
         else:
@@ -107,7 +100,7 @@ class Choice:
             return other
         if self._gone_before >= MOST_BEFORE:
             return first
-        owing = {node for node in in_step.owing(answers) if node.health is UP}
+        owing = dict.fromkeys(in_step.owing(answers))
         other = None
         if self._gone_before < MOST_BEFORE - 1:
             of = first[0].node if first[0].node in owing else None  # only its own answer proves that it owes no more
@@ -116,16 +109,17 @@ class Choice:
             ends = in_step.ends(answers)
             if ends < inf:
                 return ends
-            other = self._ask_check(now, in_step.clashes, owing)
-        if other is not None:
-            self._gone_before += 1
-            return other
-        if not self._silent_checks:
-            over = in_step.over(answers)
-            if now < over:
-                return over
-            in_step.forgive(answers)
-        return first
+            asked, silent = self._whom_to_ask(now)
+            other = self._ask_check([*owing, *asked], now, in_step.clashes)
+            if other is None and not silent:  # there is nothing unlike to ask
+                over = in_step.over(answers)
+                if now < over:
+                    return over
+                in_step.forgive(answers)
+        if other is None:
+            return first
+        self._gone_before += 1
+        return other
 
     def _other_probe(self, probe: Transaction) -> Chosen | None:
         """The same dead node asked for something that is not owed."""
@@ -162,31 +156,26 @@ class Choice:
         return None if transaction is None else (transaction, opened[0])
 
     def _ask_check(
-        self, now: float, unfit: Callable[[Sequence[bytes]], bool], owing: Iterable[NodeRecord] = ()
+        self, nodes: Iterable[NodeRecord], now: float, unfit: Callable[[Sequence[bytes]], bool]
     ) -> Chosen | None:
-        """A read whose answer is fit to prove something: of a node that owes, if it answers; else of one that does."""
-        check = self._check
-        if check is not None and isinstance(check.error, NoReply):
-            self._silent_checks.add(check.node)
-        for node in (*owing, *self._those_who_answer(now)):
-            if node in self._silent_checks:
-                continue
+        """A read of the first of these nodes that has one whose answer is fit to prove something."""
+        for node in nodes:
             for command in checks_of(node):
                 exchange = command.open(node.address, node.timings)
                 if not unfit(exchange.answers):
-                    self._check = self._dispatcher.check(node, command, now)
-                    return self._check, exchange
+                    return self._dispatcher.check(node, command, now), exchange
         return None
 
-    def _those_who_answer(self, now: float) -> Iterator[NodeRecord]:
+    def _whom_to_ask(self, now: float) -> tuple[list[NodeRecord], bool]:
+        """The nodes that answer, as far as is known, the one that did so last first; and whether others are silent."""
         nodes = [
             node
             for node in self._dispatcher.nodes
             if node.address != node.profile.broadcast and node.suspended_until <= now
         ]
-        yield from (node for node in nodes if node.health is UP)
-        yield from (node for node in nodes if node.health is not UP and node.health is not DOWN)
-        yield from (node for node in nodes if node.health is DOWN)
+        alive = [node for node in nodes if node.health is not DOWN and node.unheard < SILENT]
+        alive.sort(key=lambda node: (node.health is not UP, -node.last_reply))
+        return alive, len(alive) < len(nodes)
 
 
 def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:

@@ -82,6 +82,7 @@ class NodeRecord:
         "slowest",
         "suspended_until",
         "timings",
+        "unheard",
         "up_since",
         "waiter",
         "writes",
@@ -120,6 +121,8 @@ class NodeRecord:
         """A few reads that it has answered, by what their answers look like (R15)."""
         self.refused: set[Command[Any]] = set()
         """Checks that it has refused."""
+        self.unheard = 0
+        """Attempts in a row that brought nothing."""
         self.slowest = 0.0
         """Seconds to the first byte of about the slowest of its last replies."""
         self.lateness_until = inf
@@ -128,6 +131,7 @@ class NodeRecord:
 
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
         """It has answered rightly, after so many seconds."""
+        self.unheard = 0
         slowest = self.slowest
         self.slowest = took if took > slowest else slowest - SLOWEST_DECAY * (slowest - took)
         if len(self.answered) < MOST_ANSWERED and answers not in self.answered and not command.writes:

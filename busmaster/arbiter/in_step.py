@@ -39,6 +39,8 @@ SAID_MEMORY = 0.5
 """Seconds for which what was said may be said again."""
 LONGEST_ALIKE = 32
 """Answers alike, without a pause in which one too many would show, after which an unlike one is asked."""
+SILENT = 2
+"""Attempts in a row without a byte after which a node is not asked any more whether it is in step."""
 MOST_DEBTS = 400
 """More unheard replies than fit into LAPSE at any window that is in use; the oldest goes."""
 
@@ -52,8 +54,6 @@ class Debt:
     asked: float
     over: float
     """From then on, it is later than its node's lateness allows."""
-    silent: bool = False
-    """Its node was asked again, and was silent."""
     until: float = inf
     """It is owed until then: a right answer of another node was heard."""
 
@@ -79,13 +79,8 @@ class InStep:
 
     # what is owed
 
-    def owe(
-        self, keys: Iterable[bytes], node: NodeRecord | None, asked: float, over: float, silent: bool = False
-    ) -> None:
-        """Replies that begin with these keys were not heard. `silent`: nor was anything else of that node."""
-        if silent:
-            for debt in self.debts:
-                debt.silent = debt.silent or debt.node is node
+    def owe(self, keys: Iterable[bytes], node: NodeRecord | None, asked: float, over: float) -> None:
+        """Replies that begin with these keys were not heard."""
         self.debts += [Debt(key, node, asked, over) for key in keys]
         del self.debts[:-MOST_DEBTS]
         self.alert = True
@@ -107,8 +102,8 @@ class InStep:
         return max((min(debt.over, debt.until) for debt in self.debts if _could_be(debt, answers)), default=-inf)
 
     def owing(self, answers: Sequence[bytes]) -> Iterator[NodeRecord]:
-        """The nodes that owe what could look so, and have not been silent since."""
-        return (d.node for d in self.debts if d.node is not None and not d.silent and _could_be(d, answers))
+        """The nodes that owe what could look so, and answer, as far as is known."""
+        return (d.node for d in self.debts if d.node is not None and not _is_silent(d) and _could_be(d, answers))
 
     def ends(self, answers: Sequence[bytes]) -> float:
         """When all of what is owed and could look so is owed no more, by what was heard of others; inf if not known."""
@@ -216,7 +211,8 @@ def _could_be(debt: Debt, answers: Sequence[bytes]) -> bool:
 
 def _is_silent(debt: Debt) -> bool:
     """Its node does not answer, as far as is known: another's answer must do. One that does is asked itself."""
-    return debt.silent or debt.node is None or debt.node.health is not UP
+    node = debt.node
+    return node is None or node.unheard >= SILENT or node.health is not UP
 
 
 def _is(run: bytes, key: bytes) -> bool:

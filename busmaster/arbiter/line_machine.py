@@ -318,6 +318,8 @@ class LineMachine:
 
     def _disbelieve(self, what: str, step: Done[Any], now: float) -> None:
         self._counters.doubted += 1
+        if self._wire.transaction is not None:
+            self._wire.transaction.node.unheard = 0
         if step.rest:
             self._strays.note(step.rest, now, self._leg.quiet())
         self._attempt_failed(FrameError(what, send=step.send), now, doubted=True)

@@ -33,7 +33,7 @@ class Trust:
             in_step.doubtful_answer(answers)
             return "its answer may be an earlier request's, whose own never came"
         if in_step.is_doubtful(answers, now) and not held:
-            latest = leg.end + transaction.node.latest(leg.timing.nominal) + leg.latency
+            latest = leg.end + transaction.node.latest(leg.timing.window) + leg.latency
             if step.rest or leg.begun_at > latest:
                 return "its answer may be another's, said late or twice"
             if self._strict or in_step.doubts(now):
@@ -53,4 +53,5 @@ class Trust:
         if heard:
             keys += (ANY_BYTE,)
         if exchange.answered:
-            self._in_step.owe(keys, transaction.node, wire.leg.end, wire.leg.past(), not heard)
+            transaction.node.unheard += not heard
+            self._in_step.owe(keys, transaction.node, wire.leg.end, wire.leg.past())

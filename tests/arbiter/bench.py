@@ -103,6 +103,8 @@ class Bench:
 
     def hear(self, data: str, after: float = 0.0) -> None:
         self.to(self.now + after)
+        if self.unsent is not None and self.arbiter.output_held:
+            self.arbiter.unsent(self.unsent, self.now)
         self.arbiter.data_received(bytes.fromhex(data), self.now)
         self.listen()
 

@@ -9,7 +9,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given, settings
 
-from busmaster.arbiter.backlog import LOOKED_AT, SHARE, SLACK, Backlog
+from busmaster.arbiter.backlog import SHARE, SLACK, Backlog
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -190,34 +190,31 @@ def test_nothing_is_lost_nor_served_twice(operations: list[tuple[str, Priority]]
 
 # what goes before the first one (R15)
 
+FEW = 8
 
-@given(
-    st.lists(st.tuples(st.sampled_from(Priority), st.integers(0, 5)), min_size=1, max_size=40),
-    st.integers(0, 39),
-)
-@settings(deadline=None)
-def test_r15_what_is_put_back_is_the_next_to_go_and_its_class_keeps_its_turn(
-    entries: list[tuple[Priority, int]], when: int
-) -> None:
-    """As if nobody had looked."""
-    plain, looked = Backlog(), Backlog()
-    for backlog in (plain, looked):
-        for place, (priority, deadline) in enumerate(entries):
-            transaction = waiting(priority, float(deadline))
-            transaction.touches = place
-            backlog.push(transaction)
-    for step in range(len(entries)):
-        if step == when:
-            first = looked.pop()
-            assert first is not None
-            looked.restore(first)
-            assert len(looked) == len(entries) - step
-        expected, served = plain.pop(), looked.pop()
-        assert expected is not None
-        assert served is not None
-        assert expected.touches == served.touches
-        expected.phase = served.phase = Phase.ON_WIRE
-    assert looked.pop() is None
+
+@pytest.mark.parametrize("higher", [COMMAND, POLL])
+def test_r15_what_is_put_back_is_the_next_to_go_and_its_class_keeps_its_turn(higher: Priority) -> None:
+    """As if nobody had looked: also at the slot of the lower classes."""
+    for when in range(3 * SHARE):
+        backlogs = []
+        for _ in range(2):
+            backlog = filled(*[higher] * 3 * SHARE, *[POLL, BACKGROUND] * 3)
+            for place, transaction in enumerate(backlog.drain()):
+                transaction.touches = place
+                backlog.push(transaction)
+            backlogs.append(backlog)
+        plain, looked = backlogs
+        for step in range(3 * SHARE + 6):
+            if step == when:
+                first = looked.pop()
+                assert first is not None
+                looked.restore(first)
+            expected, served = plain.pop(), looked.pop()
+            assert expected is not None
+            assert served is not None
+            assert expected.touches == served.touches
+            expected.phase = served.phase = Phase.ON_WIRE
 
 
 @pytest.mark.parametrize("priority", Priority)
@@ -236,7 +233,7 @@ def test_r15_the_first_that_suits_is_picked_and_the_others_keep_their_places(pri
 def test_r15_only_the_first_few_are_looked_at(priority: Priority) -> None:
     """Equal polls by the hundred must not be searched for an unlike one at every exchange."""
     backlog = Backlog()
-    for _ in range(LOOKED_AT + 1):
+    for _ in range(FEW + 1):
         backlog.push(waiting(priority))
     last = waiting(priority, 2.0)
     backlog.push(last)
@@ -247,8 +244,8 @@ def test_r15_only_the_first_few_are_looked_at(priority: Priority) -> None:
         return transaction is last
 
     assert backlog.pick(priority, suits) is None
-    assert len(seen) == LOOKED_AT
-    assert len(backlog) == LOOKED_AT + 2
+    assert len(seen) == FEW
+    assert len(backlog) == FEW + 2
 
 
 @pytest.mark.parametrize("priority", Priority)

@@ -278,6 +278,30 @@ def test_r15_of_two_answers_in_one_chunk_where_one_may_be_another_nodes_neither_
     assert (read.value, doubted(bench)) == (None, 1)
 
 
+def test_r15_a_doubtful_answer_with_anything_behind_it_is_not_believed() -> None:
+    bench = Bench()
+    overtaken(bench)
+    read = bench.ask(bench.arbiter.dispatcher.nodes[0])
+    bench.until_sent()
+    bench.sent()
+    bench.hear(reply_of(1, 55) + "FF", after=REQUEST + 0.003)
+    assert (read.value, doubted(bench)) == (None, 1)
+
+
+@pytest.mark.parametrize(
+    ("command", "reply"), [(hcp2.Read(1), reply_of(1, 55)), (hcp2.Write(1, (5,)), ACK)], ids=["read", "write"]
+)
+def test_r15_of_two_answers_in_one_chunk_neither_is_believed_though_nothing_is_owed(
+    command: hcp2.Read | hcp2.Write, reply: str
+) -> None:
+    bench = Bench()
+    asked = bench.ask(up(bench), command, retries=0)
+    bench.sent()
+    bench.hear(reply + reply, after=REQUEST + 0.003)
+    assert asked.value is None
+    assert isinstance(asked.error, WriteUnconfirmed if command.writes else GarbledReply)
+
+
 def test_r15_strictly_a_doubtful_answer_is_held_until_another_would_have_come() -> None:
     bench = Bench(strict=True)
     overtaken(bench)

@@ -121,7 +121,10 @@ class EdgeLine(WatchedLine):
         pushed = own.random() < edges.pushed
         cut = len(data) - 1 if pushed else own.randrange(1, len(data))
         pauses = own.random() < (0.5 if pushed else edges.pauses)
-        parts = [data[:cut] + (bytes((own.choice(NOISE),)) if pushed else b""), data[cut:]]
+        noise = own.choice(NOISE)
+        if (noise ^ data[-1]) & 0x7F == 0:  # not the checksum itself: the frame would be whole, and right
+            noise ^= 0x40
+        parts = [data[:cut] + (bytes((noise,)) if pushed else b""), data[cut:]]
         pause = self._byte_gap - ROUNDING - own.random() * self._byte_time if pauses else 0.0
         again = start + len(parts[0]) * self.tau + pause
         end = again + len(parts[1]) * self.tau

@@ -156,7 +156,7 @@ def flapping(dead: float, alive: float) -> tuple[Load, int]:
 
 
 def test_r11_a_node_that_is_away_for_moments_is_suspect_until_it_is_calm() -> None:
-    _, changes = flapping(dead=0.5, alive=2.0)
+    _, changes = flapping(dead=0.8, alive=2.0)
     assert changes == 1
 
 

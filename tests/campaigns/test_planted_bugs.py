@@ -10,6 +10,7 @@ import pytest
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.leg import Leg
+from busmaster.arbiter.strays import QUIET
 from busmaster.arbiter.transaction import Transaction
 from busmaster.exchange import FrameError
 from busmaster.protocols.dc104 import codec as dc104
@@ -114,3 +115,36 @@ def test_without_r3_a_request_that_leaves_too_early_is_caught_before_it_does_har
 def test_a_debt_that_is_forgotten_is_caught(protocol: str) -> None:
     """R15 removed; R3's assumption does not hold behind this network."""
     assert "WRONG" in caught(protocol, "network, equal").problems[0]
+
+
+def broken(protocol: str, mix: str) -> str:
+    """The first rule that a hunt found broken."""
+    for seed in SEEDS:
+        totals = Hunt(protocol, mix, seed).run(EACH)
+        if totals.problems:
+            return totals.problems[0]
+    pytest.fail(f"{len(SEEDS)} hunts found nothing wrong")
+
+
+NOT_MSC = pytest.mark.parametrize("protocol", ["hcp", "hcp2", "mentor", "dc104"])
+
+
+@NOT_MSC
+def test_a_byte_time_left_out_of_the_lateness_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    monkeypatch.setattr(Leg, "_past", lambda leg, end, timing: end + timing.lateness + leg.latency)
+    assert "R1" in broken(protocol, "edges")
+
+
+@NOT_MSC
+def test_an_adapter_left_out_of_the_lateness_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    monkeypatch.setattr(Leg, "_past", lambda leg, end, timing: end + timing.lateness + leg.byte_time)
+    assert "R1" in broken(protocol, "edges, held back") or "R3" in broken(protocol, "edges, held back")
+
+
+@NOT_MSC
+def test_an_adapter_left_out_of_the_silence_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    monkeypatch.setattr(Leg, "quiet", lambda leg: max(QUIET, leg.timing.byte_gap) + leg.byte_time)
+    assert "adapter" in broken(protocol, "edges, pushed")

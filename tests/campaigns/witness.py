@@ -226,6 +226,10 @@ class WatchedLine(Line):
             self._exchanges[-1].heard += data
         return data
 
+    def held_back(self, now: float) -> bool:
+        """Bytes that have passed are still to reach the host."""
+        return bool(self._arrivals) and self._arrivals[-1][0] > now + ROUNDING
+
     def during(self, begin: float, end: float) -> Iterator[Spoken]:
         """What was said in that time, the latest first."""
         for spoken in reversed(self._exchanges):
