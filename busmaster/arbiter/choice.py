@@ -73,7 +73,9 @@ class Choice:
         answers = exchange.answers
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
-        elif in_step.clashes(answers):
+        elif transaction.probe and in_step.clashes(answers, now, transaction.node):
+            chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
+        elif in_step.clashes(answers, now):
             chosen = self._instead_of(first, now)
         elif in_step.alike >= LONGEST_ALIKE:
             unlike = self._another(first, now, answers.__eq__)
@@ -96,22 +98,26 @@ class Choice:
     def _instead_of(self, first: Chosen, now: float) -> Chosen | float:
         """What goes in place of one whose answer could be one that is owed."""
         in_step, answers = self._in_step, first[1].answers
-        if first[0].probe and (other := self._other_probe(first[0])) is not None:
-            return other
         if self._gone_before >= MOST_BEFORE:
             return first
-        owing = dict.fromkeys(in_step.owing(answers))
+
+        def clashes(answers: Sequence[bytes]) -> bool:
+            return in_step.clashes(answers, now)
+
+        owing = dict.fromkeys(in_step.owing(answers, now))
         other = None
         if self._gone_before < MOST_BEFORE - 1:
             of = first[0].node if first[0].node in owing else None  # only its own answer proves that it owes no more
-            other = self._another(first, now, in_step.clashes, of)
+            other = self._another(first, now, clashes, of)
         if other is None:
-            ends = in_step.ends(answers)
+            ends = in_step.ends(answers, now)
             if ends < inf:
                 return ends
             asked, silent = self._whom_to_ask(now)
-            other = self._ask_check([*owing, *asked], now, in_step.clashes)
-            if other is None and not silent:  # there is nothing unlike to ask
+            if not (owing or asked or first[0].attempts):  # all are silent: its own node as well as it itself
+                asked = [first[0].node]
+            other = self._ask_check([*owing, *asked], now, clashes)
+            if other is None and not any(_fit_checks(silent, clashes)):  # there is nothing unlike to ask
                 over = in_step.over(answers)
                 if now < over:
                     return over
@@ -121,12 +127,12 @@ class Choice:
         self._gone_before += 1
         return other
 
-    def _other_probe(self, probe: Transaction) -> Chosen | None:
+    def _other_probe(self, probe: Transaction, now: float) -> Chosen | None:
         """The same dead node asked for something that is not owed."""
         node = probe.node
         for command in checks_of(node):
             exchange = command.open(node.address, node.timings)
-            if not self._in_step.clashes(exchange.answers):
+            if not self._in_step.clashes(exchange.answers, now, node):
                 probe.command = command
                 return probe, exchange
         return None
@@ -159,15 +165,12 @@ class Choice:
         self, nodes: Iterable[NodeRecord], now: float, unfit: Callable[[Sequence[bytes]], bool]
     ) -> Chosen | None:
         """A read of the first of these nodes that has one whose answer is fit to prove something."""
-        for node in nodes:
-            for command in checks_of(node):
-                exchange = command.open(node.address, node.timings)
-                if not unfit(exchange.answers):
-                    return self._dispatcher.check(node, command, now), exchange
+        for node, command, exchange in _fit_checks(nodes, unfit):
+            return self._dispatcher.check(node, command, now), exchange
         return None
 
-    def _whom_to_ask(self, now: float) -> tuple[list[NodeRecord], bool]:
-        """The nodes that answer, as far as is known, the one that did so last first; and whether others are silent."""
+    def _whom_to_ask(self, now: float) -> tuple[list[NodeRecord], list[NodeRecord]]:
+        """The nodes that answer, as far as is known, the one that did so last first; and those that are silent."""
         nodes = [
             node
             for node in self._dispatcher.nodes
@@ -175,7 +178,18 @@ class Choice:
         ]
         alive = [node for node in nodes if node.health is not DOWN and node.unheard < SILENT]
         alive.sort(key=lambda node: (node.health is not UP, -node.last_reply))
-        return alive, len(alive) < len(nodes)
+        return alive, [node for node in nodes if node.health is DOWN or node.unheard >= SILENT]
+
+
+def _fit_checks(
+    nodes: Iterable[NodeRecord], unfit: Callable[[Sequence[bytes]], bool]
+) -> Iterator[tuple[NodeRecord, Command[Any], Exchange[Any]]]:
+    """The reads of these nodes whose answers are fit to prove something."""
+    for node in nodes:
+        for command in checks_of(node):
+            exchange = command.open(node.address, node.timings)
+            if not unfit(exchange.answers):
+                yield node, command, exchange
 
 
 def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:

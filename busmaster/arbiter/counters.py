@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from busmaster.arbiter.events import Mark
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, SETTLING, LineState
 
@@ -175,6 +176,13 @@ class LineCounters:
         self.checks = self.doubted = self.damaged = self.breaks = 0
         self._before = (self.exchanges, self._times(state, since))
         self.waits = (Histogram(), Histogram(), Histogram(), Histogram())
+
+    def mark(self, mark: Mark) -> None:
+        """The UART marked a byte."""
+        if mark is Mark.BREAK:
+            self.breaks += 1
+        else:
+            self.damaged += 1
 
     def spend(self, state: LineState, now: float) -> float:
         """The time since the last call went by in this state; returns it."""

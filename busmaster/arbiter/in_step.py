@@ -11,7 +11,8 @@ A debt is paid
 - by a right answer of the same node to something else: a node answers in the order in which it was asked;
 - once its lateness is over, and where its node has been silent since, by a right answer of any node to something else:
   a channel keeps the order. It stays for as long as its node could still take: what was held up together is let go
-  together, and the slower node answers last. Then an answer like it is doubted for three times its lateness;
+  together, and the slower node answers last. Then only that node's answer can be it, and one like it of another is
+  doubted for three times its lateness;
 - by LAPSE seconds.
 
 What nobody owed and yet came, though it looks like a reply, was said twice. Then answers like those heard lately are
@@ -55,7 +56,11 @@ class Debt:
     over: float
     """From then on, it is later than its node's lateness allows."""
     until: float = inf
-    """It is owed until then: a right answer of another node was heard."""
+    """From then on, only its own node's answers can be it: a right answer of another node was heard."""
+
+    def of(self, node: NodeRecord | None, now: float) -> bool:
+        """It could be the answer of this node (None: of any) to a request that is made now."""
+        return now < self.until or (node is not None and self.node is node)
 
 
 class InStep:
@@ -87,27 +92,27 @@ class InStep:
 
     def lapse(self, now: float) -> None:
         """Forget what has been owed for too long, and stop being careful where nothing is left to be careful of."""
-        gone = [debt for debt in self.debts if debt.until <= now]
-        self._doubted += [(debt.key, debt.until + DOUBTED_LATENESSES * (debt.over - debt.asked)) for debt in gone]
-        self.debts = [debt for debt in self.debts if now < min(debt.until, debt.asked + LAPSE)]
+        self.debts = [debt for debt in self.debts if now - debt.asked <= LAPSE]
         self._doubted = [entry for entry in self._doubted if entry[1] > now]
         self.alert = bool(self.debts or self._doubted or self._doubt_until > now)
 
-    def clashes(self, answers: Sequence[bytes]) -> bool:
-        """Whether an answer that begins with one of these keys could be a reply that is owed."""
-        return any(_could_be(debt, answers) for debt in self.debts)
+    def clashes(self, answers: Sequence[bytes], now: float, node: NodeRecord | None = None) -> bool:
+        """Whether an answer that begins with one of these keys, of this node if one is given, could be one owed."""
+        return any(debt.of(node, now) and _could_be(debt, answers) for debt in self.debts)
 
     def over(self, answers: Sequence[bytes]) -> float:
         """When all that is owed and could look so is later than its node's lateness allows."""
-        return max((min(debt.over, debt.until) for debt in self.debts if _could_be(debt, answers)), default=-inf)
+        return max((debt.over for debt in self.debts if _could_be(debt, answers)), default=-inf)
 
-    def owing(self, answers: Sequence[bytes]) -> Iterator[NodeRecord]:
+    def owing(self, answers: Sequence[bytes], now: float) -> Iterator[NodeRecord]:
         """The nodes that owe what could look so, and answer, as far as is known."""
-        return (d.node for d in self.debts if d.node is not None and not _is_silent(d) and _could_be(d, answers))
+        for debt in self.debts:
+            if debt.node is not None and now < debt.until and not _is_silent(debt) and _could_be(debt, answers):
+                yield debt.node
 
-    def ends(self, answers: Sequence[bytes]) -> float:
-        """When all of what is owed and could look so is owed no more, by what was heard of others; inf if not known."""
-        return max((debt.until for debt in self.debts if _could_be(debt, answers)), default=-inf)
+    def ends(self, answers: Sequence[bytes], now: float) -> float:
+        """When what is owed and could look so can be no other node's any more; inf if that is not known."""
+        return max((d.until for d in self.debts if now < d.until and _could_be(d, answers)), default=inf)
 
     def forgive(self, answers: Sequence[bytes]) -> None:
         """There is no unlike exchange to ask: R3's assumption must do, and doubt."""
@@ -131,6 +136,7 @@ class InStep:
         for debt in self.debts:
             if debt.over <= asked and debt.until == inf and _is_silent(debt):
                 debt.until = now + (0.0 if debt.node is None else debt.node.latest(patience))
+                self._doubted.append((debt.key, debt.until + DOUBTED_LATENESSES * (debt.over - debt.asked)))
 
     def heard(self, run: bytes, now: float) -> NodeRecord | None:
         """Take all that came up to a silence, unasked or in place of a reply. Returns who owed it, if that is known.
@@ -155,8 +161,7 @@ class InStep:
         if not payers and any(until > now and _is(run, key) for key, until in self._doubted):
             self._doubted = [entry for entry in self._doubted if not _is(run, entry[0])]
         elif not payers and any(_is(run, key) for key in (*self.last, *self.before)):
-            self._doubt_until = now + DOUBT_PERIOD
-            self.alert = True
+            self.said_twice(now)
         else:
             self.owe((ANY_BYTE,), None, now, now)
         return payers[0].node if payers else None
@@ -180,6 +185,11 @@ class InStep:
                 debt.node = None
 
     # how far an answer can be trusted
+
+    def said_twice(self, now: float) -> None:
+        """More was answered than was asked."""
+        self._doubt_until = now + DOUBT_PERIOD
+        self.alert = True
 
     def said(self, answers: Sequence[bytes], now: float) -> None:
         """A right answer was delivered; in case it is said again."""

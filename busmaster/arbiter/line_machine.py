@@ -53,7 +53,7 @@ from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
 from busmaster.arbiter.strays import LOOK_SLACK, QUIET, Strays
-from busmaster.arbiter.trust import Trust
+from busmaster.arbiter.trust import TWO_ANSWERS, Trust
 from busmaster.errors import BusError, LineDown, LineNoisy, Refused
 from busmaster.exchange import NO_REPLY, Done, FrameError, ReplyTiming
 
@@ -143,17 +143,14 @@ class LineMachine:
         if self.state is not EXCHANGE:
             self._stray(data, now)
         elif self._trust.held is not None:  # two answers where one is due: neither is believed
-            self._disbelieve("two answers came", Done(None, data, self._trust.held.send), now)
+            self._disbelieve(TWO_ANSWERS, Done(None, data, self._trust.held.send), now)
         elif self._leg.begun or (data := self._begin_reply(data, now)):
             self._strays.last_byte = now
             self._take(data, now)
 
     def byte_marked(self, mark: Mark, now: float) -> None:
         """The UART says that a byte came damaged, or a break: whatever it was, it is nobody's answer."""
-        if mark is Mark.BREAK:
-            self._counters.breaks += 1
-        else:
-            self._counters.damaged += 1
+        self._counters.mark(mark)
         self._strays.last_byte = now
         self._echo.forget()
         if self.state is EXCHANGE:
@@ -345,7 +342,10 @@ class LineMachine:
             strays.blame(now)
             strays.run[:] = error.heard
         spared = error.whole and not self._in_step.debts
-        self._trust.owe(self._wire, heard=not no_reply, whole=error.whole)
+        both = what is TWO_ANSWERS
+        if both:
+            self._in_step.said_twice(now)
+        self._trust.owe(self._wire, heard=not no_reply, whole=error.whole or both)
         if error.send:
             self._wire.say(error.send, now)
         self._end_exchange(failed=True)

@@ -8,6 +8,8 @@ from busmaster.arbiter.in_step import ANY_BYTE, InStep
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.exchange import Done
 
+TWO_ANSWERS = "two answers came where one was due"
+
 
 class Trust:
     """Of one line. `strict`: a doubtful answer is held until another could have come, not delivered at once."""
@@ -28,8 +30,8 @@ class Trust:
         in_step, answers = self._in_step, exchange.answers
         held, self.held = self.held is not None, None
         if any(step.rest.startswith(key) for key in answers):
-            return "two answers came"
-        if in_step.clashes(answers):
+            return TWO_ANSWERS
+        if in_step.clashes(answers, now, transaction.node):
             in_step.doubtful_answer(answers)
             return "its answer may be an earlier request's, whose own never came"
         if in_step.is_doubtful(answers, now) and not held:

@@ -68,6 +68,8 @@ class Bench:
         self.arbiter = Arbiter(TAU, echo=echo, receive_latency=latency, capacity=capacity, strict=strict)
         self.unsent: int | None = None
         """How many bytes the port has not sent yet, for ports that can tell."""
+        self.held = False
+        """It was told so: the port is asked again before it is heard."""
         self.now = 0.0
         self.events: list[Event] = []
         self.cycles: list[Poll] = []
@@ -103,8 +105,8 @@ class Bench:
 
     def hear(self, data: str, after: float = 0.0) -> None:
         self.to(self.now + after)
-        if self.unsent is not None and self.arbiter.output_held:
-            self.arbiter.unsent(self.unsent, self.now)
+        if self.held:
+            self._tell_unsent()
         self.arbiter.data_received(bytes.fromhex(data), self.now)
         self.listen()
 
@@ -138,8 +140,8 @@ class Bench:
         """Turn the clock, stopping at every deadline on the way."""
         while (due := self.arbiter.poll_timeout()) <= time:
             self.now = max(self.now, due)
-            if self.unsent is not None and self.arbiter.line_due(self.now):
-                self.arbiter.unsent(self.unsent, self.now)
+            if self.arbiter.line_due(self.now):
+                self._tell_unsent()
             self.arbiter.handle_timeout(self.now)
             self.listen()
         self.now = max(self.now, time)
@@ -156,6 +158,11 @@ class Bench:
             assert due - start < limit, "nothing was sent in time"
             self.to(due)
         return self.now - start
+
+    def _tell_unsent(self) -> None:
+        if self.unsent is not None:
+            self.arbiter.unsent(self.unsent, self.now)
+            self.held = self.unsent > 0
 
     def until_ready(self, limit: float = 10.0) -> None:
         """Turn the clock until the line has nothing to do."""
