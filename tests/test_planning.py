@@ -186,15 +186,16 @@ def test_merges_of_the_profile_need_no_asking() -> None:
 
 
 def test_r9_the_longest_hold_of_a_read() -> None:
-    """8 bytes; 150 ms lateness; a reply of at most 25 bytes that trickles in, 20 ms a byte; 20 ms of silence."""
+    """8 bytes; 150 ms lateness; a reply of at most 25 bytes that trickles in, 20 ms a byte; 20 ms of silence. Each of
+    these times is to a start bit, and the byte is received a byte time later."""
     hold = longest_hold(hcp2.Read(1).open(1, hcp2.PROFILE.timings), TAU)
-    assert hold == pytest.approx(8 * TAU + 0.150 + 25 * 0.020 + 0.020)
+    assert hold == pytest.approx(8 * TAU + 0.150 + TAU + 25 * (0.020 + TAU) + 0.020 + TAU)
 
 
 def test_r9_a_trickle_ends_where_the_line_counts_as_noisy() -> None:
     tau = msc.PROFILE.line.byte_time
     hold = longest_hold(msc.DataWrite(2000, 1).open(1, msc.PROFILE.timings), tau)
-    assert hold == pytest.approx(21 * tau + 1.0 + (1.0 + 0.1) + 0.1)
+    assert hold == pytest.approx(21 * tau + 1.0 + tau + (1.0 + 0.1 + tau) + 0.1 + tau)
 
 
 def test_r9_each_leg_can_last_its_window_and_only_the_last_has_its_lateness() -> None:
@@ -205,9 +206,9 @@ def test_r9_each_leg_can_last_its_window_and_only_the_last_has_its_lateness() ->
     assert three == pytest.approx(one + 2 * (leg + tau))
 
 
-def test_r9_the_receive_latency_of_an_adapter_counts_once_a_leg() -> None:
+def test_r9_the_receive_latency_of_an_adapter_counts_once_a_leg_and_in_every_silence() -> None:
     read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
-    assert longest_hold(read, TAU, 0.016) == pytest.approx(longest_hold(read, TAU) + 0.016)
+    assert longest_hold(read, TAU, 0.016) == pytest.approx(longest_hold(read, TAU) + (1 + 25 + 1) * 0.016)
 
 
 def test_r9_an_exchange_with_a_limit_may_be_repeated_until_then_but_not_while_urgent_waits() -> None:
@@ -225,13 +226,16 @@ def test_r9_every_nodes_probe_counts_but_a_broadcast_has_none() -> None:
 
 
 def test_r9_the_waits_of_the_four_classes() -> None:
+    """Before each, three others may go (R15)."""
     bound = Bounds(hold=1.0, urgent_hold=0.5, polls=10, background=0)
-    assert [bound.wait(URGENT, ahead=n) for n in (0, 1, 5)] == [0.5, 1.0, 3.0]
-    assert [bound.wait(COMMAND, ahead=n) for n in (0, 6, 7, 13)] == [1 + 0 + 1, 1 + 6 + 1, 1 + 7 + 2, 1 + 13 + 2]
-    assert bound.wait(POLL, patience=0.25) == 0.25 + 8 * 10
+    assert [bound.wait(URGENT, ahead=n) for n in (0, 1, 5)] == [0.5, 0.5 * 5, 0.5 * 21]
+    assert [bound.wait(COMMAND, ahead=n) for n in (0, 6, 7, 13)] == [
+        1 + 4 * turns + 3 for turns in (0 + 1, 6 + 1, 7 + 2, 13 + 2)
+    ]
+    assert bound.wait(POLL, patience=0.25) == 0.25 + 4 * 8 * 10
     both = replace(bound, background=3)
-    assert both.wait(POLL, patience=0.25) == 0.25 + 16 * 10
-    assert both.wait(BACKGROUND, patience=2.0) == 2.0 + 16 * 3
+    assert both.wait(POLL, patience=0.25) == 0.25 + 4 * 16 * 10
+    assert both.wait(BACKGROUND, patience=2.0) == 2.0 + 4 * 16 * 3
 
 
 def test_the_plan_tells_the_waits_of_every_class_and_of_every_group() -> None:
@@ -240,8 +244,8 @@ def test_the_plan_tells_the_waits_of_every_class_and_of_every_group() -> None:
     assert prediction.typical_wait == pytest.approx(EXCHANGE)
     assert prediction.dead_wait == pytest.approx(8 * TAU + 0.150)
     assert prediction.worst_waits[URGENT] == pytest.approx(hold)
-    assert prediction.worst_waits[COMMAND] == pytest.approx(2 * hold)
-    assert [g.worst_wait for g in prediction.groups] == pytest.approx([0.5 + 8 * 6 * hold, 10.0 + 8 * 6 * hold])
+    assert prediction.worst_waits[COMMAND] == pytest.approx((1 + 4 + 3) * hold)
+    assert [g.worst_wait for g in prediction.groups] == pytest.approx([0.5 + 4 * 8 * 6 * hold, 10.0 + 4 * 8 * 6 * hold])
     assert prediction.groups[0].worst_cycle == pytest.approx(prediction.groups[0].worst_wait + hold)
 
 

@@ -71,18 +71,18 @@ def test_r9_the_worst_case_wait_of_the_line_at_hand() -> None:
     async def story(bus: Bus) -> None:
         axis = Hcp2Controller(bus, 1)
         await axis.read(1)
-        alone = bus.worst_case_wait(Priority.COMMAND)
+        hold = bus.worst_case_wait(Priority.COMMAND) / (1 + 4 + 3)  # with three exchanges before each (R15)
         reading = [asyncio.create_task(axis.read(e)) for e in range(1, 10)]
         await asyncio.sleep(0)
-        assert bus.worst_case_wait(Priority.COMMAND) == pytest.approx(alone / 2 * (1 + 8 + 2))
-        assert bus.worst_case_wait(Priority.URGENT) == pytest.approx(alone / 2)
+        assert bus.worst_case_wait(Priority.COMMAND) == pytest.approx(hold * (1 + 4 * (8 + 2) + 3))
+        assert bus.worst_case_wait(Priority.URGENT) == pytest.approx(hold)
         await asyncio.gather(*reading)
         group = bus.poll_group("g", period=0.5, points=[axis.point(str(e)) for e in range(1, 5)])
         await cycles(group, 1)
-        assert bus.worst_case_wait(Priority.POLL) == pytest.approx(0.5 + 8 * 5 * alone / 2)
+        assert bus.worst_case_wait(Priority.POLL) == pytest.approx(0.5 + 4 * 8 * 5 * hold)
         with pytest.raises(NoReply):
             await bus.node(hcp2.PROFILE, 9).request(hcp2.Read(1), retries=0)
-        assert bus.worst_case_wait(Priority.POLL) == pytest.approx(0.5 + 16 * 5 * alone / 2)
+        assert bus.worst_case_wait(Priority.POLL) == pytest.approx(0.5 + 4 * 16 * 5 * hold)
 
     on_a_bus(story)
 

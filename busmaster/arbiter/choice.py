@@ -12,13 +12,14 @@ from math import inf
 from typing import Any, TypeAlias
 
 from busmaster.arbiter.dispatcher import Dispatcher
-from busmaster.arbiter.health import DOWN, UP, NodeRecord
-from busmaster.arbiter.in_step import LONGEST_ALIKE, SILENT, InStep
+from busmaster.arbiter.health import UP, NodeRecord
+from busmaster.arbiter.in_step import LONGEST_ALIKE, InStep
 from busmaster.arbiter.transaction import URGENT, Transaction
 from busmaster.exchange import Command, Exchange
 
 MOST_BEFORE = 3
-"""Exchanges that may go before one that is held back; then it goes, and its answer is doubted (R9 counts them)."""
+"""Exchanges that may go before one that is held back; then it goes, and its answer is doubted. The bounds of R9, in
+planning, count them."""
 
 Chosen: TypeAlias = tuple[Transaction, Exchange[Any]]
 
@@ -114,7 +115,9 @@ class Choice:
             if ends < inf:
                 return ends
             asked, silent = self._whom_to_ask(now)
-            if not (owing or asked or first[0].attempts):  # all are silent: its own node as well as it itself
+            if not (owing or asked) and (
+                first[0].writes or not first[0].attempts
+            ):  # all are silent: its own node as well as it itself
                 asked = [first[0].node]
             other = self._ask_check([*owing, *asked], now, clashes)
             if other is None and not any(_fit_checks(silent, clashes)):  # there is nothing unlike to ask
@@ -176,9 +179,9 @@ class Choice:
             for node in self._dispatcher.nodes
             if node.address != node.profile.broadcast and node.suspended_until <= now
         ]
-        alive = [node for node in nodes if node.health is not DOWN and node.unheard < SILENT]
+        alive = [node for node in nodes if not node.silent]
         alive.sort(key=lambda node: (node.health is not UP, -node.last_reply))
-        return alive, [node for node in nodes if node.health is DOWN or node.unheard >= SILENT]
+        return alive, [node for node in nodes if node.silent]
 
 
 def _fit_checks(

@@ -26,7 +26,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
 
-from busmaster.arbiter.health import UP, NodeRecord
+from busmaster.arbiter.health import NodeRecord
 
 ANY_BYTE = b""
 """The key of a debt that any lone byte could pay."""
@@ -38,10 +38,9 @@ DOUBT_PERIOD = 30.0
 """Seconds after something was said twice in which answers like those heard lately are doubted."""
 SAID_MEMORY = 0.5
 """Seconds for which what was said may be said again."""
-LONGEST_ALIKE = 32
-"""Answers alike, without a pause in which one too many would show, after which an unlike one is asked."""
-SILENT = 2
-"""Attempts in a row without a byte after which a node is not asked any more whether it is in step."""
+LONGEST_ALIKE = 31
+"""Answers alike behind a first one, without a pause in which one too many would show, after which an unlike one is
+asked: 32 in all."""
 MOST_DEBTS = 400
 """More unheard replies than fit into LAPSE at any window that is in use; the oldest goes."""
 
@@ -221,8 +220,7 @@ def _could_be(debt: Debt, answers: Sequence[bytes]) -> bool:
 
 def _is_silent(debt: Debt) -> bool:
     """Its node does not answer, as far as is known: another's answer must do. One that does is asked itself."""
-    node = debt.node
-    return node is None or node.unheard >= SILENT or node.health is not UP
+    return debt.node is None or debt.node.silent
 
 
 def _is(run: bytes, key: bytes) -> bool:

@@ -32,7 +32,7 @@ class World:
 
     `on_event` is called with each event of the arbiter; it may submit, cancel and so on. `record`, if given, is called
     with every step as a line of text: the same seeds give the same transcript.
-    The port opens at once; `unplug` and `plug` take it away and give it back.
+    The port opens at once; `unplug` and `plug` take it away and give it back. `strict` is the arbiter's (R15).
     """
 
     def __init__(
@@ -50,7 +50,6 @@ class World:
         line.prompt = False
         self.now = now
         self.plugged = False
-        options: dict[str, Any] = {"strict": True} if strict else {}
         self.arbiter = Arbiter(
             line.settings.byte_time,
             now=now,
@@ -58,7 +57,7 @@ class World:
             receive_latency=line.latency,
             capacity=capacity,
             jitter=jitter,
-            **options,
+            strict=strict,
         )
         self._on_event = on_event
         self._record = record

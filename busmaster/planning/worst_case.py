@@ -21,6 +21,8 @@ SHARE = 7
 """Exchanges of higher classes after which a lower class that waits gets a slot (R9)."""
 QUIET = 0.020
 """The least silence that ends a settle (R3)."""
+MOST_BEFORE = 3
+"""Exchanges that may go before one whose answer could be taken for another's (R15)."""
 NOISY_AFTER = 1.0
 """Without such a silence for so long, the line is NOISY and whoever waits fails (R3)."""
 
@@ -63,9 +65,9 @@ def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: flo
     for sent, timing, sizes in legs:
         said = before + sent * byte_time + receive_latency
         whole = timing.window + timing.byte_gap + sizes.longest * byte_time
-        quiet = max(QUIET, timing.byte_gap)
+        quiet = max(QUIET, timing.byte_gap) + receive_latency + byte_time
         trickle = min(sizes.longest * quiet, NOISY_AFTER + quiet)
-        worst = max(worst, said + max(whole, timing.lateness) + trickle + quiet)
+        worst = max(worst, said + max(whole, timing.lateness + byte_time) + trickle + quiet)
         before = said + whole
     return worst + exchange.closing * byte_time + exchange.timing.turnaround
 
@@ -91,16 +93,21 @@ class Bounds:
     """The longest time, in seconds, for which a poll lets later ones with a shorter period pass."""
 
     def wait(self, priority: Priority, *, ahead: int = 0, patience: float | None = None) -> float:
-        """`ahead`: how many of URGENT or COMMAND wait already."""
+        """`ahead`: how many of URGENT or COMMAND wait already. Of URGENT, it is the wait of a write.
+
+        Before each request, MOST_BEFORE others may go while an answer could be taken for its own (R15); an urgent
+        write is never held back so, an urgent read waits for so many more.
+        """
+        each = 1 + MOST_BEFORE
         if priority is Priority.URGENT:
-            return self.urgent_hold * (1 + ahead)
+            return self.urgent_hold * (1 + each * ahead)
         if priority is Priority.COMMAND:
-            return self.hold * (1 + ahead + ceil((ahead + 1) / SHARE))
+            return self.hold * (1 + each * (ahead + ceil((ahead + 1) / SHARE)) + MOST_BEFORE)
         turns = SHARE + 1
         if priority is Priority.BACKGROUND or self.background:
             turns *= 2
         rivals = self.background if priority is Priority.BACKGROUND else self.polls
-        return (self.patience if patience is None else patience) + turns * max(1, rivals) * self.hold
+        return (self.patience if patience is None else patience) + each * turns * max(1, rivals) * self.hold
 
 
 def bounds(

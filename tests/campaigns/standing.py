@@ -146,8 +146,8 @@ class StandingWorld(World):
             self._pump()
 
     def _time_out(self) -> None:
-        arbiter: Any = self.arbiter
-        if hasattr(arbiter, "line_due") and self.plugged and arbiter.line_due(self.now):
+        arbiter = self.arbiter
+        if self.plugged and arbiter.line_due(self.now):
             arbiter.unsent(self.line.unsent(self.now), self.now)
         arbiter.handle_timeout(self.now, unread=bool(self._unread))
         self._pump()
@@ -163,7 +163,7 @@ class StandingWorld(World):
         self.now = end
 
     def _pump(self) -> None:
-        arbiter: Any = self.arbiter
+        arbiter = self.arbiter
         while True:
             data = arbiter.poll_transmit()
             if data is not None:
@@ -173,8 +173,7 @@ class StandingWorld(World):
                     self._record(f"{self.now:.6f} > {data.hex(' ')}")
                 if self.plugged:
                     self.line.send(data, self.now)
-                    if hasattr(arbiter, "transmitted"):
-                        arbiter.transmitted(self.now)
+                    arbiter.transmitted(self.now)
             event = arbiter.poll_event()
             if event is None:
                 if data is None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.emulator.device import Delay, Device
@@ -158,7 +159,7 @@ def test_r9_urgent_starts_within_its_bound_beside_a_dead_node() -> None:
     waits = urgent_waits(line, 2000, Transaction(line.nodes[4], hcp2.Read(1)))
     assert line.nodes[0].counters.no_reply > 100
     assert max(waits) > 0.1
-    assert max(waits) <= line.bounds().wait(Priority.URGENT)
+    assert max(waits) <= (1 + MOST_BEFORE) * line.bounds().wait(Priority.URGENT)  # of a write; these are reads (R15)
 
 
 @pytest.mark.parametrize("pace", [0.001, 0.010, 0.0199, 0.050])
@@ -170,7 +171,7 @@ def test_r9_urgent_starts_within_its_bound_beside_a_node_whose_bytes_trickle_in(
     waits = urgent_waits(line, 1000, Transaction(line.nodes[4], hcp2.Read(1)))
     assert line.nodes[0].counters.attempts > 100
     assert max(waits) > 5 * pace
-    assert max(waits) <= line.bounds().wait(Priority.URGENT)
+    assert max(waits) <= (1 + MOST_BEFORE) * line.bounds().wait(Priority.URGENT)  # of a write; these are reads (R15)
 
 
 @pytest.mark.parametrize(
@@ -187,4 +188,4 @@ def test_r9_urgent_starts_within_its_bound_beside_an_msc_that_must_be_asked_agai
     else:
         setattr(devices[0].faults, trouble, 0.5)
     waits = urgent_waits(line, 500, Transaction(line.nodes[1], msc.DataRead(2000)), apart=0.2)
-    assert max(waits) <= line.bounds().wait(Priority.URGENT)
+    assert max(waits) <= (1 + MOST_BEFORE) * line.bounds().wait(Priority.URGENT)  # of a write; these are reads (R15)

@@ -11,13 +11,17 @@ import socket
 import sys
 
 CHUNK = 4096
+PATIENCE = 30.0
+"""Seconds within which the client must come."""
 
 
 def main(host: str, port: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         sys.stdout.write("socket://{}:{}\n".format(*listener.getsockname()[:2]))
         sys.stdout.flush()
+        listener.settimeout(PATIENCE)
         client, _ = listener.accept()
+    client.setblocking(True)
     server = socket.create_connection((host, int(port)))
     for end in (client, server):
         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
