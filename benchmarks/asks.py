@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from benchmarks.masters import Ask
 from busmaster.profile import LineSettings
-from busmaster.protocols import hcp2, msc
-from busmaster.protocols.msc_exchange import packet
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.msc import codec as msc
+from busmaster.protocols.msc.exchange import packet
 from busmaster.wire.checks import xor
 from busmaster.wire.readers import ACK, ETX, STX
 

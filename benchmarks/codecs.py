@@ -12,13 +12,16 @@ from functools import partial
 from typing import Any
 
 from benchmarks.harness import Options, Outcome, Table
-from busmaster.emulator.build import make_device
-from busmaster.emulator.device import Device
 from busmaster.exchange import Command, Expect, Timings
 from busmaster.profile import Profile
-from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.modbus import codec as modbus
+from busmaster.protocols.msc import codec as msc
+from busmaster.registry import make_device
 from busmaster.testing import answers_of
-from examples import modbus_rtu
 
 CASES: list[tuple[Profile, int, Callable[[], Command[Any]]]] = [
     (hcp.PROFILE, 5, lambda: hcp.Read(12)),
@@ -30,10 +33,10 @@ CASES: list[tuple[Profile, int, Callable[[], Command[Any]]]] = [
     (msc.PROFILE, 3, lambda: msc.BlockRead(2008)),
     (mentor.PROFILE, 12, lambda: mentor.Read(1, 17)),
     (mentor.PROFILE, 12, lambda: mentor.Write(1, 17, -100)),
-    (dc104.PROFILE, dc104.PROFILE.addresses.start, lambda: dc104.Read(12)),
-    (dc104.PROFILE, dc104.PROFILE.addresses.start, lambda: dc104.Write(12, 300)),
-    (modbus_rtu.PROFILE, 17, lambda: modbus_rtu.ReadRegisters(7, 10)),
-    (modbus_rtu.PROFILE, 17, lambda: modbus_rtu.WriteRegisters(7, (555,))),
+    (dc104.PROFILE, dc104.PROFILE.addresses[0], lambda: dc104.Read(12)),
+    (dc104.PROFILE, dc104.PROFILE.addresses[0], lambda: dc104.Write(12, 300)),
+    (modbus.PROFILE, 17, lambda: modbus.ReadRegisters(7, 10)),
+    (modbus.PROFILE, 17, lambda: modbus.WriteRegisters(7, (555,))),
 ]
 COLUMNS = ("command", "bytes out", "bytes in", "build us", "encode us", "decode us")
 
@@ -44,7 +47,7 @@ def run(options: Options) -> Outcome:
     number = options.pick(5000, 300)
     for profile, address, build in CASES:
         command = build()
-        device = _device(profile.name, address)
+        device = make_device(profile.name, address)
         sent = command.open(address, profile.timings).request
         reply = answers_of(device)(sent)
 
@@ -61,10 +64,6 @@ def _converse(command: Command[Any], address: int, timings: Timings, reply: byte
     step = exchange.feed(reply)
     while isinstance(step, Expect):
         step = exchange.feed(b"")
-
-
-def _device(protocol: str, address: int) -> Device:
-    return modbus_rtu.EmulatedUnit(address) if protocol == "modbus" else make_device(protocol, address)
 
 
 def _best(call: Callable[[], object], number: int) -> float:

@@ -22,7 +22,7 @@ from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer
 from busmaster.profile import LineSettings
-from examples.modbus_rtu import EmulatedUnit
+from busmaster.protocols.modbus.device import EmulatedModbus
 
 SETTINGS = LineSettings(57600)
 """8N1 and not Modbus's 8E1: a pty refuses parity, and some masters take that for an error."""
@@ -35,11 +35,11 @@ def value_of(unit: int, register: int) -> int:
     return unit * 256 + register
 
 
-def emulated_units(count: int, delay: Mapping[str, Any]) -> list[EmulatedUnit]:
+def emulated_units(count: int, delay: Mapping[str, Any]) -> list[EmulatedModbus]:
     """Units 1 to `count`, whose registers hold `value_of` them."""
     registers = range(REGISTERS)
     return [
-        EmulatedUnit(unit, [value_of(unit, register) for register in registers], delay=delay_of(delay))
+        EmulatedModbus(unit, [value_of(unit, register) for register in registers], delay=delay_of(delay))
         for unit in range(1, count + 1)
     ]
 

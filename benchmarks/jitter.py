@@ -17,7 +17,7 @@ from statistics import median
 from benchmarks.far_end import FarEnd, value_of
 from benchmarks.harness import Options, Outcome, Table, quantile
 from benchmarks.modbus_masters import PROFILE, RETRIES, TIMINGS, Busmaster, Failed, ModbusMaster, masters, notes
-from examples.modbus_rtu import ModbusUnit
+from busmaster.protocols.modbus.handle import ModbusUnit
 
 UNITS = 8
 REGISTER, WRITTEN = 7, 99
@@ -93,7 +93,7 @@ async def _poll_group(master: Busmaster, line: FarEnd, cycles: int, alive: Delay
     bus = master.bus
     assert bus is not None
     units = [Unit(bus, unit, timings=TIMINGS, retries=RETRIES) for unit in range(1, UNITS + 1)]
-    group = bus.poll_group("registers", period=PERIOD, points=[unit.point(str(REGISTER)) for unit in units])
+    group = bus.poll_group("registers", period=PERIOD, points=[unit.point(f"holding:{REGISTER}") for unit in units])
     wrong = 0
     known = inf
     async for snapshot in group:

@@ -19,7 +19,7 @@ from benchmarks.lines import Lines
 from benchmarks.masters import Ask
 from busmaster.bus import Bus
 from busmaster.profile import LineSettings
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.transport.endpoints import Endpoint
 
 SETTINGS = LineSettings(19200)

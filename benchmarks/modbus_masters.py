@@ -19,9 +19,9 @@ from benchmarks.far_end import SETTINGS
 from benchmarks.harness import Options, installed
 from busmaster import Bus, BusError, Node, Priority, ReplyTiming, SerialPort, Timings
 from busmaster.planning import longest_hold
+from busmaster.protocols.modbus import codec as modbus
+from busmaster.protocols.modbus.codec import SILENCE, ReadRegisters, WriteRegisters
 from busmaster.transport.endpoints import Endpoint
-from examples import modbus_rtu
-from examples.modbus_rtu import SILENCE, ReadRegisters, WriteRegisters
 
 T = TypeVar("T")
 
@@ -29,7 +29,7 @@ WINDOW = 0.1
 LATENESS = 0.15
 RETRIES = 2
 LONGEST_REPLY = 8
-PROFILE = replace(modbus_rtu.PROFILE, line=SETTINGS)
+PROFILE = replace(modbus.PROFILE, line=SETTINGS)
 TIMINGS = Timings.uniform(
     ReplyTiming(nominal=0.05, window=WINDOW, lateness=LATENESS, byte_gap=0.02, turnaround=SILENCE)
 )

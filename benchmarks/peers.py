@@ -18,7 +18,7 @@ from benchmarks.masters import Ask, Bare
 from benchmarks.modbus_masters import PROFILE, TIMINGS, Busmaster, Failed, Minimalmodbus, ModbusMaster, masters, notes
 from busmaster import SerialPort, Timings
 from busmaster.profile import LineSettings
-from examples.modbus_rtu import ReadRegisters, with_crc
+from busmaster.protocols.modbus.codec import ReadRegisters, with_crc
 
 DELAY = 0.002
 CALLERS = 4

@@ -16,11 +16,11 @@ from busmaster.arbiter.events import Completed, Event, Polled
 from busmaster.arbiter.schedule import Poll, set_members
 from busmaster.arbiter.transaction import Transaction
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.mint import LAST_COMMS, MintController
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.world import World
-from busmaster.protocols import hcp2
+from busmaster.protocols._comms.mint import LAST_COMMS, EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
 
 NODES = range(1, 33)
 ELEMENTS = range(1, LAST_COMMS + 1)
@@ -67,7 +67,7 @@ class Simulation:
 
     def __init__(self, faults: Faults, seconds: float) -> None:
         chance = Random(1)
-        devices = [MintController(node, delay=Delay(REPLY_TIME)) for node in NODES]
+        devices = [EmulatedMint(node, delay=Delay(REPLY_TIME)) for node in NODES]
         for device in devices:
             device.comms = [value_of(device.address, element) for element in range(LAST_COMMS + 1)]
         line = Line(hcp2.PROFILE.line, devices, chance=chance, faults=faults)

@@ -15,7 +15,7 @@ from benchmarks.asks import hcp2_asks
 from benchmarks.harness import Claim, Options, Outcome, Table, alternate, loops, quantile, run_on
 from benchmarks.lines import Kind, Lines
 from benchmarks.masters import Bare, Blocking, Master, Ours, Streams
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 
 WARM_UP = 100
 OTHER_WORK = 500e-6

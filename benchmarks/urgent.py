@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from benchmarks.far_end import SETTINGS, FarEnd, value_of
 from benchmarks.harness import Claim, Options, Outcome, Table, quantile
 from benchmarks.modbus_masters import Busmaster, Failed, ModbusMaster, masters, notes
-from examples.modbus_rtu import SILENCE
+from busmaster.protocols.modbus.codec import SILENCE
 
 UNITS = 8
 DEAD = 8

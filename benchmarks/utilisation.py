@@ -16,7 +16,8 @@ from benchmarks.harness import Claim, Options, Outcome, Table, alternate
 from benchmarks.lines import Lines
 from benchmarks.masters import Ask, Bare, Ours
 from busmaster.profile import LineSettings, Profile
-from busmaster.protocols import hcp2, msc
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.msc import codec as msc
 
 BAUDRATES = (9600, 57600, 115200)
 REPLY_TIMES = (0.0, 0.002, 0.02)

@@ -28,21 +28,21 @@ from busmaster.errors import (
     WriteUnconfirmed,
 )
 from busmaster.exchange import ReplyTiming, Timings
-from busmaster.handles import (
-    Dc104Drive,
-    Hcp2Controller,
-    HcpController,
-    MentorDrive,
-    MicroFlexDrive,
-    MscController,
-)
 from busmaster.node import Node
 from busmaster.planning import GroupPlan, Plan, PlannedGroup, PlannedNode
 from busmaster.points import Point
 from busmaster.polling import GroupStatistics, PollGroup, Quality, Sample, Snapshot, Stream
 from busmaster.profile import LineSettings, Profile
-from busmaster.protocols.microflex import CommandWord, StatusWord
-from busmaster.protocols.msc import ProgramStatus
+from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
+from busmaster.protocols.dc104.handle import Dc104Drive
+from busmaster.protocols.hcp.handle import HcpController
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
+from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
+from busmaster.protocols.mentor.handle import MentorDrive
+from busmaster.protocols.modbus.handle import ModbusUnit
+from busmaster.protocols.msc.codec import ProgramStatus
+from busmaster.protocols.msc.handle import MscController
 from busmaster.transport.endpoints import Endpoint, endpoint
 from busmaster.transport.memory import MemoryPort
 from busmaster.transport.serial_port import SerialPort
@@ -57,6 +57,7 @@ __all__ = [
     "BusClosed",
     "BusError",
     "CommandWord",
+    "CtAnsiDrive",
     "Dc104Drive",
     "DriverErrors",
     "Endpoint",
@@ -79,6 +80,7 @@ __all__ = [
     "MemoryPort",
     "MentorDrive",
     "MicroFlexDrive",
+    "ModbusUnit",
     "MscController",
     "NoReply",
     "NoSuchParameter",

@@ -66,7 +66,8 @@ class Profile:
 
     name: str
     title: str
-    addresses: range
+    addresses: Sequence[int]
+    """In rising order."""
     line: LineSettings
     timings: Timings
     probe: Command[Any]
@@ -89,8 +90,10 @@ class Profile:
             raise InvalidCommand(f"{self.name}: an address is a whole number, not {address!r}")
         if address in self.addresses or address == self.broadcast:
             return
+        lowest, highest = self.addresses[0], self.addresses[-1]
+        gaps = [str(gap) for gap in range(lowest, highest) if gap not in self.addresses]
         raise InvalidCommand(
-            f"{self.name}: address {address} does not exist; "
-            f"use {self.addresses.start} to {self.addresses.stop - 1}"
+            f"{self.name}: address {address} does not exist; use {lowest} to {highest}"
+            + (f" without {', '.join(gaps)}" if gaps else "")
             + ("" if self.broadcast is None else f", or {self.broadcast} to write to all")
         )

@@ -11,8 +11,8 @@ import sys
 import anyio
 
 from busmaster import Bus, Endpoint, MemoryPort, MscController, endpoint
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
+from busmaster.registry import make_device
 
 TABLE = [round(1000 * math.sin(2 * math.pi * step / 64)) for step in range(64)]
 

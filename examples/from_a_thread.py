@@ -11,8 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 
 from busmaster import Bus, Endpoint, Hcp2Controller, MemoryPort, endpoint
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
+from busmaster.registry import make_device
 
 
 def main(port: Endpoint) -> None:

@@ -15,9 +15,9 @@ from collections.abc import Generator
 import anyio
 
 from busmaster import Bus, Endpoint, HcpController, MemoryPort, endpoint
-from busmaster.emulator.devices.hostcomms import HCP
-from busmaster.emulator.devices.mint import MintController, command_handshake
 from busmaster.emulator.line import Line
+from busmaster.protocols._comms.device import HCP
+from busmaster.protocols._comms.mint import EmulatedMint, command_handshake
 
 MOVE_ABSOLUTE = 1
 ATTEMPTS = 100
@@ -52,7 +52,7 @@ async def main(port: Endpoint) -> None:
             print(f"moved to {target}{lost}")
 
 
-def program(mint: MintController) -> Generator[int, None, None]:
+def program(mint: EmulatedMint) -> Generator[int, None, None]:
     """The document's, with one more line: Comms(10) = POS(1)."""
     for line in command_handshake(mint):
         mint.comms[10] = mint.axes[1].position(mint.now)
@@ -61,5 +61,5 @@ def program(mint: MintController) -> Generator[int, None, None]:
 
 if __name__ == "__main__":
     settings = HcpController.profile.line
-    emulated = MemoryPort(Line(settings, [MintController(2, HCP, program=program)]))
+    emulated = MemoryPort(Line(settings, [EmulatedMint(2, HCP, program=program)]))
     anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)

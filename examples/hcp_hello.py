@@ -10,8 +10,8 @@ import sys
 import anyio
 
 from busmaster import Bus, Endpoint, HcpController, MemoryPort, endpoint
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
+from busmaster.registry import make_device
 
 
 async def main(port: Endpoint) -> None:

@@ -10,8 +10,8 @@ import sys
 import anyio
 
 from busmaster import Bus, Endpoint, MemoryPort, MentorDrive, NoSuchParameter, endpoint
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
+from busmaster.registry import make_device
 
 DECIMALS = {"1.17": 1, "3.02": 1}  # the line carries whole numbers: these have one decimal, so that values are in %
 

@@ -11,8 +11,8 @@ import sys
 import anyio
 
 from busmaster import Bus, Endpoint, MemoryPort, MicroFlexDrive, endpoint
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
+from busmaster.registry import make_device
 
 NODES = range(1, 41)
 CYCLES = 4

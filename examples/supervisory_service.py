@@ -27,8 +27,8 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from busmaster import Bus, BusError, Endpoint, Hcp2Controller, InvalidCommand, MemoryPort, Point, Refused, endpoint
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
+from busmaster.registry import make_device
 
 NODES = range(1, 5)
 

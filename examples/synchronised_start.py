@@ -12,8 +12,8 @@ import sys
 import anyio
 
 from busmaster import Bus, Endpoint, MemoryPort, MentorDrive, endpoint
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
+from busmaster.registry import make_device
 
 ADDRESSES = (11, 12, 13)
 REFERENCE, FEEDBACK = "1.17", "3.02"

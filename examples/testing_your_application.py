@@ -10,8 +10,8 @@ import asyncio
 import time
 
 from busmaster import Bus, MemoryPort, MicroFlexDrive
-from busmaster.emulator.devices.microflex import MicroFlexDrive as EmulatedDrive
 from busmaster.emulator.line import Line
+from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 from busmaster.testing import run_in_virtual_time
 
 # The application
@@ -42,7 +42,7 @@ def test_a_drive_that_gets_too_hot_is_disabled() -> None:
             await asyncio.wait_for(guard(drive, limit=60.0), timeout=600)
         assert not emulated.enabled
 
-    emulated = EmulatedDrive(7, current_control=True)
+    emulated = EmulatedMicroFlex(7, current_control=True)
     line = Line(MicroFlexDrive.profile.line, [emulated])
     run_in_virtual_time(scenario())
 
@@ -59,7 +59,7 @@ def test_a_drive_that_stays_cool_is_left_alone_for_an_hour() -> None:
             assert emulated.enabled
             guarding.cancel()
 
-    emulated = EmulatedDrive(7)
+    emulated = EmulatedMicroFlex(7)
     line = Line(MicroFlexDrive.profile.line, [emulated])
     run_in_virtual_time(scenario())
 

@@ -7,10 +7,10 @@ from collections.abc import Awaitable, Callable
 
 from busmaster.bus import Bus
 from busmaster.emulator.device import Device
-from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.line import Line
 from busmaster.polling import PollGroup, Snapshot
 from busmaster.profile import LineSettings
+from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport.memory import MemoryPort
 
@@ -21,7 +21,7 @@ def on_a_bus(story: Story, *devices: Device, settings: LineSettings | None = Non
     """Run it on a line with these devices; two HCP2 controllers, 1 and 2, by default."""
 
     async def run() -> None:
-        chosen = devices or (MintController(1), MintController(2))
+        chosen = devices or (EmulatedMint(1), EmulatedMint(2))
         line = Line(settings or LineSettings(57600), chosen, chance=random.Random(1))
         async with Bus(MemoryPort(line), seed=1) as bus:
             await story(bus)

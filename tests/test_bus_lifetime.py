@@ -16,20 +16,20 @@ from anyio.from_thread import start_blocking_portal
 
 from busmaster.bus import Bus
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.line import Line
 from busmaster.errors import BusClosed, InvalidCommand
-from busmaster.handles import Hcp2Controller
 from busmaster.polling import PollGroup
 from busmaster.profile import LineSettings
-from busmaster.protocols import hcp2
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport.memory import MemoryPort
 
 
 def slow_bus() -> Bus:
     """On a line whose one controller takes 80 ms to answer."""
-    line = Line(LineSettings(57600), [MintController(1, delay=Delay(0.080))], chance=random.Random(1))
+    line = Line(LineSettings(57600), [EmulatedMint(1, delay=Delay(0.080))], chance=random.Random(1))
     return Bus(MemoryPort(line), seed=1)
 
 

@@ -14,15 +14,16 @@ import pytest
 from busmaster.arbiter.schedule import AT_ONCE, SLICE, Schedule
 from busmaster.arbiter.transaction import Transaction
 from busmaster.bus import Bus
-from busmaster.emulator.devices.mint import MintController
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Command
-from busmaster.handles import Hcp2Controller, MentorDrive
 from busmaster.merging import WEIGHING
 from busmaster.points import Point
 from busmaster.polling import PollGroup
 from busmaster.profile import Batch
-from busmaster.protocols import hcp2
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.mentor.handle import MentorDrive
 from busmaster.testing.virtual_time import VirtualTimeLoop
 from tests.stories import cycles, on_a_bus
 
@@ -218,7 +219,7 @@ def test_a_point_of_the_address_that_is_for_all_is_refused() -> None:
         with pytest.raises(InvalidCommand, match="nobody answers"):
             bus.poll_group("all", period=1.0, points=[MentorDrive(bus, 0).point("1.17")])
 
-    on_a_bus(story, MintController(1))
+    on_a_bus(story, EmulatedMint(1))
 
 
 def test_samples_keep_the_order_of_the_points_whichever_came_first() -> None:

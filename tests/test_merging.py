@@ -12,7 +12,8 @@ from busmaster.exchange import Command
 from busmaster.merging import Merge, at_once, cheapest
 from busmaster.planning import PlannedNode
 from busmaster.profile import Batch
-from busmaster.protocols import mentor, msc
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
 
 TAU_9600 = 10 / 9600
 READS = [mentor.Read(1, number) for number in (17, 18, 19, 25)]

@@ -26,10 +26,10 @@ from busmaster import (
     TcpPort,
     Timings,
 )
-from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.registry import make_device
 from busmaster.testing import run_in_virtual_time
 
 TIMING = ReplyTiming(0.05, 0.1, 0.15, 0.02)

@@ -17,7 +17,11 @@ from busmaster.errors import InvalidCommand
 from busmaster.exchange import Command, ReplyTiming, Timings
 from busmaster.planning import Bounds, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan
 from busmaster.profile import LineSettings
-from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
 
 LINE = LineSettings(57600)
 TAU = LINE.byte_time

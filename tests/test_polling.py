@@ -10,15 +10,17 @@ import pytest
 
 from busmaster.bus import Bus
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.mentor import MentorDrive
-from busmaster.emulator.devices.msc import MscController as EmulatedMsc
 from busmaster.errors import GarbledReply, NoReply, Refused
-from busmaster.handles import Hcp2Controller, MscController
-from busmaster.handles import MentorDrive as MentorHandle
 from busmaster.points import Point
 from busmaster.polling import Quality
 from busmaster.profile import LineSettings
-from busmaster.protocols import hcp2, mentor
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.mentor.device import EmulatedMentor
+from busmaster.protocols.mentor.handle import MentorDrive as MentorHandle
+from busmaster.protocols.msc.device import EmulatedMsc
+from busmaster.protocols.msc.handle import MscController
 from tests.stories import cycles, on_a_bus
 
 # consumers
@@ -233,7 +235,7 @@ def test_a_broadcast_makes_every_drive_stale() -> None:
         await bus.node(mentor.PROFILE, 0).request(mentor.Write(1, 17, 100))
         assert bus.latest(point) is None
 
-    on_a_bus(story, MentorDrive(11), settings=mentor.PROFILE.line)
+    on_a_bus(story, EmulatedMentor(11), settings=mentor.PROFILE.line)
 
 
 def test_reading_with_a_greatest_age_takes_the_polled_sample_until_a_write_makes_it_stale() -> None:
@@ -336,7 +338,7 @@ def test_runs_of_parameters_are_chained_only_by_those_who_opt_in() -> None:
         assert (one.exchanges, other.exchanges) == (3, 1)
         assert other.merged[0].saved > 0
 
-    on_a_bus(story, MentorDrive(11), settings=mentor.PROFILE.line)
+    on_a_bus(story, EmulatedMentor(11), settings=mentor.PROFILE.line)
 
 
 # points of one quantity, made by several hands
@@ -353,7 +355,7 @@ def test_a_write_makes_the_same_quantity_stale_by_whatever_name_it_is_polled() -
         assert [bus.latest(point) for point in polled] == [None] * 3
         assert bus.latest(other) is not None
 
-    on_a_bus(story, MentorDrive(11), settings=mentor.PROFILE.line)
+    on_a_bus(story, EmulatedMentor(11), settings=mentor.PROFILE.line)
 
 
 def test_two_handles_that_scale_a_parameter_differently_have_different_points() -> None:
@@ -369,7 +371,7 @@ def test_two_handles_that_scale_a_parameter_differently_have_different_points() 
         assert await scaled.point("1.17").read(max_age=1.0) == 47.6
         assert MentorHandle(bus, 11, decimals={"1.17": 1}).point("1.17") == points[1]
 
-    on_a_bus(story, MentorDrive(11), settings=mentor.PROFILE.line)
+    on_a_bus(story, EmulatedMentor(11), settings=mentor.PROFILE.line)
 
 
 # values that mean nothing

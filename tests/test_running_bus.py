@@ -14,12 +14,12 @@ from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import line_time
 from busmaster.bus import Bus
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.mint import MintController
 from busmaster.errors import BusError, InvalidCommand, NodeDown, NoReply
-from busmaster.handles import Hcp2Controller
 from busmaster.node import Node, Priority
 from busmaster.polling import PollGroup
-from busmaster.protocols import hcp2
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
 from tests.stories import cycles, on_a_bus
 
 # plans and bounds of the running bus
@@ -42,7 +42,7 @@ def test_the_plan_of_a_running_bus_is_what_it_does() -> None:
             assert group.statistics().cycle_time.mean == pytest.approx(planned.cycle, rel=0.1)
             assert group.statistics().cycle_time.highest <= planned.worst_cycle
 
-    devices = [MintController(address, delay=Delay(0.001, 0.009)) for address in (1, 2)]
+    devices = [EmulatedMint(address, delay=Delay(0.001, 0.009)) for address in (1, 2)]
     devices[0].comms = [-1234567.8912] * 100
     on_a_bus(story, *devices)
 
@@ -91,7 +91,7 @@ def test_r9_the_worst_case_wait_of_the_line_at_hand() -> None:
 
 
 def test_r11_the_hook_of_a_node_that_returns_runs_before_its_polls_and_health_is_told() -> None:
-    device = MintController(1)
+    device = EmulatedMint(1)
 
     async def story(bus: Bus) -> None:
         point = Hcp2Controller(bus, 1).point("7")
@@ -123,7 +123,7 @@ def test_r11_the_hook_of_a_node_that_returns_runs_before_its_polls_and_health_is
 
 
 def test_r11_a_node_that_returns_again_while_its_hook_runs_gets_another_run_after_it() -> None:
-    device = MintController(1)
+    device = EmulatedMint(1)
 
     async def story(bus: Bus) -> None:
         point = Hcp2Controller(bus, 1).point("7")
@@ -211,7 +211,7 @@ def test_a_refused_probe_of_a_suspect_is_an_answer_and_a_request_that_was_not_se
         node.record.failed_at = bus.now()
         assert await node.probe()
 
-    on_a_bus(story, MintController(1, axes=0, refuse_reserved=True))
+    on_a_bus(story, EmulatedMint(1, axes=0, refuse_reserved=True))
 
 
 def test_a_second_handle_with_the_same_timings_is_welcome_after_lateness_was_raised() -> None:

@@ -20,8 +20,10 @@ from busmaster import (
     Timings,
 )
 from busmaster.emulator.line import Line
-from busmaster.handles import Handle
-from busmaster.protocols import hcp2, mentor, msc
+from busmaster.handle import Handle
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
 
 SLOW = Timings.uniform(ReplyTiming(0.1, 0.2, 0.3, 0.02))
 Make = Callable[[Bus], Handle]

@@ -7,16 +7,18 @@ only after it has sent the next request, so an exchange is held back until then:
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 from busmaster.capture.decode import Decoder
-from busmaster.capture.dialects import dialect, protocol_of
-from busmaster.capture.frames import UNACKED, UNASKED, Frame, Kind
-from busmaster.capture.pcapng import Direction, Outcome, Packet
+from busmaster.capture.frames import UNACKED, UNASKED, Direction, Frame, Kind
+from busmaster.capture.pcapng import Outcome, Packet
+from busmaster.registry import find, kinds
 
 SAME_CALLBACK = 0.005
 """Seconds: a verdict that comes later than this after a request is not of the exchange before it."""
-_BROADCAST = ("mentor", 0)
+REQUESTS_KEPT = 4096
+"""Requests of which is remembered what protocol they speak."""
 
 
 class Verdict(NamedTuple):
@@ -27,12 +29,35 @@ class Verdict(NamedTuple):
     comment: str
 
 
+def protocol_of(request: bytes, declared: str = "") -> str:
+    """Return the protocol of what a master says, or "" if it begins no exchange: an acknowledgement, say.
+
+    It is the one that is `declared` if that has such a request, else the first that has: they are tried in the order
+    in which captures came to know them.
+    """
+    known = sorted(kinds().values(), key=lambda kind: (not kind.capture_id, kind.capture_id))
+    names = (declared, *(kind.name for kind in known))
+    return next((name for name in names if name and _is_request(request, name)), "")
+
+
+def _is_request(said: bytes, protocol: str) -> bool:
+    dialect = find(protocol).protocol.dialect()
+    if not said or dialect.size(said, Direction.HOST) != len(said):
+        return False
+    frame = dialect.explain(said, Direction.HOST)
+    return frame.kind in (Kind.READ, Kind.WRITE) and not frame.fault and not frame.continues
+
+
+def _is_broadcast(request: Frame, protocol: str) -> bool:
+    return request.node is not None and bool(protocol) and request.node == find(protocol).profile.broadcast
+
+
 class _Held:
     """One exchange whose packets wait for its verdict."""
 
     def __init__(self, request: Frame | None, protocol: str = "") -> None:
         self.request = request
-        self.broadcast = request is not None and (protocol, request.node) == _BROADCAST
+        self.broadcast = request is not None and _is_broadcast(request, protocol)
         self.last: Frame | None = None
         self.packets: list[Packet] = []
         self.answer: Packet | None = None
@@ -73,15 +98,16 @@ class _Held:
 class Assembler:
     """Makes packets and hands them to `write`, in order. `now` is in seconds, and `offset` what makes it 1970's.
 
-    `protocol` is only needed for what cannot be told from requests: "microflex", or a line that is listened to. With
-    `echo` what the host sends is received too, and left out.
+    `protocol` is needed where requests do not tell it: of two kinds of nodes that speak alike, and on a line that is
+    listened to. With `echo` what the host sends is received too, and left out.
     """
 
     def __init__(
         self, write: Callable[[Packet], object], *, protocol: str = "", echo: bool = False, offset: float = 0.0
     ) -> None:
         self._write = write
-        self._declared = protocol
+        kinds()  # they are looked for now, not while the line runs
+        self._protocol_of = lru_cache(REQUESTS_KEPT)(partial(protocol_of, declared=protocol))
         self._echo = echo
         self._echo_owed = b""
         self._sent = b""
@@ -149,15 +175,11 @@ class Assembler:
         self._release_previous()
         self._release(self._current)
 
-    def _protocol_of(self, request: bytes) -> str:
-        protocol = protocol_of(request)
-        return self._declared if protocol == "hcp2" and self._declared == "microflex" else protocol
-
     def _speak(self, protocol: str) -> None:
         """The next bytes are of this protocol; of the same as before if it is "" (an acknowledgement)."""
         self._protocol = protocol or self._protocol
         if protocol and protocol not in self._decoders:
-            self._decoders[protocol] = Decoder(dialect(protocol))
+            self._decoders[protocol] = Decoder(find(protocol).protocol.dialect())
 
     def _strip_echo(self, data: bytes) -> bytes:
         """What is not the echo of what was sent last, or before that (MSC's closing ACK comes with the next request).

@@ -6,10 +6,11 @@ by position, as PROTOCOLS 1.1 demands. Silence ends a frame only to give it up.
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol
 
-from busmaster.capture.frames import Frame, Kind
-from busmaster.capture.pcapng import Direction
+from busmaster.capture.frames import Direction, Frame, Kind
+from busmaster.exchange import Command
 
 LONGEST_FRAME = 250
 DEFAULT_GAP = 0.1
@@ -31,6 +32,13 @@ class Dialect(Protocol):
 
     def explain(self, raw: bytes, sender: Direction, /) -> Frame:
         """What a whole frame says. `sender` UNKNOWN: it is inferred from the frame and what was asked before."""
+        ...
+
+    def command(self, request: Frame, continued: Sequence[Frame], /) -> Command[Any]:
+        """Return the command that a request speaks, with what the host said in the midst of the same exchange.
+
+        Raises InvalidCommand, ValueError or KeyError for a request that no command would send.
+        """
         ...
 
 

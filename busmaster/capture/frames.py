@@ -5,12 +5,18 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 
-from busmaster.capture.pcapng import Direction
-
 UNASKED = "unasked"
 """The fault of a frame from a node that nobody had asked."""
 UNACKED = "before the ACK"
 """The fault of an MSC packet whose request was not yet acknowledged: it may answer an older one."""
+
+
+class Direction(enum.IntEnum):
+    """Who spoke."""
+
+    UNKNOWN = 0
+    NODE = 1
+    HOST = 2
 
 
 class Kind(enum.StrEnum):
@@ -45,6 +51,8 @@ class Frame:
     fault: str = ""
     answers: bool = False
     """It ends what the last request asked for, or one leg of it."""
+    continues: bool = False
+    """It is what the host says in the midst of an exchange, and begins none."""
     time: float = 0.0
     """Seconds, when its first byte was heard, on the clock of whoever heard it."""
     delay: float | None = None

@@ -4,10 +4,13 @@ Every packet is one frame on the line. Its bytes follow a header of our own, six
 what no byte of an anonymous reply tells:
 
     0      version of this header, 1
-    1      protocol, see `PROTOCOLS`
+    1      the protocol's capture id, 0 where it has none
     2      direction: 0 unknown, 1 from a node, 2 from the host (the codes of the packet's own flags option)
     3      outcome of the exchange, see `Outcome`; on the last packet from the node, 0 on the others
     4, 5   node, big-endian; FFFF where unknown or the protocol has none
+
+The protocol's name is the description of the packet's interface: a file has an interface for each protocol on the line,
+all named for the port. In files of older versions, which have one interface without a description, the id tells it.
 
 An exchange that nobody answered ends in a packet of the header alone. Times are whole microseconds since 1970.
 The link type is `LINK_TYPE`, one of those set aside for private use.
@@ -19,11 +22,13 @@ import enum
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
+
+from busmaster.capture.frames import Direction
+from busmaster.registry import find, kinds
 
 LINK_TYPE = 157
 """LINKTYPE_USER10: private, and not the first of them, which other people's dissectors take."""
-PROTOCOLS = ("", "hcp", "hcp2", "microflex", "msc", "mentor", "dc104")
 HEADER_VERSION = 1
 NO_NODE = 0xFFFF
 
@@ -31,21 +36,13 @@ _HEADER = struct.Struct(">BBBBH")
 _SECTION, _INTERFACE, _PACKET, _STATISTICS = 0x0A0D0D0A, 1, 6, 5
 _BYTE_ORDER = 0x1A2B3C4D
 _COMMENT, _FLAGS, _DROPPED = 1, 2, 4
-_APPLICATION, _NAME, _RESOLUTION, _IF_DROPPED = 4, 2, 9, 5
+_APPLICATION, _NAME, _DESCRIPTION, _RESOLUTION, _IF_DROPPED = 4, 2, 3, 9, 5
 _MICROSECONDS = 6
 _LONGEST_BLOCK = 1 << 20
 
 
 class CaptureError(ValueError):
     """The file is no capture, or not one of ours."""
-
-
-class Direction(enum.IntEnum):
-    """Who spoke."""
-
-    UNKNOWN = 0
-    NODE = 1
-    HOST = 2
 
 
 class Outcome(enum.IntEnum):
@@ -79,26 +76,41 @@ class PcapngWriter:
 
     def __init__(self, file: BinaryIO, *, port: str = "") -> None:
         self._file = file
+        self._port = port
+        self._interfaces: dict[str, int] = {}
         self._write(_SECTION, struct.pack("<IHHq", _BYTE_ORDER, 1, 0, -1) + _options((_APPLICATION, b"busmaster")))
-        options = _options((_NAME, port.encode()), (_RESOLUTION, bytes([_MICROSECONDS])))
-        self._write(_INTERFACE, struct.pack("<HHI", LINK_TYPE, 0, 0) + options)
+        self._interface_of("")
 
     def write(self, packet: Packet) -> None:
+        interface = self._interface_of(packet.protocol)
         node = NO_NODE if packet.node is None else packet.node
-        head = (HEADER_VERSION, PROTOCOLS.index(packet.protocol), packet.direction, packet.outcome, node)
+        capture_id = find(packet.protocol).capture_id if packet.protocol else 0
+        head = (HEADER_VERSION, capture_id, packet.direction, packet.outcome, node)
         data = _HEADER.pack(*head) + packet.frame
         options = _options(
             (_COMMENT, packet.comment.encode()),
             (_FLAGS, struct.pack("<I", packet.direction) if packet.direction else b""),
             (_DROPPED, struct.pack("<Q", packet.dropped) if packet.dropped else b""),
         )
-        fixed = struct.pack("<IIIII", 0, packet.micros >> 32, packet.micros & 0xFFFFFFFF, len(data), len(data))
+        fixed = struct.pack("<IIIII", interface, packet.micros >> 32, packet.micros & 0xFFFFFFFF, len(data), len(data))
         self._write(_PACKET, fixed + _padded(data) + options)
 
     def finish(self, micros: int, dropped: int) -> None:
         """The closing statistics: how many events were dropped in all."""
         fixed = struct.pack("<III", 0, micros >> 32, micros & 0xFFFFFFFF)
         self._write(_STATISTICS, fixed + _options((_IF_DROPPED, struct.pack("<Q", dropped))))
+
+    def _interface_of(self, protocol: str) -> int:
+        """The number of a protocol's interface, which is described in the file before its first packet."""
+        if protocol not in self._interfaces:
+            self._interfaces[protocol] = len(self._interfaces)
+            options = _options(
+                (_NAME, self._port.encode()),
+                (_DESCRIPTION, protocol.encode()),
+                (_RESOLUTION, bytes([_MICROSECONDS])),
+            )
+            self._write(_INTERFACE, struct.pack("<HHI", LINK_TYPE, 0, 0) + options)
+        return self._interfaces[protocol]
 
     def _write(self, kind: int, body: bytes) -> None:
         length = len(body) + 12
@@ -107,34 +119,48 @@ class PcapngWriter:
 
 def read_packets(file: BinaryIO) -> Iterator[Packet]:
     """The packets of a capture of ours, in order. Raises CaptureError for any other file, or one cut in mid-block."""
-    ticks: list[int] = []
-    link_types: list[int] = []
+    interfaces: list[_Interface] = []
     for kind, body, order in _blocks(file):
         if kind == _SECTION:
-            ticks.clear()
-            link_types.clear()
+            interfaces.clear()
         elif kind == _INTERFACE:
-            link_types.append(struct.unpack_from(f"{order}H", body)[0])
-            resolution = dict(_read_options(body[8:], order)).get(_RESOLUTION, bytes([_MICROSECONDS]))[0]
-            ticks.append(2 ** (resolution & 0x7F) if resolution & 0x80 else 10**resolution)
+            interfaces.append(_interface(body, order))
         elif kind == _PACKET:
-            interface, high, low, size, _ = struct.unpack_from(f"{order}IIIII", body)
-            if interface >= len(ticks) or link_types[interface] != LINK_TYPE:
+            number, high, low, size, _ = struct.unpack_from(f"{order}IIIII", body)
+            if number >= len(interfaces) or interfaces[number].link_type != LINK_TYPE:
                 raise CaptureError(f"not a capture of a serial line: no link type {LINK_TYPE}")
-            micros = ((high << 32) | low) * 1_000_000 // ticks[interface]
-            yield _packet(
-                micros, body[20 : 20 + size], dict(_read_options(body[20 + size + -size % 4 :], order)), order
-            )
+            interface = interfaces[number]
+            micros = ((high << 32) | low) * 1_000_000 // interface.ticks
+            options = dict(_read_options(body[20 + size + -size % 4 :], order))
+            yield _packet(micros, interface.protocol, body[20 : 20 + size], options, order)
 
 
-def _packet(micros: int, data: bytes, options: dict[int, bytes], order: str) -> Packet:
+class _Interface(NamedTuple):
+    """`ticks`: its time stamps' in a second. `protocol`: what it is described as, "" in older files."""
+
+    link_type: int
+    ticks: int
+    protocol: str
+
+
+def _interface(body: bytes, order: str) -> _Interface:
+    options = dict(_read_options(body[8:], order))
+    resolution = options.get(_RESOLUTION, bytes([_MICROSECONDS]))[0]
+    return _Interface(
+        struct.unpack_from(f"{order}H", body)[0],
+        2 ** (resolution & 0x7F) if resolution & 0x80 else 10**resolution,
+        options.get(_DESCRIPTION, b"").decode(errors="replace"),
+    )
+
+
+def _packet(micros: int, protocol: str, data: bytes, options: dict[int, bytes], order: str) -> Packet:
     if len(data) < _HEADER.size or data[0] != HEADER_VERSION:
         raise CaptureError("a packet without our header, or of a later version")
-    _, protocol, direction, outcome, node = _HEADER.unpack_from(data)
+    _, capture_id, direction, outcome, node = _HEADER.unpack_from(data)
     try:
         return Packet(
             micros,
-            PROTOCOLS[protocol],
+            protocol or _by_id()[capture_id],
             Direction(direction),
             data[_HEADER.size :],
             None if node == NO_NODE else node,
@@ -142,8 +168,13 @@ def _packet(micros: int, data: bytes, options: dict[int, bytes], order: str) -> 
             options.get(_COMMENT, b"").decode(errors="replace"),
             struct.unpack(f"{order}Q", options[_DROPPED])[0] if _DROPPED in options else 0,
         )
-    except (IndexError, ValueError) as error:
+    except (KeyError, ValueError) as error:
         raise CaptureError(f"a packet with a header that means nothing: {data[: _HEADER.size].hex(' ')}") from error
+
+
+def _by_id() -> dict[int, str]:
+    """The protocols of older files."""
+    return {0: "", **{kind.capture_id: kind.name for kind in kinds().values() if kind.capture_id}}
 
 
 def _blocks(file: BinaryIO) -> Iterator[tuple[int, bytes, str]]:

@@ -15,7 +15,8 @@ from typing import Any, BinaryIO, TypeAlias
 
 from busmaster.arbiter.transaction import Transaction
 from busmaster.capture.assemble import Assembler, Verdict
-from busmaster.capture.pcapng import Direction, Outcome, Packet, PcapngWriter
+from busmaster.capture.frames import Direction
+from busmaster.capture.pcapng import Outcome, Packet, PcapngWriter
 from busmaster.errors import BusError, GarbledReply, NoReply, Refused
 from busmaster.exchange import Command, Timings
 

@@ -11,13 +11,12 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Any
 
-from busmaster.capture.commands import PROFILES, SHORT_COMMANDS, command_of
 from busmaster.capture.decode import Decoder
-from busmaster.capture.dialects import dialect
-from busmaster.capture.frames import Frame, Kind
-from busmaster.capture.pcapng import Direction, Outcome, Packet
+from busmaster.capture.frames import Direction, Frame, Kind
+from busmaster.capture.pcapng import Outcome, Packet
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.exchange import Command, Done, Exchange, Expect, FrameError, Step
+from busmaster.registry import Protocol, find
 
 
 @dataclass(slots=True)
@@ -78,7 +77,7 @@ class _Heard:
     def is_request(self) -> bool:
         frame = self.frame
         asks = self.packet.direction is Direction.HOST and frame.kind in (Kind.READ, Kind.WRITE)
-        return asks and frame.command not in SHORT_COMMANDS
+        return asks and not frame.continues
 
 
 class _Run:
@@ -189,7 +188,7 @@ def listen(packets: Iterable[Packet]) -> Iterator[_Heard]:
     decoders: dict[str, Decoder] = {}
     for number, packet in enumerate(packets, 1):
         if packet.protocol and packet.protocol not in decoders:
-            decoders[packet.protocol] = Decoder(dialect(packet.protocol))
+            decoders[packet.protocol] = Decoder(find(packet.protocol).protocol.dialect())
         frame = Frame(Kind.NOISE, packet.direction, packet.frame)
         if packet.protocol and packet.frame:
             decoder = decoders[packet.protocol]
@@ -200,15 +199,30 @@ def listen(packets: Iterable[Packet]) -> Iterator[_Heard]:
 def open_run(heard: Sequence[_Heard], place: int) -> _Run:
     """Today's exchange for a recorded request. Raises InvalidCommand for one that we would not send."""
     asked = heard[place]
-    shorts = []
+    continued = []
     for follower in heard[place + 1 :]:
         if follower.packet.direction is Direction.HOST:
-            if follower.frame.command not in SHORT_COMMANDS:
+            if not follower.frame.continues:
                 break
-            shorts.append(follower.frame.command)
-    command = command_of(asked.packet.protocol, asked.frame, shorts)
-    timings = PROFILES[asked.packet.protocol].timings
-    return _Run(asked, command, command.open(asked.frame.node or 0, timings))
+            continued.append(follower.frame)
+    protocol = find(asked.packet.protocol).protocol
+    command = command_of(protocol, asked.frame, continued)
+    return _Run(asked, command, command.open(asked.frame.node or 0, protocol.profile.timings))
+
+
+def command_of(protocol: Protocol, request: Frame, continued: Sequence[Frame] = ()) -> Command[Any]:
+    """Return the command that a request speaks, with what the host said in the midst of the same exchange.
+
+    Raises InvalidCommand for a request that no command of ours would send.
+    """
+    if request.fault:
+        raise InvalidCommand(f"{request.text}: {request.fault}")
+    try:
+        return protocol.dialect().command(request, continued)
+    except InvalidCommand:
+        raise
+    except (KeyError, ValueError) as error:
+        raise InvalidCommand(f"no command of ours: {request.text}") from error
 
 
 def recorded_outcome(heard: Sequence[_Heard], place: int) -> Outcome:

@@ -3,169 +3,25 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import click
 
 from busmaster.bus import Bus
 from busmaster.cli.capturing import capture_option, capturing
-from busmaster.errors import InvalidCommand
+from busmaster.cli.parsing import Whole, option_type, parse_nodes, parse_seconds, parse_window, parsed
+from busmaster.cli.protocols import handle_options, protocol_option, take_options
 from busmaster.exchange import Timings
-from busmaster.handles import HANDLES, Handle, MscController
+from busmaster.handle import Handle
 from busmaster.profile import LineSettings, Profile
+from busmaster.registry import find
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
 F = TypeVar("F", bound=Callable[..., Any])
-S = TypeVar("S")
-T = TypeVar("T")
-
-HIGHEST_ADDRESS = 255
-HIGHEST_PORT = 65535
-LONGEST_WINDOW = 60.0
-"""Seconds. Lateness moves with it, and a line is first listened to for that long."""
-
-WHAT_ITEMS_ARE = """\b
-ITEM, by protocol:
-  hcp        a comms element, 1 to 99
-  hcp2       an element, 1 to 255, or its name: axis0.position (to axis7;
-             position velocity mode axis_error demand encoder idle
-             following_error), inputs outputs adc0 (to adc7) error error_line
-             error_axis running line_number firmware
-  microflex  an element, or its name: position demand_position
-             following_error axis_error drive_error command_word status_word
-             speed_reference speed_demand speed_measured speed_error
-             torque_reference torque_demand current current_u current_v
-             bus_voltage drive_overload motor_overload hall_state
-             absolute_encoder phase_search_status inputs outputs analog_input
-             firmware temperature
-  msc        2008 (a data address), 2008:32 (32 values from there on), flag:5,
-             flags, status
-  mentor     1.17 (menu and parameter), 15.60:wide, 1.17:hires, 1.17:20 (20
-             parameters from there on)
-  dc104      a parameter, 1 to 255
-"""
-"""For the help of commands that take some."""
-
-
-class Whole(click.IntRange):
-    """Says "is not a valid whole number" of what is none."""
-
-    name = "whole number"
-
-
-def option_type(parse: Callable[[str], T]) -> Callable[[str], T]:
-    """For click's `type=`: a value that `parse` refuses with InvalidCommand is wrong usage of that option."""
-
-    def convert(text: str) -> T:
-        try:
-            return parse(text)
-        except InvalidCommand as error:
-            raise click.BadParameter(str(error)) from None
-
-    return convert
-
-
-def parse_nodes(text: str) -> tuple[int, ...]:
-    """The addresses of `1-8,255`. Raises InvalidCommand."""
-    addresses: dict[int, None] = {}
-    for part in text.split(","):
-        first, dash, last = (piece.strip() for piece in part.partition("-"))
-        if not is_decimal(first) or (dash and not is_decimal(last)):
-            raise InvalidCommand(f"a node list is written like 1-8,255, not {text!r}")
-        start, stop = int(first), int(last or first)
-        if start > stop:
-            raise InvalidCommand(f"a range goes upwards: {stop}-{start}, not {part.strip()}")
-        if stop > HIGHEST_ADDRESS:
-            raise InvalidCommand(f"no protocol has a node {stop}")
-        addresses.update(dict.fromkeys(range(start, stop + 1)))
-    return tuple(addresses)
-
-
-def parse_seconds(text: str) -> float:
-    """Seconds above 0. Raises InvalidCommand."""
-    seconds = parse_value(text)
-    if not 0 < seconds < float("inf"):
-        raise InvalidCommand(f"a time is above 0, not {text}")
-    return seconds
-
-
-def parse_window(text: str) -> float:
-    """A reply window in milliseconds, in seconds. Raises InvalidCommand for one that nobody would wait for."""
-    seconds = parse_seconds(text) / 1000
-    if seconds > LONGEST_WINDOW:
-        raise InvalidCommand(f"a reply window is at most {LONGEST_WINDOW * 1000:.0f} ms, not {text}")
-    return seconds
-
-
-def parse_items(text: str) -> tuple[str, ...]:
-    """The items of `--items a,b,c`. Raises InvalidCommand for none."""
-    items = tuple(item for item in (part.strip() for part in text.split(",")) if item)
-    if not items:
-        raise InvalidCommand("--items names at least one item")
-    return tuple(dict.fromkeys(items))
-
-
-def parse_assignment(text: str) -> tuple[str, tuple[float, ...]]:
-    """`ITEM=VALUE[,VALUE...]` -> the item and its numbers. Raises InvalidCommand."""
-    item, equals, values = text.partition("=")
-    if not equals or not item.strip() or not values.strip():
-        raise InvalidCommand(f"an assignment is written ITEM=VALUE, like 1=123.456, not {text!r}")
-    return item.strip(), tuple(parse_value(part) for part in values.split(","))
-
-
-def parse_value(text: str) -> float:
-    """A whole number stays one. Hexadecimal (0x41) is taken for the words. Raises InvalidCommand."""
-    text = text.strip()
-    try:
-        return int(text, 16) if text.lower().startswith("0x") else int(text)
-    except ValueError:
-        pass
-    try:
-        return float(text)
-    except ValueError:
-        raise InvalidCommand(f"{text!r} is no number") from None
-
-
-def parse_host_port(text: str) -> tuple[str, int]:
-    """`HOST:PORT`. Raises InvalidCommand."""
-    host, colon, port = text.rpartition(":")
-    if not colon or not host or not is_decimal(port) or int(port) > HIGHEST_PORT:
-        raise InvalidCommand(f"a TCP address is written HOST:PORT, like 127.0.0.1:5020, not {text!r}")
-    return host.strip("[]"), int(port)
-
-
-def parsed(parse: Callable[[S], T], value: S) -> T:
-    """What `parse` makes of an argument; what it refuses is wrong usage. Raises UsageError."""
-    try:
-        return parse(value)
-    except InvalidCommand as error:
-        raise click.UsageError(str(error), click.get_current_context()) from None
-
-
-def is_run(item: str) -> bool:
-    """`2008:32`, `1.17:20`: values from there on."""
-    first, colon, count = item.partition(":")
-    return bool(colon) and first != "flag" and is_decimal(count)
-
-
-def run_names(handle: Handle, item: str, count: int) -> tuple[str, ...]:
-    """What each value of a run, or of several from `item` on, is called: 1.17, 1.18, ..."""
-    if isinstance(handle, MscController):
-        return handle.run_items(item)
-    first, colon, kind = item.partition(":")
-    suffix = f":{kind}" if colon and not is_decimal(kind) else ""
-    menu, dot, number = first.rpartition(".")
-    if not is_decimal(number):
-        raise InvalidCommand(f"several values begin at a number, not at {item!r}")
-    return tuple(f"{menu}{dot}{int(number) + i:0{len(number)}d}{suffix}" for i in range(count))
-
-
-def is_decimal(text: str) -> bool:
-    return text.isascii() and text.isdigit()
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,16 +34,13 @@ class Connection:
     echo: bool = False
     timeout: float | None = None
     retries: int | None = None
-    address_step: int | None = None
     capture: str | None = None
-
-    @property
-    def handle(self) -> type[Handle]:
-        return HANDLES[self.protocol]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments of the protocol's handle."""
 
     @property
     def profile(self) -> Profile:
-        return self.handle.profile
+        return find(self.protocol).profile
 
     @property
     def line(self) -> LineSettings:
@@ -213,10 +66,8 @@ class Connection:
 
     def open_handle(self, bus: Bus, address: int) -> Handle:
         """A handle on the bus, which need not be open. Raises InvalidCommand."""
-        options: dict[str, Any] = {"timings": self.timings, "retries": self.retries}
-        if self.address_step is not None:
-            options["address_step"] = self.address_step
-        return self.handle(bus, address, **options)
+        handle: Callable[..., Handle] = find(self.protocol).handle
+        return handle(bus, address, timings=self.timings, retries=self.retries, **self.options)
 
     def node_number(self, address: int) -> int | None:
         """For JSON: null where the protocol has no addresses."""
@@ -250,7 +101,7 @@ def line_settings(profile: Profile, baud: int | None) -> LineSettings:
 def only_address(profile: Profile) -> int:
     if profile.addressed:
         raise click.UsageError(f"{profile.name} needs a node: one of {span(profile)}")
-    return profile.addresses.start
+    return profile.addresses[0]
 
 
 def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
@@ -264,20 +115,14 @@ def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
 def slaves_of(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
     """The addresses to emulate: those of --nodes, else 1, or the one drive. Raises UsageError."""
     if nodes is None:
-        return (1,) if profile.addressed else (profile.addresses.start,)
+        return (1,) if 1 in profile.addresses else (profile.addresses[0],)
     if profile.broadcast in nodes:
         raise click.UsageError(f"{profile.name}: no node has address {profile.broadcast}, which means all of them")
     return checked(profile, nodes)
 
 
 def span(profile: Profile) -> str:
-    return f"{profile.addresses.start}-{profile.addresses.stop - 1}"
-
-
-def protocol_option(command: F) -> F:
-    return click.option(
-        "--protocol", required=True, type=click.Choice(list(HANDLES)), metavar="P", help=f"One of {', '.join(HANDLES)}."
-    )(command)
+    return f"{profile.addresses[0]}-{profile.addresses[-1]}"
 
 
 def connected(command: F) -> F:
@@ -291,18 +136,16 @@ def connected(command: F) -> F:
         echo: bool,
         timeout: float | None,
         retries: int | None,
-        address_step: int | None,
         capture: str | None,
         **options: Any,
     ) -> Any:
-        if address_step is not None and protocol != "msc":
-            raise click.UsageError("--address-step is msc's alone")
-        connection = Connection(port, protocol, baud, echo, timeout, retries, address_step, capture)
+        own = take_options(handle_options(), protocol, options)
+        connection = Connection(port, protocol, baud, echo, timeout, retries, capture, own)
         return command(connection=connection, **options)
 
     options = (
         click.argument("port"),
-        protocol_option,
+        protocol_option(),
         click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default."),
         click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire)."),
         click.option(
@@ -310,9 +153,6 @@ def connected(command: F) -> F:
         ),
         click.option("--retries", type=Whole(min=0), metavar="N", help="How often a read is tried again."),
         capture_option,
-        click.option(
-            "--address-step", type=Whole(min=1), metavar="N", help="msc: addresses from one value to the next."
-        ),
     )
     for option in reversed(options):
         gathered = option(gathered)
@@ -332,7 +172,7 @@ def viewed(command: F) -> F:
     return gathered  # type: ignore[return-value]  # likewise
 
 
-node_option = click.option("--node", type=Whole(0, HIGHEST_ADDRESS), metavar="N", help="The node's address.")
+node_option = click.option("--node", type=Whole(0), metavar="N", help="The node's address.")
 nodes_option = click.option(
     "--nodes", type=option_type(parse_nodes), metavar="N-M,K", help="Node addresses, like 1-8,255."
 )

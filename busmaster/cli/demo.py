@@ -17,8 +17,8 @@ from busmaster.cli.demo_line import CONTROLLERS, DRIVES, SETTINGS
 from busmaster.cli.ending import until_ended
 from busmaster.cli.watching import Watch, follow
 from busmaster.errors import BusError
-from busmaster.handles.hcp2 import Hcp2Controller
-from busmaster.handles.microflex import MicroFlexDrive
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from busmaster.transport.serial_port import SerialPort
 
 PERIOD = 0.2

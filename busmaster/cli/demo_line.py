@@ -13,11 +13,11 @@ import select
 import sys
 
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.microflex import MicroFlexDrive
-from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, serve_pty
 from busmaster.profile import LineSettings
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 
 CONTROLLERS = range(1, 4)
 DRIVES = range(4, 9)
@@ -32,11 +32,11 @@ def make_line(seed: int = 1) -> Line:
     delay = Delay(0.001, 0.004)
     line = Line(SETTINGS, chance=random.Random(seed))
     for address in CONTROLLERS:
-        controller = MintController(address, delay=delay)
+        controller = EmulatedMint(address, delay=delay)
         controller.axes[0].swing(amplitude=50.0 * address, period=4.0 + address, phase=address / 3, now=0.0)
         line.add(controller)
     for address in DRIVES:
-        line.add(MicroFlexDrive(address, delay=delay, ripple=0.02))
+        line.add(EmulatedMicroFlex(address, delay=delay, ripple=0.02))
     return line
 
 

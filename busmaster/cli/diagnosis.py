@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from statistics import median
 
 from busmaster.capture.decode import Decoder
-from busmaster.capture.dialects import dialect
 from busmaster.capture.frames import Kind
 from busmaster.cli.probing import Outcome, Probe
 from busmaster.exchange import ReplyTiming
 from busmaster.profile import LineSettings, Profile
+from busmaster.registry import find
 from busmaster.transport.adapters import Finding
 
 SHOWN = 12
@@ -79,7 +79,7 @@ def unasked(heard: bytes, protocol: str | None) -> Finding:
 
 def spoken(heard: bytes, protocol: str) -> list[str]:
     """The whole frames among it, in words."""
-    decoder = Decoder(dialect(protocol))
+    decoder = Decoder(find(protocol).protocol.dialect())
     frames = [*decoder.feed(heard, 0.0), *decoder.quiet()]
     return [frame.text for frame in frames if not frame.fault and frame.kind is not Kind.NOISE]
 

@@ -10,7 +10,7 @@ from textual.containers import Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Input, Label
 
-from busmaster.cli.arguments import parse_value
+from busmaster.cli.parsing import parse_value
 from busmaster.errors import InvalidCommand
 
 

@@ -7,21 +7,13 @@ from dataclasses import replace
 
 import click
 
-from busmaster.cli.arguments import (
-    Connection,
-    Whole,
-    checked,
-    nodes_option,
-    only_address,
-    option_type,
-    parse_window,
-    parsed,
-)
+from busmaster.cli.arguments import Connection, checked, nodes_option, only_address
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
 from busmaster.cli.examination import Patient, examine
 from busmaster.cli.output import emit_all, note
-from busmaster.handles import HANDLES
+from busmaster.cli.parsing import Whole, option_type, parse_window, parsed
+from busmaster.cli.protocols import protocol_option
 from busmaster.profile import LineSettings, Profile
 from busmaster.transport.adapters import Finding
 from busmaster.transport.endpoints import endpoint
@@ -35,7 +27,7 @@ USUAL = LineSettings(9600)
 
 @click.command(short_help="What is wrong with this port, adapter or line?")
 @click.argument("port")
-@click.option("--protocol", type=click.Choice(list(HANDLES)), metavar="P", help=f"One of {', '.join(HANDLES)}.")
+@protocol_option(required=False)
 @nodes_option
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
 @click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire).")

@@ -8,26 +8,18 @@ import threading
 
 import click
 
-from busmaster.cli.arguments import (
-    Whole,
-    line_settings,
-    nodes_option,
-    option_type,
-    parse_host_port,
-    parsed,
-    seconds_option,
-    slaves_of,
-)
+from busmaster.cli.arguments import line_settings, nodes_option, seconds_option, slaves_of
 from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import emit
+from busmaster.cli.parsing import Whole, option_type, parse_host_port, parsed
+from busmaster.cli.protocols import protocol_option
 from busmaster.config import ConfiguredLine, LineFile, emulated_line
-from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import NAMES, Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, serve_pty, serve_tcp
 from busmaster.errors import LineDown
-from busmaster.handles import HANDLES
+from busmaster.registry import find, make_device
 from busmaster.transport.identity import USB
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -35,9 +27,7 @@ from busmaster.transport.tcp import TcpPort
 
 @click.command(short_help="Emulate drives on a pseudo-terminal or a TCP port.")
 @file_argument(required=False)
-@click.option(
-    "--protocol", type=click.Choice(list(HANDLES)), metavar="P", help=f"One of {', '.join(HANDLES)}; without a file."
-)
+@protocol_option(required=False, text="One of {}; without a file.")
 @nodes_option
 @click.option(
     "--pty", is_flag=False, flag_value="", metavar="[LINK]", help="A pseudo-terminal (the default), and a link to it."
@@ -123,7 +113,7 @@ def drives(
 ) -> Line:
     if protocol is None:
         raise click.UsageError("name a LINE.toml, or the drives: --protocol P")
-    profile = HANDLES[protocol].profile
+    profile = find(protocol).profile
     devices = [make_device(protocol, address, delay=delay) for address in slaves_of(profile, nodes)]
     wrong = parsed(Faults.parse, faults)
     for device in devices:

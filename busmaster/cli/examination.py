@@ -15,8 +15,8 @@ from busmaster.cli.probing import Outcome, Prober, Wire, opened
 from busmaster.cli.progress import Bar
 from busmaster.errors import LineDown
 from busmaster.exchange import Timings
-from busmaster.handles import HANDLES
 from busmaster.profile import LineSettings, Profile
+from busmaster.registry import find
 from busmaster.transport import adapters
 from busmaster.transport.adapters import Finding
 from busmaster.transport.endpoints import Endpoint
@@ -55,7 +55,7 @@ class Patient:
     @property
     def profile(self) -> Profile:
         assert self.protocol is not None
-        return HANDLES[self.protocol].profile
+        return find(self.protocol).profile
 
     def crowd(self, addresses: Sequence[int]) -> str:
         """How nodes that do not answer are spoken of."""

@@ -12,23 +12,23 @@ from typing import Any
 import click
 
 from busmaster.capture.decode import DEFAULT_GAP, Decoder
-from busmaster.capture.dialects import dialect
-from busmaster.capture.frames import Frame, Kind
-from busmaster.capture.pcapng import Direction
+from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.capture.recorder import Recorder
-from busmaster.cli.arguments import Connection, Whole, protocol_option
+from busmaster.cli.arguments import Connection
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit
+from busmaster.cli.parsing import Whole
+from busmaster.cli.protocols import protocol_option
 from busmaster.errors import BusError, LineDown
-from busmaster.handles import HANDLES
+from busmaster.registry import find
 
 ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 
 
 @click.command(short_help="Listen only; decode what passes.")
 @click.argument("port")
-@protocol_option
+@protocol_option()
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
 @capture_option
@@ -39,10 +39,12 @@ def command(port: str, protocol: str, baud: int | None, as_json: bool, capture: 
     apart by what they say: a silence only ends one that was cut short.
     """
     endpoint = Connection(port, protocol, baud).endpoint()
-    names = element_names(protocol)
+    kind = find(protocol)
+    names = kind.handle.names_of_items()
     write = json_text if as_json else plain_text
     with capturing(capture, port=endpoint.name, protocol=protocol) as recorder:
-        until_ended(listen, endpoint, Decoder(dialect(protocol)), lambda frame: emit(write(frame, names)), recorder)
+        decoder = Decoder(kind.protocol.dialect())
+        until_ended(listen, endpoint, decoder, lambda frame: emit(write(frame, names)), recorder)
 
 
 class Listener(asyncio.Protocol):
@@ -96,12 +98,6 @@ async def listen(
         await listener.lost
     finally:
         transport.close()
-
-
-def element_names(protocol: str) -> dict[str, str]:
-    """What the protocol's map calls its elements, by number."""
-    elements: Mapping[str, Any] = getattr(HANDLES[protocol], "elements", {})
-    return {str(element.number): name for name, element in elements.items()}
 
 
 def plain_text(frame: Frame, names: Mapping[str, str]) -> str:

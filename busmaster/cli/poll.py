@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import click
 
-from busmaster.cli.arguments import (
-    WHAT_ITEMS_ARE,
-    Connection,
-    View,
-    connected,
-    nodes_option,
-    option_type,
-    parse_items,
-    parse_seconds,
-    viewed,
-)
+from busmaster.cli.arguments import Connection, View, connected, nodes_option, viewed
 from busmaster.cli.ending import until_ended
+from busmaster.cli.parsing import option_type, parse_items, parse_seconds
+from busmaster.cli.protocols import ItemCommand
 from busmaster.cli.watching import Watch, follow
 
 
-@click.command(short_help="Read values of several nodes once a period.", epilog=WHAT_ITEMS_ARE)
+@click.command(short_help="Read values of several nodes once a period.", cls=ItemCommand)
 @connected
 @nodes_option
 @click.option("--items", required=True, type=option_type(parse_items), metavar="ITEM,ITEM...", help="What to read.")

@@ -17,10 +17,11 @@ from busmaster.arbiter.state import LineState
 from busmaster.bus import Bus
 from busmaster.cli import uart
 from busmaster.cli.app import OK
-from busmaster.cli.arguments import View, parse_value
+from busmaster.cli.arguments import View
 from busmaster.cli.drawing import draw
 from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row
 from busmaster.cli.output import emit_all, json_line, note, value_text
+from busmaster.cli.parsing import parse_value
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.outputs.values import cycle_fields, event_text
 from busmaster.points import Point

@@ -14,7 +14,7 @@ from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
 from busmaster.config.table import nearest
 from busmaster.errors import InvalidCommand
-from busmaster.handles import HANDLES, Handle
+from busmaster.handle import Handle
 from busmaster.outputs.fan import Fan
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
@@ -22,9 +22,6 @@ from busmaster.points import Point
 from busmaster.polling import PollGroup
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.pump import Tap
-
-WHOLE = ("msc", "mentor", "dc104")
-"""Protocols whose numbers are whole."""
 
 
 class ConfiguredLine:
@@ -109,10 +106,10 @@ class ConfiguredLine:
 
     def _handle(self, node: NodeSection) -> Handle:
         options = dict(node.options)
-        if node.protocol == "mentor":
+        if node.kind.takes_decimals:
             options["decimals"] = _decimals(node)
         with node.table.at():
-            make: Callable[..., Handle] = HANDLES[node.protocol]
+            make: Callable[..., Handle] = node.kind.handle
             handle = make(self.bus, node.address, timings=node.timings, retries=node.retries, **options)
             if node.reply_time is not None:
                 handle.node.record.reply_time = node.reply_time  # until it is measured
@@ -157,8 +154,8 @@ class ConfiguredLine:
         if section is None:
             source = _known(handle, name, node.points)
             return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
-        decimals = 0 if node.protocol == "mentor" else section.decimals
-        scale = Scale.of(section.factor, section.offset, decimals, whole=node.protocol in WHOLE)
+        decimals = 0 if node.kind.takes_decimals else section.decimals
+        scale = Scale.of(section.factor, section.offset, decimals, whole=node.kind.whole_numbers(section.item))
         return NamedPoint.of(handle.point(section.item), where=where, name=name, unit=section.unit, scale=scale)
 
     def _add_outputs(self) -> None:
@@ -190,7 +187,7 @@ def _known(handle: Handle, item: str, points: Iterable[str]) -> Point[Any]:
 
 
 def _decimals(node: NodeSection) -> dict[str, int]:
-    """Of a Mentor II drive's parameters: its handle rounds by them."""
+    """Of each quantity the digits, where the handle rounds by them. What is behind a colon only says how it is sent."""
     decimals: dict[str, int] = {}
     for point in node.points.values():
         parameter = point.item.partition(":")[0]

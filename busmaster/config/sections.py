@@ -18,17 +18,11 @@ from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import NAMES, Faults
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Timings
-from busmaster.handles import HANDLES
 from busmaster.profile import Profile
+from busmaster.registry import NodeKind, Option, find, kinds
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
-OPTIONS: dict[str, tuple[str, ...]] = {
-    "msc": ("symbols", "address_step", "model"),
-    "mentor": ("chained",),
-    "dc104": ("maximum", "allow_zero"),
-}
-"""What only nodes of one protocol have: the options of its handle."""
 PRIORITIES = {"poll": Priority.POLL, "background": Priority.BACKGROUND}
 
 
@@ -61,8 +55,12 @@ class NodeSection:
     table: Table = field(compare=False, repr=False)
 
     @property
+    def kind(self) -> NodeKind:
+        return find(self.protocol)
+
+    @property
     def profile(self) -> Profile:
-        return HANDLES[self.protocol].profile
+        return self.kind.profile
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,11 +132,10 @@ def read(source: Source) -> LineFile:
 def _defaults(top: Table) -> dict[str, Table]:
     """`[protocols.hcp2]`: what holds for all nodes of one protocol that do not say otherwise."""
     tables = {table.name: table for table in top.tables("protocols")}
-    top.table("protocols").only(*HANDLES)
+    top.table("protocols").only(*kinds())
     for protocol, table in tables.items():
-        table.only(
-            "timing", "retries", "reply_time", *(name for name in OPTIONS.get(protocol, ()) if name != "symbols")
-        )
+        common = (option.name for option in find(protocol).options if option.common)
+        table.only("timing", "retries", "reply_time", *common)
     return tables
 
 
@@ -158,16 +155,12 @@ def _nodes(top: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSection]:
 
 def _several(table: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSection]:
     """The nodes of one table: several where its name is a range."""
-    protocol = table.choice("protocol", HANDLES)
-    own = OPTIONS.get(protocol, ())
-    for key in table.data:
-        holders = [name for name, options in OPTIONS.items() if key in options]
-        if holders and protocol not in holders:
-            raise table.error(f"only nodes of {' and '.join(holders)} have this, not those of {protocol}", key)
-    table.only("protocol", "address", "timing", "retries", "reply_time", "points", *own)
+    protocol = table.choice("protocol", kinds())
+    own = find(protocol).options
+    _check_own(table, protocol)
     with table.at():
         names = list(expanded(table.name))
-    profile = HANDLES[protocol].profile
+    profile = find(protocol).profile
     addresses = _addresses(table, profile)
     if len(names) != len(addresses):
         raise table.error(f"{len(names)} names need as many addresses, not {len(addresses)}", "address")
@@ -194,6 +187,16 @@ def _several(table: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSectio
         )
 
 
+def _check_own(table: Table, protocol: str) -> None:
+    """Raises FileError for a key that nodes of this kind do not have."""
+    names = {kind.name: [option.name for option in kind.options] for kind in kinds().values()}
+    for key in table.data:
+        holders = [name for name, options in names.items() if key in options]
+        if holders and protocol not in holders:
+            raise table.error(f"only nodes of {' and '.join(holders)} have this, not those of {protocol}", key)
+    table.only("protocol", "address", "timing", "retries", "reply_time", "points", *names[protocol])
+
+
 def _addresses(table: Table, profile: Profile) -> Sequence[int]:
     """`address = 5`, or `address = "4-8"`."""
     if not profile.addressed:
@@ -218,22 +221,22 @@ def _no_address(text: str) -> int:
     raise InvalidCommand(f'an address is a number, or a range such as "4-8", not {text!r}')
 
 
-def _options(table: Table, names: Sequence[str]) -> dict[str, Any]:
-    options: dict[str, Any] = {}
-    for name in names:
-        if name not in table:
-            continue
-        match name:
-            case "symbols":
-                symbols = table.table(name)
-                options[name] = {symbol: symbols.whole(symbol, most=0xFFFF_FFFF) for symbol in symbols.data}
-            case "chained" | "allow_zero":
-                options[name] = table.flag(name, False)
-            case "model":
-                options[name] = table.text(name)
-            case _:
-                options[name] = table.whole(name, least=1)
-    return options
+def _options(table: Table, known: Sequence[Option]) -> dict[str, Any]:
+    """Those of them that the table has."""
+    return {option.name: _option(table, option) for option in known if option.name in table}
+
+
+def _option(table: Table, option: Option) -> Any:
+    match option.kind:
+        case "addresses":
+            named = table.table(option.name)
+            return {name: named.whole(name, most=0xFFFF_FFFF) for name in named.data}
+        case "flag":
+            return table.flag(option.name, False)
+        case "text":
+            return table.text(option.name)
+        case "whole":
+            return table.whole(option.name, least=1)
 
 
 def _point(table: Table) -> PointSection:

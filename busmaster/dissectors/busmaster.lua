@@ -1,4 +1,5 @@
--- Wireshark dissector for the captures of busmaster: HCP, HCP2, MicroFlex, MSC, Mentor II and DC104.
+-- Wireshark dissector for the captures of busmaster: HCP, HCP2, MicroFlex, MSC, Mentor II, DC104, CT-ANSI; what Modbus
+-- frames say is left to Wireshark's own dissector.
 --
 -- Copy it into the folder that Help > About Wireshark > Folders calls "Personal Lua Plugins", or run
 -- tshark -X lua_script:busmaster.lua -r line.pcapng. Every packet is one frame on the line behind a header of six bytes
@@ -8,9 +9,9 @@
 local HEADER, VERSION, NO_NODE = 6, 1, 0xFFFF
 local STX, ETX, EOT, ENQ, ACK, BEL, BS, NAK = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x15
 local FROM_NODE, FROM_HOST = 1, 2
-local HCP, HCP2, MICROFLEX, MSC, MENTOR, DC104 = 1, 2, 3, 4, 5, 6
+local HCP, HCP2, MICROFLEX, MSC, MENTOR, DC104, MODBUS, CT_ANSI = 1, 2, 3, 4, 5, 6, 7, 8
 
-local TITLES = { [0] = "unknown", "HCP", "HCP2", "MicroFlex", "MSC", "Mentor", "DC104" }
+local TITLES = { [0] = "unknown", "HCP", "HCP2", "MicroFlex", "MSC", "Mentor", "DC104", "Modbus", "CT-ANSI" }
 local DIRECTIONS = { [0] = "unknown", "node to host", "host to node" }
 local OUTCOMES = { [0] = "-", "ok", "no reply", "garbled", "refused", "stray" }
 local NO_REPLY, STRAY = 2, 5
@@ -427,9 +428,21 @@ local function dc104(p, frame)
   return true
 end
 
+-- Modbus RTU -----------------------------------------------------------------------------------------------------------
+
+local function modbus(p, frame)
+  local size = frame:len()
+  if size < 4 then return false end
+  p.kind = p.direction == FROM_HOST and "request" or "value"
+  p.node = frame(0, 1):uint()
+  p.what = string.format("function %d", frame(1, 1):uint() % 128)
+  if p.direction == FROM_NODE and frame(1, 1):uint() >= 128 then p.what = p.what .. ", refused" end
+  return true
+end
+
 -- The conversation: which request a reply answers --------------------------------------------------------------------
 
-local READERS = { comms, comms, comms, msc, mentor, dc104 }
+local READERS = { comms, comms, comms, msc, mentor, dc104, modbus, mentor }
 local asked, links = nil, {}
 
 function line.init()
@@ -508,6 +521,10 @@ function line.dissector(tvb, pinfo, root)
   if request then add_link(p, pinfo, request) end
   if p.node and not in_frame then tree:add(f.node, tvb(4, 2), p.node):set_generated() end
   if p.leg then tree:add(f.leg, p.leg):set_generated() end
+  if protocol == MODBUS and size > 0 then
+    local found, own = pcall(Dissector.get, "mbrtu")
+    if found and own then own:call(tvb(HEADER):tvb(), pinfo, root) end
+  end
 
   local text = add_outcome(p, outcome, whole, size)
   tree:append_text(", " .. (TITLES[protocol] or "") .. ", " .. text)

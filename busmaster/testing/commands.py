@@ -125,6 +125,6 @@ def check_addresses(profile: Profile) -> Iterator[str]:
             asked[request] = address
     yield from check_invalid(
         partial(profile.check_address, address)
-        for address in (profile.addresses.start - 1, profile.addresses.stop)
+        for address in (profile.addresses[0] - 1, profile.addresses[-1] + 1)
         if address != profile.broadcast
     )

@@ -11,21 +11,11 @@ from typing import Any, Protocol
 
 import pytest
 
-from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
-from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from busmaster.registry import find, make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
-
-PROFILES = {
-    "hcp": hcp.PROFILE,
-    "hcp2": hcp2.PROFILE,
-    "microflex": hcp2.PROFILE,
-    "msc": msc.PROFILE,
-    "mentor": mentor.PROFILE,
-    "dc104": dc104.PROFILE,
-}
 
 
 class LineFactory(Protocol):
@@ -70,6 +60,6 @@ def emulated_line() -> LineFactory:
         settings = tuple(faults)
         for device in devices:
             device.faults = Faults.parse(settings)
-        return Line(PROFILES[protocol].line, devices, chance=random.Random(seed), **options)
+        return Line(find(protocol).profile.line, devices, chance=random.Random(seed), **options)
 
     return make

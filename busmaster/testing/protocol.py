@@ -1,4 +1,4 @@
-"""The conformance kit for a protocol: it runs over the five that are here, and over a sixth that you add.
+"""The conformance kit for a protocol: it runs over those that are here, and over one that you add.
 
     def test_modbus_keeps_the_contract():
         check_protocol(

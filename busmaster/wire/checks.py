@@ -1,4 +1,4 @@
-"""The checksums of the five protocols. Which bytes they cover is the protocol's business."""
+"""Checksums. Which bytes they cover is the protocol's business."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.exchange import Command, Timings
 from busmaster.profile import Profile
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.wire.checks import xor
 from busmaster.wire.readers import ENQ
 

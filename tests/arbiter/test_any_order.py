@@ -19,7 +19,7 @@ from busmaster.arbiter.schedule import Poll, set_members
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.errors import BusError
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.wire.checks import xor
 from tests.arbiter.bench import TAU
 

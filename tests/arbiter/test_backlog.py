@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from busmaster.arbiter.backlog import SHARE, SLACK, Backlog
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 
 NODE = NodeRecord(hcp2.PROFILE, 1, hcp2.PROFILE.timings, 2)
 READ = hcp2.Read(1)

@@ -10,7 +10,7 @@ import pytest
 from busmaster.arbiter.health import SILENT, Health
 from busmaster.arbiter.transaction import Priority
 from busmaster.errors import WriteUnconfirmed
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import ACK, NAK, TAU, WRITE_5, Bench, lost, reply_of, request_of, up
 
 REQUEST = 8 * TAU

@@ -9,7 +9,9 @@ import pytest
 from busmaster.arbiter.state import LineState
 from busmaster.errors import NoReply
 from busmaster.exchange import ReplyTiming, Timings
-from busmaster.protocols import hcp2, mentor, msc
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import ACK, FIVE, LATENESS, QUIET, SEVEN, TAU, WRITE_5, Bench, up
 
 REQUEST = 8 * TAU

@@ -7,7 +7,7 @@ import pytest
 from busmaster.arbiter.state import LineState
 from busmaster.errors import GarbledReply, NoReply, WriteUnconfirmed
 from busmaster.exchange import Exchange, Timings
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import (
     ANOTHER_ELEMENT,
     BAD_CHECKSUM,

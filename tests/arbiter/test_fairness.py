@@ -14,7 +14,7 @@ from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.errors import BacklogFull, BusError, Superseded, WriteUnconfirmed
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 
 URGENT, COMMAND, POLL, BACKGROUND = Priority
 NODES = 2

@@ -14,7 +14,8 @@ from busmaster.arbiter.health import (
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Priority
 from busmaster.errors import NodeDown, Refused, WriteUnconfirmed
-from busmaster.protocols import hcp2, mentor
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
 from tests.arbiter.bench import FIVE, NAK, READ_1_OF_NODE_1, WRITE_5, Bench, dead, heard
 
 UNKNOWN, UP, SUSPECT, DOWN = Health

@@ -7,7 +7,7 @@ import pytest
 from busmaster.arbiter.events import Mark
 from busmaster.arbiter.state import LineState
 from busmaster.errors import GarbledReply, WriteUnconfirmed
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import ACK, FIVE, LATENESS, QUIET, TAU, WRITE_5, Bench, request_of, up
 
 REQUEST = 8 * TAU

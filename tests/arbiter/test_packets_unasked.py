@@ -7,7 +7,7 @@ import pytest
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority
 from busmaster.errors import GarbledReply, NoReply, Refused
-from busmaster.protocols import msc
+from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import Bench
 
 READ_2008 = "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74"

@@ -19,8 +19,12 @@ from busmaster.arbiter.health import (
 )
 from busmaster.errors import NodeDown, NoReply
 from busmaster.profile import Profile
-from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
-from busmaster.protocols.comms import CHECKED
+from busmaster.protocols._comms.codec import CHECKED
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import NAK, READ_1_OF_NODE_1, TAU, Bench, dead, request_of, up
 
 UNKNOWN, UP, SUSPECT, DOWN = Health

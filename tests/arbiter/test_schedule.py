@@ -30,7 +30,8 @@ from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import InvalidCommand
 from busmaster.merging import at_once
 from busmaster.profile import LineSettings
-from busmaster.protocols import hcp2, msc
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.msc import codec as msc
 
 TAU = LineSettings(57600).byte_time
 PERIODS = st.sampled_from([0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0])

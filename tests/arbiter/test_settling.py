@@ -10,7 +10,8 @@ from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, St
 from busmaster.arbiter.state import LineState
 from busmaster.errors import GarbledReply, LineNoisy, Refused
 from busmaster.exchange import ReplyTiming, Timings
-from busmaster.protocols import hcp2, mentor
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
 from tests.arbiter.bench import (
     ACK,
     ANOTHER_ELEMENT,

@@ -18,7 +18,7 @@ from busmaster.errors import (
     Superseded,
     WriteUnconfirmed,
 )
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import ACK, FIVE, READ_1_OF_NODE_1, SEVEN, TAU, WRITE_5, Bench
 
 WRITE_6 = "07 30 31 02 30 31 36 03 37"

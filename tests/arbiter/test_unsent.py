@@ -6,7 +6,7 @@ import pytest
 
 from busmaster.arbiter.state import LineState
 from busmaster.errors import GarbledReply, NoReply
-from busmaster.protocols import msc
+from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import ACK, FIVE, LATENESS, QUIET, READ_1_OF_NODE_1, SEVEN, TAU, Bench, up
 
 REQUEST = 8 * TAU

@@ -21,7 +21,8 @@ from benchmarks.trials import ours_in_virtual_time
 from busmaster.emulator.faults import Faults
 from busmaster.exchange import Done
 from busmaster.profile import LineSettings, Profile
-from busmaster.protocols import hcp2, msc
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.msc import codec as msc
 from busmaster.testing.virtual_time import run_in_virtual_time
 
 QUICK = Options(quick=True)

@@ -11,8 +11,8 @@ from random import Random
 from typing import Any
 
 from busmaster.emulator.device import Chance, Delay, Device
-from busmaster.emulator.devices.dc104 import Dc104Drive
-from busmaster.emulator.devices.msc import MscController
+from busmaster.protocols.dc104.device import EmulatedDc104
+from busmaster.protocols.msc.device import EmulatedMsc
 from tests.campaigns.kinds import Kind
 from tests.campaigns.mixes import Edges
 from tests.campaigns.witness import Ledger, WatchedLine
@@ -75,9 +75,9 @@ def crowd(kind: Kind, device: Device, edges: Edges, usual: Delay) -> None:
     timings, byte_time = kind.profile.timings, kind.profile.line.byte_time
     read, write, packet = ((leg.window, leg.lateness) for leg in (timings.read, timings.write, timings.packet))
     device.delay = Crowded(usual, edges.late, read, byte_time)
-    if isinstance(device, MscController):
+    if isinstance(device, EmulatedMsc):
         device.packet_delay = Crowded(usual, edges.late, packet, byte_time)
-    elif isinstance(device, Dc104Drive):
+    elif isinstance(device, EmulatedDc104):
         device.eeprom = Storing(usual, edges.late, write, byte_time, device.delay)
 
 

@@ -7,13 +7,17 @@ from dataclasses import dataclass, replace
 from random import Random
 from typing import Any
 
-from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay, Device
-from busmaster.emulator.devices.dc104 import Dc104Drive
-from busmaster.emulator.devices.msc import MscController
 from busmaster.exchange import Command
 from busmaster.profile import Profile
-from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.dc104.device import EmulatedDc104
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
+from busmaster.protocols.msc.device import EmulatedMsc
+from busmaster.registry import make_device
 from busmaster.wire.checks import sum8, sum16, xor
 from tests.campaigns.witness import Ledger, Witness
 
@@ -48,15 +52,15 @@ class Kind:
 
     def device(self, ledger: Ledger, address: int) -> Device:
         device = make_device(self.name, address, oracle=Witness(ledger, address))
-        if isinstance(device, MscController):
+        if isinstance(device, EmulatedMsc):
             device.flags |= {flag for flag in range(64) if (flag + address) % 2}
         return device
 
     def slow_down(self, device: Device, delay: Delay) -> None:
         """How long whatever follows a first answer takes: MSC's packet, DC104's EEPROM."""
-        if isinstance(device, MscController):
+        if isinstance(device, EmulatedMsc):
             device.packet_delay = delay
-        elif isinstance(device, Dc104Drive):
+        elif isinstance(device, EmulatedDc104):
             device.eeprom = replace(delay, straggle=(EEPROM * delay.straggle[0], EEPROM * delay.straggle[1]))
 
 

@@ -12,14 +12,14 @@ from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.schedule import Poll, line_time, set_members
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.emulator.device import Delay, Device
-from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.world import World
 from busmaster.exchange import Command, Timings
 from busmaster.planning import Bounds, PlannedNode, bounds
 from busmaster.profile import LineSettings, Profile
-from busmaster.protocols import hcp2
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
 
 VALUE = 123.0
 """Three characters, as short as most real values."""
@@ -50,7 +50,7 @@ class Load:
         self.random = random.Random(seed)
         delay = Delay(REPLY_TIME * (1 - spread), REPLY_TIME * (1 + spread))
         if devices is None:
-            devices = [MintController(address, delay=delay) for address in range(1, nodes + 1)]
+            devices = [EmulatedMint(address, delay=delay) for address in range(1, nodes + 1)]
             for device in devices:
                 device.comms = [VALUE] * len(device.comms)  # type: ignore[attr-defined]  # all are MintControllers
         line = Line(settings, devices, chance=random.Random(seed), faults=faults)

@@ -9,7 +9,7 @@ import pytest
 from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import BUDGET_SHARE, PROBE_JITTER, Health
 from busmaster.arbiter.transaction import Transaction
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 from tests.campaigns.loads import EXCHANGE, Load
 
 SATURATED = 0.03

@@ -15,10 +15,11 @@ import pytest
 from busmaster import Bus, BusError, MicroFlexDrive, Priority, WriteUnconfirmed
 from busmaster.arbiter.transaction import Transaction
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.microflex import MicroFlexDrive as EmulatedDrive
 from busmaster.emulator.line import Line
 from busmaster.profile import LineSettings
-from busmaster.protocols import hcp2, microflex
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2 import microflex
+from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport.memory import MemoryPort
 
@@ -70,7 +71,7 @@ def trial(
     `at_once`: while that write is on the wire. `silent`: no drive hears anything any more, but for the first one if it
     `hears`. `polled`: each drive has a poll group of one point.
     """
-    devices = [EmulatedDrive(address, delay=Delay(0.002)) for address in range(1, nodes + 1)]
+    devices = [EmulatedMicroFlex(address, delay=Delay(0.002)) for address in range(1, nodes + 1)]
     line = Line(SETTINGS, devices, paced=paced, chance=random.Random(1))
     sent = Sent()
 

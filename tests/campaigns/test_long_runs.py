@@ -12,7 +12,7 @@ import pytest
 from busmaster.arbiter.in_step import LONGEST_ALIKE
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.planning import Plan, PlannedGroup, PlannedNode, plan
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 from tests.campaigns.loads import EXCHANGE, LINE, REPLY_TIME, VALUE, Load, quantile
 
 SPREAD = 0.3

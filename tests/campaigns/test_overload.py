@@ -10,11 +10,12 @@ from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.emulator.device import Delay, Device
-from busmaster.emulator.devices.mint import MintController
-from busmaster.emulator.devices.msc import MscController
 from busmaster.errors import BacklogFull
 from busmaster.profile import LineSettings
-from busmaster.protocols import hcp2, msc
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.msc import codec as msc
+from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.wire.checks import xor
 from tests.campaigns.loads import EXCHANGE, LINE, REPLY_TIME, Load, quantile
 
@@ -101,7 +102,7 @@ def test_r9_at_120_percent_command_load_the_polls_keep_their_eighth() -> None:
 # urgent
 
 
-class Trickler(MintController):
+class Trickler(EmulatedMint):
     """Its replies come byte by byte, a pause of `pace` seconds between two."""
 
     pace = 0.015
@@ -165,7 +166,7 @@ def test_r9_urgent_starts_within_its_bound_beside_a_dead_node() -> None:
 def test_r9_urgent_starts_within_its_bound_beside_a_node_whose_bytes_trickle_in(pace: float) -> None:
     trickler = Trickler(1)
     trickler.pace = pace
-    line = saturated([trickler, *(MintController(address, delay=Delay(REPLY_TIME)) for address in range(2, 9))])
+    line = saturated([trickler, *(EmulatedMint(address, delay=Delay(REPLY_TIME)) for address in range(2, 9))])
     line.every(lambda: 0.3, lambda: line.ask(line.nodes[0], priority=Priority.POLL, probe=True))
     waits = urgent_waits(line, 1000, Transaction(line.nodes[4], hcp2.Read(1)))
     assert line.nodes[0].counters.attempts > 100
@@ -177,7 +178,7 @@ def test_r9_urgent_starts_within_its_bound_beside_a_node_whose_bytes_trickle_in(
     "trouble", ["naks_ahead", "bad_packets_ahead", "missing_acks_ahead", "flip", "truncated", "lost"]
 )
 def test_r9_urgent_starts_within_its_bound_beside_an_msc_that_must_be_asked_again_and_again(trouble: str) -> None:
-    devices = [MscController(1), MscController(2)]
+    devices = [EmulatedMsc(1), EmulatedMsc(2)]
     line = Load(devices=devices, profile=msc.PROFILE, settings=LineSettings(9600))
     for node in line.nodes:
         line.poll_of(str(node.address), 0.1, [Transaction(node, c) for c in (msc.DataRead(2000), msc.BlockRead(2000))])

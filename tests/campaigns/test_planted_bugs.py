@@ -13,7 +13,8 @@ from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.strays import QUIET
 from busmaster.arbiter.transaction import Transaction
 from busmaster.exchange import FrameError
-from busmaster.protocols import dc104, msc_exchange
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.msc import exchange as msc_exchange
 from busmaster.wire import readers
 from tests.campaigns.hunt import Hunt
 from tests.campaigns.judge import Judge, Totals

@@ -6,9 +6,8 @@ import json
 from pathlib import Path
 
 from busmaster.capture.decode import Decoder
-from busmaster.capture.dialects import dialect
-from busmaster.capture.frames import Frame
-from busmaster.capture.pcapng import Direction
+from busmaster.capture.frames import Direction, Frame
+from busmaster.registry import find
 
 HOST, NODE, UNKNOWN = Direction.HOST, Direction.NODE, Direction.UNKNOWN
 VECTORS = json.loads((Path(__file__).parents[1] / "vectors" / "frames.json").read_text())
@@ -32,7 +31,7 @@ def sender_of(name: str) -> Direction:
 
 def hear(protocol: str, *chunks: str, gap: float = 0.1) -> list[Frame]:
     """What a listener makes of these bytes, a millisecond apart; "|" is a silence longer than the gap."""
-    decoder = Decoder(dialect(protocol), gap=gap)
+    decoder = Decoder(find(protocol).protocol.dialect(), gap=gap)
     frames: list[Frame] = []
     now = 0.0
     for chunk in chunks:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from busmaster.capture.assemble import Assembler, Verdict
-from busmaster.capture.pcapng import Direction, Outcome, Packet
+from busmaster.capture.frames import Direction
+from busmaster.capture.pcapng import Outcome, Packet
 
 READ = bytes.fromhex("07 30 32 02 30 31 05 04")
 VALUE = bytes.fromhex("02 30 31 35 03 37")

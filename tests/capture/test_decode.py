@@ -6,16 +6,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from busmaster.capture.assemble import protocol_of
 from busmaster.capture.decode import Decoder
-from busmaster.capture.dialects import DIALECTS, dialect, protocol_of
 from busmaster.capture.frames import Frame, Kind
 from busmaster.errors import InvalidCommand
+from busmaster.registry import find, kinds
 from tests.capture.hearing import HOST, NODE, hear, said, sender_of, vectors
 
 
 @pytest.mark.parametrize(("protocol", "name", "raw"), vectors())
 def test_every_frame_of_the_documents_is_one_frame_with_nothing_wrong(protocol: str, name: str, raw: bytes) -> None:
-    (frame,) = Decoder(dialect(protocol)).feed(raw, 0.0, sender_of(name))
+    (frame,) = Decoder(find(protocol).protocol.dialect()).feed(raw, 0.0, sender_of(name))
     assert frame.raw == raw
     assert frame.fault == ("unasked" if frame.sender is NODE else "")
 
@@ -262,12 +263,12 @@ def test_a_status_word_may_be_followed_by_anything() -> None:
 
 
 def test_a_mentor_write_without_an_address_goes_to_the_drive_read_last() -> None:
-    decoder = Decoder(dialect("mentor"))
+    decoder = Decoder(find("mentor").protocol.dialect())
     decoder.feed(bytes.fromhex("04 31 31 32 32 30 31 31 37 05"), 0.0, HOST)
     decoder.feed(bytes.fromhex("02 30 31 31 37 2D 30 34 37 36 03 2C"), 0.01, NODE)
     frames = decoder.feed(bytes.fromhex("02 30 31 31 37 2D 30 34 37 36 03 2C"), 0.02, HOST)
     assert said(frames + decoder.feed(b"\x06", 0.03, NODE)) == ["host 12 write 01.17 = -0476", "node 12 ACK"]
-    fresh = Decoder(dialect("mentor"))
+    fresh = Decoder(find("mentor").protocol.dialect())
     assert said(fresh.feed(b"\x06", 0.0, HOST)) == ["host next [unasked]"]
 
 
@@ -285,7 +286,7 @@ def test_noise_is_one_line_and_the_frame_after_it_is_whole() -> None:
 
 
 def test_delays_are_from_the_last_byte_of_the_request_to_the_first_of_the_reply() -> None:
-    decoder = Decoder(dialect("hcp2"))
+    decoder = Decoder(find("hcp2").protocol.dialect())
     decoder.feed(bytes.fromhex("07 30 32 02"), 1.000)
     (asked,) = decoder.feed(bytes.fromhex("30 31 05 04"), 1.010)
     assert decoder.feed(bytes.fromhex("02 30 31"), 1.030) == []
@@ -296,7 +297,7 @@ def test_delays_are_from_the_last_byte_of_the_request_to_the_first_of_the_reply(
 
 
 def test_a_sender_that_is_known_is_believed() -> None:
-    decoder = Decoder(dialect("hcp2"))
+    decoder = Decoder(find("hcp2").protocol.dialect())
     assert decoder.feed(bytes.fromhex("02 30 31"), 0.0, NODE) == []
     frames = decoder.feed(bytes.fromhex("07 30 32 02 30 31 05 04"), 0.001, HOST)
     assert said(frames) == ["node 3 bytes [cut short after 3 bytes]", "host 2 read 1"]
@@ -311,7 +312,7 @@ def test_a_sender_that_is_known_is_believed() -> None:
     ],
 )
 def test_a_request_that_the_host_receives_is_no_answer_to_it(protocol: str, request_: str, answer: str) -> None:
-    decoder = Decoder(dialect(protocol))
+    decoder = Decoder(find(protocol).protocol.dialect())
     decoder.feed(bytes.fromhex(request_), 0.0, HOST)
     echo, reply = decoder.feed(bytes.fromhex(request_ + answer), 0.001, NODE)
     assert (echo.kind, echo.fault, echo.raw) == (Kind.NOISE, "a request, received", bytes.fromhex(request_))
@@ -320,7 +321,7 @@ def test_a_request_that_the_host_receives_is_no_answer_to_it(protocol: str, requ
 
 def test_a_protocol_that_does_not_exist_is_refused_by_name() -> None:
     with pytest.raises(InvalidCommand, match=r"'hcp3'.*hcp, hcp2"):
-        dialect("hcp3")
+        find("hcp3").protocol.dialect()
 
 
 CHUNKS = st.lists(
@@ -333,7 +334,7 @@ CHUNKS = st.lists(
 )
 
 
-@given(protocol=st.sampled_from(sorted(DIALECTS)), chunks=CHUNKS, cut=st.integers(0, 60))
+@given(protocol=st.sampled_from(sorted(kinds())), chunks=CHUNKS, cut=st.integers(0, 60))
 def test_every_byte_is_accounted_for_and_chunks_change_nothing(protocol: str, chunks: list[bytes], cut: int) -> None:
     data = b"".join(chunks)[:240]
     at_once, in_two, bytewise = (
@@ -346,6 +347,6 @@ def test_every_byte_is_accounted_for_and_chunks_change_nothing(protocol: str, ch
 
 
 def decode_all(protocol: str, *chunks: bytes) -> list[Frame]:
-    decoder = Decoder(dialect(protocol))
+    decoder = Decoder(find(protocol).protocol.dialect())
     frames = [frame for chunk in chunks for frame in decoder.feed(chunk, 0.0)]
     return frames + decoder.quiet()

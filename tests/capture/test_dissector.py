@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 
 from busmaster.capture import DISSECTOR
-from busmaster.capture.pcapng import PROTOCOLS, Direction, Outcome, Packet, PcapngWriter
-from busmaster.protocols import hcp2
-from busmaster.protocols.comms_array import ELEMENTS as CONTROLLER
-from busmaster.protocols.comms_array import Element
-from busmaster.protocols.microflex import ELEMENTS as DRIVE
+from busmaster.capture.frames import Direction
+from busmaster.capture.pcapng import Outcome, Packet, PcapngWriter
+from busmaster.protocols._comms.elements import Element
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.comms_array import ELEMENTS as CONTROLLER
+from busmaster.protocols.hcp2.microflex import ELEMENTS as DRIVE
+from busmaster.registry import kinds
 from tests.capture.hearing import HOST, NODE, sender_of, vectors
 
 pytestmark = pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
@@ -284,7 +286,7 @@ def test_no_bytes_however_garbled_upset_it(tmp_path: Path) -> None:
         garbled = bytearray(raw[: draw.randrange(len(raw) + 1)] if draw.random() < 0.4 else raw)
         for _ in range(draw.randrange(4) if garbled else 0):
             garbled[draw.randrange(len(garbled))] = draw.randrange(256)
-        spoken = protocol if draw.random() < 0.8 else draw.choice(PROTOCOLS)
+        spoken = protocol if draw.random() < 0.8 else draw.choice(["", *kinds()])
         sender, outcome = draw.choice(list(Direction)), draw.choice(list(Outcome))
         packets.append(Packet(START, spoken, sender, bytes(garbled), draw.choice([None, 1]), outcome))
     rows = dissect(tmp_path, packets, EXPERT)

@@ -9,15 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from busmaster.capture.pcapng import (
-    PROTOCOLS,
-    CaptureError,
-    Direction,
-    Outcome,
-    Packet,
-    PcapngWriter,
-    read_packets,
-)
+from busmaster.capture.frames import Direction
+from busmaster.capture.pcapng import CaptureError, Outcome, Packet, PcapngWriter, read_packets
+from busmaster.registry import kinds
 
 HEAD = bytes.fromhex(
     "0a0d0d0a 30000000 4d3c2b1a 0100 0000 ffffffffffffffff 0400 0900 6275736d61737465 72 000000 00000000 30000000"
@@ -42,7 +36,9 @@ def test_the_head_of_a_file() -> None:
 def test_a_packet_byte_by_byte() -> None:
     ack = Packet(0x0006_2345_6789_ABCD, "hcp2", Direction.NODE, b"\x06", 5, Outcome.OK, "done", 3)
     assert written(ack, port="COM")[len(HEAD) :] == bytes.fromhex(
-        "06000000 48000000 00000000"  # enhanced packet block, interface 0
+        "01000000 30000000 9d00 0000 00000000 0200 0300 434f4d00 0300 0400 68637032"  # interface 1: port, protocol
+        "0900 0100 06000000 00000000 30000000"
+        "06000000 48000000 01000000"  # enhanced packet block, interface 1
         "45230600 cdab8967 07000000 07000000"  # time, captured and original length
         "01 02 01 01 0005 06 00"  # our header (HCP2, from a node, ok, node 5), ACK, padding
         "0100 0400 646f6e65  0200 0400 01000000  0400 0800 0300000000000000  00000000"  # comment, inbound, dropped, end
@@ -50,10 +46,20 @@ def test_a_packet_byte_by_byte() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("capture_id", "name"), [(1, "hcp"), (2, "hcp2"), (3, "microflex"), (4, "msc"), (5, "mentor"), (6, "dc104")]
+)
+def test_a_file_of_an_older_version_which_names_protocols_by_number_is_read(capture_id: int, name: str) -> None:
+    packet = bytes((1, capture_id, Direction.NODE, Outcome.OK, 0, 5, 0x06, 0))
+    head = struct.pack("<IIIIIII", 6, 40, 0, 0, 0, 7, 7)
+    (read,) = read_packets(io.BytesIO(HEAD + head + packet + struct.pack("<I", 40)))
+    assert read == Packet(0, name, Direction.NODE, b"\x06", 5, Outcome.OK)
+
+
 packets = st.builds(
     Packet,
     micros=st.integers(0, 2**63),
-    protocol=st.sampled_from(PROTOCOLS),
+    protocol=st.sampled_from(["", *kinds()]),
     direction=st.sampled_from(Direction),
     frame=st.binary(max_size=250),
     node=st.none() | st.integers(0, 255),

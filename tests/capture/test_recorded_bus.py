@@ -11,11 +11,13 @@ from busmaster.bus import Bus
 from busmaster.capture.pcapng import Outcome, Packet, read_packets
 from busmaster.capture.recorder import Recorder
 from busmaster.capture.replay import replay
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Echo, Line
 from busmaster.errors import NoReply, Refused
-from busmaster.handles import HANDLES, Hcp2Controller, HcpController, MicroFlexDrive
 from busmaster.profile import LineSettings
+from busmaster.protocols.hcp.handle import HcpController
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
+from busmaster.registry import find, make_device
 from busmaster.transport.memory import MemoryPort
 
 
@@ -72,7 +74,7 @@ async def test_each_protocol_reads_back_as_it_was_recorded(
     tmp_path: Path, protocol: str, address: int, items: tuple[str, ...], echo: bool
 ) -> None:
     path = tmp_path / "line.pcapng"
-    handle = HANDLES[protocol]
+    handle = find(protocol).handle
     line = Line(
         replace(handle.profile.line, baudrate=115200), [make_device(protocol, address)], echo=Echo() if echo else None
     )

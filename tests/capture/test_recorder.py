@@ -14,7 +14,7 @@ from busmaster.capture import recorder
 from busmaster.capture.pcapng import Outcome, read_packets
 from busmaster.capture.recorder import Recorder, outcome_of
 from busmaster.errors import BusClosed, BusError, GarbledReply, NoReply, NoSuchParameter, Refused, WriteUnconfirmed
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
 
 READ = hcp2.Read(1)
 REQUEST = READ.open(2, hcp2.PROFILE.timings).request

@@ -5,10 +5,15 @@ from __future__ import annotations
 import pytest
 
 from busmaster.capture.assemble import Assembler, Verdict
-from busmaster.capture.pcapng import Direction, Outcome, Packet
+from busmaster.capture.frames import Direction
+from busmaster.capture.pcapng import Outcome, Packet
 from busmaster.capture.replay import Replayed, replay
 from busmaster.exchange import Command, Timings
-from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
 from tests.capture.hearing import HOST, NODE
 
 ACK, NAK, EOT = "06", "15", "04"

@@ -15,10 +15,9 @@ from pathlib import Path
 import pytest
 
 from busmaster.cli import main
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_tcp
-from busmaster.handles import HANDLES
+from busmaster.registry import find, make_device
 
 ROOT = Path(__file__).parent.parent.parent
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "error", "PYTHONUNBUFFERED": ""}
@@ -54,7 +53,7 @@ def busmaster(capfd: pytest.CaptureFixture[str]) -> Iterator[Command]:
 
 def serve(protocol: str, *addresses: int) -> TcpServer:
     devices = [make_device(protocol, address) for address in addresses]
-    return serve_tcp(Line(HANDLES[protocol].profile.line, devices, chance=random.Random(1), paced=False))
+    return serve_tcp(Line(find(protocol).profile.line, devices, chance=random.Random(1), paced=False))
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.capture.pcapng import Direction, read_packets
+from busmaster.capture.frames import Direction
+from busmaster.capture.pcapng import read_packets
 from busmaster.emulator.serve import TcpServer
-from busmaster.handles import HANDLES, Hcp2Controller, MicroFlexDrive
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
+from busmaster.registry import kinds
 from tests.cli.conftest import Command, serve
 
 HCP2 = ("--protocol", "hcp2")
@@ -100,7 +103,7 @@ def test_a_bad_assignment_is_status_2_and_nothing_is_sent(busmaster: Command, as
         (("read", "PORT", *HCP2, "--node", "1"), "missing argument 'ITEM...'"),
         (("read", "PORT", *HCP2, "--node", "1", "axis0.positoin"), "did you mean 'axis0.position'?"),
         (("read", "PORT", *HCP2, "--node", "1", "1", "--timeout", "0"), "a time is above 0"),
-        (("read", "PORT", *HCP2, "--node", "1", "1", "--chain"), "--chain is mentor's alone"),
+        (("read", "PORT", *HCP2, "--node", "1", "1", "--chain"), "--chain is for ct-ansi and mentor alone"),
         (("read", "PORT?baud=3", *HCP2, "--node", "1", "1"), "did you mean 'baudrate'?"),
         (("read", "rfc2217://host:1", *HCP2, "--node", "1", "1"), "use socket://host:1"),
         (("read", "host:5020", *HCP2, "--node", "1", "1"), "a TCP port is written socket://host:5020"),
@@ -140,7 +143,7 @@ def test_help_and_version_go_to_standard_output(busmaster: Command) -> None:
 @pytest.mark.parametrize("command", ["read", "write", "poll"])
 def test_help_names_the_items_of_every_protocol(busmaster: Command, command: str) -> None:
     listed = {line.split()[0] for line in busmaster(command, "--help").out.partition("ITEM, by")[2].splitlines()[1:]}
-    assert listed >= set(HANDLES)
+    assert listed >= set(kinds())
 
 
 def test_help_names_every_element_of_the_maps(busmaster: Command) -> None:

@@ -24,14 +24,13 @@ from busmaster.capture.pcapng import read_packets
 from busmaster.cli import diagnosis, examination
 from busmaster.cli.examination import HARMLESS, Patient, examine, other_settings
 from busmaster.cli.probing import Outcome, Prober, opened
-from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay, Device
-from busmaster.emulator.devices.msc import MscController
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
-from busmaster.handles import HANDLES
 from busmaster.profile import LineSettings
+from busmaster.protocols.msc.device import EmulatedMsc
+from busmaster.registry import find, kinds, make_device
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport import identity
 from busmaster.transport.adapters import Finding
@@ -46,7 +45,7 @@ HCP2 = ("--protocol", "hcp2")
 
 def line_of(protocol: str, devices: Iterable[Device], **options: object) -> Line:
     chance = random.Random(1)
-    return Line(HANDLES[protocol].profile.line, devices, chance=chance, **options)  # type: ignore[arg-type]  # Line's own
+    return Line(find(protocol).profile.line, devices, chance=chance, **options)  # type: ignore[arg-type]  # Line's own
 
 
 def hcp2(address: int, delay: Delay | None = None, **faults: float) -> Device:
@@ -114,13 +113,13 @@ def test_on_a_line_in_order_every_node_is_measured_and_nothing_is_to_be_mended()
     assert findings.on("windows").what.endswith("set are 50 / 100 / 150 ms (nominal / window / lateness)")
 
 
-@pytest.mark.parametrize("protocol", list(HANDLES))
+@pytest.mark.parametrize("protocol", list(kinds()))
 def test_every_protocol_is_asked_its_cheapest_read(protocol: str) -> None:
-    address = HANDLES[protocol].profile.addresses.start
+    address = find(protocol).profile.addresses[0]
     findings = examined(line_of(protocol, [make_device(protocol, address)]), (address,), protocol)
     assert findings.wrong == set()
-    label = HANDLES[protocol].profile.label(address)
-    assert str(HANDLES[protocol].profile.probe) in findings.on(label).what
+    label = find(protocol).profile.label(address)
+    assert str(find(protocol).profile.probe) in findings.on(label).what
 
 
 def test_a_node_is_left_with_nothing_unacknowledged() -> None:
@@ -132,8 +131,8 @@ def test_a_node_is_left_with_nothing_unacknowledged() -> None:
             assert (await prober.ask(3)).outcome is Outcome.ANSWERED
             assert await wire.hear_all(5.0) == b""
 
-    profile = HANDLES["msc"].profile
-    controller = MscController(3)
+    profile = find("msc").profile
+    controller = EmulatedMsc(3)
     line = line_of("msc", [controller])
     run_in_virtual_time(ask())
     assert (controller.unacknowledged, controller.retransmitted) == (False, 0)
@@ -143,9 +142,9 @@ def test_a_node_is_left_with_nothing_unacknowledged() -> None:
 
 
 def test_the_harmless_bytes_begin_no_frame_and_acknowledge_nothing() -> None:
-    for protocol, handle in HANDLES.items():
+    for protocol, handle in kinds().items():
         profile = handle.profile
-        request = profile.probe.open(profile.addresses.start, profile.timings).request
+        request = profile.probe.open(profile.addresses[0], profile.timings).request
         assert not set(HARMLESS) & {request[0], 0x02, 0x04, 0x06, 0x07, 0x08, 0x15}, protocol
 
 

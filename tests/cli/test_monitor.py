@@ -16,11 +16,11 @@ from typing import Any
 import pytest
 
 from busmaster.capture.decode import Decoder
-from busmaster.capture.dialects import dialect
 from busmaster.capture.frames import Frame
 from busmaster.capture.pcapng import Outcome, read_packets
-from busmaster.cli.monitor import Listener, element_names, json_text, plain_text
+from busmaster.cli.monitor import Listener, json_text, plain_text
 from busmaster.errors import LineDown
+from busmaster.registry import find
 
 HCP2 = "07 46 46 02 36 39 05 08  02 36 39 34 30 39 36 03 07"  # AN00129: read node 255 Comms(105), and 4096
 MSC = (
@@ -29,12 +29,12 @@ MSC = (
 
 
 def decoded(protocol: str, text: str) -> list[Frame]:
-    decoder = Decoder(dialect(protocol))
+    decoder = Decoder(find(protocol).protocol.dialect())
     return decoder.feed(bytes.fromhex(text), 1_700_000_000.25) + decoder.quiet()
 
 
 def test_a_frame_is_one_line_with_its_time_its_speaker_and_its_name() -> None:
-    names = element_names("hcp2")
+    names = find("hcp2").handle.names_of_items()
     lines = [plain_text(frame, names) for frame in decoded("hcp2", HCP2 + "02 36 39 34 30 39 36 03 08")]
     assert [line[8:] for line in lines] == [
         ".250000 -> node 255 read 105 (axis0.encoder)",
@@ -44,7 +44,9 @@ def test_a_frame_is_one_line_with_its_time_its_speaker_and_its_name() -> None:
 
 
 def test_json_has_numbers_and_nulls() -> None:
-    asked, answered = (json.loads(json_text(frame, element_names("hcp2"))) for frame in decoded("hcp2", HCP2))
+    asked, answered = (
+        json.loads(json_text(frame, find("hcp2").handle.names_of_items())) for frame in decoded("hcp2", HCP2)
+    )
     assert asked == {
         "time": 1_700_000_000.25,
         "from": "host",
@@ -79,14 +81,14 @@ def test_json_values_are_numbers_or_lists_of_them_or_the_text_as_it_came(
 
 
 def test_drives_have_names_of_their_own() -> None:
-    assert element_names("microflex")["109"] == "status_word"
-    assert element_names("hcp") == {}
+    assert find("microflex").handle.names_of_items()["109"] == "status_word"
+    assert find("hcp").handle.names_of_items() == {}
 
 
 @pytest.mark.asyncio
 async def test_a_frame_that_is_cut_short_is_told_when_the_line_falls_silent() -> None:
     heard: asyncio.Queue[Frame] = asyncio.Queue()
-    listener = Listener(Decoder(dialect("hcp2")), heard.put_nowait)
+    listener = Listener(Decoder(find("hcp2").protocol.dialect()), heard.put_nowait)
     listener.data_received(bytes.fromhex("07 30 32"))
     assert heard.empty()
     assert (await heard.get()).fault == "cut short after 3 bytes"
@@ -100,7 +102,7 @@ async def test_whoever_reads_the_output_may_leave() -> None:
     def leave(_: Frame) -> None:
         raise BrokenPipeError
 
-    listener = Listener(Decoder(dialect("hcp2")), leave)
+    listener = Listener(Decoder(find("hcp2").protocol.dialect()), leave)
     listener.data_received(bytes.fromhex(HCP2))
     with pytest.raises(BrokenPipeError):
         await listener.lost

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.capture.pcapng import Direction, Outcome, Packet, PcapngWriter
+from busmaster.capture.frames import Direction
+from busmaster.capture.pcapng import Outcome, Packet, PcapngWriter
 from busmaster.cli import main
 
 REQUEST = bytes.fromhex("07 46 46 02 36 39 05 08")

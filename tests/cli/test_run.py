@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from busmaster.capture.pcapng import read_packets
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.registry import make_device
 from tests.cli.conftest import ROOT, Command, started
 
 PATIENCE = 20.0

@@ -12,9 +12,9 @@ from busmaster.arbiter.events import Mark
 from busmaster.cli import uart
 from busmaster.cli.examination import Patient, examine
 from busmaster.cli.probing import opened
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.registry import make_device
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport.adapters import Finding
 from busmaster.transport.kernel import OpenPort

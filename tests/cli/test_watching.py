@@ -15,8 +15,8 @@ from busmaster.cli.messages import Action, Frame
 from busmaster.cli.watching import Watch, count_cycles
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer
-from busmaster.handles import Hcp2Controller
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.transport.memory import MemoryPort
 from busmaster.transport.tcp import TcpPort
 

@@ -11,10 +11,11 @@ from busmaster.config import ConfiguredLine, FileError, LineFile, emulated_line,
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.emulator.device import Delay
-from busmaster.handles import HANDLES, MscController
 from busmaster.outputs.settings import FileSettings, MqttSettings, SqliteSettings
 from busmaster.profile import LineSettings
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.msc.handle import MscController
+from busmaster.registry import kinds
 
 EXAMPLES = sorted((Path(__file__).parent.parent.parent / "examples").glob("*.toml"))
 HEAD = 'port = "/dev/ttyUSB0?baudrate=57600"\n'
@@ -40,7 +41,7 @@ def test_an_example_is_a_line_that_fits_and_can_be_emulated(path: Path) -> None:
 
 def test_the_examples_show_all_protocols() -> None:
     shown = {node.protocol for path in EXAMPLES for node in load(path).nodes.values()}
-    assert shown == set(HANDLES)
+    assert shown == set(kinds())
 
 
 # ports

@@ -11,7 +11,7 @@ from busmaster import BusClosed, InvalidCommand, MemoryPort, WriteUnconfirmed
 from busmaster.config import ConfiguredLine, emulated_line
 from busmaster.config.sections import read
 from busmaster.config.source import Source
-from busmaster.handles import Hcp2Controller
+from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.testing import run_in_virtual_time
 
 TEXT = """
@@ -38,6 +38,23 @@ def opened(text: str = TEXT) -> ConfiguredLine:
     """On its own emulation."""
     file = read(Source("line.toml", text))
     return ConfiguredLine(file, port=MemoryPort(emulated_line(file)))
+
+
+def test_a_protocol_that_sends_decimal_points_rounds_by_decimals_and_scales_nothing() -> None:
+    text = """
+port = "/dev/ttyS0"
+[nodes.belt]
+protocol = "ct-ansi"
+address = 12
+points = { reference = { item = "1.21", decimals = 1 } }
+"""
+
+    async def main() -> None:
+        async with opened(text) as line:
+            await line.point("belt/reference").write(-47.64)
+            assert await line.point("belt/reference").read() == -47.6
+
+    run_in_virtual_time(main())
 
 
 def test_nodes_and_groups_are_there_by_name_and_polled() -> None:

@@ -18,20 +18,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from busmaster.emulator.device import Device
-from busmaster.emulator.devices.dc104 import Dc104Drive
-from busmaster.emulator.devices.hostcomms import HCP
-from busmaster.emulator.devices.mentor import EVEN_PARITY, MentorDrive
-from busmaster.emulator.devices.microflex import MicroFlexDrive
-from busmaster.emulator.devices.mint import MintController, command_handshake, jog_on_comms1, winding
-from busmaster.emulator.devices.msc import MscController
 from busmaster.emulator.line import Line
 from busmaster.emulator.oracle import Oracle
 from busmaster.exchange import Command
 from busmaster.profile import Profile
-from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from busmaster.protocols._comms.device import HCP
+from busmaster.protocols._comms.mint import EmulatedMint, command_handshake, jog_on_comms1, winding
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.dc104.device import EmulatedDc104
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.mentor.device import EVEN_PARITY, EmulatedMentor
+from busmaster.protocols.modbus import codec as modbus
+from busmaster.protocols.modbus.codec import ReadRegisters, WriteRegisters, with_crc
+from busmaster.protocols.modbus.device import EmulatedModbus
+from busmaster.protocols.msc import codec as msc
+from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.wire.checks import bcc, sum8, sum16, xor
-from examples import modbus_rtu
-from examples.modbus_rtu import EmulatedUnit, ReadRegisters, WriteRegisters, with_crc
 
 Commands = Sequence[Command[Any]]
 TAU = 1e-3
@@ -98,33 +103,33 @@ def mentor_with_parity_sealed(frame: bytes) -> bytes:
 
 
 HCP2_KINDS = {
-    "hcp2": lambda: MintController(ADDRESS, single_precision=True),
-    "hcp2, few axes": lambda: MintController(ADDRESS, axes=2, refuse_reserved=True, all_or_nothing=True),
-    "hcp2, events": lambda: MintController(ADDRESS, events=[jog_on_comms1], fixed_decimals=True),
-    "hcp2, handshake": lambda: MintController(ADDRESS, program=command_handshake, statement=0.05),
-    "hcp2, winding": lambda: MintController(ADDRESS, program=winding, statement=0.05),
-    "hcp2, oracle": lambda: MintController(ADDRESS, oracle=Oracle(ADDRESS)),
-    "microflex": lambda: MicroFlexDrive(ADDRESS, ripple=0.1),
-    "microflex, current": lambda: MicroFlexDrive(ADDRESS, current_control=True, refuse_unmapped=True),
+    "hcp2": lambda: EmulatedMint(ADDRESS, single_precision=True),
+    "hcp2, few axes": lambda: EmulatedMint(ADDRESS, axes=2, refuse_reserved=True, all_or_nothing=True),
+    "hcp2, events": lambda: EmulatedMint(ADDRESS, events=[jog_on_comms1], fixed_decimals=True),
+    "hcp2, handshake": lambda: EmulatedMint(ADDRESS, program=command_handshake, statement=0.05),
+    "hcp2, winding": lambda: EmulatedMint(ADDRESS, program=winding, statement=0.05),
+    "hcp2, oracle": lambda: EmulatedMint(ADDRESS, oracle=Oracle(ADDRESS)),
+    "microflex": lambda: EmulatedMicroFlex(ADDRESS, ripple=0.1),
+    "microflex, current": lambda: EmulatedMicroFlex(ADDRESS, current_control=True, refuse_unmapped=True),
 }
 MENTOR_KINDS = {
-    "mentor": lambda: MentorDrive(ADDRESS, ripple=0.1),
-    "mentor, options": lambda: MentorDrive(ADDRESS, short_after_write=True, refuse_malformed=True),
-    "mentor, oracle": lambda: MentorDrive(ADDRESS, oracle=Oracle(ADDRESS, 10**4)),
+    "mentor": lambda: EmulatedMentor(ADDRESS, ripple=0.1),
+    "mentor, options": lambda: EmulatedMentor(ADDRESS, short_after_write=True, refuse_malformed=True),
+    "mentor, oracle": lambda: EmulatedMentor(ADDRESS, oracle=Oracle(ADDRESS, 10**4)),
 }
 KINDS = {
     "hcp": Kind(
-        lambda: MintController(ADDRESS, HCP), hcp.PROFILE, HCP_COMMANDS, lambda f: f[:-1] + bytes((xor(f[4:-1]),))
+        lambda: EmulatedMint(ADDRESS, HCP), hcp.PROFILE, HCP_COMMANDS, lambda f: f[:-1] + bytes((xor(f[4:-1]),))
     ),
     **{name: Kind(make, hcp2.PROFILE, HCP2_COMMANDS, hcp2_sealed) for name, make in HCP2_KINDS.items()},
     **{
         name: Kind(make, mentor.PROFILE, MENTOR_COMMANDS, lambda f: f[:-1] + bytes((bcc(f[6:-1]),)))
         for name, make in MENTOR_KINDS.items()
     },
-    "mentor, parity": Kind(lambda: MentorDrive(ADDRESS), mentor.PROFILE, MENTOR_COMMANDS, mentor_with_parity_sealed),
+    "mentor, parity": Kind(lambda: EmulatedMentor(ADDRESS), mentor.PROFILE, MENTOR_COMMANDS, mentor_with_parity_sealed),
     **{
         f"msc, {step} a value": Kind(
-            partial(MscController, ADDRESS, address_step=step, addresses=4096),
+            partial(EmulatedMsc, ADDRESS, address_step=step, addresses=4096),
             msc.PROFILE,
             MSC_COMMANDS,
             lambda f: f[:-2] + sum16(f[1:-2]).to_bytes(2, "big"),
@@ -132,9 +137,9 @@ KINDS = {
         for step in (1, 4)
     },
     "dc104": Kind(
-        lambda: Dc104Drive(lively=True), dc104.PROFILE, DC104_COMMANDS, lambda f: f[:-1] + bytes((sum8(f[1:-1]),))
+        lambda: EmulatedDc104(lively=True), dc104.PROFILE, DC104_COMMANDS, lambda f: f[:-1] + bytes((sum8(f[1:-1]),))
     ),
-    "modbus": Kind(lambda: EmulatedUnit(ADDRESS), modbus_rtu.PROFILE, MODBUS_COMMANDS, lambda f: with_crc(f[:-2])),
+    "modbus": Kind(lambda: EmulatedModbus(ADDRESS), modbus.PROFILE, MODBUS_COMMANDS, lambda f: with_crc(f[:-2])),
 }
 
 

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from busmaster.emulator.build import MAKERS, make_device
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.hostcomms import HCP, HostCommsDevice
 from busmaster.emulator.oracle import Oracle, oracle_value
 from busmaster.errors import InvalidCommand
+from busmaster.protocols._comms.device import HCP, HostCommsDevice
+from busmaster.registry import find, kinds, make_device
 from tests.emulator.lines import ask, line_of
 
 
-@pytest.mark.parametrize("protocol", sorted(MAKERS))
+@pytest.mark.parametrize("protocol", list(kinds()))
 def test_every_protocol_has_a_device(protocol: str) -> None:
-    device = make_device(protocol, 2, delay=Delay(0.01))
-    assert device.address == 2
+    address = find(protocol).profile.addresses[-1]
+    device = make_device(protocol, address, delay=Delay(0.01))
+    assert device.address == address
     assert device.delay == Delay(0.01)
     line_of(device)
 
@@ -33,11 +34,14 @@ def test_something_moves_on_a_lively_device() -> None:
         ("microflex", "07 30 32 02 36 34 05 07"),
         ("msc", "02 02 00 08 00 00 44 52 45 41 44 2C 07 D0 02 6D"),  # DREAD 2000, what its program counts
         ("mentor", "04 30 30 32 32 30 33 30 32 05"),  # 03.02, the speed feedback
+        ("ct-ansi", "04 31 31 34 34 30 33 30 32 05"),
         ("dc104", "02 AA 01 AB"),
+        ("modbus", "02 03 00 00 00 01 84 39"),  # holding register 0
     ):
-        line = line_of(make_device(protocol, 2, lively=True))
+        address = 14 if protocol == "ct-ansi" else 2
+        line = line_of(make_device(protocol, address, lively=True))
         assert len({ask(line, request, now) for now in range(1000, 1005)}) > 3
-        still = line_of(make_device(protocol, 2))
+        still = line_of(make_device(protocol, address))
         assert len({ask(still, request, now) for now in range(1000, 1005)}) == 1
 
 
@@ -47,5 +51,5 @@ def test_the_oracle_answers_in_their_place() -> None:
 
 
 def test_a_protocol_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(InvalidCommand, match="no such protocol 'modbus'"):
-        make_device("modbus", 1)
+    with pytest.raises(InvalidCommand, match="no such protocol 'profibus'"):
+        make_device("profibus", 1)

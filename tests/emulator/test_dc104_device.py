@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.dc104 import Dc104Drive, packet
 from busmaster.emulator.oracle import Oracle, oracle_value
 from busmaster.errors import InvalidCommand
+from busmaster.protocols.dc104.device import EmulatedDc104, packet
 from busmaster.wire.checks import sum8
 from tests.emulator.lines import ask, ask_bytewise, hexed, line_of
 
@@ -52,13 +52,13 @@ def write(parameter: int, value: int) -> str:
 )
 def test_it_answers_as_the_document_says(value: int, text: str, heard: str) -> None:
     for asking in (ask, ask_bytewise):
-        drive = Dc104Drive()
+        drive = EmulatedDc104()
         drive.registers = [value] * 256
         assert asking(line_of(drive), text) == heard
 
 
 def test_every_parameter_keeps_what_was_written() -> None:
-    line = line_of(Dc104Drive())
+    line = line_of(EmulatedDc104())
     for parameter in range(1, 256):
         value = parameter * 257 % 65536
         assert ask(line, write(parameter, value), parameter * 2.0) == ACK
@@ -66,14 +66,14 @@ def test_every_parameter_keeps_what_was_written() -> None:
 
 
 def test_a_write_is_acknowledged_when_it_is_completed() -> None:
-    line = line_of(Dc104Drive(eeprom=Delay(0.3)))
+    line = line_of(EmulatedDc104(eeprom=Delay(0.3)))
     assert ask(line, write(1, 5), 0.0, 0.3) == SILENCE
     assert ask(line, "", 0.3, 0.1) == ACK
     assert ask(line, read(1), 0.5, 0.05) == "02 01 00 05 06"
 
 
 def test_what_it_has_not_is_refused_or_by_option_met_with_silence() -> None:
-    drive = Dc104Drive(last_parameter=10, read_only=frozenset({3}))
+    drive = EmulatedDc104(last_parameter=10, read_only=frozenset({3}))
     line = line_of(drive)
     drive.registers[3] = 33
     assert ask(line, read(11), 0.0) == NAK
@@ -87,20 +87,20 @@ def test_what_it_has_not_is_refused_or_by_option_met_with_silence() -> None:
 
 
 def test_parameter_0_is_there_by_option() -> None:
-    line = line_of(Dc104Drive(allow_zero=True))
+    line = line_of(EmulatedDc104(allow_zero=True))
     assert ask(line, write(0, 9), 0.0) == ACK
     assert ask(line, read(0), 1.0) == "02 00 00 09 09"
 
 
 def test_what_was_begun_is_forgotten_after_50_ms() -> None:
     for pause, heard in ((0.04, NAK), (0.06, "02 01 00 00 01")):
-        line = line_of(Dc104Drive())
+        line = line_of(EmulatedDc104())
         assert ask(line, "02 AA 01", 0.0, pause) == SILENCE
         assert ask(line, read(1), pause)[: len(heard)] == heard
 
 
 def test_parameters_outlive_a_power_failure_and_half_a_packet_does_not() -> None:
-    drive = Dc104Drive()
+    drive = EmulatedDc104()
     line = line_of(drive)
     ask(line, write(1, 1234), 0.0)
     ask(line, "02 AA", 1.0)
@@ -110,7 +110,7 @@ def test_parameters_outlive_a_power_failure_and_half_a_packet_does_not() -> None
 
 def test_the_oracle_answers_and_counts_writes() -> None:
     oracle = Oracle(0, 2**16)
-    line = line_of(Dc104Drive(oracle=oracle))
+    line = line_of(EmulatedDc104(oracle=oracle))
     assert ask(line, write(7, oracle_value(0, 7, 0, 2**16)), 0.0) == ACK
     assert (oracle.writes[7], oracle.strays) == (1, 0)
     assert ask(line, read(7), 1.0) == hexed(packet(7, oracle_value(0, 7, 1, 2**16)))
@@ -119,21 +119,21 @@ def test_the_oracle_answers_and_counts_writes() -> None:
 def test_what_no_dc104_is_cannot_be_made() -> None:
     for bad in (0, 256):
         with pytest.raises(InvalidCommand):
-            Dc104Drive(last_parameter=bad)
+            EmulatedDc104(last_parameter=bad)
     with pytest.raises(InvalidCommand, match=r"2\*\*16 oracle values"):
-        Dc104Drive(oracle=Oracle(0))
+        EmulatedDc104(oracle=Oracle(0))
 
 
 @given(st.binary(max_size=20), st.booleans())
 @settings(max_examples=60)
 def test_whatever_it_hears_it_answers_after_a_pause(data: bytes, bytewise: bool) -> None:
-    line = line_of(Dc104Drive(read_only=frozenset(range(256))))
+    line = line_of(EmulatedDc104(read_only=frozenset(range(256))))
     (ask_bytewise if bytewise else ask)(line, data.hex())
     assert ask(line, read(1), 10.0) == "02 01 00 00 01"
 
 
 def test_a_disguised_reply_names_another_parameter_with_a_right_checksum() -> None:
-    drive = Dc104Drive()
+    drive = EmulatedDc104()
     drive.registers[1] = 1234
     drive.faults.wrong = 1.0
     heard = bytes.fromhex(ask(line_of(drive), read(1)))

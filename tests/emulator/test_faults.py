@@ -6,13 +6,13 @@ from random import Random
 
 import pytest
 
-from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.faults import BEYOND, FORGED, HEARING, NAMES, SPEAKING, WITHIN, Faults, noise
 from busmaster.emulator.line import Line
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.registry import make_device
 from tests.emulator.lines import TAU, arrivals, ask, hexed, line_of
 
 READ = "07 30 32 02 30 31 05 04"  # AN00129: read node 2 Comms(1)
@@ -21,7 +21,7 @@ REPLY = bytes.fromhex("02 30 31 31 32 33 2E 34 35 36 03 2B")
 
 
 def line_with(*settings: str, on_line: bool = False, seed: int = 1) -> Line:
-    mint = MintController(2)
+    mint = EmulatedMint(2)
     mint.comms[1] = 123.456
     line = line_of(mint, seed=seed)
     line.prompt = False
@@ -111,7 +111,7 @@ def test_a_request_that_is_not_heard_changes_nothing_but_one_whose_answer_is_los
         line = line_with(f"{fault}=1")
         assert ask(line, "07 30 32 02 30 31 37 03 35") == ""  # Comms(1) = 7
         mint = line.device(2)
-        assert isinstance(mint, MintController)
+        assert isinstance(mint, EmulatedMint)
         assert mint.comms[1] == stored
 
 
@@ -238,7 +238,7 @@ def test_a_storm_of_refusals_changes_nothing() -> None:
     line = line_with("nak=1")
     assert ask(line, "07 30 32 02 30 31 37 03 35") == "15"
     mint = line.device(2)
-    assert isinstance(mint, MintController)
+    assert isinstance(mint, EmulatedMint)
     assert mint.comms[1] == 123.456
 
 
@@ -270,7 +270,7 @@ def test_faults_of_the_line_strike_requests_too() -> None:
     line = line_with("lost=1", on_line=True)
     assert ask(line, WRITE.replace("31 32 33", "39 32 33")) == ""
     mint = line.device(2)
-    assert isinstance(mint, MintController)
+    assert isinstance(mint, EmulatedMint)
     assert mint.comms[1] == 123.456
     answers = {heard("flip=1", on_line=True, seed=seed) for seed in range(20)}
     assert b"" in answers  # the node's address was hit

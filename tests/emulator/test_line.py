@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay, Device
-from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.faults import HEARING, SPEAKING, Faults
 from busmaster.emulator.line import PIECE, Echo, Line
 from busmaster.emulator.wave import Wave
 from busmaster.errors import InvalidCommand
 from busmaster.profile import LineSettings
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.registry import make_device
 from tests.emulator.lines import SETTINGS, TAU, arrivals, ask, hexed, line_of
 
 READ_2 = bytes.fromhex("07 30 32 02 30 31 05 04")  # AN00129: read node 2 Comms(1)
@@ -37,8 +37,8 @@ class Ear(Device):
         self.heard.append((now, byte))
 
 
-def mint(address: int = 2, delay: float = 0.002) -> MintController:
-    return MintController(address, delay=Delay(delay))
+def mint(address: int = 2, delay: float = 0.002) -> EmulatedMint:
+    return EmulatedMint(address, delay=Delay(delay))
 
 
 # Time
@@ -393,7 +393,7 @@ def test_whatever_happens_the_line_comes_to_rest_and_then_works(
 def test_a_spread_delay_is_drawn_from_the_chance_that_was_handed_in() -> None:
     times = []
     for _ in range(2):
-        line = line_of(MintController(2, delay=Delay(0.05, 0.1)), seed=7)
+        line = line_of(EmulatedMint(2, delay=Delay(0.05, 0.1)), seed=7)
         line.prompt = False
         line.send(READ_2, 0.0)
         times.append(arrivals(line, 1.0)[0][0] - 14 * TAU)
@@ -409,7 +409,7 @@ def test_stragglers_are_a_share_of_the_replies() -> None:
 
 
 def test_chance_that_was_not_handed_in_is_asked_for() -> None:
-    line = Line(SETTINGS, [MintController(2, delay=Delay(0.05, 0.1))])
+    line = Line(SETTINGS, [EmulatedMint(2, delay=Delay(0.05, 0.1))])
     line.send(READ_2, 0.0)
     with pytest.raises(ValueError, match=r"random\.Random"):
         line.receive(1.0)

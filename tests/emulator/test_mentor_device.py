@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from busmaster.emulator.devices.mentor import EVEN_PARITY, SPEED_REFERENCE, MentorDrive, telegram
 from busmaster.emulator.line import Line
 from busmaster.emulator.oracle import Oracle, oracle_value
 from busmaster.errors import InvalidCommand
+from busmaster.protocols.mentor.device import EVEN_PARITY, SPEED_REFERENCE, EmulatedMentor, telegram
 from busmaster.wire.checks import bcc
 from tests.emulator.lines import ask, ask_bytewise, hexed, line_of
 
@@ -32,9 +32,9 @@ def write(drive: int, text: str) -> str:
     return hexed(address(drive) + b"\x02" + body + bytes([bcc(body)]))
 
 
-def backwards(drive: int, *, short_after_write: bool = False) -> tuple[MentorDrive, Line]:
+def backwards(drive: int, *, short_after_write: bool = False) -> tuple[EmulatedMentor, Line]:
     """A drive whose speed reference is -47.6 %."""
-    device = MentorDrive(drive, short_after_write=short_after_write)
+    device = EmulatedMentor(drive, short_after_write=short_after_write)
     device.set_value(SPEED_REFERENCE, -476, 0.0)
     return device, line_of(device)
 
@@ -82,7 +82,7 @@ def test_it_answers_as_the_guide_says(drive: int, text: str, heard: str, bytewis
     ],
 )
 def test_what_is_written_is_read_back(text: str, value: int) -> None:
-    drive = MentorDrive(14)
+    drive = EmulatedMentor(14)
     line = line_of(drive)
     assert ask(line, write(14, text)) == ACK
     parameter = int(text[:4])
@@ -131,15 +131,15 @@ def test_it_says_nak_to_what_it_cannot_take(text: str) -> None:
 )
 def test_a_malformed_read_request_gets_silence_or_by_option_nak(text: str) -> None:
     for asking in (ask, ask_bytewise):
-        assert asking(line_of(MentorDrive(12)), text) == SILENCE
-        assert asking(line_of(MentorDrive(12, refuse_malformed=True)), text) == NAK
-        assert asking(line_of(MentorDrive(13, refuse_malformed=True)), text) == SILENCE
+        assert asking(line_of(EmulatedMentor(12)), text) == SILENCE
+        assert asking(line_of(EmulatedMentor(12, refuse_malformed=True)), text) == NAK
+        assert asking(line_of(EmulatedMentor(13, refuse_malformed=True)), text) == SILENCE
 
 
 @pytest.mark.parametrize("text", ["04 31 31 32 32 02 30 31 07", "04 31 31 32 32 02 30 31 31 37 31 01 03 20", "04 02"])
 def test_a_control_character_inside_a_frame_ends_it_unanswered(text: str) -> None:
     for asking in (ask, ask_bytewise):
-        assert asking(line_of(MentorDrive(12, refuse_malformed=True)), text) == SILENCE
+        assert asking(line_of(EmulatedMentor(12, refuse_malformed=True)), text) == SILENCE
 
 
 # All drives at once
@@ -147,7 +147,7 @@ def test_a_control_character_inside_a_frame_ends_it_unanswered(text: str) -> Non
 
 def test_a_broadcast_is_taken_by_all_and_answered_by_none() -> None:
     for asking in (ask, ask_bytewise):
-        drives = [MentorDrive(number) for number in (1, 14, 99)]
+        drives = [EmulatedMentor(number) for number in (1, 14, 99)]
         line = line_of(*drives)
         assert asking(line, "04 30 30 30 30 02 30 31 31 37 2B 30 30 30 30 03 2F") == SILENCE
         assert asking(line, write(0, "0117+0250"), 1.0) == SILENCE
@@ -168,7 +168,7 @@ def test_next_previous_and_same_again_after_a_read() -> None:
 
 
 def test_a_run_goes_through_a_gap_and_back() -> None:
-    line = line_of(MentorDrive(12))
+    line = line_of(EmulatedMentor(12))
     heard = [ask(line, text, number) for number, text in enumerate([read(12, "0135"), ACK, ACK, ACK, BS, BS])]
     last = hexed(telegram(136, 0))
     assert heard == [hexed(telegram(135, 0)), last, EOT, EOT, EOT, last]
@@ -189,7 +189,7 @@ def test_a_run_goes_through_a_gap_and_back() -> None:
 )
 def test_what_ends_short_commands(between: str) -> None:
     for asking in (ask, ask_bytewise):
-        line = line_of(MentorDrive(12))
+        line = line_of(EmulatedMentor(12))
         asking(line, read(12, "0117"))
         asking(line, between, 1.0)
         assert asking(line, ACK, 2.0) == SILENCE
@@ -197,7 +197,7 @@ def test_what_ends_short_commands(between: str) -> None:
 
 @pytest.mark.parametrize("between", ["00", "FF 00 7F"])
 def test_idle_bytes_do_not_end_them(between: str) -> None:
-    line = line_of(MentorDrive(12))
+    line = line_of(EmulatedMentor(12))
     ask(line, read(12, "0117"))
     ask(line, between, 1.0)
     assert ask(line, ACK, 2.0) == NEXT
@@ -212,7 +212,7 @@ def test_short_commands_after_a_write_are_an_option() -> None:
 
 
 def test_another_drives_acknowledgement_is_not_taken_for_a_short_command() -> None:
-    line = line_of(*(MentorDrive(number) for number in range(11, 16)))
+    line = line_of(*(EmulatedMentor(number) for number in range(11, 16)))
     for now, drive in enumerate([12, 13, 14, 12, 15]):
         assert ask(line, read(12, "0117"), now) == hexed(telegram(117, 0))
         assert ask(line, write(drive, "0118+0001"), now + 0.5) == ACK
@@ -238,7 +238,7 @@ def test_the_parity_bit_is_dropped_and_given_where_it_was_heard() -> None:
 
 
 def test_the_speed_follows_its_reference_on_a_ramp() -> None:
-    drive = MentorDrive(14, acceleration=500.0)
+    drive = EmulatedMentor(14, acceleration=500.0)
     line = line_of(drive)
     assert ask(line, read(14, "0302"), 0.0) == "02 30 33 30 32 2B 30 30 30 30 03 29"
     assert ask(line, write(14, "0117+1000"), 10.0) == ACK
@@ -265,7 +265,7 @@ def test_it_knows_its_own_address_and_forgets_the_rest_when_power_fails() -> Non
 
 def test_the_oracle_answers_for_every_parameter_and_counts_writes() -> None:
     oracle = Oracle(14, 10**4)
-    line = line_of(MentorDrive(14, oracle=oracle))
+    line = line_of(EmulatedMentor(14, oracle=oracle))
     sent = oracle_value(14, 117, 0, 10**4)
     assert ask(line, write(14, f"0117{sent:+05d}")) == ACK
     assert (oracle.writes[117], oracle.strays) == (1, 0)
@@ -276,15 +276,15 @@ def test_the_oracle_answers_for_every_parameter_and_counts_writes() -> None:
 def test_what_no_mentor_ii_is_cannot_be_made() -> None:
     for bad in (0, 100):
         with pytest.raises(InvalidCommand):
-            MentorDrive(bad)
+            EmulatedMentor(bad)
     with pytest.raises(InvalidCommand, match=r"10\*\*4 oracle values"):
-        MentorDrive(1, oracle=Oracle(1))
+        EmulatedMentor(1, oracle=Oracle(1))
 
 
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_write_whose_checksum_arrives_as_enq_is_refused_and_no_read(whole: bool) -> None:
     """05 is also the byte that ends a read request."""
-    line = line_of(MentorDrive(5))
+    line = line_of(EmulatedMentor(5))
     garbled = "04 30 30 35 35 02 30 31 31 37 2d 30 34 37 36 03 05"
     assert (ask if whole else ask_bytewise)(line, garbled) == NAK
     assert ask(line, read(5, "0117"), 1.0) == hexed(telegram(117, 0))
@@ -317,8 +317,8 @@ def test_a_disguised_reply_names_another_parameter_with_a_right_bcc() -> None:
 
 def test_it_does_not_wait_for_anything_between_requests_to_others() -> None:
     """What a read leaves behind is gone with the next request to another drive: then it need not hear every byte."""
-    drive = MentorDrive(12)
-    line = line_of(drive, MentorDrive(13))
+    drive = EmulatedMentor(12)
+    line = line_of(drive, EmulatedMentor(13))
     waits = []
     for now, number in enumerate((12, 13)):
         ask(line, read(number, "0117"), now)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from busmaster.emulator.devices.microflex import AMBIENT, FULL_SPEED, MicroFlexDrive
 from busmaster.emulator.line import Line
+from busmaster.protocols.hcp2.microflex_device import AMBIENT, FULL_SPEED, EmulatedMicroFlex
 from busmaster.wire.checks import xor
 from tests.emulator.lines import ask, hexed, line_of
 
@@ -24,12 +24,12 @@ def read(line: Line, element: int, now: float) -> float:
 
 
 @pytest.fixture
-def drive() -> MicroFlexDrive:
-    return MicroFlexDrive(7)
+def drive() -> EmulatedMicroFlex:
+    return EmulatedMicroFlex(7)
 
 
 @pytest.fixture
-def line(drive: MicroFlexDrive) -> Line:
+def line(drive: EmulatedMicroFlex) -> Line:
     return line_of(drive)
 
 
@@ -64,7 +64,7 @@ def test_a_disabled_drive_keeps_its_reference_and_stands(line: Line) -> None:
     assert read(line, 109, 20) == HARDWARE
 
 
-def test_it_is_not_enabled_without_the_hardware_enable(drive: MicroFlexDrive, line: Line) -> None:
+def test_it_is_not_enabled_without_the_hardware_enable(drive: EmulatedMicroFlex, line: Line) -> None:
     drive.set_hardware_enable(False, 0.0)
     assert write(line, 108, "128", 1) == ACK
     assert read(line, 109, 2) == 0
@@ -74,7 +74,7 @@ def test_it_is_not_enabled_without_the_hardware_enable(drive: MicroFlexDrive, li
     assert read(line, 109, 6) == HARDWARE | ENABLED
 
 
-def test_an_error_latches_disables_and_is_cancelled_by_bit_6(drive: MicroFlexDrive, line: Line) -> None:
+def test_an_error_latches_disables_and_is_cancelled_by_bit_6(drive: EmulatedMicroFlex, line: Line) -> None:
     write(line, 108, "128", 0)
     write(line, 118, "50", 1)
     drive.trip(4, 5.0)
@@ -91,7 +91,7 @@ def test_an_error_latches_disables_and_is_cancelled_by_bit_6(drive: MicroFlexDri
     assert read(line, 120, 20) == 50
 
 
-def test_an_error_whose_cause_is_still_there_cannot_be_cancelled(drive: MicroFlexDrive, line: Line) -> None:
+def test_an_error_whose_cause_is_still_there_cannot_be_cancelled(drive: EmulatedMicroFlex, line: Line) -> None:
     drive.causes = 4
     drive.trip(5, 0.0, drive_errors=1)
     assert read(line, 110, 1) == 1
@@ -100,14 +100,14 @@ def test_an_error_whose_cause_is_still_there_cannot_be_cancelled(drive: MicroFle
     assert read(line, 110, 4) == 0
 
 
-def test_a_cancel_bit_left_high_keeps_errors_from_latching(drive: MicroFlexDrive, line: Line) -> None:
+def test_a_cancel_bit_left_high_keeps_errors_from_latching(drive: EmulatedMicroFlex, line: Line) -> None:
     write(line, 108, "192", 0)
     drive.trip(4, 1.0)
     assert read(line, 103, 2) == 0
     assert read(line, 108, 3) == 192
 
 
-def test_an_active_stop_input_shows_and_stops(drive: MicroFlexDrive, line: Line) -> None:
+def test_an_active_stop_input_shows_and_stops(drive: EmulatedMicroFlex, line: Line) -> None:
     write(line, 108, "128", 0)
     write(line, 118, "50", 1)
     drive.stop_input = True
@@ -123,13 +123,13 @@ def test_an_active_stop_input_shows_and_stops(drive: MicroFlexDrive, line: Line)
 def test_a_reference_is_taken_only_in_its_mode_and_from_the_host(
     current_control: bool, host_reference: bool, torque: str, speed: str
 ) -> None:
-    line = line_of(MicroFlexDrive(7, current_control=current_control, host_reference=host_reference))
+    line = line_of(EmulatedMicroFlex(7, current_control=current_control, host_reference=host_reference))
     assert write(line, 116, "10", 0) == torque
     assert write(line, 118, "10", 1) == speed
 
 
 def test_in_current_control_the_torque_reference_drives_it() -> None:
-    line = line_of(MicroFlexDrive(7, current_control=True))
+    line = line_of(EmulatedMicroFlex(7, current_control=True))
     write(line, 108, "128", 0)
     write(line, 116, "40", 1)
     assert read(line, 117, 2) == 40
@@ -151,7 +151,7 @@ def test_a_command_word_of_more_than_eight_bits_is_refused(line: Line, word: str
 
 def test_unmapped_elements_read_zero_or_are_refused_if_so_set(line: Line) -> None:
     assert read(line, 50, 0) == read(line, 101, 1) == read(line, 236, 2) == 0
-    strict = line_of(MicroFlexDrive(7, refuse_unmapped=True))
+    strict = line_of(EmulatedMicroFlex(7, refuse_unmapped=True))
     assert ask(strict, "07 30 37 02 30 31 05 01") == NAK
 
 
@@ -167,7 +167,7 @@ def test_it_reports_firmware_bus_voltage_and_a_temperature_that_rises_under_load
     assert read(line, 242, 2000) == pytest.approx(AMBIENT, abs=0.01)
 
 
-def test_a_restart_disables_it_and_forgets_its_references(drive: MicroFlexDrive, line: Line) -> None:
+def test_a_restart_disables_it_and_forgets_its_references(drive: EmulatedMicroFlex, line: Line) -> None:
     write(line, 108, "128", 0)
     write(line, 118, "50", 1)
     drive.trip(4, 4.0)
@@ -175,7 +175,7 @@ def test_a_restart_disables_it_and_forgets_its_references(drive: MicroFlexDrive,
     assert [read(line, element, element) for element in (103, 108, 109, 118, 120)] == [0, 0, HARDWARE, 0, 0]
 
 
-def test_a_ripple_makes_the_measured_speed_live(drive: MicroFlexDrive, line: Line) -> None:
+def test_a_ripple_makes_the_measured_speed_live(drive: EmulatedMicroFlex, line: Line) -> None:
     drive.ripple = 0.01
     write(line, 108, "128", 0)
     write(line, 118, "50", 1)

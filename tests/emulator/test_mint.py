@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from busmaster.emulator.devices.hostcomms import HCP, HCP2, number_text, numbers
-from busmaster.emulator.devices.mint import MintController, command_handshake, jog_on_comms1, winding
 from busmaster.emulator.motion import Motion
 from busmaster.emulator.oracle import Oracle, oracle_value
+from busmaster.protocols._comms.device import HCP, HCP2, number_text, numbers
+from busmaster.protocols._comms.mint import EmulatedMint, command_handshake, jog_on_comms1, winding
 from busmaster.wire.checks import xor
 from tests.emulator.lines import TAU, ask, ask_bytewise, hexed, line_of
 
@@ -45,7 +45,7 @@ def value(reply: str) -> str:
     ],
 )
 def test_hcp2_answers_the_documents_own_scenarios(request_: str, reply: str) -> None:
-    mint = MintController(2)
+    mint = EmulatedMint(2)
     mint.comms[1] = 123.456
     assert ask(line_of(mint), request_) == reply
 
@@ -67,7 +67,7 @@ def test_hcp2_answers_the_documents_own_scenarios(request_: str, reply: str) -> 
 )
 def test_hcp_answers_as_the_document_says(node: int, request_: str, reply: str) -> None:
     for asking in (ask, ask_bytewise):
-        mint = MintController(node, HCP)
+        mint = EmulatedMint(node, HCP)
         mint.comms[1] = 123.456
         assert asking(line_of(mint), request_) == reply
 
@@ -94,12 +94,12 @@ def test_hcp_answers_as_the_document_says(node: int, request_: str, reply: str) 
 )
 def test_hcp2_acknowledges_refuses_and_ignores_as_the_document_says(request_: str, reply: str) -> None:
     for asking in (ask, ask_bytewise):
-        assert asking(line_of(MintController(1)), request_) == reply
+        assert asking(line_of(EmulatedMint(1)), request_) == reply
 
 
 def test_every_element_can_be_read_and_names_itself_in_hex() -> None:
     for node in (0, 1, 13, 255):
-        mint = MintController(node)
+        mint = EmulatedMint(node)
         line = line_of(mint)
         for element in range(1, 256):
             reply = bytes.fromhex(ask(line, read(node, element), element))
@@ -111,7 +111,7 @@ def test_every_element_can_be_read_and_names_itself_in_hex() -> None:
 
 
 def test_a_multi_value_write_stores_up_to_the_first_bad_one_and_is_then_refused() -> None:
-    mint = MintController(1)
+    mint = EmulatedMint(1)
     assert ask(line_of(mint), write(1, 10, "1,x,3")) == NAK
     assert mint.comms[10:13] == [1, 0, 0]
     assert ask(line_of(mint), write(1, 10, "10,20,30")) == ACK
@@ -119,7 +119,7 @@ def test_a_multi_value_write_stores_up_to_the_first_bad_one_and_is_then_refused(
 
 
 def test_all_or_nothing_stores_nothing_of_a_bad_write() -> None:
-    mint = MintController(1, all_or_nothing=True)
+    mint = EmulatedMint(1, all_or_nothing=True)
     assert ask(line_of(mint), write(1, 99, "7,8")) == NAK
     assert mint.comms[99] == 0
     assert ask(line_of(mint), write(1, 98, "7,8")) == ACK
@@ -127,7 +127,7 @@ def test_all_or_nothing_stores_nothing_of_a_bad_write() -> None:
 
 def test_a_data_field_of_sixty_characters_is_taken_and_one_of_sixty_one_refused() -> None:
     for asking in (ask, ask_bytewise):
-        mint = MintController(1)
+        mint = EmulatedMint(1)
         assert asking(line_of(mint), write(1, 1, "0" * 59 + "7")) == ACK
         assert mint.comms[1] == 7
         assert asking(line_of(mint), write(1, 2, "0" * 60 + "7")) == NAK
@@ -173,13 +173,13 @@ def test_a_number_written_and_read_again_is_the_same_to_four_decimals(number: fl
 
 
 def test_a_value_too_long_for_a_reply_is_refused() -> None:
-    mint = MintController(1)
+    mint = EmulatedMint(1)
     mint.comms[1] = 1e30
     assert ask(line_of(mint), read(1, 1)) == NAK
 
 
 def test_single_precision_keeps_24_bits() -> None:
-    mint = MintController(1, single_precision=True)
+    mint = EmulatedMint(1, single_precision=True)
     ask(line_of(mint), write(1, 1, "16777217"))
     assert value(ask(line_of(mint), read(1, 1))) == "16777216"
     assert ask(line_of(mint), write(1, 1, "9" * 60)) == ACK
@@ -188,7 +188,7 @@ def test_single_precision_keeps_24_bits() -> None:
 @given(st.binary(max_size=40), st.sampled_from([HCP, HCP2]), st.booleans())
 @settings(max_examples=150)
 def test_it_survives_any_bytes_and_then_answers(data: bytes, framing: object, bytewise: bool) -> None:
-    mint = MintController(1, HCP if framing is HCP else HCP2)
+    mint = EmulatedMint(1, HCP if framing is HCP else HCP2)
     line = line_of(mint)
     (ask_bytewise if bytewise else ask)(line, data.hex())
     assert (ask(line, "04 31 31 02 30 31 05", 10) or ask(line, read(1, 1), 20)).startswith("02 30 31")
@@ -198,7 +198,7 @@ def test_it_survives_any_bytes_and_then_answers(data: bytes, framing: object, by
 
 
 def test_an_axis_tells_position_velocity_encoder_and_idle() -> None:
-    mint = MintController(1)
+    mint = EmulatedMint(1)
     line = line_of(mint)
     mint.axes[2].jog(10.0, 0.0)
     assert float(value(ask(line, read(1, 130), 10.0))) == pytest.approx(100, abs=0.5)
@@ -210,7 +210,7 @@ def test_an_axis_tells_position_velocity_encoder_and_idle() -> None:
 
 
 def test_inputs_outputs_and_analog_channels_can_be_read() -> None:
-    mint = MintController(1)
+    mint = EmulatedMint(1)
     line = line_of(mint)
     mint.inputs, mint.adc[3] = 5, 12.25
     assert ask(line, write(1, 222, "9")) == ACK
@@ -223,10 +223,10 @@ def test_inputs_outputs_and_analog_channels_can_be_read() -> None:
 
 
 def test_reserved_elements_read_zero_or_are_refused_if_so_set() -> None:
-    assert value(ask(line_of(MintController(1)), read(1, 221))) == "0"
-    assert ask(line_of(MintController(1, refuse_reserved=True)), read(1, 221)) == NAK
-    assert ask(line_of(MintController(1, axes=1, refuse_reserved=True)), read(1, 115)) == NAK
-    assert ask(line_of(MintController(1)), write(1, 221, "1")) == NAK
+    assert value(ask(line_of(EmulatedMint(1)), read(1, 221))) == "0"
+    assert ask(line_of(EmulatedMint(1, refuse_reserved=True)), read(1, 221)) == NAK
+    assert ask(line_of(EmulatedMint(1, axes=1, refuse_reserved=True)), read(1, 115)) == NAK
+    assert ask(line_of(EmulatedMint(1)), write(1, 221, "1")) == NAK
 
 
 # Programs and events
@@ -234,7 +234,7 @@ def test_reserved_elements_read_zero_or_are_refused_if_so_set() -> None:
 
 def test_a_write_to_the_first_five_elements_raises_its_event_even_if_nothing_changed() -> None:
     heard: list[tuple[int, float]] = []
-    mint = MintController(1, events=[lambda mint, element, now: heard.append((element, mint.comms[element]))])
+    mint = EmulatedMint(1, events=[lambda mint, element, now: heard.append((element, mint.comms[element]))])
     line = line_of(mint)
     for element in (1, 1, 5, 6):
         ask(line, write(1, element, "3"))
@@ -242,14 +242,14 @@ def test_a_write_to_the_first_five_elements_raises_its_event_even_if_nothing_cha
 
 
 def test_event_comms1_jogs_the_axis() -> None:
-    mint = MintController(1, events=[jog_on_comms1])
+    mint = EmulatedMint(1, events=[jog_on_comms1])
     line = line_of(mint)
     ask(line, write(1, 1, "-25"))
     assert float(value(ask(line, read(1, 101), 2.0))) == -25
 
 
 def test_the_winding_program_traverses_between_its_two_ends() -> None:
-    mint = MintController(1, program=winding)
+    mint = EmulatedMint(1, program=winding)
     line = line_of(mint)
     assert value(ask(line, read(1, 3))) == "0"
     ask(line, write(1, 1, "10,20,4.3"), 1.0)
@@ -260,7 +260,7 @@ def test_the_winding_program_traverses_between_its_two_ends() -> None:
 
 
 def test_the_command_handshake_clears_comms1_when_the_move_is_over() -> None:
-    mint = MintController(1, program=command_handshake)
+    mint = EmulatedMint(1, program=command_handshake)
     line = line_of(mint)
     ask(line, read(1, 1))
     ask(line, write(1, 2, "10,5"), 0.1)  # speed 10, target 5
@@ -274,7 +274,7 @@ def test_the_command_handshake_clears_comms1_when_the_move_is_over() -> None:
 
 
 def test_the_command_handshake_loses_a_command_that_comes_between_its_read_and_its_clear() -> None:
-    mint = MintController(1, program=command_handshake)
+    mint = EmulatedMint(1, program=command_handshake)
     mint.run(0.0)
     mint.run(1.0)
     while mint.line_number != 4:  # Comms(1) has been read as 0
@@ -287,7 +287,7 @@ def test_the_command_handshake_loses_a_command_that_comes_between_its_read_and_i
 
 
 def test_the_command_handshake_moves_relative_and_home() -> None:
-    mint = MintController(1, program=command_handshake)
+    mint = EmulatedMint(1, program=command_handshake)
     mint.run(0.0)
     mint.comms[2:4] = [100.0, 5.0]
     for command, position in ((2, 5), (2, 10), (3, 0)):
@@ -300,11 +300,11 @@ def test_the_command_handshake_moves_relative_and_home() -> None:
 
 
 def test_a_program_that_ends_is_no_longer_running() -> None:
-    def short(mint: MintController) -> Generator[int, None, None]:
+    def short(mint: EmulatedMint) -> Generator[int, None, None]:
         mint.comms[7] = 1
         yield 1
 
-    mint = MintController(1, program=short)
+    mint = EmulatedMint(1, program=short)
     assert [mint.read_element(235, now) for now in (0.0, 1.0)] == [True, False]
     assert mint.comms[7] == 1
     mint.start_program()
@@ -312,7 +312,7 @@ def test_a_program_that_ends_is_no_longer_running() -> None:
 
 
 def test_a_restart_loses_what_was_in_ram() -> None:
-    mint = MintController(1)
+    mint = EmulatedMint(1)
     line = line_of(mint)
     ask(line, write(1, 1, "3"))
     line.restart(mint, 1.0)
@@ -323,7 +323,7 @@ def test_a_restart_loses_what_was_in_ram() -> None:
 
 
 def test_with_an_oracle_every_element_tells_node_element_and_writes() -> None:
-    mint = MintController(7, oracle=Oracle(7))
+    mint = EmulatedMint(7, oracle=Oracle(7))
     line = line_of(mint)
     assert value(ask(line, read(7, 5))) == str(oracle_value(7, 5, 0))
     assert ask(line, write(7, 5, str(oracle_value(7, 5, 0)))) == ACK

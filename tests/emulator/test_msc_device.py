@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.msc import COUNT, RUN_FLAG, MscController, packet
 from busmaster.emulator.line import Line
 from busmaster.emulator.oracle import Oracle, oracle_value
 from busmaster.errors import InvalidCommand
+from busmaster.protocols.msc.device import COUNT, RUN_FLAG, EmulatedMsc, packet
 from tests.emulator.lines import arrivals, ask, ask_bytewise, hexed, line_of
 
 ACK, NAK, SILENCE = "06", "15", ""
@@ -57,14 +57,14 @@ FLAGS_ON = "02 03 00 27 00 00 52 46 4C 41 47 53 2C 01 02 00 80" + 27 * " 00" + "
     ],
 )
 def test_it_answers_the_packets_of_the_document(unit: int, text: str, heard: str, bytewise: bool) -> None:
-    controller = MscController(unit)
+    controller = EmulatedMsc(unit)
     controller.flags = {0, 9, 31, 255}
     controller.set_value(2008, 1234)
     assert answer(line_of(controller), text, 0.0, bytewise=bytewise) == heard
 
 
 def test_a_value_written_is_stored_signed_and_read_back() -> None:
-    controller = MscController(1)
+    controller = EmulatedMsc(1)
     line = line_of(controller)
     for number, value in enumerate((1234, -1, 0, 2**31 - 1, -(2**31), 0x02020202, 0x06061515)):
         now = number * 100.0
@@ -76,7 +76,7 @@ def test_a_value_written_is_stored_signed_and_read_back() -> None:
 
 @pytest.mark.parametrize("step", [1, 2, 4])
 def test_a_block_is_32_values_one_address_step_apart(step: int) -> None:
-    controller = MscController(4, address_step=step)
+    controller = EmulatedMsc(4, address_step=step)
     line = line_of(controller)
     values = list(range(-16, 16))
     block = b"BWRITE," + (2008).to_bytes(2, "big") + b"".join(v.to_bytes(4, "big", signed=True) for v in values)
@@ -88,7 +88,7 @@ def test_a_block_is_32_values_one_address_step_apart(step: int) -> None:
 
 
 def test_flags_are_set_cleared_and_read() -> None:
-    controller = MscController(1, read_only_flags=frozenset({7}))
+    controller = EmulatedMsc(1, read_only_flags=frozenset({7}))
     line = line_of(controller)
     assert answer(line, request(1, "SFLAG", 5), 0.0) == ACK
     assert controller.flags == {5}
@@ -123,19 +123,19 @@ def test_flags_are_set_cleared_and_read() -> None:
     ],
 )
 def test_it_says_nak_to_what_is_unsound_unknown_or_not_there(text: str, bytewise: bool) -> None:
-    controller = MscController(1)
+    controller = EmulatedMsc(1)
     assert answer(line_of(controller), text, 0.0, bytewise=bytewise) == NAK
     assert not any(controller.value(address) for address in range(0, 0x7FFC, 4))
 
 
 @pytest.mark.parametrize(("model", "known"), [("MSC-250", True), ("MSC-850/32", True), ("MSC-850", False)])
 def test_only_two_models_know_rflags(model: str, known: bool) -> None:
-    heard = answer(line_of(MscController(1, model=model)), request(1, "RFLAGS"), 0.0)
+    heard = answer(line_of(EmulatedMsc(1, model=model)), request(1, "RFLAGS"), 0.0)
     assert heard.startswith(ACK if known else NAK)
 
 
 def test_a_packet_that_is_not_completed_is_refused_after_half_a_second() -> None:
-    line = line_of(MscController(1, delay=Delay(0.0)))
+    line = line_of(EmulatedMsc(1, delay=Delay(0.0)))
     line.prompt = False
     line.send(bytes.fromhex(DREAD)[:-1], 0.0)
     [(when, heard)] = arrivals(line, 5.0)
@@ -145,7 +145,7 @@ def test_a_packet_that_is_not_completed_is_refused_after_half_a_second() -> None
 
 
 def test_another_units_packet_that_is_not_completed_is_passed_over() -> None:
-    line = line_of(MscController(1))
+    line = line_of(EmulatedMsc(1))
     assert ask(line, "02 02 00 08 00", 0.0, 5.0) == SILENCE
     assert ask(line, "02", 5.0, 5.0) == SILENCE
     assert answer(line, DREAD, 10.0).startswith(ACK)
@@ -162,11 +162,11 @@ def test_another_units_packet_that_is_not_completed_is_passed_over() -> None:
     ],
 )
 def test_noise_and_other_units_packets_in_front_of_a_request(before: str, heard: str) -> None:
-    assert ask(line_of(MscController(1)), f"{before} {DREAD}")[:2] == heard
+    assert ask(line_of(EmulatedMsc(1)), f"{before} {DREAD}")[:2] == heard
 
 
 def test_what_never_pauses_is_passed_over_after_half_a_second_too() -> None:
-    line = line_of(MscController(1))
+    line = line_of(EmulatedMsc(1))
     assert ask(line, f"02 02 F0 00 {3000 * '00 '} {DREAD}", 0.0, 1.0).startswith(ACK)
 
 
@@ -174,7 +174,7 @@ def test_what_never_pauses_is_passed_over_after_half_a_second_too() -> None:
 
 
 def test_other_units_hear_requests_and_replies_and_say_nothing() -> None:
-    devices = [MscController(unit) for unit in range(1, 16)]
+    devices = [EmulatedMsc(unit) for unit in range(1, 16)]
     line = line_of(*devices)
     for unit in range(1, 16):
         heard = answer(line, request(unit, "DREAD", 2008), unit * 20.0)
@@ -187,14 +187,14 @@ def test_other_units_hear_requests_and_replies_and_say_nothing() -> None:
 )
 def test_a_reply_packet_of_its_own_number_is_no_request(body: bytes) -> None:
     for asking in (ask, ask_bytewise):
-        assert asking(line_of(MscController(5)), hexed(packet(5, body))) == SILENCE
+        assert asking(line_of(EmulatedMsc(5)), hexed(packet(5, body))) == SILENCE
 
 
 # "The MSC will retransmit the Packet up to 5 times if necessary"
 
 
 def test_a_packet_is_sent_again_on_each_nak_five_times_at_most() -> None:
-    controller = MscController(1)
+    controller = EmulatedMsc(1)
     line = line_of(controller)
     controller.set_value(2008, 1234)
     assert ask(line, DREAD, 0.0) == f"{ACK} {REPLY}"
@@ -207,7 +207,7 @@ def test_a_packet_is_sent_again_on_each_nak_five_times_at_most() -> None:
 
 
 def test_a_packet_is_sent_again_each_second_in_which_no_ack_comes() -> None:
-    controller = MscController(1, delay=Delay(0.002), packet_delay=Delay(0.0))
+    controller = EmulatedMsc(1, delay=Delay(0.002), packet_delay=Delay(0.0))
     line = line_of(controller)
     line.prompt = False
     line.send(bytes.fromhex(DREAD), 0.0)
@@ -219,7 +219,7 @@ def test_a_packet_is_sent_again_each_second_in_which_no_ack_comes() -> None:
 
 
 def test_nothing_is_sent_again_after_the_hosts_ack() -> None:
-    controller = MscController(1)
+    controller = EmulatedMsc(1)
     line = line_of(controller)
     ask(line, DREAD, 0.0)
     assert ask(line, ACK, 0.5, PAUSE) == SILENCE
@@ -229,7 +229,7 @@ def test_nothing_is_sent_again_after_the_hosts_ack() -> None:
 
 def test_a_new_request_takes_the_place_of_a_packet_that_was_not_acknowledged() -> None:
     for asking in (ask, ask_bytewise):
-        controller = MscController(1)
+        controller = EmulatedMsc(1)
         line = line_of(controller)
         controller.set_value(2008, 7)
         asking(line, DREAD, 0.0)
@@ -238,7 +238,7 @@ def test_a_new_request_takes_the_place_of_a_packet_that_was_not_acknowledged() -
 
 
 def test_a_packet_waits_while_another_units_request_passes() -> None:
-    controller = MscController(1, delay=Delay(0.0), packet_delay=Delay(0.0))
+    controller = EmulatedMsc(1, delay=Delay(0.0), packet_delay=Delay(0.0))
     line = line_of(controller)
     ask(line, DREAD, 0.0)
     start = line.next_event() - 0.001
@@ -248,7 +248,7 @@ def test_a_packet_waits_while_another_units_request_passes() -> None:
 
 
 def test_what_is_refused_left_out_and_damaged_for_a_test() -> None:
-    controller = MscController(1)
+    controller = EmulatedMsc(1)
     controller.set_value(2008, 1234)
     controller.naks_ahead, controller.missing_acks_ahead, controller.bad_packets_ahead = 2, 1, 2
     line = line_of(controller)
@@ -261,7 +261,7 @@ def test_what_is_refused_left_out_and_damaged_for_a_test() -> None:
 
 
 def test_ack_and_packet_come_apart_or_in_one_piece() -> None:
-    line = line_of(MscController(1, delay=Delay(0.01), packet_delay=Delay(0.02)))
+    line = line_of(EmulatedMsc(1, delay=Delay(0.01), packet_delay=Delay(0.02)))
     line.prompt = False
     line.send(bytes.fromhex(DREAD), 0.0)
     (acked, ack), (replied, _) = arrivals(line, 0.5)
@@ -271,7 +271,7 @@ def test_ack_and_packet_come_apart_or_in_one_piece() -> None:
 
 
 def test_only_the_ack_of_a_late_answer_is_late() -> None:
-    controller = MscController(1)
+    controller = EmulatedMsc(1)
     controller.faults.late = 1.0
     line = line_of(controller)
     line.prompt = False
@@ -285,7 +285,7 @@ def test_only_the_ack_of_a_late_answer_is_late() -> None:
 
 
 def test_the_program_counts_while_its_flag_is_on() -> None:
-    controller = MscController(1, period=0.1)
+    controller = EmulatedMsc(1, period=0.1)
     line = line_of(controller)
 
     def count(now: float) -> int:
@@ -306,7 +306,7 @@ def test_the_program_counts_while_its_flag_is_on() -> None:
 
 def test_a_power_failure_clears_program_and_data_unless_there_is_a_battery() -> None:
     for battery, status, value in ((False, 0b1100, 0), (True, 65, 1234)):
-        controller = MscController(1, battery=battery)
+        controller = EmulatedMsc(1, battery=battery)
         controller.set_value(2008, 1234)
         line = line_of(controller)
         ask(line, DREAD, 0.0)
@@ -318,7 +318,7 @@ def test_a_power_failure_clears_program_and_data_unless_there_is_a_battery() -> 
 
 def test_the_oracle_holds_data_values_and_counts_writes() -> None:
     oracle = Oracle(5, 2**31)
-    line = line_of(MscController(5, oracle=oracle))
+    line = line_of(EmulatedMsc(5, oracle=oracle))
     sent = oracle_value(5, 2008, 0, 2**31)
     answer(line, request(5, "DWRITE", 2008, value=sent), 0.0)
     assert (oracle.writes[2008], oracle.strays) == (1, 0)
@@ -330,11 +330,11 @@ def test_the_oracle_holds_data_values_and_counts_writes() -> None:
 @pytest.mark.parametrize(
     "bad",
     [
-        lambda: MscController(0),
-        lambda: MscController(16),
-        lambda: MscController(1, model="MSC-1000"),
-        lambda: MscController(1, address_step=3),
-        lambda: MscController(1, oracle=Oracle(1)),
+        lambda: EmulatedMsc(0),
+        lambda: EmulatedMsc(16),
+        lambda: EmulatedMsc(1, model="MSC-1000"),
+        lambda: EmulatedMsc(1, address_step=3),
+        lambda: EmulatedMsc(1, oracle=Oracle(1)),
     ],
 )
 def test_what_no_msc_is_cannot_be_made(bad: object) -> None:
@@ -349,7 +349,7 @@ def test_what_no_msc_is_cannot_be_made(bad: object) -> None:
 @given(st.lists(st.binary(max_size=30), max_size=5), st.booleans())
 @settings(max_examples=60)
 def test_whatever_it_hears_it_listens_again_when_time_has_passed(chunks: list[bytes], acked: bool) -> None:
-    controller = MscController(1)
+    controller = EmulatedMsc(1)
     line = line_of(controller)
     for number, chunk in enumerate(chunks):
         line.send(chunk, number * 0.1)
@@ -359,7 +359,7 @@ def test_whatever_it_hears_it_listens_again_when_time_has_passed(chunks: list[by
 
 
 def test_a_disguised_packet_comes_from_another_unit_with_a_right_checksum() -> None:
-    controller = MscController(1)
+    controller = EmulatedMsc(1)
     line = line_of(controller)
     controller.faults.wrong = 1.0
     heard = bytes.fromhex(ask(line, DREAD))

@@ -13,19 +13,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from busmaster.arbiter.transaction import Phase, Transaction
-from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay, Device
-from busmaster.emulator.devices.dc104 import Dc104Drive
-from busmaster.emulator.devices.hostcomms import HCP
-from busmaster.emulator.devices.mentor import MentorDrive
-from busmaster.emulator.devices.mint import MintController
-from busmaster.emulator.devices.msc import MscController
 from busmaster.emulator.line import Line
 from busmaster.emulator.world import World
 from busmaster.errors import BusError, NoReply, NoSuchParameter, Refused
 from busmaster.exchange import Command
 from busmaster.profile import Profile
-from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from busmaster.protocols._comms.device import HCP
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.dc104.device import EmulatedDc104
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.mentor.device import EmulatedMentor
+from busmaster.protocols.msc import codec as msc
+from busmaster.protocols.msc.device import EmulatedMsc
+from busmaster.registry import make_device
 
 PROFILES = {"hcp": hcp.PROFILE, "hcp2": hcp2.PROFILE, "msc": msc.PROFILE, "mentor": mentor.PROFILE}
 PROFILES |= {"microflex": hcp2.PROFILE, "dc104": dc104.PROFILE}
@@ -192,19 +196,19 @@ words = st.integers(0, 65535)
 @given(st.integers(-(2**31), 2**31 - 1), words, words, st.integers(-1000, 1000), st.sampled_from([1, 2, 4]))
 @settings(max_examples=30)
 def test_every_value_comes_back_as_it_was_written(value: int, wide: int, word: int, speed: int, step: int) -> None:
-    press = Master(msc.PROFILE, MscController(2, address_step=step, addresses=0x10000))
+    press = Master(msc.PROFILE, EmulatedMsc(2, address_step=step, addresses=0x10000))
     block = tuple((value * place) % 2**32 - 2**31 for place in range(32))
     press.tries([(msc.DataWrite(0xFFFF - 4, value), None), (msc.DataRead(0xFFFF - 4), value)])
     press.tries([(msc.BlockWrite(word // 2, block), None), (msc.BlockRead(word // 2), block)])
-    drive = Master(mentor.PROFILE, MentorDrive(42))
+    drive = Master(mentor.PROFILE, EmulatedMentor(42))
     drive.tries([(mentor.Write(15, 63, wide, wide=True), None), (mentor.Read(15, 63), wide)])
     drive.tries([(mentor.Write(1, 36, speed), None), (mentor.Read(1, 36), speed)])
-    motor = Master(dc104.PROFILE, Dc104Drive())
+    motor = Master(dc104.PROFILE, EmulatedDc104())
     motor.tries([(dc104.Write(1 + word % 255, wide), None), (dc104.Read(1 + word % 255), wide)])
 
 
 def test_a_broadcast_reaches_all_and_the_line_goes_on() -> None:
-    drives = [MentorDrive(address) for address in (11, 14)]
+    drives = [EmulatedMentor(address) for address in (11, 14)]
     master = Master(mentor.PROFILE, *drives)
     master.knows(mentor.PROFILE, 0)
     assert master.asks(mentor.Write(1, 17, 250), 0) is None
@@ -216,8 +220,8 @@ def test_a_broadcast_reaches_all_and_the_line_goes_on() -> None:
 
 def test_hcp_and_hcp2_controllers_share_a_line() -> None:
     """HCP2 telegrams end in EOT and HCP telegrams in BEL now and then: the other protocol's reset byte."""
-    old = [MintController(address, HCP) for address in range(4)]
-    new = [MintController(address) for address in range(4, 8)]
+    old = [EmulatedMint(address, HCP) for address in range(4)]
+    new = [EmulatedMint(address) for address in range(4, 8)]
     master = Master(hcp2.PROFILE, *new)
     for controller in old:
         master.line.add(controller)
@@ -239,7 +243,7 @@ def test_hcp_and_hcp2_controllers_share_a_line() -> None:
 
 
 def test_msc_reads_right_through_two_naks_and_four_bad_packets() -> None:
-    controller = MscController(3)
+    controller = EmulatedMsc(3)
     controller.set_value(2008, 1234)
     controller.naks_ahead, controller.bad_packets_ahead = 2, 4
     master = Master(msc.PROFILE, controller)
@@ -250,7 +254,7 @@ def test_msc_reads_right_through_two_naks_and_four_bad_packets() -> None:
 
 
 def test_msc_writes_through_three_naks_and_is_refused_at_the_fourth() -> None:
-    controller = MscController(3)
+    controller = EmulatedMsc(3)
     master = Master(msc.PROFILE, controller)
     controller.naks_ahead = 3
     assert master.asks(msc.DataWrite(2008, 5)) is None
@@ -261,7 +265,7 @@ def test_msc_writes_through_three_naks_and_is_refused_at_the_fourth() -> None:
 
 
 def test_msc_never_takes_a_packet_whose_ack_was_lost_for_the_answer() -> None:
-    controller = MscController(3)
+    controller = EmulatedMsc(3)
     controller.set_value(2008, 1234)
     controller.missing_acks_ahead = 1
     master = Master(msc.PROFILE, controller)
@@ -274,7 +278,7 @@ def test_msc_never_takes_a_packet_whose_ack_was_lost_for_the_answer() -> None:
 
 def test_a_packet_that_was_never_acknowledged_does_not_come_again_into_other_exchanges() -> None:
     """The host's closing ACK is lost; one second later the controller sends its packet again (S16)."""
-    first, second = MscController(3), MscController(4)
+    first, second = EmulatedMsc(3), EmulatedMsc(4)
     second.set_value(2008, 44)
     master = Master(msc.PROFILE, first, second)
     master.world.run(2.0)
@@ -286,7 +290,7 @@ def test_a_packet_that_was_never_acknowledged_does_not_come_again_into_other_exc
 
 def test_twenty_parameters_in_one_run_cost_at_most_65_percent_of_twenty_reads() -> None:
     def line_bytes(*commands: Command[Any]) -> int:
-        master = Master(mentor.PROFILE, MentorDrive(14))
+        master = Master(mentor.PROFILE, EmulatedMentor(14))
         for command in commands:
             master.asks(command)
         passed = (entry.split(maxsplit=2) for entry in master.transcript)
@@ -298,7 +302,7 @@ def test_twenty_parameters_in_one_run_cost_at_most_65_percent_of_twenty_reads() 
 
 
 def test_a_dc104_write_is_awaited_until_its_eeprom_is_written() -> None:
-    master = Master(dc104.PROFILE, Dc104Drive(eeprom=Delay(0.4)))
+    master = Master(dc104.PROFILE, EmulatedDc104(eeprom=Delay(0.4)))
     assert master.asks(dc104.Write(1, 5)) is None
     assert master.asks(dc104.Read(1)) == 5
 

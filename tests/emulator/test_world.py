@@ -10,19 +10,19 @@ from busmaster.arbiter.events import Completed, Event, LineChange, LineChanged, 
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo, Line
 from busmaster.emulator.oracle import Oracle, oracle_value
 from busmaster.emulator.world import StuckWorldError, World
 from busmaster.errors import LineDown, NoReply
-from busmaster.protocols import hcp2
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
 from tests.emulator.lines import SETTINGS, TAU
 
 SETTLED = 0.2
 
 
-def world_of(*devices: MintController, seed: int = 1, **options: object) -> World:
+def world_of(*devices: EmulatedMint, seed: int = 1, **options: object) -> World:
     line = Line(SETTINGS, devices, chance=Random(seed), **options)  # type: ignore[arg-type]  # options of Line
     world = World(line)
     world.run(SETTLED)
@@ -30,7 +30,7 @@ def world_of(*devices: MintController, seed: int = 1, **options: object) -> Worl
 
 
 def test_a_read_takes_as_long_as_its_bytes_and_the_devices_delay() -> None:
-    mint = MintController(2, delay=Delay(0.002))
+    mint = EmulatedMint(2, delay=Delay(0.002))
     mint.comms[1] = 123.456
     world = world_of(mint)
     read = world.request(world.node(hcp2.PROFILE, 2), hcp2.Read(1))
@@ -56,7 +56,7 @@ def test_run_until_gives_up_at_its_limit() -> None:
 
 def test_an_action_happens_at_its_time_and_events_reach_their_listener() -> None:
     events: list[tuple[float, Event]] = []
-    line = Line(SETTINGS, [MintController(2)])
+    line = Line(SETTINGS, [EmulatedMint(2)])
     world = World(line, on_event=lambda event: events.append((world.now, event)))
     node = world.node(hcp2.PROFILE, 2)
     world.at(0.5, lambda: world.request(node, hcp2.Write(1, (5.0,))))
@@ -76,7 +76,7 @@ def test_a_listener_may_submit_the_next_request() -> None:
             if len(done) < 100:
                 world.request(node, hcp2.Read(len(done)))
 
-    world = World(Line(SETTINGS, [MintController(2)]), on_event=on_event)
+    world = World(Line(SETTINGS, [EmulatedMint(2)]), on_event=on_event)
     world.run(SETTLED)
     node = world.node(hcp2.PROFILE, 2)
     world.request(node, hcp2.Read(100))
@@ -92,7 +92,7 @@ def test_unplugging_fails_what_waits_and_plugging_in_lets_it_go_on() -> None:
         if isinstance(event, LineChanged):
             changes.append(event.change)
 
-    world = World(Line(SETTINGS, [MintController(2, delay=Delay(0.02))]), on_event=on_event)
+    world = World(Line(SETTINGS, [EmulatedMint(2, delay=Delay(0.02))]), on_event=on_event)
     node = world.node(hcp2.PROFILE, 2)
     world.run(SETTLED)
     first = world.request(node, hcp2.Read(1))
@@ -107,10 +107,10 @@ def test_unplugging_fails_what_waits_and_plugging_in_lets_it_go_on() -> None:
 
 
 def transcript(seed: int) -> list[str]:
-    mint = MintController(2, delay=Delay(0.001, 0.01), oracle=Oracle(2))
+    mint = EmulatedMint(2, delay=Delay(0.001, 0.01), oracle=Oracle(2))
     mint.faults = Faults.parse(["lost=0.1", "flip=0.1", "late=0.2", "trailing=0.1", "split=0.3", "babble=0.05"])
     lines: list[str] = []
-    world = World(Line(SETTINGS, [mint, MintController(3)], chance=Random(seed)), record=lines.append)
+    world = World(Line(SETTINGS, [mint, EmulatedMint(3)], chance=Random(seed)), record=lines.append)
     for address in (2, 3):
         poll = Poll(f"node {address}", 0.05)
         node = world.node(hcp2.PROFILE, address)
@@ -148,7 +148,7 @@ def test_faults_inside_the_assumption_give_no_wrong_value_and_progress_goes_on()
                     if read.value != oracle_value(read.node.address, element_of(read), 0):
                         wrong.append(f"{world.now}: {read.node.label}, {read.command} = {read.value}")
 
-    devices = [MintController(address, oracle=Oracle(address)) for address in range(1, 5)]
+    devices = [EmulatedMint(address, oracle=Oracle(address)) for address in range(1, 5)]
     faults = ["lost=.05", "late=.05", "late_by=.14", "flip=.05", "truncated=.05", "doubled=.05", "wrong=.05"]
     faults += ["leading=.05", "trailing=.05", "babble=.02", "split=.05", "nak=.05"]
     for device in devices:
@@ -170,7 +170,7 @@ def test_faults_inside_the_assumption_give_no_wrong_value_and_progress_goes_on()
 
 
 def test_an_echo_is_stripped() -> None:
-    world = World(Line(SETTINGS, [MintController(2)], echo=Echo()))
+    world = World(Line(SETTINGS, [EmulatedMint(2)], echo=Echo()))
     world.run(SETTLED)
     read = world.request(world.node(hcp2.PROFILE, 2), hcp2.Read(1))
     world.run(1.0)

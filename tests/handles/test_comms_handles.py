@@ -9,13 +9,14 @@ import pytest
 
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command
-from busmaster.handles.comms import CommsHandle
-from busmaster.handles.hcp import HcpController
-from busmaster.handles.hcp2 import Hcp2Controller
-from busmaster.handles.microflex import MicroFlexDrive
 from busmaster.node import Priority
-from busmaster.protocols import comms_array, hcp2, microflex
-from busmaster.protocols.comms import ReadElement, WriteElements
+from busmaster.protocols._comms.codec import ReadElement, WriteElements
+from busmaster.protocols._comms.handle import CommsHandle
+from busmaster.protocols.hcp.handle import HcpController
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2 import comms_array, microflex
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from tests.handles.fake_bus import FakeBus
 
 

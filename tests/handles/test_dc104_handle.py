@@ -8,9 +8,9 @@ import pytest
 
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command
-from busmaster.handles.dc104 import Dc104Drive
 from busmaster.node import Priority
-from busmaster.protocols.dc104 import Read, Write
+from busmaster.protocols.dc104.codec import Read, Write
+from busmaster.protocols.dc104.handle import Dc104Drive
 from tests.handles.fake_bus import FakeBus
 
 

@@ -26,13 +26,15 @@ from busmaster import (
     VerifyFailed,
 )
 from busmaster.emulator.device import Device
-from busmaster.emulator.devices import dc104, mentor, msc
-from busmaster.emulator.devices.hostcomms import HCP
-from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.line import Line
-from busmaster.handles.base import Handle
-from busmaster.protocols import msc as msc_commands
-from busmaster.protocols.msc import ProgramStatus
+from busmaster.handle import Handle
+from busmaster.protocols._comms.device import HCP
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.dc104 import device as dc104
+from busmaster.protocols.mentor import device as mentor
+from busmaster.protocols.msc import codec as msc_commands
+from busmaster.protocols.msc import device as msc
+from busmaster.protocols.msc.codec import ProgramStatus
 from busmaster.testing.virtual_time import run_in_virtual_time
 
 Story = Callable[[], Coroutine[Any, Any, None]]
@@ -69,7 +71,7 @@ async def line_of(handle: type[Handle], *devices: Device) -> AsyncIterator[Bus]:
 
 @in_virtual_time
 async def test_msc_reads_right_through_two_naks_and_four_bad_packets() -> None:
-    device = msc.MscController(3)
+    device = msc.EmulatedMsc(3)
     device.set_value(2008, 1234)
     device.naks_ahead, device.bad_packets_ahead = 2, 4
     async with line_of(MscController, device) as bus:
@@ -80,7 +82,7 @@ async def test_msc_reads_right_through_two_naks_and_four_bad_packets() -> None:
 @in_virtual_time
 async def test_msc_gives_up_after_six_bad_packets_and_leaves_the_line_free() -> None:
     """The host NAKs five times; the sixth packet is ACKed all the same, so that the controller falls silent."""
-    device, other = msc.MscController(3), msc.MscController(4)
+    device, other = msc.EmulatedMsc(3), msc.EmulatedMsc(4)
     device.bad_packets_ahead = 6
     other.set_value(2008, 44)
     async with line_of(MscController, device, other) as bus:
@@ -97,7 +99,7 @@ async def test_msc_gives_up_after_six_bad_packets_and_leaves_the_line_free() -> 
 
 @in_virtual_time
 async def test_a_cam_table_of_1000_values_is_written_and_verified_at_nearly_the_speed_of_the_line() -> None:
-    device = msc.MscController(3)
+    device = msc.EmulatedMsc(3)
     table = [number * 7919 % 2**32 - 2**31 for number in range(1000)]
     told: list[tuple[int, int]] = []
     async with line_of(MscController, device) as bus:
@@ -118,7 +120,7 @@ async def test_a_cam_table_of_1000_values_is_written_and_verified_at_nearly_the_
 @pytest.mark.parametrize("step", [1, 4])
 def test_the_address_step_is_found_and_a_wrong_one_fails_verification(step: int) -> None:
     async def story() -> None:
-        device = msc.MscController(3, address_step=step)
+        device = msc.EmulatedMsc(3, address_step=step)
         device.set_value(2000, *range(1, 40))
         async with line_of(MscController, device) as bus:
             press = MscController(bus, 3)
@@ -133,7 +135,7 @@ def test_the_address_step_is_found_and_a_wrong_one_fails_verification(step: int)
 
 @in_virtual_time
 async def test_msc_blocks_of_any_length_touch_nothing_else() -> None:
-    device = msc.MscController(3)
+    device = msc.EmulatedMsc(3)
     device.set_value(4000, *[-1] * 200)
     async with line_of(MscController, device) as bus:
         press = MscController(bus, 3, address_step=4)
@@ -151,7 +153,7 @@ async def test_msc_blocks_of_any_length_touch_nothing_else() -> None:
 
 @in_virtual_time
 async def test_msc_flags_and_status() -> None:
-    new, old = msc.MscController(3, read_only_flags=frozenset({7})), msc.MscController(4, model="MSC-850")
+    new, old = msc.EmulatedMsc(3, read_only_flags=frozenset({7})), msc.EmulatedMsc(4, model="MSC-850")
     async with line_of(MscController, new, old) as bus:
         press, winder = MscController(bus, 3, model="MSC-250"), MscController(bus, 4, model="MSC-850")
         for handle in (press, winder):
@@ -176,7 +178,7 @@ async def test_msc_flags_and_status() -> None:
 
 @in_virtual_time
 async def test_mentor_parameters_with_and_without_decimals_wide_and_fine() -> None:
-    device = mentor.MentorDrive(14)
+    device = mentor.EmulatedMentor(14)
     async with line_of(MentorDrive, device) as bus:
         drive = MentorDrive(bus, 14, decimals={"1.17": 1})
         await drive.write("1.17", -47.6, verify=True)
@@ -195,7 +197,7 @@ async def test_mentor_parameters_with_and_without_decimals_wide_and_fine() -> No
 
 @in_virtual_time
 async def test_mentor_drives_start_together_and_follow_their_reference() -> None:
-    devices = [mentor.MentorDrive(address) for address in (11, 14, 27)]
+    devices = [mentor.EmulatedMentor(address) for address in (11, 14, 27)]
     async with line_of(MentorDrive, *devices) as bus:
         drives = [MentorDrive(bus, address) for address in (11, 14, 27)]
         await drives[0].write_all("1.17", 250)
@@ -209,7 +211,7 @@ async def test_mentor_drives_start_together_and_follow_their_reference() -> None
 
 @in_virtual_time
 async def test_neighbouring_parameters_are_polled_as_runs_where_that_is_allowed() -> None:
-    device = mentor.MentorDrive(14)
+    device = mentor.EmulatedMentor(14)
     for number in range(17, 25):
         device.set_value(100 + number, number, 0.0)
     async with line_of(MentorDrive, device) as bus:
@@ -226,7 +228,7 @@ async def test_neighbouring_parameters_are_polled_as_runs_where_that_is_allowed(
 
 @in_virtual_time
 async def test_dc104_parameters() -> None:
-    device = dc104.Dc104Drive(last_parameter=100)
+    device = dc104.EmulatedDc104(last_parameter=100)
     async with line_of(Dc104Drive, device) as bus:
         drive = Dc104Drive(bus)
         await drive.write(12, 1500, verify=True)
@@ -242,7 +244,7 @@ async def test_dc104_parameters() -> None:
 
 @in_virtual_time
 async def test_controllers_of_both_host_comms_protocols_share_a_line() -> None:
-    devices = [MintController(1, HCP), MintController(2, HCP), MintController(4), MintController(200)]
+    devices = [EmulatedMint(1, HCP), EmulatedMint(2, HCP), EmulatedMint(4), EmulatedMint(200)]
     async with line_of(Hcp2Controller, *devices) as bus:
         handles = [HcpController(bus, 1), HcpController(bus, 2), Hcp2Controller(bus, 4), Hcp2Controller(bus, 200)]
         for number, handle in enumerate(handles):

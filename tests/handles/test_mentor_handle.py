@@ -8,8 +8,8 @@ import pytest
 
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command
-from busmaster.handles.mentor import MentorDrive, from_line, to_line
-from busmaster.protocols.mentor import CHAINED, PROFILE, Read, ReadRun, Write
+from busmaster.protocols.mentor.codec import CHAINED, PROFILE, Read, ReadRun, Write
+from busmaster.protocols.mentor.handle import MentorDrive, from_line, to_line
 from tests.handles.fake_bus import FakeBus
 
 

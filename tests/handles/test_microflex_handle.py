@@ -12,11 +12,11 @@ import pytest
 
 from busmaster.errors import BusClosed, BusError, InvalidCommand, NoReply, Superseded, VerifyFailed, WriteUnconfirmed
 from busmaster.exchange import Command
-from busmaster.handles import microflex as module
-from busmaster.handles.microflex import MicroFlexDrive
 from busmaster.node import Priority
-from busmaster.protocols.hcp2 import Read, Write
-from busmaster.protocols.microflex import CommandWord, StatusWord
+from busmaster.protocols.hcp2 import microflex_handle as module
+from busmaster.protocols.hcp2.codec import Read, Write
+from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
+from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from tests.handles.fake_bus import FakeBus
 
 READY = StatusWord.HARDWARE_ENABLE

@@ -8,9 +8,8 @@ import pytest
 
 from busmaster.errors import InvalidCommand, Refused, VerifyFailed
 from busmaster.exchange import Command
-from busmaster.handles.msc import MscController
 from busmaster.node import Priority
-from busmaster.protocols.msc import (
+from busmaster.protocols.msc.codec import (
     BlockRead,
     BlockWrite,
     ClearFlag,
@@ -22,6 +21,7 @@ from busmaster.protocols.msc import (
     ReadStatus,
     SetFlag,
 )
+from busmaster.protocols.msc.handle import MscController
 from tests.handles.fake_bus import FakeBus
 
 FIRST = 2000
@@ -320,8 +320,8 @@ def test_points_are_equal_if_they_ask_the_same(press: MscController) -> None:
 
 
 def test_each_value_of_a_run_has_a_name(press: MscController, line: Controller) -> None:
-    assert press.run_items("cam:3") == ("2000", "2004", "2008")
-    assert MscController(line.bus, 4).run_items("2000:2") == ("2000[0]", "2000[1]")
+    assert press.run_items("cam:3", 3) == ("2000", "2004", "2008")
+    assert MscController(line.bus, 4).run_items("2000:2", 2) == ("2000[0]", "2000[1]")
 
 
 def test_poll_groups_merge_by_what_is_known(line: Controller) -> None:

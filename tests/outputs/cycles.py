@@ -9,12 +9,12 @@ from typing import Any
 from busmaster.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.errors import NoReply
-from busmaster.handles import Hcp2Controller
 from busmaster.node import Timeline
 from busmaster.outputs.base import Output
 from busmaster.points import Point
 from busmaster.polling import Quality, Sample, Snapshot
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.transport.memory import MemoryPort
 
 BUS = Bus(MemoryPort(Line(hcp2.PROFILE.line)))

@@ -12,14 +12,14 @@ import pytest
 
 from busmaster.arbiter.counters import DriverErrors
 from busmaster.bus import Bus
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
 from busmaster.errors import NoReply
-from busmaster.handles import Hcp2Controller
 from busmaster.outputs.base import OutputStatistics
 from busmaster.outputs.metrics import MetricsOutput
 from busmaster.outputs.settings import MetricsSettings
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.registry import make_device
 from busmaster.transport.memory import MemoryPort
 from tests.outputs.brokers import free_port
 from tests.outputs.cycles import BUS, until

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from busmaster.bus import Bus
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand, NoReply
-from busmaster.handles import Hcp2Controller
 from busmaster.outputs.base import Happening
 from busmaster.outputs.mqtt import MqttOutput, command_value
 from busmaster.outputs.settings import MqttSettings
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.registry import make_device
 from busmaster.transport.memory import MemoryPort
 from tests.outputs.brokers import Broker, free_port, needs_mosquitto, running
 from tests.outputs.cycles import BUS, cycle, until

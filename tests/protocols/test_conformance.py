@@ -1,15 +1,19 @@
-"""All five protocols through the conformance kit: what each document says, and what its checks cannot see."""
+"""Five protocols through the conformance kit: what each document says, and what its checks cannot see."""
 
 from __future__ import annotations
 
 from collections.abc import Hashable
 from typing import Any
 
-from busmaster.emulator.devices.hostcomms import HCP, HCP2
-from busmaster.emulator.devices.mint import MintController
 from busmaster.errors import NoSuchParameter, Refused
 from busmaster.exchange import Command
-from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from busmaster.protocols._comms.device import HCP, HCP2
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
 from busmaster.testing import Case, Foreign, RoundTrip, Unseen, answers_of, check_protocol
 from tests.protocols.slaves import MscSlave, dc104_slave, mentor_slave
 
@@ -42,7 +46,7 @@ def test_hcp_keeps_the_contract() -> None:
             RoundTrip(3, lambda value: hcp.Write(1, (value,)), hcp.Read(1), DECIMALS),
             RoundTrip(3, lambda value: hcp.Write(98, (0, value)), hcp.Read(99), DECIMALS),
         ],
-        device=answers_of(MintController(3, HCP)),
+        device=answers_of(EmulatedMint(3, HCP)),
     )
 
 
@@ -65,7 +69,7 @@ def test_hcp2_keeps_the_contract() -> None:
         ],
         invalid=[lambda: hcp2.Read(0), lambda: hcp2.Read(256), lambda: hcp2.Write(1, (float("nan"),))],
         round_trips=[RoundTrip(200, lambda value: hcp2.Write(99, (value,)), hcp2.Read(99), DECIMALS)],
-        device=answers_of(MintController(200, HCP2)),
+        device=answers_of(EmulatedMint(200, HCP2)),
     )
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.exchange import MORE, Done, FrameError
-from busmaster.protocols.dc104 import PROFILE, Read, Write
+from busmaster.protocols.dc104.codec import PROFILE, Read, Write
 from tests.protocols.asking import vectors
 
 FRAMES = vectors("DC104")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from busmaster.protocols import comms_array, microflex
-from busmaster.protocols.microflex import CommandWord, StatusWord
+from busmaster.protocols._comms.elements import Element, whole
+from busmaster.protocols.hcp2 import comms_array, microflex
+from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
 
 
 @pytest.mark.parametrize(
@@ -83,7 +84,7 @@ def test_a_microflex_has_27_names_of_which_three_are_writable() -> None:
 
 
 @pytest.mark.parametrize("elements", [comms_array.ELEMENTS, microflex.ELEMENTS])
-def test_names_come_in_the_order_of_their_numbers(elements: dict[str, comms_array.Element[object]]) -> None:
+def test_names_come_in_the_order_of_their_numbers(elements: dict[str, Element[object]]) -> None:
     numbers = [element.number for element in elements.values()]
     assert numbers == sorted(set(numbers))
 
@@ -101,4 +102,4 @@ def test_bitmaps_are_non_negative_whole_numbers() -> None:
 
 def test_counts_and_codes_are_rounded() -> None:
     assert comms_array.FIRMWARE.decode(5221.0) == 5221
-    assert comms_array.whole(-1.0001) == -1
+    assert whole(-1.0001) == -1

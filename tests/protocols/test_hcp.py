@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.exchange import Done, FrameError
-from busmaster.protocols import hcp2
-from busmaster.protocols.comms import is_read_back, telegrams
-from busmaster.protocols.hcp import PROFILE, Read, Write
+from busmaster.protocols._comms.codec import is_read_back, telegrams
+from busmaster.protocols.hcp.codec import PROFILE, Read, Write
+from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.wire.checks import xor
 from busmaster.wire.numbers import LONGEST_LIST, format_list
 from tests.protocols.asking import answer, debris, outcome, single_bytes, vectors

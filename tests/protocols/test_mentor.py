@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from busmaster.errors import InvalidCommand, NoSuchParameter, Refused
 from busmaster.exchange import MORE, Command, Done, Expect, FrameError
 from busmaster.profile import Batch
-from busmaster.protocols import hcp2
-from busmaster.protocols.mentor import CHAINED, PROFILE, Read, ReadRun, Write, merge_runs, parse_parameter
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor.codec import CHAINED, PROFILE, Read, ReadRun, Write, merge_runs, parse_parameter
 from busmaster.wire.checks import bcc
 from tests.protocols.asking import answer, debris, outcome, single_bytes, vectors
 

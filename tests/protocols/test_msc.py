@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Command, Done, Expect, FrameError
 from busmaster.profile import Batch
-from busmaster.protocols.msc import (
+from busmaster.protocols.msc.codec import (
     PROFILE,
     BlockRead,
     BlockWrite,
@@ -28,7 +28,7 @@ from busmaster.protocols.msc import (
     ReadStatus,
     SetFlag,
 )
-from busmaster.protocols.msc_exchange import packet
+from busmaster.protocols.msc.exchange import packet
 from tests.protocols.asking import vectors
 
 FRAMES = vectors("MSC")

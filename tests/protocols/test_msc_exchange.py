@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from busmaster.exchange import MORE, Done, Expect, FrameError, Refused
-from busmaster.protocols.msc import PROFILE, BlockRead, DataRead, DataWrite, ReadFlag, ReadStatus
-from busmaster.protocols.msc_exchange import PacketExchange, StalePacketListener, packet
+from busmaster.protocols.msc.codec import PROFILE, BlockRead, DataRead, DataWrite, ReadFlag, ReadStatus
+from busmaster.protocols.msc.exchange import PacketExchange, StalePacketListener, packet
 
 ACK, NAK = b"\x06", b"\x15"
 TIMINGS = PROFILE.timings

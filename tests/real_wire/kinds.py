@@ -7,14 +7,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.msc import MscController
 from busmaster.emulator.line import Line
 from busmaster.emulator.oracle import Oracle
 from busmaster.exchange import Command
 from busmaster.profile import Profile
-from busmaster.protocols import dc104, hcp, hcp2, mentor, msc
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
+from busmaster.protocols.msc.device import EmulatedMsc
+from busmaster.registry import make_device
 
 PROMPT = Delay(0.002, 0.003)
 """Seconds after which a device answers, always."""
@@ -71,7 +75,7 @@ def make_line(protocol: str, told: Told) -> Line:
     devices = []
     for address in kind.addresses:
         device = make_device(protocol, address, delay=PROMPT, oracle=Teller(address, kind.modulus, told))
-        if isinstance(device, MscController):
+        if isinstance(device, EmulatedMsc):
             device.packet_delay = PROMPT
         devices.append(device)
     return Line(kind.profile.line, devices, paced=False, chance=random.Random(1))

@@ -15,10 +15,10 @@ import pytest
 
 from busmaster import Bus, GarbledReply, Hcp2Controller, MscController, SerialPort
 from busmaster.arbiter.events import Mark
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import serve_pty
-from busmaster.protocols import msc
+from busmaster.protocols.msc import codec as msc
+from busmaster.registry import make_device
 from busmaster.transport.marks import Unescape
 from busmaster.transport.serial_port import PortTransport
 from busmaster.wire.checks import xor

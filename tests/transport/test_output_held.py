@@ -12,10 +12,10 @@ import pytest
 
 from busmaster import Bus, Hcp2Controller, LineDown, MemoryPort, NoReply, SerialPort, TcpPort, WriteUnconfirmed
 from busmaster.arbiter.events import LineChange, LineChanged
-from busmaster.emulator.build import make_device
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
-from busmaster.protocols import hcp2
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport import pump as pump_module
 from busmaster.transport.memory import MemoryTransport

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from busmaster.emulator.device import Delay
-from busmaster.emulator.devices.mint import MintController
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, TcpServer, serve_pty, serve_tcp
 from busmaster.profile import LineSettings
+from busmaster.protocols._comms.mint import EmulatedMint
 
 WRITE = bytes.fromhex("07 30 32 02 30 31 31 32 33 2E 34 35 36 03 2B")  # AN00129: node 2, Comms(1) = 123.456
 READ = bytes.fromhex("07 30 32 02 30 31 05 04")
@@ -23,7 +23,7 @@ REPLY = bytes.fromhex("02 30 31 31 32 33 2E 34 35 36 03 2B")
 
 
 def mint_line(paced: bool = False, delay: float = 0.0) -> Line:
-    return Line(LineSettings(57600), [MintController(2, delay=Delay(delay))], paced=paced)
+    return Line(LineSettings(57600), [EmulatedMint(2, delay=Delay(delay))], paced=paced)
 
 
 def ask(port: int, request: bytes, length: int, seconds: float = 2.0) -> bytes:
@@ -188,7 +188,7 @@ def test_the_thread_of_the_line_can_be_asked_to_change_it() -> None:
 
 
 def test_a_fault_in_a_device_ends_the_server_and_is_told_at_its_close() -> None:
-    class Broken(MintController):
+    class Broken(EmulatedMint):
         def read_element(self, element: int, now: float) -> float:
             raise ZeroDivisionError
 

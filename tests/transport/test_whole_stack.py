@@ -22,10 +22,10 @@ from busmaster import (
     SerialPort,
     TcpPort,
 )
-from busmaster.emulator.build import make_device
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, serve_pty, serve_tcp
 from busmaster.profile import LineSettings
+from busmaster.registry import make_device
 from busmaster.transport.endpoints import Endpoint
 
 PATIENCE = 5.0

@@ -1,1 +1,0 @@
-"""The emulated slaves, a module a protocol or a product."""

@@ -1,0 +1,1 @@
+"""What HCP and HCP2 share: numbered elements of a comms array, and the controllers that have one."""

@@ -1,0 +1,110 @@
+"""HCP and HCP2 as a listener hears them: what the two share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from busmaster.capture.frames import UNASKED, Direction, Frame, Kind
+from busmaster.capture.telegrams import (
+    ACK,
+    ANSWERS,
+    ENQ,
+    NAK,
+    STX,
+    came_back,
+    characters,
+    checked,
+    closed_size,
+    field_end,
+)
+from busmaster.exchange import Command
+from busmaster.protocols._comms.codec import ReadElement, WriteElements
+from busmaster.wire.checks import xor
+
+
+class CommsDialect:
+    """What HCP and HCP2 share: a reset byte, the node as two characters, the element as two characters."""
+
+    starts: bytes
+    reset: ClassVar[int]
+    checked_read: ClassVar[int]
+    """Checksum bytes of a read request."""
+    reads: ClassVar[type[ReadElement]]
+    writes: ClassVar[type[WriteElements]]
+
+    def __init__(self) -> None:
+        self.starts = bytes((self.reset, STX))
+        self._asked: Frame | None = None
+
+    def node(self, field: bytes) -> int | None:
+        raise NotImplementedError
+
+    def element(self, field: bytes) -> str:
+        """As a decimal number, or as it stands, quoted, if it is none."""
+        raise NotImplementedError
+
+    def request_fault(self, raw: bytes) -> str:
+        raise NotImplementedError
+
+    def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
+        if data[0] in (ACK, NAK):
+            size = 1
+        elif data[0] == STX:
+            end = field_end(data, 1)
+            size = -end if end < min(3, len(data)) else closed_size(data, 3)
+        elif data[0] == self.reset:
+            size = self._request_size(data)
+        else:
+            size = -1
+        return size or (-len(data) if quiet else 0)
+
+    def _request_size(self, data: bytes) -> int:
+        end = field_end(data, 1)
+        if end == len(data) < 4:
+            return 0
+        if end != 3 or data[3] != STX:
+            return -end
+        end = field_end(data, 4)
+        if end < min(6, len(data)):
+            return -end
+        if len(data) > 6 and data[6] == ENQ:
+            size = 7 + self.checked_read
+            return size if len(data) >= size else 0
+        return closed_size(data, 6)
+
+    def explain(self, raw: bytes, sender: Direction, /) -> Frame:
+        if raw[0] != self.reset:
+            return self._reply(raw)
+        return came_back(raw) if sender is Direction.NODE else self._request(raw)
+
+    def _request(self, raw: bytes) -> Frame:
+        kind = Kind.READ if raw[6] == ENQ else Kind.WRITE
+        value = "" if kind is Kind.READ else characters(raw[6:-2])
+        node, item, fault = self.node(raw[1:3]), self.element(raw[4:6]), self.request_fault(raw)
+        if node is None:
+            fault = f"no node address: {characters(raw[1:3])!r}"
+        frame = Frame(kind, Direction.HOST, raw, node, kind.value, item, value, fault)
+        self._asked = frame
+        return frame
+
+    def _reply(self, raw: bytes) -> Frame:
+        asked, self._asked = self._asked, None
+        node = asked.node if asked else None
+        fault = "" if asked else UNASKED
+        if raw[0] != STX:
+            if asked and asked.kind is Kind.READ and raw[0] == ACK:
+                fault = "an ACK answers no read"
+            return Frame(ANSWERS[raw[0]], Direction.NODE, raw, node, fault=fault, answers=asked is not None)
+        item, value = self.element(raw[1:3]), characters(raw[3:-2])
+        if asked and asked.kind is Kind.WRITE:
+            fault = "a value answers no write"
+        elif asked and asked.item != item:
+            fault = f"wrong element: {asked.item} was asked"
+        fault = checked(raw, 1, xor) or fault
+        return Frame(Kind.VALUE, Direction.NODE, raw, node, "", item, value, fault, asked is not None)
+
+    def command(self, request: Frame, continued: Sequence[Frame], /) -> Command[Any]:
+        if request.kind is Kind.READ:
+            return self.reads(int(request.item))
+        return self.writes(int(request.item), tuple(float(value) for value in request.value.split(",")))

@@ -1,0 +1,131 @@
+"""What HCP and HCP2 share: numbered elements of the comms array, read one at a time and written one or many.
+
+The two differ in how they address a node, count elements and check a telegram: see `hcp` and `hcp2`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from ctypes import c_float
+from dataclasses import dataclass, field
+from typing import ClassVar, NoReturn
+
+from busmaster.arguments import whole_number
+from busmaster.errors import InvalidCommand, Refused
+from busmaster.exchange import ReplyTiming, Sizes, Timings
+from busmaster.profile import LineSettings
+from busmaster.wire.numbers import LONGEST_LIST, LONGEST_NUMBER, format_list, format_number, parse_number
+from busmaster.wire.readers import NAK, AcknowledgeReader, TelegramReader, telegram_sizes
+
+LINE = LineSettings(57600)
+CHECKED = (1, 2, 3, 4, 5, 6, 7, 99)
+"""Elements that every controller has, the cheap reads that tell one answer from another (R15)."""
+TIMINGS = Timings.uniform(ReplyTiming(nominal=0.05, window=0.1, lateness=0.15, byte_gap=0.02))
+"""Both documents: "normally within 50ms", but other work "could delay the reply by 100mS"."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadElement:
+    """Read one element. Raises InvalidCommand for one that the protocol cannot name."""
+
+    element: int
+
+    last: ClassVar[int]
+    writes: ClassVar[bool] = False
+    idempotent: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "element", whole_number(self.element, 1, self.last, "element"))
+
+    def __str__(self) -> str:
+        return f"read element {self.element}"
+
+    def open(self, address: int, timings: Timings) -> Reading:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, slots=True)
+class WriteElements:
+    """Write `values` to `element` and those after it, in one telegram.
+
+    Writing Comms 1 to 5 starts a Mint event, even of an equal value: `idempotent` is for the caller to say. Raises
+    InvalidCommand for no value, for elements that do not exist, and for values that cannot be sent or do not fit into
+    60 characters.
+    """
+
+    element: int
+    values: tuple[float, ...]
+    idempotent: bool = False
+    text: str = field(init=False, repr=False, compare=False)
+
+    last: ClassVar[int]
+    writes: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        values = tuple(self.values)
+        if not values:
+            raise InvalidCommand("there is no value to write")
+        element = whole_number(self.element, 1, self.last, "element")
+        whole_number(element + len(values) - 1, 1, self.last, "the last of the elements")
+        object.__setattr__(self, "element", element)
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "text", format_list(values))
+
+    def __str__(self) -> str:
+        many = len(self.values) - 1
+        which = f"elements {self.element}-{self.element + many}" if many else f"element {self.element}"
+        return f"write {which} = {self.text}"
+
+    def open(self, address: int, timings: Timings) -> Writing | WritingMany:
+        raise NotImplementedError
+
+
+class Reading(TelegramReader[float]):
+    """One attempt to read an element."""
+
+    __slots__ = ()
+
+    longest = LONGEST_NUMBER
+    sizes: ClassVar[Sizes] = telegram_sizes(echo=2, typical=7, longest=LONGEST_NUMBER)
+
+    def parse(self, field: bytes) -> float:
+        return parse_number(field)
+
+
+class Writing(AcknowledgeReader):
+    """One attempt to write one element."""
+
+    __slots__ = ()
+
+
+class WritingMany(AcknowledgeReader):
+    """One attempt to write several elements: a NAK is final, for values before the refused one may be stored."""
+
+    __slots__ = ()
+
+    def reject(self, heard: bytes) -> NoReturn:
+        if heard[0] == NAK[0]:
+            raise Refused(
+                "refused; the values before the one refused may be stored",
+                confirm=False,
+                hint="read the elements back; check that each exists, is writable and within its limits",
+            )
+        super().reject(heard)
+
+
+def telegrams(values: Sequence[float]) -> Iterator[tuple[int, tuple[float, ...]]]:
+    """Cut a list so that each part fits one telegram: (offset of its first value, its values)."""
+    start = used = 0
+    for index, value in enumerate(values):
+        size = len(format_number(value))
+        if index > start and used + 1 + size > LONGEST_LIST:
+            yield start, tuple(values[start:index])
+            start, used = index, 0
+        used += size + (index > start)
+    if len(values) > start:
+        yield start, tuple(values[start:])
+
+
+def is_read_back(written: float, read: float) -> bool:
+    """Whether `read` is what a controller that keeps single-precision numbers shows of `written`, at 4 decimals."""
+    return c_float(float(format_number(written))).value == c_float(round(read, 4)).value

@@ -1,0 +1,269 @@
+"""A Mint controller: 99 elements to read and write, and in HCP2 the extended comms array on top of its axes and I/O."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Generator, Sequence
+
+from busmaster.emulator.device import NEVER, Delay
+from busmaster.emulator.motion import Axis, Motion
+from busmaster.emulator.oracle import Oracle
+from busmaster.protocols._comms.device import HCP2, Framing, HostCommsDevice
+
+LAST_COMMS = 99
+FIRST_AXIS = 100
+AXIS_SIZE = 15
+AXES = 8
+FIRST_IO = FIRST_AXIS + AXES * AXIS_SIZE
+OUTPUTS = 222
+FIRST_ADC, LAST_ADC = 224, 231
+LAST_EVENT = 5
+COUNTS = 1000.0
+"""Encoder counts per unit of position."""
+FULL_SPEED = 100.0
+"""Units per second at a drive demand of 100 %."""
+LAG = 0.002
+"""Seconds by which the position stays behind: following error over speed."""
+GREATEST_SINGLE = struct.unpack(">f", b"\x7f\x7f\xff\xff")[0]
+
+Program = Callable[["EmulatedMint"], Generator[int, None, None]]
+"""What a controller runs, statement by statement: a generator that yields the number of the line it has executed."""
+Event = Callable[["EmulatedMint", int, float], None]
+"""`Event commsX`: called with the controller, the element (1 to 5) and the time."""
+
+
+class EmulatedMint(HostCommsDevice):
+    """Eight axes, I/O, and a comms array. By default it runs no program and has no events.
+
+    `axes` fewer than 8: the others' elements are reserved. Reserved elements read 0 and refuse writes;
+    `refuse_reserved` refuses reads too. `single_precision` keeps values as the real one does, with 24 bits.
+    `statement` is how many seconds a program's statement takes.
+    """
+
+    def __init__(
+        self,
+        address: int,
+        framing: Framing = HCP2,
+        *,
+        axes: int = AXES,
+        program: Program | None = None,
+        events: Sequence[Event] = (),
+        delay: Delay | None = None,
+        oracle: Oracle | None = None,
+        fixed_decimals: bool = False,
+        all_or_nothing: bool = False,
+        refuse_reserved: bool = False,
+        single_precision: bool = False,
+        statement: float = 0.001,
+        firmware: int = 5628,
+    ) -> None:
+        super().__init__(
+            address,
+            framing,
+            delay=delay,
+            oracle=oracle,
+            fixed_decimals=fixed_decimals,
+            all_or_nothing=all_or_nothing,
+        )
+        self.comms = [0.0] * (LAST_COMMS + 1)
+        """Comms(1) to Comms(99); [0] is not used."""
+        self.axes = [Axis() for _ in range(axes)]
+        self.inputs = 0
+        self.outputs = 0
+        self.adc = [0.0] * (LAST_ADC - FIRST_ADC + 1)
+        """Analog channels in %."""
+        self.events = list(events)
+        self.firmware = firmware
+        self.refuse_reserved = refuse_reserved
+        self.single_precision = single_precision
+        self.statement = statement
+        self.now = NEVER
+        """Of the statement that is being executed; NEVER before the first."""
+        self.line_number = 0
+        self.program = program
+        self._run: Generator[int, None, None] | None = None
+        self.start_program()
+
+    # The program
+
+    def start_program(self) -> None:
+        """From its first statement, with the comms array as it is. Its time begins when it is next asked."""
+        self.now = NEVER
+        self._run = None if self.program is None else self.program(self)
+
+    def run(self, now: float) -> None:
+        """Executes the statements that are due by `now`."""
+        if self.now == NEVER:
+            self.now = now
+        while self._run is not None and self.now + self.statement <= now:
+            self.now += self.statement
+            try:
+                self.line_number = next(self._run)
+            except StopIteration:
+                self._run = None
+
+    def restart(self, now: float) -> None:
+        super().restart(now)
+        self.comms = [0.0] * (LAST_COMMS + 1)
+        self.outputs = 0
+        self.axes = [Axis() for _ in self.axes]
+        self.start_program()
+
+    # The elements
+
+    def read_element(self, element: int, now: float) -> float | None:
+        if self._run is not None:
+            self.run(now)
+        if element <= LAST_COMMS:
+            return self.comms[element]
+        value = self._read_io(element) if element >= FIRST_IO else self._read_axis(element, now)
+        if value is None and not self.refuse_reserved:
+            return 0
+        return value
+
+    def write_element(self, element: int, value: float, now: float) -> bool:
+        if self._run is not None:
+            self.run(now)
+        if element > LAST_COMMS:
+            if element == OUTPUTS:
+                self.outputs = round(value)
+            return element == OUTPUTS
+        self.comms[element] = single(value) if self.single_precision else value
+        if element <= LAST_EVENT:
+            for event in self.events:
+                event(self, element, now)
+        return True
+
+    def writable(self, element: int) -> bool:
+        return element <= LAST_COMMS or element == OUTPUTS
+
+    def _read_axis(self, element: int, now: float) -> float | None:
+        number, offset = divmod(element - FIRST_AXIS, AXIS_SIZE)
+        if number >= len(self.axes):
+            return None
+        axis = self.axes[number]
+        match offset:
+            case 0:
+                return axis.position(now)
+            case 1:
+                return axis.velocity(now)
+            case 2:
+                axis.position(now)
+                return axis.motion
+            case 3:
+                return axis.error
+            case 4:
+                return axis.velocity(now) / FULL_SPEED * 100
+            case 5:
+                return round(axis.position(now) * COUNTS)
+            case 6:
+                return axis.idle(now)
+            case 7:
+                return axis.velocity(now) * LAG
+        return None
+
+    def _read_io(self, element: int) -> float | None:
+        if FIRST_ADC <= element <= LAST_ADC:
+            return self.adc[element - FIRST_ADC]
+        match element:
+            case 220:
+                return self.inputs
+            case 222:
+                return self.outputs
+            case 232 | 233:
+                return 0
+            case 234:
+                return next((number for number, axis in enumerate(self.axes) if axis.error), 0)
+            case 235:
+                return self._run is not None
+            case 237:
+                return self.line_number
+            case 239:
+                return self.firmware
+        return None
+
+
+def single(value: float) -> float:
+    """As a single-precision float keeps it; beyond its range, its greatest."""
+    value = max(-GREATEST_SINGLE, min(value, GREATEST_SINGLE))
+    kept: float = struct.unpack("f", struct.pack("f", value))[0]
+    return kept
+
+
+# The programs of the documents (AN00110 and AN00129, "Use of the Comms Array" and "Events")
+
+
+def winding(mint: EmulatedMint) -> Generator[int, None, None]:
+    """A drum traversed between Comms(1) and Comms(2) at the ratio Comms(3); Comms(4) is its position.
+
+    The drum whose rotation axis 0 follows turns at 1 unit a second.
+    """
+    comms, axis = mint.comms, mint.axes[0]
+    comms[3] = 0
+    yield 1
+    while True:
+        yield 2
+        if axis.position(mint.now) > comms[2]:
+            axis.follow(-comms[3], mint.now)
+        yield 3
+        if axis.position(mint.now) < comms[1]:
+            axis.follow(comms[3], mint.now)
+        yield 4
+        comms[4] = axis.position(mint.now)
+        yield 5
+
+
+def command_handshake(mint: EmulatedMint) -> Generator[int, None, None]:
+    """A command in Comms(1), its data in Comms(2) to Comms(4); Comms(1) becomes 0 when it is done.
+
+    The race is the document's: the last line clears Comms(1) whether or not a command was seen, so one that is
+    written between the read and the clear is lost although the host sees zero.
+    """
+    comms, axis = mint.comms, mint.axes[1]
+    comms[1] = 0
+    yield 2
+    while True:
+        yield 3
+        command = round(comms[1])
+        yield 4
+        if command:
+            yield 5
+            if command in (1, 2):
+                axis.speed = abs(comms[2])
+                yield 5 + command
+                axis.move(comms[3] + (axis.position(mint.now) if command == 2 else 0), mint.now)
+                yield 5 + command
+            elif command == 3:
+                axis.move(0.0, mint.now, Motion.HOME)
+                yield 8
+            while not axis.idle(mint.now):
+                yield 5 + min(command, 3)
+        yield 9
+        comms[1] = 0
+        yield 10
+
+
+def report_positions(mint: EmulatedMint) -> Generator[int, None, None]:
+    """Not in the documents: keeps Comms(11) to Comms(18) at the positions of the axes, for a host that speaks HCP."""
+    while True:
+        for number, axis in enumerate(mint.axes):
+            mint.comms[11 + number] = axis.position(mint.now)
+        yield 1
+
+
+def jog_on_comms1(mint: EmulatedMint, element: int, now: float) -> None:
+    """`Event comms1`: JOG(0) = COMMS(1), on every write to Comms(1), of an equal value too."""
+    if element == 1:
+        mint.axes[0].jog(mint.comms[1], now)
+
+
+def make_mint(framing: Framing, address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedMint:
+    """Make a controller; if it is lively, its axes swing, and its program reports their positions in its elements."""
+    controller = EmulatedMint(address, framing, delay=delay, oracle=oracle)
+    if lively:
+        controller.program = report_positions
+        controller.statement = 0.05
+        controller.start_program()
+        for number, axis in enumerate(controller.axes):
+            axis.swing(100.0, 8.0 + number, address / 7 + number / 3, 0.0)
+    return controller

@@ -1,0 +1,27 @@
+"""CT-ANSI of Unidrive and Commander: Mentor II's frames, numbers with a decimal point."""
+
+from __future__ import annotations
+
+from busmaster.protocols.ct_ansi.capture import CtAnsiDialect
+from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
+from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
+from busmaster.protocols.mentor import CHAIN
+from busmaster.registry import NodeKind, Protocol, device_of
+
+PROTOCOL = Protocol(
+    profile=PROFILE,
+    kinds=(
+        NodeKind(
+            "ct-ansi",
+            CtAnsiDrive,
+            device_of("busmaster.protocols.ct_ansi.device"),
+            items="1.21 (menu and parameter), 1.21:8 (8 parameters from there on)",
+            read_options=(CHAIN,),
+            takes_decimals=True,
+            capture_id=8,
+        ),
+    ),
+    commands={"read": Read, "read_run": ReadRun, "write": Write},
+    dialect=CtAnsiDialect,
+    shares_line_with=frozenset({"mentor"}),
+)

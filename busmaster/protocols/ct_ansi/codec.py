@@ -1,0 +1,127 @@
+"""CT-ANSI as Control Techniques' later drives speak it (Unidrive, Commander; option modules UD70 and UD78).
+
+The frames are Mentor II's; the data have a decimal point, and up to twelve characters. No drive has an address whose
+second digit is 0: that means a group, and 00 all drives.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from decimal import Decimal
+from typing import ClassVar
+
+from busmaster.arguments import whole_number
+from busmaster.errors import InvalidCommand
+from busmaster.exchange import FrameError, ReplyTiming, Sizes, Timings
+from busmaster.profile import LineSettings, Profile
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.mentor.codec import Broadcast, ParameterReading, Writing, read_request, reset
+from busmaster.wire.checks import bcc
+from busmaster.wire.readers import ETX, STX, telegram_sizes
+
+LONGEST_DATA = 12
+_NUMBER = re.compile(rb" *([+-]?(?:\d+\.?\d*|\.\d+))", re.ASCII)
+_HEXADECIMAL = re.compile(rb" *X([0-9A-Fa-f]+)")
+
+
+class Reading(ParameterReading[float]):
+    """One attempt to read a parameter, or one leg of a run: a number with or without a decimal point."""
+
+    __slots__ = ()
+
+    longest = LONGEST_DATA
+    sizes: ClassVar[Sizes] = telegram_sizes(echo=4, typical=6, longest=LONGEST_DATA)
+
+    def parse(self, field: bytes) -> float:
+        if match := _NUMBER.fullmatch(field):
+            return float(match[1]) if b"." in match[1] else int(match[1])
+        if match := _HEXADECIMAL.fullmatch(field):
+            return int(match[1], 16)
+        raise FrameError(f"{field!r} is no number")
+
+
+class RunReading(mentor.RunReading):
+    """One attempt to read a run."""
+
+    __slots__ = ()
+
+    reading = Reading
+    sizes: ClassVar[Sizes] = Reading.sizes
+
+
+@dataclass(frozen=True, slots=True)
+class Read(mentor.Read):
+    """Read one parameter: an int, or a float where the drive sends a decimal point."""
+
+    def open(self, address: int, timings: Timings) -> Reading:  # type: ignore[override]  # its value may be a float
+        """Raises InvalidCommand for the broadcast address: every drive would answer at once."""
+        request, echo = read_request(address, self.menu, self.number)
+        return Reading(request, echo, timings.read)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadRun(mentor.ReadRun):
+    """Read `count` parameters from one on, in one exchange: a tuple. See Mentor II's for when that is safe."""
+
+    def open(self, address: int, timings: Timings) -> RunReading:
+        """Raises InvalidCommand for the broadcast address."""
+        return RunReading(self, address, timings.read)
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """Write one parameter: a number, shortest exact, with a decimal point if it needs one; a bit as 1 or 0.
+
+    Raises InvalidCommand for what does not fit into twelve characters.
+    """
+
+    menu: int
+    number: int
+    value: float
+    idempotent: bool = False
+    text: str = field(init=False, repr=False, compare=False)
+
+    writes: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        whole_number(self.menu, 0, 99, "menu")
+        whole_number(self.number, 0, 99, "parameter number")
+        object.__setattr__(self, "text", self._format())
+
+    def _format(self) -> str:
+        if isinstance(self.value, bool):
+            return str(int(self.value))
+        try:
+            finite = math.isfinite(self.value)
+        except (TypeError, OverflowError):
+            finite = False
+        if not finite:
+            raise InvalidCommand(f"{self.value!r} is no number that can be sent")
+        text = f"{Decimal(str(self.value)):+f}"
+        if "." in text:
+            text = text.rstrip("0").rstrip(".")
+        if len(text) > LONGEST_DATA:
+            raise InvalidCommand(f"{self.value!r} does not fit into {LONGEST_DATA} characters")
+        return "+0" if float(text) == 0 else text
+
+    def __str__(self) -> str:
+        return f"write {self.menu:02d}.{self.number:02d} = {self.text}"
+
+    def open(self, address: int, timings: Timings, /) -> Writing | Broadcast:
+        body = b"%02d%02d%b" % (self.menu, self.number, self.text.encode()) + ETX
+        request = reset(address) + STX + body + bytes((bcc(body),))
+        return Writing(request, timings.write) if address else Broadcast(request, timings.write)
+
+
+PROFILE = Profile(
+    name="ct-ansi",
+    title="CT-ANSI",
+    addresses=tuple(address for address in range(11, 100) if address % 10),
+    broadcast=0,
+    line=LineSettings(9600, bytesize=7, parity="E"),
+    timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.15, lateness=0.3, byte_gap=0.05)),
+    probe=Read(1, 17),
+    checks=tuple(Read(1, number) for number in range(17, 22)),
+)

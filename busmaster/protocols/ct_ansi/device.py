@@ -1,0 +1,68 @@
+"""An emulated drive with CT-ANSI (Unidrive, Commander): Mentor II's frames, values with a decimal point."""
+
+from __future__ import annotations
+
+import re
+from decimal import Decimal
+
+from busmaster.emulator.device import Delay
+from busmaster.emulator.oracle import Oracle
+from busmaster.errors import InvalidCommand
+from busmaster.protocols.mentor.device import FINE, SPEED_FEEDBACK, SPEED_REFERENCE, EmulatedMentor, Parameter
+from busmaster.wire.checks import bcc
+
+VALUE = re.compile(rb" *[+-]?(\d+\.?\d*|\.\d+)", re.ASCII)
+LONGEST_VALUE = 12
+
+
+class EmulatedCtAnsi(EmulatedMentor):
+    """Addresses 11 to 99 without the tens. Menus are Mentor II's; references and feedback have one decimal, in %.
+
+    `plus`: a value that is not negative is sent with a sign. `width`: how many characters zeros fill a value up to.
+    """
+
+    def __init__(
+        self,
+        address: int,
+        *,
+        plus: bool = False,
+        width: int = 0,
+        ripple: float = 0.0,
+        delay: Delay | None = None,
+        oracle: Oracle | None = None,
+    ) -> None:
+        if address % 10 == 0 or address < 11:
+            raise InvalidCommand(f"a drive has an address from 11 to 99 without the tens, not {address}")
+        super().__init__(address, ripple=ripple, delay=delay, oracle=oracle)
+        self.plus = plus
+        self.width = width
+
+    def has_decimal(self, parameter: int) -> bool:
+        """Whether the parameter has a decimal: 117 is 01.17."""
+        return self.parameters[parameter].fine or parameter == SPEED_FEEDBACK
+
+    def _telegram(self, parameter: int, now: float) -> bytes:
+        number = self.value(parameter, now)
+        sign = "-" if number < 0 else "+" if self.plus else ""
+        digits = str(abs(number))
+        if self.has_decimal(parameter) and self.oracle is None:
+            digits = f"{abs(number) // FINE}.{abs(number) % FINE}"
+        summed = b"%04d" % parameter + (sign + digits.zfill(self.width - len(sign))).encode() + b"\x03"
+        return b"\x02" + summed + bytes((bcc(summed),))
+
+    def _fine_of(self, parameter: Parameter, data: bytes) -> int | None:
+        """A parameter with a decimal counts in tenths of a percent, and takes no finer value."""
+        if not VALUE.fullmatch(data) or len(data) > LONGEST_VALUE:
+            return None
+        value = Decimal(data.decode().strip())
+        steps = value * FINE if self.oracle is None and parameter.fine else value
+        return int(steps) * FINE if steps == int(steps) else None
+
+
+def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedCtAnsi:
+    """Make a drive; if it is lively, it runs."""
+    drive = EmulatedCtAnsi(address, delay=delay, oracle=oracle)
+    if lively:
+        drive.ripple = 0.01
+        drive.set_value(SPEED_REFERENCE, 313 + 50 * (address % 8), 0.0)
+    return drive

@@ -1,0 +1,132 @@
+"""The handle of a drive that speaks CT-ANSI with decimal points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from decimal import ROUND_HALF_UP, Decimal
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from busmaster.errors import InvalidCommand, VerifyFailed
+from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.points import Point
+from busmaster.profile import Profile
+from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
+from busmaster.protocols.mentor.codec import parse_parameter
+
+if TYPE_CHECKING:
+    from busmaster.bus import Bus
+    from busmaster.exchange import Timings
+    from busmaster.node import Priority
+
+FORM = "a parameter such as 1.21, or 1.21:8 for a run of 8"
+
+
+class CtAnsiDrive(Handle):
+    """A drive with CT-ANSI: addresses 11-99 without the tens, and 0 to write to all drives at once.
+
+        drive = CtAnsiDrive(bus, 12, decimals={"1.21": 1})
+        await drive.write("1.21", -47.6)
+        speed = await drive.read("1.21")
+
+    The drive sends decimal points itself. `decimals` says to how many digits a parameter's values are rounded before
+    they are written, half away from zero; without an entry a value is sent as it is.
+    """
+
+    profile: ClassVar[Profile] = PROFILE
+
+    def __init__(
+        self,
+        bus: Bus,
+        address: int,
+        *,
+        decimals: Mapping[str, int] | None = None,
+        timings: Timings | None = None,
+        retries: int | None = None,
+    ) -> None:
+        super().__init__(bus, address, timings=timings, retries=retries)
+        self._decimals = {parse_parameter(text): digits for text, digits in (decimals or {}).items()}
+
+    def point(self, item: str) -> Point[Any]:
+        """A parameter ("1.21"), or a run, always read in one exchange ("1.21:8")."""
+        text, colon, count = item_text(item).partition(":")
+        try:
+            menu, number = parse_parameter(text)
+        except InvalidCommand:
+            raise unknown_item(item, (), FORM) from None
+        if not colon:
+            return Point(self.node, item, Read(menu, number), encode=lambda value: self._write(menu, number, value))
+        if not is_decimal(count):
+            raise unknown_item(item, (), FORM)
+        return Point(self.node, item, ReadRun(menu, number, int(count)))
+
+    async def read(
+        self,
+        parameter: str,
+        *,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+    ) -> float:
+        """A parameter's value. Raises NoSuchParameter, or InvalidCommand at address 0."""
+        command = Read(*parse_parameter(parameter))
+        return await self.node.request(command, priority=priority, start_within=start_within, retries=retries)
+
+    async def read_run(
+        self, parameter: str, count: int, *, chain: bool = False, priority: Priority | None = None
+    ) -> tuple[float, ...]:
+        """`count` parameters of one menu, from `parameter` on; with `chain` in one exchange, where that is safe.
+
+        It is where no other drive can take or send a lone ACK for its own. Raises NoSuchParameter where the menu has a
+        gap.
+        """
+        run = ReadRun(*parse_parameter(parameter), count)
+        if chain:
+            return await self.node.request(run, priority=priority)
+        singles = [Read(run.menu, run.number + i) for i in range(count)]
+        return tuple([await self.node.request(single, priority=priority) for single in singles])
+
+    async def write(
+        self,
+        parameter: str,
+        value: float,
+        *,
+        verify: bool = False,
+        idempotent: bool = False,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+    ) -> None:
+        """Write a parameter, acknowledged; at address 0 to all drives, which do not answer.
+
+        `verify` reads back, and raises VerifyFailed if the value differs. Raises InvalidCommand, before anything is
+        sent, for a value that does not fit.
+        """
+        menu, number = parse_parameter(parameter)
+        command = self._write(menu, number, value, idempotent)
+        await self.node.request(command, priority=priority, start_within=start_within)
+        if verify:
+            check = Read(menu, number)
+            found = await self.node.request(check, priority=priority)
+            if found != float(command.text):
+                raise VerifyFailed(
+                    f"{parameter} reads {found} after {command.text} was written",
+                    node=self.node.label,
+                    command=str(check),
+                )
+
+    async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
+        """As `point(item).read()`; a run without `chain` parameter by parameter, which is always safe."""
+        parameter, _, count = item_text(item).partition(":")
+        if is_decimal(count) and not chain:
+            return await self.read_run(parameter, int(count))
+        return await self.point(item).read()
+
+    def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
+        encoder(self.point(item))(value)
+        return lambda: self.write(item, value, verify=verify)
+
+    def _write(self, menu: int, number: int, value: float, idempotent: bool = False) -> Write:
+        digits = self._decimals.get((menu, number))
+        if digits is not None and math.isfinite(value) and not isinstance(value, bool):
+            value = float(Decimal(str(value)).quantize(Decimal(1).scaleb(-digits), ROUND_HALF_UP))
+        return Write(menu, number, value, idempotent)

@@ -1,0 +1,25 @@
+"""DC104-SER drives, one to a line."""
+
+from __future__ import annotations
+
+from busmaster.protocols.dc104.capture import Dc104Dialect
+from busmaster.protocols.dc104.codec import PROFILE, Read, Write
+from busmaster.protocols.dc104.handle import Dc104Drive
+from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
+
+PROTOCOL = Protocol(
+    profile=PROFILE,
+    kinds=(
+        NodeKind(
+            "dc104",
+            Dc104Drive,
+            device_of("busmaster.protocols.dc104.device"),
+            items="a parameter, 1 to 255",
+            options=(Option("maximum", "whole"), Option("allow_zero", "flag")),
+            whole_numbers=everywhere,
+            capture_id=6,
+        ),
+    ),
+    commands={"read": Read, "write": Write},
+    dialect=Dc104Dialect,
+)

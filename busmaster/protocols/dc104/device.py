@@ -1,0 +1,136 @@
+"""A DC104-SER drive: 255 registers of 16 bits behind packets without an address. What they mean is not published.
+
+    read   STX AA parameter sum              ->  STX parameter high low sum
+    write  STX 55 parameter high low sum     ->  ACK once it is in the EEPROM, or NAK
+
+The sum is that of all bytes between STX and itself, modulo 256.
+"""
+
+from __future__ import annotations
+
+import math
+
+from busmaster.emulator.device import NAK, Chance, Delay, Device
+from busmaster.emulator.oracle import Oracle
+from busmaster.errors import InvalidCommand
+from busmaster.wire.checks import sum8
+
+STX, READ, WRITE = 0x02, 0xAA, 0x55
+ACK = b"\x06"
+SIZES = {READ: 4, WRITE: 6}
+LAST_PARAMETER = 255
+BYTE_GAP = 0.05
+"""Seconds after which what was begun is forgotten."""
+LIVE = 1
+"""The parameter that moves on a lively drive: a sine about the middle of its range."""
+SWING, TURN = 10_000, 10.0
+
+
+class EmulatedDc104(Device):
+    """The drive of a line. Parameters 1 to `last_parameter`; `allow_zero`: 0 too. `read_only` ones refuse writes.
+
+    `eeprom` is the time that storing takes. `silent`: a read of what is not there gets no answer, in place of NAK,
+    since the document names none. `lively`: parameter 1 moves. With an `oracle` every value is the oracle's.
+    """
+
+    def __init__(
+        self,
+        address: int = 0,
+        *,
+        last_parameter: int = LAST_PARAMETER,
+        allow_zero: bool = False,
+        read_only: frozenset[int] = frozenset(),
+        eeprom: Delay | None = None,
+        silent: bool = False,
+        lively: bool = False,
+        delay: Delay | None = None,
+        oracle: Oracle | None = None,
+    ) -> None:
+        super().__init__(address, delay=delay)
+        if not 1 <= last_parameter <= LAST_PARAMETER:
+            raise InvalidCommand(f"the last parameter is from 1 to {LAST_PARAMETER}, not {last_parameter}")
+        if oracle is not None and oracle.modulus > 2**16:
+            raise InvalidCommand(f"a DC104 carries 2**16 oracle values, not {oracle.modulus}")
+        self.registers = [0] * (LAST_PARAMETER + 1)
+        self.parameters = range(0 if allow_zero else 1, last_parameter + 1)
+        self.read_only = read_only
+        self.eeprom = Delay(0.01) if eeprom is None else eeprom
+        self.silent = silent
+        self.lively = lively
+        self.oracle = oracle
+        self.routes = (bytes((STX, READ)), bytes((STX, WRITE)))
+        self._frame = bytearray()
+        self._heard_at = 0.0
+
+    def restart(self, now: float) -> None:
+        """Its parameters are in the EEPROM."""
+        super().restart(now)
+        self._frame.clear()
+
+    # Hearing
+
+    def take(self, frame: bytes, now: float) -> bool:
+        if self._frame or len(frame) != SIZES[frame[1]]:
+            return False
+        self._handle(frame, now)
+        return True
+
+    def hear_byte(self, byte: int, now: float) -> None:
+        frame = self._frame
+        if frame and now - self.tau - self._heard_at > BYTE_GAP:
+            frame.clear()
+        self._heard_at = now
+        if len(frame) == 1 and byte not in SIZES:
+            frame.clear()
+        if frame or byte == STX:
+            frame.append(byte)
+        if len(frame) > 1 and len(frame) == SIZES[frame[1]]:
+            self._handle(bytes(frame), now)
+            frame.clear()
+        self.attentive = bool(frame)
+
+    # Answering
+
+    def _handle(self, frame: bytes, now: float) -> None:
+        parameter = frame[2]
+        right = sum8(frame[1:-1]) == frame[-1] and parameter in self.parameters
+        if frame[1] == READ:
+            if right:
+                self.reply(packet(parameter, self._read(parameter, now)), now)
+            elif not self.silent:
+                self.reply(NAK, now)
+        elif right and parameter not in self.read_only:
+            self._write(parameter, int.from_bytes(frame[3:5], "big"))
+            self.reply(ACK, now + self.eeprom.draw(self.chance))
+        else:
+            self.reply(NAK, now)
+
+    def _read(self, parameter: int, now: float) -> int:
+        if self.oracle is not None:
+            return self.oracle.read(parameter)
+        if self.lively and parameter == LIVE:
+            return 2**15 + round(SWING * math.sin(now / TURN * math.tau))
+        return self.registers[parameter]
+
+    def _write(self, parameter: int, value: int) -> None:
+        self.registers[parameter] = value
+        if self.oracle is not None:
+            self.oracle.write(parameter, value)
+
+    def disguise(self, reply: bytes, chance: Chance) -> bytes:
+        if reply[0] != STX:
+            return reply
+        other = chance.randrange(0, LAST_PARAMETER)
+        value = int.from_bytes(reply[2:4], "big") if self.oracle is None else self.oracle.elsewhere()
+        return packet(other + (other >= reply[1]), value)
+
+
+def packet(parameter: int, value: int) -> bytes:
+    """A reply to a read. It has no direction byte."""
+    summed = bytes((parameter, value >> 8, value & 0xFF))
+    return bytes((STX,)) + summed + bytes((sum8(summed),))
+
+
+def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedDc104:
+    """Make a drive; if it is lively, its parameter 1 moves."""
+    return EmulatedDc104(address, delay=delay, oracle=oracle, lively=lively)

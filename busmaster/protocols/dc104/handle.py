@@ -1,0 +1,105 @@
+"""The handle of a DC104-SER drive."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from busmaster.errors import VerifyFailed
+from busmaster.exchange import Command, Timings
+from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.points import Point
+from busmaster.profile import Profile
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.dc104.codec import Read, Write
+
+if TYPE_CHECKING:
+    from busmaster.bus import Bus
+    from busmaster.node import Priority
+
+
+class Dc104Drive(Handle):
+    """The one drive of its line: parameters 1 to `maximum`, each 0 to 65535. What they mean is not published.
+
+        drive = Dc104Drive(bus)
+        await drive.write(12, 1500)
+        value = await drive.read(12)
+
+    `allow_zero` lets parameter 0 be asked for, which the document's own routines never do.
+    """
+
+    profile: ClassVar[Profile] = dc104.PROFILE
+
+    def __init__(
+        self,
+        bus: Bus,
+        address: int = 0,
+        *,
+        maximum: int = dc104.HIGHEST_PARAMETER,
+        allow_zero: bool = False,
+        timings: Timings | None = None,
+        retries: int | None = None,
+    ) -> None:
+        super().__init__(bus, address, timings=timings, retries=retries)
+        self._maximum = maximum
+        self._minimum = 0 if allow_zero else 1
+        self._read(maximum)
+
+    def point(self, item: str) -> Point[int]:
+        """A parameter by its number, decimal."""
+        if not is_decimal(item_text(item)):
+            raise unknown_item(item, (), f"a parameter number, {self._minimum} to {self._maximum}")
+        return self.parameter(int(item))
+
+    def parameter(self, number: int) -> Point[int]:
+        """A parameter as a point. Raises InvalidCommand for one that the drive does not have."""
+
+        def encode(value: int) -> Command[None]:
+            return self._write(number, value)
+
+        return Point(self.node, str(number), self._read(number), encode=encode)
+
+    async def read(
+        self,
+        parameter: int,
+        *,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+    ) -> int:
+        """A parameter's value now. Raises Refused where the drive says NAK."""
+        command = self._read(parameter)
+        return await self.node.request(command, priority=priority, start_within=start_within, retries=retries)
+
+    async def write(
+        self,
+        parameter: int,
+        value: int,
+        *,
+        verify: bool = False,
+        idempotent: bool = False,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+    ) -> None:
+        """Write a parameter: acknowledged when the drive has completed it.
+
+        `verify` reads it back, and raises VerifyFailed if it differs. `idempotent` allows a retry after an unknown
+        outcome. Raises InvalidCommand, before anything is sent, for a value that is not 0 to 65535.
+        """
+        command = self._write(parameter, value)
+        await self.node.request(command, priority=priority, start_within=start_within, idempotent=idempotent or None)
+        if verify:
+            found = await self.read(parameter, priority=priority)
+            if found != command.value:
+                raise VerifyFailed(
+                    f"parameter {parameter} reads {found} after {command.value} was written", node=self.node.label
+                )
+
+    def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
+        encoder(self.point(item))(value)
+        return lambda: self.write(int(item), value, verify=verify)
+
+    def _read(self, parameter: int) -> Read:
+        return Read(parameter, self._maximum, self._minimum)
+
+    def _write(self, parameter: int, value: int) -> Write:
+        return Write(parameter, value, self._maximum, self._minimum)

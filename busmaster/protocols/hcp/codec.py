@@ -1,0 +1,74 @@
+"""HCP (AN00110): nodes 0-15 as one upper-case hexadecimal character sent twice, elements 1-99 as two decimal digits.
+
+    write   EOT n n STX d d data ETX check      answered by ACK or NAK
+    read    EOT n n STX d d ENQ                 answered by STX d d data ETX check, or NAK
+
+Every checksum is the exclusive-or of everything after STX; a read request has none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+from busmaster.exchange import Timings
+from busmaster.profile import Profile
+from busmaster.protocols._comms.codec import (
+    CHECKED,
+    LINE,
+    TIMINGS,
+    ReadElement,
+    Reading,
+    WriteElements,
+    Writing,
+    WritingMany,
+)
+from busmaster.wire.checks import xor
+from busmaster.wire.readers import ENQ, EOT, ETX, STX
+
+LAST_ELEMENT = 99
+
+
+@dataclass(frozen=True, slots=True)
+class Read(ReadElement):
+    """Read element 1-99: a float."""
+
+    last: ClassVar[int] = LAST_ELEMENT
+
+    def open(self, address: int, timings: Timings) -> Reading:
+        request, echo = _read_request(address, self.element)
+        return Reading(request, echo, timings.read)
+
+
+@dataclass(frozen=True, slots=True)
+class Write(WriteElements):
+    """Write elements 1-99."""
+
+    last: ClassVar[int] = LAST_ELEMENT
+
+    def open(self, address: int, timings: Timings) -> Writing | WritingMany:
+        body = b"%02d%b" % (self.element, self.text.encode()) + ETX
+        exchange = Writing if len(self.values) == 1 else WritingMany
+        return exchange(_reset(address) + STX + body + bytes((xor(body),)), timings.write)
+
+
+@lru_cache(maxsize=4096)
+def _read_request(address: int, element: int) -> tuple[bytes, bytes]:
+    echo = b"%02d" % element
+    return _reset(address) + STX + echo + ENQ, echo
+
+
+def _reset(address: int) -> bytes:
+    return EOT + b"%X" % address * 2
+
+
+PROFILE = Profile(
+    name="hcp",
+    title="Host Comms Protocol",
+    addresses=range(16),
+    line=LINE,
+    timings=TIMINGS,
+    probe=Read(1),
+    checks=tuple(Read(element) for element in CHECKED),
+)

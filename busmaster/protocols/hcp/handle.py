@@ -1,0 +1,23 @@
+"""The handle of a controller that speaks HCP."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from busmaster.profile import Profile
+from busmaster.protocols._comms.handle import CommsHandle
+from busmaster.protocols.hcp import codec as hcp
+
+
+class HcpController(CommsHandle):
+    """A Mint controller over HCP: nodes 0-15, comms elements 1-99.
+
+    winder = HcpController(bus, 2)
+    await winder.write(1, 100.0, 250.0)      # Comms(1) and Comms(2), in one telegram
+    position = await winder.read(4)
+    """
+
+    profile: ClassVar[Profile] = hcp.PROFILE
+    read_command = hcp.Read
+    write_command = hcp.Write
+    form = "an element number, 1 to 99"

@@ -1,0 +1,34 @@
+"""Host Comms Protocol 2 (AN00129): Mint controllers, and MicroFlex drives with a map of their own."""
+
+from __future__ import annotations
+
+from busmaster.protocols.hcp2.capture import Hcp2Dialect
+from busmaster.protocols.hcp2.codec import PROFILE, Read, Write
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
+from busmaster.registry import NodeKind, Protocol, device_of
+
+PROTOCOL = Protocol(
+    profile=PROFILE,
+    kinds=(
+        NodeKind(
+            "hcp2",
+            Hcp2Controller,
+            device_of("busmaster.protocols.hcp2.device"),
+            items="an element, 1 to 255, or its name: axis0.position (to axis7; position velocity mode axis_error "
+            "demand encoder idle following_error), inputs outputs adc0 (to adc7) error error_line error_axis running "
+            "line_number firmware",
+            capture_id=2,
+        ),
+        NodeKind(
+            "microflex",
+            MicroFlexDrive,
+            device_of("busmaster.protocols.hcp2.microflex_device"),
+            items=f"an element, or its name: {' '.join(MicroFlexDrive.elements)}",
+            capture_id=3,
+        ),
+    ),
+    commands={"read": Read, "write": Write},
+    dialect=Hcp2Dialect,
+    shares_line_with=frozenset({"hcp"}),
+)

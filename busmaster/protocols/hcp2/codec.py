@@ -1,0 +1,71 @@
+"""HCP2 (AN00129): nodes 0-255, elements 1-255, both as two upper-case hexadecimal characters.
+
+    write   BEL h h STX e e data ETX check      answered by ACK or NAK
+    read    BEL h h STX e e ENQ check           answered by STX e e data ETX check, or NAK
+
+The checksum of a request is the exclusive-or of everything after BEL, that of a reply of everything after STX.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+from busmaster.exchange import Timings
+from busmaster.profile import Profile
+from busmaster.protocols._comms.codec import (
+    CHECKED,
+    LINE,
+    TIMINGS,
+    ReadElement,
+    Reading,
+    WriteElements,
+    Writing,
+    WritingMany,
+)
+from busmaster.wire.checks import xor
+from busmaster.wire.readers import BEL, ENQ, ETX
+
+LAST_ELEMENT = 255
+
+
+@dataclass(frozen=True, slots=True)
+class Read(ReadElement):
+    """Read element 1-255: a float."""
+
+    last: ClassVar[int] = LAST_ELEMENT
+
+    def open(self, address: int, timings: Timings) -> Reading:
+        request, echo = _read_request(address, self.element)
+        return Reading(request, echo, timings.read)
+
+
+@dataclass(frozen=True, slots=True)
+class Write(WriteElements):
+    """Write elements 1-255. Which ones are writable is the node's to say: controllers differ."""
+
+    last: ClassVar[int] = LAST_ELEMENT
+
+    def open(self, address: int, timings: Timings) -> Writing | WritingMany:
+        body = b"%02X\x02%02X%b" % (address, self.element, self.text.encode()) + ETX
+        exchange = Writing if len(self.values) == 1 else WritingMany
+        return exchange(BEL + body + bytes((xor(body),)), timings.write)
+
+
+@lru_cache(maxsize=4096)
+def _read_request(address: int, element: int) -> tuple[bytes, bytes]:
+    echo = b"%02X" % element
+    body = b"%02X\x02%b" % (address, echo) + ENQ
+    return BEL + body + bytes((xor(body),)), echo
+
+
+PROFILE = Profile(
+    name="hcp2",
+    title="Host Comms Protocol 2",
+    addresses=range(256),
+    line=LINE,
+    timings=TIMINGS,
+    probe=Read(1),
+    checks=tuple(Read(element) for element in CHECKED),
+)

@@ -1,0 +1,10 @@
+"""An emulated Mint controller that speaks HCP2."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from busmaster.protocols._comms.device import HCP2
+from busmaster.protocols._comms.mint import make_mint
+
+make_device = partial(make_mint, HCP2)

@@ -1,0 +1,269 @@
+"""A MicroFlex drive (AN00129, "Use of HCP2 and Extended Comms Array on MicroFlex Drive"): HCP2 and its own map."""
+
+from __future__ import annotations
+
+import math
+
+from busmaster.emulator.device import Delay
+from busmaster.emulator.motion import Ramp
+from busmaster.emulator.oracle import Oracle
+from busmaster.protocols._comms.device import HCP2, HostCommsDevice
+
+COMMAND_WORD, TORQUE_REFERENCE, SPEED_REFERENCE = 108, 116, 118
+
+CANCEL = 1 << 6
+ENABLE = 1 << 7
+COMMAND_BITS = 0xFF
+
+STATUS_ERROR = 1 << 3
+STATUS_STOP_INPUT = 1 << 5
+STATUS_HARDWARE_ENABLE = 1 << 6
+STATUS_ENABLED = 1 << 7
+
+FULL_SPEED = 200_000.0
+"""Counts per second at 100 % of the application's maximum speed."""
+COUNTS_PER_TURN = 4096
+RATED_CURRENT = 3.0
+"""RMS amperes at 100 % torque."""
+BUS_VOLTAGE = 320.0
+AMBIENT = 25.0
+HEATING = 40.0
+"""Degrees above ambient, in the end, at 100 % torque."""
+THERMAL_TIME = 60.0
+FRICTION = 0.1
+"""Torque per speed, % per %."""
+ACCELERATING = 50.0
+"""Torque in % while the speed ramps."""
+LAG = 0.001
+"""Seconds by which the position stays behind its demand."""
+
+
+class EmulatedMicroFlex(HostCommsDevice):
+    """One axis, its command and status word, a speed that follows its reference, errors that latch.
+
+    `current_control` False: speed control. `host_reference`: the references come from the host. Otherwise writes to
+    the reference that does not apply are refused. `ripple` is by how much of itself, 0 to 1, the measured speed swings
+    with every turn. Unmapped elements read 0 and refuse writes; `refuse_unmapped` refuses reads too.
+    """
+
+    def __init__(
+        self,
+        address: int,
+        *,
+        current_control: bool = False,
+        host_reference: bool = True,
+        ripple: float = 0.0,
+        delay: Delay | None = None,
+        oracle: Oracle | None = None,
+        refuse_unmapped: bool = False,
+        firmware: int = 5221,
+        acceleration: float = 50.0,
+    ) -> None:
+        super().__init__(address, HCP2, delay=delay, oracle=oracle)
+        self.current_control = current_control
+        self.host_reference = host_reference
+        self.ripple = ripple
+        self.refuse_unmapped = refuse_unmapped
+        self.firmware = firmware
+        self.hardware_enable = True
+        self.stop_input = False
+        """An input set up as error or stop input is active."""
+        self.inputs = 0
+        self.analog_input = 0.0
+        self.axis_error = 0
+        """Latched asynchronous errors, a bitmap."""
+        self.drive_error = 0
+        self.causes = 0
+        """The axis errors that cannot be cancelled, since what caused them is still there."""
+        self.command_word = 0
+        self.speed_reference = 0.0
+        self.torque_reference = 0.0
+        self.enabled = False
+        self._motor = Ramp(acceleration)
+        self._temperature = AMBIENT
+        self._updated = -math.inf
+
+    # What happens to it
+
+    def trip(self, errors: int, now: float, drive_errors: int = 0) -> None:
+        """An error occurs. It latches and disables the drive, unless the cancel bit was left high."""
+        self._update(now)
+        self.drive_error |= drive_errors
+        if not self.command_word & CANCEL:
+            self.axis_error |= errors
+        self._apply(now)
+
+    def set_hardware_enable(self, active: bool, now: float) -> None:
+        """Without it the drive is disabled; when it comes back the drive stays so until it is commanded again."""
+        self._update(now)
+        self.hardware_enable = active
+        self._apply(now)
+
+    def restart(self, now: float) -> None:
+        super().restart(now)
+        self.command_word = 0
+        self.speed_reference = self.torque_reference = 0.0
+        self.axis_error = self.causes
+        self.drive_error = 0
+        self._motor = Ramp(self._motor.rate, now=now)
+        self._apply(now)
+
+    def command(self, word: int, now: float) -> None:
+        """What a write to the command word does."""
+        self._update(now)
+        self.command_word = word
+        if word & CANCEL:
+            self.axis_error &= self.causes
+            self.drive_error = 0
+        self.enabled = bool(word & ENABLE)
+        self._apply(now)
+
+    # The elements
+
+    def read_element(self, element: int, now: float) -> float | None:
+        self._update(now)
+        value = self._read_axis(element) if element < 220 else self._read_io(element)
+        return 0 if value is None and not self.refuse_unmapped else value
+
+    def write_element(self, element: int, value: float, now: float) -> bool:
+        if not self.writable(element):
+            return False
+        self._update(now)
+        if element == COMMAND_WORD:
+            word = round(value)
+            if not 0 <= word <= COMMAND_BITS:
+                return False
+            self.command(word, now)
+        elif element == SPEED_REFERENCE:
+            self.speed_reference = value
+        else:
+            self.torque_reference = value
+        self._apply(now)
+        return True
+
+    def writable(self, element: int) -> bool:
+        if element == COMMAND_WORD:
+            return True
+        applies = TORQUE_REFERENCE if self.current_control else SPEED_REFERENCE
+        return self.host_reference and element == applies
+
+    @property
+    def status_word(self) -> int:
+        return (
+            STATUS_ERROR * bool(self.axis_error or self.drive_error)
+            | STATUS_STOP_INPUT * self.stop_input
+            | STATUS_HARDWARE_ENABLE * self.hardware_enable
+            | STATUS_ENABLED * self.enabled
+        )
+
+    def _read_axis(self, element: int) -> float | None:
+        match element:
+            case 100 | 131:
+                return round(self._position)
+            case 103:
+                return self.axis_error
+            case 107:
+                return round(self._motor.speed / 100 * FULL_SPEED * LAG)
+            case 108:
+                return self.command_word
+            case 109:
+                return self.status_word
+            case 110:
+                return self.drive_error
+            case 111:
+                return round(self._position + self._motor.speed / 100 * FULL_SPEED * LAG)
+            case 116:
+                return self.torque_reference
+            case 117:
+                return self._torque
+            case 118:
+                return self.speed_reference
+            case 119:
+                return self._motor.target
+            case 120:
+                return self._speed
+            case 121:
+                return self._motor.target - self._speed
+            case 124 | 125:
+                return max(0.0, abs(self._torque) - 100)
+            case 126:
+                return BUS_VOLTAGE - 0.05 * abs(self._torque)
+            case 127:
+                return self._current
+            case 128:
+                return self._current * math.sqrt(2) * math.sin(self._angle)
+            case 129:
+                return self._current * math.sqrt(2) * math.sin(self._angle - math.tau / 3)
+            case 130:
+                return (0b001, 0b011, 0b010, 0b110, 0b100, 0b101)[int(self._angle / math.tau * 6) % 6]
+        return None
+
+    def _read_io(self, element: int) -> float | None:
+        match element:
+            case 220:
+                return self.inputs
+            case 222:
+                return int(bool(self.axis_error or self.drive_error))
+            case 224:
+                return self.analog_input
+            case 239:
+                return self.firmware
+            case 242:
+                return self._temperature
+        return None
+
+    # The motor
+
+    @property
+    def _position(self) -> float:
+        return self._motor.position / 100 * FULL_SPEED
+
+    @property
+    def _angle(self) -> float:
+        """Of the shaft, in radians."""
+        return self._position % COUNTS_PER_TURN / COUNTS_PER_TURN * math.tau
+
+    @property
+    def _speed(self) -> float:
+        return self._motor.speed * (1 + self.ripple * math.sin(self._angle))
+
+    @property
+    def _torque(self) -> float:
+        """Demand, in %."""
+        if not self.enabled:
+            return 0.0
+        if self.current_control:
+            return self.torque_reference
+        change = self._motor.target - self._motor.speed
+        accelerating = math.copysign(ACCELERATING, change) if change else 0.0
+        return self._speed * FRICTION * (1 + 10 * self.ripple * math.cos(self._angle)) + accelerating
+
+    @property
+    def _current(self) -> float:
+        return abs(self._torque) / 100 * RATED_CURRENT
+
+    def _update(self, now: float) -> None:
+        """Time has passed: the motor has turned, and the drive has warmed up or cooled down."""
+        if now > self._updated:
+            self._motor.advance(now)
+            final = AMBIENT + HEATING * abs(self._torque) / 100
+            self._temperature += (final - self._temperature) * -math.expm1((self._updated - now) / THERMAL_TIME)
+            self._updated = now
+
+    def _apply(self, now: float) -> None:
+        """Whether the drive runs, and at what speed it aims. After the cancel bit, motion waits until it is cleared."""
+        if self.axis_error or self.drive_error or not self.hardware_enable:
+            self.enabled = False
+        reference = self.torque_reference if self.current_control else self.speed_reference
+        runs = self.enabled and not self.command_word & CANCEL and not self.stop_input
+        self._motor.target = reference if runs else 0.0
+
+
+def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedMicroFlex:
+    """Make a drive; if it is lively, it runs."""
+    drive = EmulatedMicroFlex(address, delay=delay, oracle=oracle)
+    if lively:
+        drive.ripple = 0.01
+        drive.speed_reference = 20.0 + 5 * (address % 8)
+        drive.command(ENABLE, 0.0)
+    return drive

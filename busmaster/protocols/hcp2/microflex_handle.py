@@ -1,0 +1,213 @@
+"""The handle of a MicroFlex drive, over HCP2."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from typing import Any, ClassVar
+from weakref import WeakKeyDictionary
+
+import anyio
+
+from busmaster.arguments import seconds
+from busmaster.errors import BusClosed, BusError, VerifyFailed, WriteUnconfirmed
+from busmaster.node import Node, Priority
+from busmaster.profile import Profile
+from busmaster.protocols._comms.handle import CommsHandle, Named
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2 import microflex
+from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
+
+CLEAR_WITHIN = 2.0
+"""Seconds for which cancel_errors goes on trying to clear the cancel bit, even if its caller was cancelled."""
+LOOK_AGAIN = 0.02
+"""Seconds between two looks at the status word."""
+
+_NOTHING = CommandWord(0)
+_disables: WeakKeyDictionary[Node, int] = WeakKeyDictionary()
+"""How often each drive was told to disable, through whichever handle: what was decided before must not undo it."""
+
+
+class MicroFlexDrive(CommsHandle):
+    """A MicroFlex servo drive: nodes 0-255. Needs firmware build 5221 or newer (`check_firmware`).
+
+        drive = MicroFlexDrive(bus, 7)
+        await drive.enable()
+        await drive.set_speed_reference(25.0)       # % of the application's maximum speed
+        speed = await drive.speed_measured.read()
+
+    No loss of communication stops the drive: assume that it keeps its last reference when the master dies.
+    """
+
+    profile: ClassVar[Profile] = hcp2.PROFILE
+    read_command = hcp2.Read
+    write_command = hcp2.Write
+    elements = microflex.ELEMENTS
+    form = "an element number, 1 to 255, or a name such as speed_measured"
+
+    position = Named(microflex.POSITION)
+    axis_error = Named(microflex.AXIS_ERROR)
+    following_error = Named(microflex.FOLLOWING_ERROR)
+    command_word = Named(microflex.COMMAND_WORD)
+    status_word = Named(microflex.STATUS_WORD)
+    drive_error = Named(microflex.DRIVE_ERROR)
+    demand_position = Named(microflex.DEMAND_POSITION)
+    torque_reference = Named(microflex.TORQUE_REFERENCE)
+    torque_demand = Named(microflex.TORQUE_DEMAND)
+    speed_reference = Named(microflex.SPEED_REFERENCE)
+    speed_demand = Named(microflex.SPEED_DEMAND)
+    speed_measured = Named(microflex.SPEED_MEASURED)
+    speed_error = Named(microflex.SPEED_ERROR)
+    drive_overload = Named(microflex.DRIVE_OVERLOAD)
+    motor_overload = Named(microflex.MOTOR_OVERLOAD)
+    bus_voltage = Named(microflex.BUS_VOLTAGE)
+    current = Named(microflex.CURRENT)
+    current_u = Named(microflex.CURRENT_U)
+    current_v = Named(microflex.CURRENT_V)
+    hall_state = Named(microflex.HALL_STATE)
+    absolute_encoder = Named(microflex.ABSOLUTE_ENCODER)
+    phase_search_status = Named(microflex.PHASE_SEARCH_STATUS)
+    inputs = Named(microflex.INPUTS)
+    outputs = Named(microflex.OUTPUTS)
+    analog_input = Named(microflex.ANALOG_INPUT)
+    firmware = Named(microflex.FIRMWARE)
+    temperature = Named(microflex.TEMPERATURE)
+
+    async def status(self, *, priority: Priority | None = None) -> StatusWord:
+        return await self.status_word.read(priority=priority)
+
+    async def check_firmware(self) -> int:
+        """The drive's firmware build. Raises VerifyFailed if it is too old to have this map."""
+        build = await self.firmware.read()
+        if build < microflex.FIRST_FIRMWARE:
+            raise VerifyFailed(
+                f"firmware build {build} is older than {microflex.FIRST_FIRMWARE}, which brought the element map",
+                node=self.node.label,
+                hint="update the drive's firmware",
+            )
+        return build
+
+    async def enable(self, *, within: float = 0.5) -> StatusWord:
+        """Enable the drive, and return its status word once that says so.
+
+        Raises VerifyFailed, naming the cause that the status word gives, if it is not enabled `within` so many
+        seconds: an axis error, or the hardware enable input. Superseded if a `disable` overtook it.
+        """
+        within = seconds(within, f"{self.node.label}: within")
+        await self._command(CommandWord.ENABLE)
+        return await self._await_enabled(True, within, Priority.COMMAND)
+
+    async def disable(self, *, within: float = 0.5) -> StatusWord:
+        """Disable the drive before anything else on the line, and return its status word once that says so.
+
+        It is retried like a read. Writes to this drive that wait are dropped with Superseded, and a `cancel_errors`
+        under way will not enable it again. Raises VerifyFailed if it is still enabled after `within` seconds.
+        A cancelled caller's disable is not sent: shield it where it must go out.
+        """
+        within = seconds(within, f"{self.node.label}: within")
+        _disables[self.node] = _disables.get(self.node, 0) + 1
+        await self._command(_NOTHING, Priority.URGENT)
+        return await self._await_enabled(False, within, Priority.URGENT)
+
+    async def cancel_errors(self) -> StatusWord:
+        """Cancel asynchronous axis errors: set the cancel bit, keep the enable bit, and clear the cancel bit again.
+
+        The cancel bit is cleared whatever happens, also when the caller is cancelled; this may take up to 2 s. Raises
+        WriteUnconfirmed, or what the last attempt raised, if that could not be done: the drive must not be left so.
+        Returns the status word after it.
+        """
+        disables = _disables.get(self.node, 0)
+        word = await self.command_word.read()
+
+        def enable() -> CommandWord:
+            """Decided anew for each write: the drive may have been disabled meanwhile."""
+            return word & CommandWord.ENABLE if _disables.get(self.node, 0) == disables else _NOTHING
+
+        try:
+            await self._command(enable() | CommandWord.CANCEL)
+        except BaseException:
+            try:
+                await _to_the_end(self._clear_cancel(enable))
+            except BusError:
+                pass  # what went wrong first says more
+            raise
+        await _to_the_end(self._clear_cancel(enable))
+        return await self.status()
+
+    async def set_speed_reference(self, percent: float) -> None:
+        """In % of the application's maximum speed. Raises Refused unless in speed control with the host as source."""
+        await self.speed_reference.write(percent)
+
+    async def set_torque_reference(self, percent: float) -> None:
+        """In % of the rated current. Raises Refused unless in current control with the host as source."""
+        await self.torque_reference.write(percent)
+
+    async def _command(self, word: CommandWord, priority: Priority | None = None) -> None:
+        """Write the command word. It changes more than its own point: all samples of the drive are stale after it."""
+        command = hcp2.Write(microflex.COMMAND_WORD.number, (word,), idempotent=True)
+        await self.node.request(command, priority=priority)
+
+    async def _clear_cancel(self, enable: Callable[[], CommandWord]) -> None:
+        last: BusError | None = None
+        with anyio.move_on_after(CLEAR_WITHIN):
+            while True:
+                try:
+                    await self._command(enable())
+                except BusClosed:
+                    raise
+                except BusError as error:
+                    last = error
+                else:
+                    return
+                await anyio.sleep(LOOK_AGAIN)
+        raise last or WriteUnconfirmed(
+            "the cancel bit of the command word may still be set",
+            node=self.node.label,
+            hint="clear it: errors do not latch while it is set",
+        )
+
+    async def _await_enabled(self, wanted: bool, within: float, priority: Priority) -> StatusWord:
+        """Look at the status word until its bit 7 is as wanted."""
+        deadline = self.node.bus.now() + within
+        while True:
+            status = await self.status(priority=priority)
+            if (StatusWord.ENABLED in status) is wanted:
+                return status
+            if self.node.bus.now() >= deadline:
+                raise VerifyFailed(
+                    _why_not(status) if wanted else "still enabled",
+                    node=self.node.label,
+                    command=str(self.status_word.command),
+                )
+            await anyio.sleep(LOOK_AGAIN)
+
+
+async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
+    """Run `work` whole, even if the caller is cancelled meanwhile: it gets its CancelledError after that.
+
+    In a task of its own, since a scope's shield holds off anyio's cancellation, but not `Task.cancel()`.
+    """
+    task = asyncio.ensure_future(work)
+    cancelled: asyncio.CancelledError | None = None
+    with anyio.CancelScope(shield=True):
+        while not task.done():
+            try:
+                await asyncio.wait([task])
+            except asyncio.CancelledError as error:
+                cancelled = error
+    if cancelled is not None:
+        await asyncio.gather(task, return_exceptions=True)
+        raise cancelled
+    task.result()
+
+
+def _why_not(status: StatusWord) -> str:
+    """Why a drive that was told to enable has not, as far as its status word tells."""
+    reasons = []
+    if StatusWord.ASYNCHRONOUS_ERROR in status:
+        reasons.append("it has an error (see axis_error and drive_error)")
+    if StatusWord.STOP_INPUT in status:
+        reasons.append("its error or stop input is active")
+    if StatusWord.HARDWARE_ENABLE not in status:
+        reasons.append("its hardware enable input is not active")
+    return f"not enabled: {', '.join(reasons) or 'its status word gives no reason'}"

@@ -1,0 +1,30 @@
+"""Mentor II (ANSI x3.28-2.5-A4)."""
+
+from __future__ import annotations
+
+from busmaster.protocols.mentor.capture import MentorDialect
+from busmaster.protocols.mentor.codec import PROFILE, Read, ReadRun, Write
+from busmaster.protocols.mentor.handle import MentorDrive
+from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
+
+CHAIN = Option("chain", "flag", "read a run in one exchange, where no other drive can mistake it")
+
+PROTOCOL = Protocol(
+    profile=PROFILE,
+    kinds=(
+        NodeKind(
+            "mentor",
+            MentorDrive,
+            device_of("busmaster.protocols.mentor.device"),
+            items="1.17 (menu and parameter), 15.60:wide, 1.17:hires, 1.17:20 (20 parameters from there on)",
+            options=(Option("chained", "flag"),),
+            read_options=(CHAIN,),
+            whole_numbers=everywhere,
+            takes_decimals=True,
+            capture_id=5,
+        ),
+    ),
+    commands={"read": Read, "read_run": ReadRun, "write": Write},
+    dialect=MentorDialect,
+    shares_line_with=frozenset({"ct-ansi"}),
+)

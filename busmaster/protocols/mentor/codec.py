@@ -1,0 +1,322 @@
+"""Mentor II (ANSI x3.28-2.5-A4): addresses 1-99, each of their two digits sent twice; parameters as menu and number.
+
+    read    EOT a a a a m m p p ENQ                 answered by STX m m p p data ETX BCC; EOT: no such parameter
+    write   EOT a a a a STX m m p p data ETX BCC    answered by ACK or NAK; by nothing when it goes to address 0
+    then    ACK, BS or NAK alone                    the drive read last sends the next, previous or same parameter
+
+Values are whole numbers: where the decimal point belongs is for a table to say. The line has 7 bits and even parity;
+where 8 bits come through, the parity bit is dropped.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any, ClassVar, NoReturn, TypeVar
+
+from busmaster.arguments import whole_number
+from busmaster.errors import InvalidCommand, NoSuchParameter, Refused
+from busmaster.exchange import Command, Done, Expect, FrameError, Leg, Need, ReplyTiming, Sizes, Timings
+from busmaster.profile import Batch, LineSettings, Profile
+from busmaster.wire.checks import bcc
+from busmaster.wire.readers import (
+    ACK,
+    ENQ,
+    EOT,
+    ETX,
+    NAK,
+    STX,
+    AcknowledgeReader,
+    SingleLeg,
+    TelegramReader,
+    telegram_sizes,
+)
+
+LONGEST_DATA = 5
+"""Characters of a reply's data: sign and 4 digits, or 5 digits."""
+LONGEST_BATCH = 8
+"""Parameters that `merge_runs` reads in one exchange, so that a command never waits longer for it."""
+
+_BS = b"\x08"
+T = TypeVar("T")
+
+_SHORT_COMMANDS = {1: ACK, 0: NAK, -1: _BS}
+_SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))
+_REFUSALS = {NAK[0]: Refused, EOT[0]: NoSuchParameter}
+_PARAMETER = re.compile(r"(\d{1,2})\.(\d{1,2})", re.ASCII)
+_VALUE = re.compile(rb"[+-]?\d+")
+
+
+def with_parity(starts: bytes) -> bytes:
+    """The same characters and what they are where the parity bit comes through."""
+    return starts + bytes(byte | 0x80 for byte in starts)
+
+
+def parse_parameter(text: str) -> tuple[int, int]:
+    """Menu and number of "1.17" or "01.17". Raises InvalidCommand for anything else."""
+    try:
+        match = _PARAMETER.fullmatch(text)
+    except TypeError:  # a number, of which 1.10 would be 1.1
+        match = None
+    if match is None:
+        raise InvalidCommand(f"{text!r} is not a parameter: write menu and number as text, as in '1.17'")
+    return int(match[1]), int(match[2])
+
+
+def _check_parameter(menu: int, number: int) -> None:
+    whole_number(menu, 0, 99, "menu")
+    whole_number(number, 0, 99, "parameter number")
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """Read one parameter: an int. A bit parameter is 0 or 1. Raises InvalidCommand for a number above 99."""
+
+    menu: int
+    number: int
+
+    writes: ClassVar[bool] = False
+    idempotent: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        _check_parameter(self.menu, self.number)
+
+    def __str__(self) -> str:
+        return f"read {self.menu:02d}.{self.number:02d}"
+
+    def open(self, address: int, timings: Timings) -> Reading:
+        """Raises InvalidCommand for the broadcast address: every drive would answer at once."""
+        request, echo = read_request(address, self.menu, self.number)
+        return Reading(request, echo, timings.read)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadRun:
+    """Read `count` parameters from one on, in one exchange: a tuple of ints.
+
+    `step` 1 goes on to the next parameter, -1 to the previous, and 0 reads the same one again. Every parameter but the
+    first costs one request byte. It fails as a whole, with NoSuchParameter where the menu has a gap. Another drive's
+    ACK or NAK is the same byte: use it only where each drive forgets its last read when another is addressed.
+    Raises InvalidCommand for a run that leaves the menu.
+    """
+
+    menu: int
+    number: int
+    count: int
+    step: int = 1
+
+    writes: ClassVar[bool] = False
+    idempotent: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        _check_parameter(self.menu, self.number)
+        whole_number(self.count, 1, 100, "count")
+        whole_number(self.step, -1, 1, "step")
+        whole_number(self.number + self.step * (self.count - 1), 0, 99, "the last parameter number")
+
+    def __str__(self) -> str:
+        first = f"read {self.menu:02d}.{self.number:02d}"
+        last = self.number + self.step * (self.count - 1)
+        return f"{first} to {self.menu:02d}.{last:02d}" if self.step else f"{first}, {self.count} times"
+
+    def open(self, address: int, timings: Timings) -> RunReading:
+        """Raises InvalidCommand for the broadcast address."""
+        return RunReading(self, address, timings.read)
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """Write one parameter.
+
+    A number is sent as sign and 4 digits (-9999 to 9999); `wide` as 5 digits without a sign (0 to 65535), for
+    parameters that are wide integers; with `high_resolution` as sign and 5 digits (-99999 to 99999) in tenths of the
+    parameter's own unit; True and False as one digit. Raises InvalidCommand for what does not fit.
+    """
+
+    menu: int
+    number: int
+    value: int
+    wide: bool = False
+    high_resolution: bool = False
+    idempotent: bool = False
+    text: str = field(init=False, repr=False, compare=False)
+
+    writes: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        _check_parameter(self.menu, self.number)
+        object.__setattr__(self, "text", self._format())
+
+    def _format(self) -> str:
+        if self.wide and self.high_resolution:
+            raise InvalidCommand("a parameter is written either wide or in high resolution")
+        if isinstance(self.value, bool):
+            return str(int(self.value))
+        if self.wide:
+            return f"{whole_number(self.value, 0, 65535, 'a wide value'):05d}"
+        if self.high_resolution:
+            return f"{whole_number(self.value, -99999, 99999, 'a high-resolution value'):+06d}"
+        return f"{whole_number(self.value, -9999, 9999, 'a value that is not declared wide'):+05d}"
+
+    def __str__(self) -> str:
+        return f"write {self.menu:02d}.{self.number:02d} = {self.text}"
+
+    def open(self, address: int, timings: Timings) -> Writing | Broadcast:
+        body = b"%02d%02d%b" % (self.menu, self.number, self.text.encode()) + ETX
+        request = reset(address) + STX + body + bytes((bcc(body),))
+        return Writing(request, timings.write) if address else Broadcast(request, timings.write)
+
+
+class ParameterReading(TelegramReader[T]):
+    """One attempt to read a parameter, or one leg of a run, whatever its data look like."""
+
+    __slots__ = ()
+
+    check = staticmethod(bcc)
+    starts: ClassVar[bytes] = with_parity(STX + NAK + EOT)
+    refusals = _REFUSALS
+
+    def feed(self, data: bytes) -> Need | Expect | Done[T]:
+        return super().feed(data.translate(_SEVEN_BITS))
+
+
+class Reading(ParameterReading[int]):
+    """Mentor II's: a whole number."""
+
+    __slots__ = ()
+
+    longest = LONGEST_DATA
+    sizes: ClassVar[Sizes] = telegram_sizes(echo=4, typical=LONGEST_DATA, longest=LONGEST_DATA)
+
+    def parse(self, field: bytes) -> int:
+        if _VALUE.fullmatch(field) is None:
+            raise FrameError(f"{field!r} is not a whole number")
+        return int(field)
+
+
+class RunReading:
+    """One attempt to read a run: a leg for each parameter."""
+
+    __slots__ = ("_leg", "_next", "_short", "_values", "answers", "later", "request", "timing")
+
+    reading: ClassVar[type[ParameterReading[Any]]] = Reading
+    """What reads each leg."""
+    sizes: ClassVar[Sizes] = Reading.sizes
+    starts: ClassVar[bytes] = Reading.starts
+    closing: ClassVar[int] = 0
+    answered: ClassVar[bool] = True
+
+    def __init__(self, run: ReadRun, address: int, timing: ReplyTiming) -> None:
+        numbers = [run.number + run.step * i for i in range(run.count)]
+        self.request, echo = read_request(address, run.menu, run.number)
+        self.timing = timing
+        self.later: Sequence[Leg] = (Leg(timing, self.sizes, sent=1),) * (run.count - 1)
+        self._short = _SHORT_COMMANDS[run.step]
+        self._next = [b"%02d%02d" % (run.menu, number) for number in reversed(numbers[1:])]
+        self._leg = self.reading(self.request, echo, timing)
+        self.answers = tuple(STX + b"%02d%02d" % (run.menu, number) for number in numbers)
+        self._values: list[Any] = []
+
+    @property
+    def owed(self) -> tuple[bytes, ...]:
+        """The parameter asked for last: the next ones take a word from the host."""
+        return self._leg.answers
+
+    def feed(self, data: bytes) -> Need | Expect | Done[tuple[Any, ...]]:
+        step = self._leg.feed(data)
+        if not isinstance(step, Done):
+            return step
+        self._values.append(step.value)
+        if not self._next:
+            return Done(tuple(self._values), rest=step.rest)
+        if step.rest:
+            raise FrameError("bytes came before the next parameter was asked for")
+        self._leg = self.reading(self._short, self._next.pop(), self.timing)
+        return Expect(self.timing, self.sizes, self._short)
+
+    def expired(self, started: bool) -> NoReturn:
+        self._leg.expired(started)
+
+
+class Writing(AcknowledgeReader):
+    """One attempt to write a parameter."""
+
+    __slots__ = ()
+
+    starts: ClassVar[bytes] = with_parity(ACK + NAK + EOT)
+    refusals = _REFUSALS
+
+    def feed(self, data: bytes) -> Need | Expect | Done[None]:
+        return super().feed(data.translate(_SEVEN_BITS))
+
+
+class Broadcast(SingleLeg):
+    """One write to all drives: none answers, and the line is left to them for as long as an answer would take."""
+
+    __slots__ = ()
+
+    sizes: ClassVar[Sizes] = Sizes(0, 0)
+    starts: ClassVar[bytes] = b""
+    answered: ClassVar[bool] = False
+    answers: ClassVar[tuple[bytes, ...]] = ()
+    owed: ClassVar[tuple[bytes, ...]] = ()
+
+    def __init__(self, request: bytes, timing: ReplyTiming) -> None:
+        super().__init__(request, replace(timing, turnaround=max(timing.turnaround, timing.nominal)))
+
+    def feed(self, data: bytes) -> Need | Expect | Done[None]:
+        return Done(None, rest=data)
+
+    def expired(self, started: bool) -> Expect | Done[None]:
+        return Done(None)
+
+
+def merge_runs(commands: Sequence[Command[Any]]) -> list[Batch]:
+    """Batches of neighbouring parameters, each read as one run of at most 8; what has no neighbour is left alone.
+
+    Short commands rest on the drive that was read last being the one that hears them (see ReadRun), so the profile has
+    no merge by default: `CHAINED` has.
+    """
+    wanted: dict[tuple[int, int], int] = {}
+    for index, command in enumerate(commands):
+        if isinstance(command, Read):
+            wanted.setdefault((command.menu, command.number), index)
+    batches: list[Batch] = []
+    run: list[tuple[int, int]] = []
+    for parameter in [*sorted(wanted), None]:
+        if run and (parameter != (run[-1][0], run[-1][1] + 1) or len(run) == LONGEST_BATCH):
+            if len(run) > 1:
+                batches.append(Batch(ReadRun(*run[0], len(run)), tuple(wanted[p] for p in run)))
+            run = []
+        if parameter is not None:
+            run.append(parameter)
+    return batches
+
+
+@lru_cache(maxsize=4096)
+def read_request(address: int, menu: int, number: int) -> tuple[bytes, bytes]:
+    if not address:
+        raise InvalidCommand("a read cannot go to all drives: they would answer at once")
+    echo = b"%02d%02d" % (menu, number)
+    return reset(address) + echo + ENQ, echo
+
+
+def reset(address: int) -> bytes:
+    tens, units = divmod(address, 10)
+    return EOT + b"%d%d%d%d" % (tens, tens, units, units)
+
+
+PROFILE = Profile(
+    name="mentor",
+    title="Mentor II",
+    addresses=range(1, 100),
+    broadcast=0,
+    line=LineSettings(9600, bytesize=7, parity="E"),
+    timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.15, lateness=0.3, byte_gap=0.05)),
+    probe=Read(1, 17),
+    checks=tuple(Read(1, number) for number in range(17, 22)),
+)
+CHAINED = replace(PROFILE, merge=merge_runs)
+"""For lines on which short commands are safe: poll groups read neighbours as runs."""

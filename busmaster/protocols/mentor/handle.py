@@ -1,0 +1,238 @@
+"""The handle of a Mentor II drive."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from decimal import ROUND_HALF_UP, Decimal
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+from busmaster.arguments import whole_number
+from busmaster.errors import InvalidCommand, VerifyFailed
+from busmaster.exchange import Command, Timings
+from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.points import Point
+from busmaster.profile import Profile
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.mentor.codec import Read, ReadRun, Write, parse_parameter
+
+if TYPE_CHECKING:
+    from busmaster.bus import Bus
+    from busmaster.node import Node, Priority
+
+T = TypeVar("T")
+
+_BEYOND_ANY_FORM = 1e9
+MOST_DECIMALS = 9
+FORM = "a parameter such as 1.17, 15.60:wide, 1.17:hires, or 1.17:20 for a run of 20"
+
+
+class MentorDrive(Handle):
+    """A Mentor II drive: addresses 1-99, and 0 to write to all drives at once.
+
+        drive = MentorDrive(bus, 14, decimals={"1.17": 1})
+        await drive.write("1.17", -47.6)
+        speed = await drive.read("1.17")
+
+    The line carries whole numbers. `decimals` says of how many digits a parameter's last ones are decimals: its values
+    are then in its own unit, rounded to that; without an entry a value is the number on the line. `chained` lets poll
+    groups read neighbouring parameters of this drive as runs, whichever handle they are from: see `read_run` for when
+    that is safe. The first handle of a drive says so, or none.
+    """
+
+    profile: ClassVar[Profile] = mentor.PROFILE
+
+    def __init__(
+        self,
+        bus: Bus,
+        address: int,
+        *,
+        decimals: Mapping[str, int] | None = None,
+        chained: bool = False,
+        timings: Timings | None = None,
+        retries: int | None = None,
+    ) -> None:
+        self.node: Node = bus.node(
+            mentor.CHAINED if chained else mentor.PROFILE, address, timings=timings, retries=retries
+        )
+        self._decimals = {
+            parse_parameter(text): whole_number(digits, 0, MOST_DECIMALS, f"the decimals of {text}")
+            for text, digits in (decimals or {}).items()
+        }
+        if address and (address < 10 or address % 10 == 0):
+            warnings.warn(
+                f"mentor: address {address} means a group to later Control Techniques products: "
+                "if some share the line, use 11 to 99 without the tens",
+                stacklevel=2,
+            )
+
+    def point(self, item: str) -> Point[Any]:
+        """A parameter ("1.17"), one written as a wide integer ("15.60:wide") or in high resolution ("1.17:hires"), or
+        a run, always read in one exchange ("1.17:20")."""
+        text, colon, kind = item_text(item).partition(":")
+        try:
+            menu, number = parse_parameter(text)
+        except InvalidCommand:
+            raise unknown_item(item, (), FORM) from None
+        if is_decimal(kind):
+            return self._run_point(item, ReadRun(menu, number, int(kind)))
+        if kind not in ("wide", "hires") and colon:
+            raise unknown_item(item, (), FORM)
+        return self._parameter_point(item, Read(menu, number), wide=kind == "wide", high_resolution=kind == "hires")
+
+    def _parameter_point(self, item: str, read: Read, *, wide: bool, high_resolution: bool) -> Point[float]:
+        decimals = self._decimals.get((read.menu, read.number))
+
+        def encode(value: float) -> Command[None]:
+            return self._write(read.menu, read.number, value, wide=wide, high_resolution=high_resolution)
+
+        def decode(number: int) -> float:
+            """In the unit in which it is written: without decimals, high resolution counts in tenths."""
+            return from_line(number * 10 if high_resolution and decimals is None else number, decimals)
+
+        return ScaledPoint(self.node, item, read, decode=decode, encode=encode, decimals=(decimals,))
+
+    def _run_point(self, item: str, run: ReadRun) -> Point[tuple[float, ...]]:
+        decimals = tuple(self._decimals.get(parameter) for parameter in _parameters(run))
+        return ScaledPoint(self.node, item, run, decode=lambda sent: self._values(run, sent), decimals=decimals)
+
+    async def read(
+        self,
+        parameter: str,
+        *,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+    ) -> float:
+        """A parameter's value; a bit is 0 or 1. Raises NoSuchParameter, or InvalidCommand at address 0."""
+        self._check_readable()
+        menu, number = parse_parameter(parameter)
+        command = Read(menu, number)
+        found = await self.node.request(command, priority=priority, start_within=start_within, retries=retries)
+        return from_line(found, self._decimals.get((menu, number)))
+
+    async def read_run(
+        self, parameter: str, count: int, *, chain: bool = False, priority: Priority | None = None
+    ) -> tuple[float, ...]:
+        """`count` parameters of one menu, from `parameter` on.
+
+        With `chain` all in one exchange, one request byte for each after the first: only where no other drive can take
+        or send that byte for its own (M14), that is where every node of the line is a drive that forgets what it last
+        sent when another is addressed. Raises NoSuchParameter where the menu has a gap.
+        """
+        self._check_readable()
+        menu, number = parse_parameter(parameter)
+        run = ReadRun(menu, number, count)
+        if chain:
+            return self._values(run, await self.node.request(run, priority=priority))
+        singles = [Read(menu, number + i) for i in range(count)]
+        return self._values(run, [await self.node.request(single, priority=priority) for single in singles])
+
+    async def write(
+        self,
+        parameter: str,
+        value: float,
+        *,
+        wide: bool = False,
+        high_resolution: bool = False,
+        verify: bool = False,
+        idempotent: bool = False,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+    ) -> None:
+        """Write a parameter, acknowledged; at address 0 to all drives, which do not answer.
+
+        `wide` is for the 16-bit integers (13.14, 15.60 to 15.63). With `high_resolution` a value without declared
+        decimals counts in tenths of what a read returns. `verify` reads back, and raises VerifyFailed if the value
+        differs. Raises InvalidCommand, before anything is sent, for a value that does not fit.
+        """
+        menu, number = parse_parameter(parameter)
+        command = self._write(menu, number, value, wide=wide, high_resolution=high_resolution, idempotent=idempotent)
+        if verify:
+            self._check_readable()
+        await self.node.request(command, priority=priority, start_within=start_within)
+        if verify:
+            check = Read(menu, number)
+            found = await self.node.request(check, priority=priority)
+            if abs(found * 10 - command.value) >= 10 if high_resolution else found != command.value:
+                raise VerifyFailed(
+                    f"{parameter} reads {found} after {command.text} was written",
+                    node=self.node.label,
+                    command=str(check),
+                )
+
+    async def write_all(
+        self, parameter: str, value: float, *, wide: bool = False, high_resolution: bool = False
+    ) -> None:
+        """Write a parameter of every drive on the line at once (address 0). None answers."""
+        menu, number = parse_parameter(parameter)
+        everyone = self.node.bus.node(mentor.PROFILE, 0)
+        await everyone.request(self._write(menu, number, value, wide=wide, high_resolution=high_resolution))
+
+    async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
+        """As `point(item).read()`; a run without `chain` parameter by parameter, which is always safe."""
+        parameter, _, count = item_text(item).partition(":")
+        if is_decimal(count) and not chain:
+            return await self.read_run(parameter, int(count))
+        return await self.point(item).read()
+
+    def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
+        encoder(self.point(item))(value)
+        parameter, _, kind = item.partition(":")
+        return lambda: self.write(parameter, value, wide=kind == "wide", high_resolution=kind == "hires", verify=verify)
+
+    def _check_readable(self) -> None:
+        if self.node.address == self.profile.broadcast:
+            raise InvalidCommand("mentor: a read cannot go to all drives: they would answer at once")
+
+    def _write(
+        self,
+        menu: int,
+        number: int,
+        value: float,
+        *,
+        wide: bool = False,
+        high_resolution: bool = False,
+        idempotent: bool = False,
+    ) -> Write:
+        decimals = self._decimals.get((menu, number))
+        if decimals is not None:
+            decimals += high_resolution
+        return Write(menu, number, to_line(value, decimals), wide, high_resolution, idempotent)
+
+    def _values(self, run: ReadRun, sent: Sequence[int]) -> tuple[float, ...]:
+        parameters = _parameters(run)
+        return tuple(from_line(n, self._decimals.get(parameter)) for n, parameter in zip(sent, parameters, strict=True))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScaledPoint(Point[T]):
+    """Points of one parameter are equal only if the handles that made them scale it alike."""
+
+    decimals: tuple[int | None, ...]
+
+
+def _parameters(run: ReadRun) -> list[tuple[int, int]]:
+    return [(run.menu, run.number + i) for i in range(run.count)]
+
+
+def to_line(value: float, decimals: int | None) -> int:
+    """The whole number that stands for a value, rounded half away from zero. True and False stay what they are.
+
+    Raises InvalidCommand for a fraction where no decimals are declared, and for NaN and infinity.
+    """
+    if isinstance(value, bool):
+        return value
+    if not abs(value) < _BEYOND_ANY_FORM:
+        raise InvalidCommand(f"{value!r} cannot be sent: a parameter has at most five digits")
+    if decimals is None:
+        if value != int(value):
+            raise InvalidCommand(f"{value!r} is not a whole number, and the parameter has no declared decimals")
+        return int(value)
+    return int(Decimal(str(value)).scaleb(decimals).quantize(Decimal(1), ROUND_HALF_UP))
+
+
+def from_line(number: int, decimals: int | None) -> float:
+    """The value that a number on the line stands for."""
+    return number / 10**decimals if decimals else number

@@ -1,0 +1,303 @@
+"""Modbus RTU: coils, discrete inputs, input registers and holding registers of units 1 to 247.
+
+    read     unit 01|02|03|04 first first count count crc crc    answered by unit function bytes data... crc crc
+    write    unit 05|06 address address value value crc crc      answered by the same
+             unit 0F|10 first first count count bytes data... crc crc
+                                                                 answered by unit function first first count count crc
+    refused                                                      answered by unit function+80 code crc crc
+
+Numbers are big-endian, the CRC is not. A write to unit 0 is for all, and answered by none. A reply to a read does not
+say which register was read.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Generic, TypeVar
+
+from busmaster.arguments import whole_number
+from busmaster.errors import InvalidCommand, Refused
+from busmaster.exchange import MORE, Done, FrameError, Leg, ReplyTiming, Sizes, Step, Timings, no_reply
+from busmaster.profile import LineSettings, Profile
+
+T = TypeVar("T")
+
+READS = {"coil": 0x01, "discrete": 0x02, "holding": 0x03, "input": 0x04}
+"""The function that reads each table."""
+WRITE_COIL, WRITE_REGISTER, WRITE_COILS, WRITE_REGISTERS = 0x05, 0x06, 0x0F, 0x10
+ON, OFF = 0xFF00, 0x0000
+REFUSED = 0x80
+BROADCAST = 0
+MOST_BITS_READ, MOST_BITS_WRITTEN = 2000, 1968
+MOST_READ, MOST_WRITTEN = 125, 123
+"""Registers."""
+HIGHEST = 0xFFFF
+LISTED = 8
+"""Values that a command's text lists; of more it says how many."""
+SILENCE = 0.00175
+"""Seconds between frames: 3.5 characters, or this above 19200 baud. Here it is the reply's turnaround."""
+EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal data address",
+    3: "illegal data value",
+    4: "device failure",
+    5: "acknowledged, but it takes long",
+    6: "device busy",
+    8: "memory parity error",
+    10: "gateway path unavailable",
+    11: "gateway target did not respond",
+}
+"""What each exception code means."""
+HINTS = {5: "ask again later", 6: "ask again later", 10: "look at the gateway", 11: "look behind the gateway"}
+"""What to do about some of them."""
+
+
+def _crc_table() -> list[int]:
+    table = []
+    for value in range(256):
+        for _ in range(8):
+            value = value >> 1 ^ (0xA001 if value & 1 else 0)
+        table.append(value)
+    return table
+
+
+CRC_TABLE = _crc_table()
+
+
+def with_crc(body: bytes) -> bytes:
+    """Return `body` and its CRC-16, low byte first."""
+    crc = 0xFFFF
+    for byte in body:
+        crc = crc >> 8 ^ CRC_TABLE[(crc ^ byte) & 0xFF]
+    return body + crc.to_bytes(2, "little")
+
+
+class Conversation(Generic[T]):
+    """One attempt: the reply begins with `header`, then come `payload` bytes of which `decode` makes the value."""
+
+    __slots__ = (
+        "_buffer",
+        "_decode",
+        "_header",
+        "_refusal",
+        "_size",
+        "answered",
+        "answers",
+        "request",
+        "sizes",
+        "starts",
+        "timing",
+    )
+
+    later: ClassVar[Sequence[Leg]] = ()
+    closing: ClassVar[int] = 0
+
+    def __init__(
+        self, body: bytes, header: bytes, payload: int, timing: ReplyTiming, decode: Callable[[bytes], T]
+    ) -> None:
+        self.request = with_crc(body)
+        self.answered = body[0] != BROADCAST
+        self.timing = timing if self.answered else replace(timing, turnaround=max(timing.turnaround, timing.nominal))
+        self.answers = (header,) if self.answered else ()
+        self.starts = header[:1] if self.answered else b""
+        self._header = header
+        self._refusal = bytes((body[0], body[1] | REFUSED))
+        self._size = len(header) + payload + 2
+        self.sizes = Sizes(self._size, self._size) if self.answered else Sizes(0, 0)
+        self._decode = decode
+        self._buffer = b""
+
+    @property
+    def owed(self) -> tuple[bytes, ...]:
+        return self.answers
+
+    def feed(self, data: bytes, /) -> Step[T]:
+        buffer = self._buffer = self._buffer + data
+        header, size = self._header, self._size
+        if buffer.startswith(self._refusal):
+            return self._refused(buffer)
+        if not buffer.startswith(header) and not header.startswith(buffer):
+            raise FrameError(
+                f"wrong echo: {buffer[: len(header)].hex(' ')} in place of {header.hex(' ')}", heard=buffer
+            )
+        if len(buffer) < size:
+            return MORE
+        if with_crc(buffer[: size - 2]) != buffer[:size]:
+            raise FrameError("bad CRC", whole=len(buffer) == size)
+        return Done(self._decode(buffer[len(header) : size - 2]), rest=buffer[size:])
+
+    def _refused(self, buffer: bytes) -> Step[T]:
+        if len(buffer) < 5:
+            return MORE
+        if with_crc(buffer[:3]) != buffer:
+            raise FrameError("bad CRC")  # or a damaged function code before a longer reply: not whole
+        code = buffer[2]
+        name = EXCEPTIONS.get(code, f"exception {code}")
+        raise Refused(f"refused: {name}", confirm=False, hint=HINTS.get(code))
+
+    def expired(self, started: bool, /) -> Done[T]:
+        if not self.answered:
+            return Done(self._decode(b""))
+        raise FrameError(f"reply cut short after {len(self._buffer)} bytes") if started else no_reply()
+
+
+@dataclass(frozen=True, slots=True)
+class ReadRegisters:
+    """Read `count` registers, 1 to 125, from `first` on: a tuple of ints, 0 to 65535 each."""
+
+    first: int
+    count: int = 1
+    table: str = "holding"
+
+    writes: ClassVar[bool] = False
+    idempotent: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        _check_table(self.table, ("holding", "input"))
+        _check_span(self.first, self.count, MOST_READ)
+
+    def __str__(self) -> str:
+        return f"read {_span(self.table, self.first, self.count)}"
+
+    def open(self, address: int, timings: Timings, /) -> Conversation[tuple[int, ...]]:
+        """Raises InvalidCommand for the broadcast address: nobody would answer."""
+        decode = struct.Struct(f">{self.count}H").unpack
+        return _ask(address, READS[self.table], self.first, self.count, 2 * self.count, timings, decode)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadBits:
+    """Read `count` coils or discrete inputs, 1 to 2000, from `first` on: a tuple of bools."""
+
+    first: int
+    count: int = 1
+    table: str = "coil"
+
+    writes: ClassVar[bool] = False
+    idempotent: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        _check_table(self.table, ("coil", "discrete"))
+        _check_span(self.first, self.count, MOST_BITS_READ)
+
+    def __str__(self) -> str:
+        return f"read {_span(self.table, self.first, self.count)}"
+
+    def open(self, address: int, timings: Timings, /) -> Conversation[tuple[bool, ...]]:
+        """Raises InvalidCommand for the broadcast address."""
+
+        def decode(payload: bytes) -> tuple[bool, ...]:
+            states = int.from_bytes(payload, "little")
+            return tuple(bool(states >> place & 1) for place in range(self.count))
+
+        return _ask(address, READS[self.table], self.first, self.count, (self.count + 7) // 8, timings, decode)
+
+
+@dataclass(frozen=True, slots=True)
+class WriteRegisters:
+    """Write `values`, 0 to 65535 each and 123 at most, to the holding registers from `first` on.
+
+    One value goes as a single register (function 6), more by function 16. `idempotent` is for the caller to say: what a
+    unit does with a register is its own business. Raises InvalidCommand for what does not fit.
+    """
+
+    first: int
+    values: tuple[int, ...]
+    idempotent: bool = False
+
+    writes: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        values = (whole_number(value, 0, HIGHEST, "a register's value") for value in self.values)
+        object.__setattr__(self, "values", tuple(values))
+        _check_span(self.first, len(self.values), MOST_WRITTEN)
+
+    def __str__(self) -> str:
+        return f"write {_span('holding', self.first, len(self.values))} = {_listed(self.values)}"
+
+    def open(self, address: int, timings: Timings, /) -> Conversation[None]:
+        count = len(self.values)
+        if count == 1:
+            return _tell(struct.pack(">BBHH", address, WRITE_REGISTER, self.first, self.values[0]), timings)
+        header = struct.pack(">BBHH", address, WRITE_REGISTERS, self.first, count)
+        return _tell(header, timings, struct.pack(f">B{count}H", 2 * count, *self.values))
+
+
+@dataclass(frozen=True, slots=True)
+class WriteCoils:
+    """Write `values`, each on or off and 1968 at most, to the coils from `first` on: one by function 5, more by 15."""
+
+    first: int
+    values: tuple[bool, ...]
+    idempotent: bool = False
+
+    writes: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if any(value not in (0, 1) for value in self.values):
+            raise InvalidCommand(f"a coil is written 1 or 0, not {self.values!r}")
+        object.__setattr__(self, "values", tuple(map(bool, self.values)))
+        _check_span(self.first, len(self.values), MOST_BITS_WRITTEN)
+
+    def __str__(self) -> str:
+        return f"write {_span('coil', self.first, len(self.values))} = {_listed(self.values)}"
+
+    def open(self, address: int, timings: Timings, /) -> Conversation[None]:
+        count = len(self.values)
+        if count == 1:
+            return _tell(struct.pack(">BBHH", address, WRITE_COIL, self.first, ON if self.values[0] else OFF), timings)
+        header = struct.pack(">BBHH", address, WRITE_COILS, self.first, count)
+        states = sum(on << place for place, on in enumerate(self.values))
+        size = (count + 7) // 8
+        return _tell(header, timings, bytes((size,)) + states.to_bytes(size, "little"))
+
+
+def _ask(
+    unit: int, function: int, first: int, count: int, size: int, timings: Timings, decode: Callable[[bytes], T]
+) -> Conversation[T]:
+    if unit == BROADCAST:
+        raise InvalidCommand("nobody answers a read that goes to all: read one unit at a time")
+    body = struct.pack(">BBHH", unit, function, first, count)
+    return Conversation(body, bytes((unit, function, size)), size, timings.read, decode)
+
+
+def _tell(header: bytes, timings: Timings, data: bytes = b"") -> Conversation[None]:
+    """A write: the unit says the first six bytes of it again."""
+    return Conversation(header + data, header, 0, timings.write, _nothing)
+
+
+def _nothing(_: bytes) -> None:
+    return None
+
+
+def _check_table(table: str, known: Sequence[str]) -> None:
+    if table not in known:
+        raise InvalidCommand(f"there is no table {table!r} to read here: use {' or '.join(known)}")
+
+
+def _check_span(first: int, count: int, longest: int) -> None:
+    whole_number(first, 0, HIGHEST, "an address")
+    whole_number(count, 1, longest, "how many")
+    whole_number(first + count - 1, 0, HIGHEST, "the last address")
+
+
+def _listed(values: Sequence[int]) -> str:
+    return ", ".join(str(int(value)) for value in values) if len(values) <= LISTED else f"{len(values)} values"
+
+
+def _span(table: str, first: int, count: int) -> str:
+    return f"{table} {first}" if count == 1 else f"{table} {first}-{first + count - 1}"
+
+
+PROFILE = Profile(
+    name="modbus",
+    title="Modbus RTU",
+    addresses=range(1, 248),
+    line=LineSettings(19200, parity="E"),
+    timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.2, lateness=0.4, byte_gap=0.02, turnaround=SILENCE)),
+    probe=ReadRegisters(0),
+    checks=tuple(ReadRegisters(0, count) for count in range(1, 5)),
+    broadcast=BROADCAST,
+)

@@ -1,0 +1,197 @@
+"""The handle of a Modbus unit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from busmaster.errors import InvalidCommand, VerifyFailed
+from busmaster.handle import Handle, Send, is_decimal, item_text, unknown_item
+from busmaster.points import Point
+from busmaster.profile import Profile
+from busmaster.protocols.modbus.codec import (
+    MOST_BITS_WRITTEN,
+    MOST_WRITTEN,
+    PROFILE,
+    READS,
+    ReadBits,
+    ReadRegisters,
+    WriteCoils,
+    WriteRegisters,
+)
+from busmaster.protocols.modbus.numbers import FORMS, Number
+
+if TYPE_CHECKING:
+    from busmaster.node import Priority
+
+BITS = ("coil", "discrete")
+WRITABLE = ("coil", "holding")
+FORM = (
+    "holding:100, input:100, coil:5 or discrete:5, with :10 for a run of ten, or :float32 (and :swapped) for a number"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Describe what an ITEM names: a number in a table at an address, or a run of `count` coils or registers there."""
+
+    table: str
+    first: int
+    count: int | None
+    number: Number
+
+    @classmethod
+    def parse(cls, item: str) -> Place:
+        """Raises InvalidCommand for an item that does not exist."""
+        table, _, rest = item_text(item).partition(":")
+        address, *kind = rest.split(":")
+        if table not in READS or not is_decimal(address):
+            raise unknown_item(item, READS, FORM)
+        first = int(address)
+        match kind:
+            case []:
+                return cls(table, first, None, Number())
+            case [count] if is_decimal(count):
+                return cls(table, first, int(count), Number())
+            case [name] if name in FORMS and table not in BITS:
+                return cls(table, first, None, Number(name))
+            case [name, "swapped"] if name in FORMS and table not in BITS:
+                return cls(table, first, None, Number(name, swapped=True))
+        raise unknown_item(item, FORMS, FORM)
+
+    @property
+    def is_bit(self) -> bool:
+        return self.table in BITS
+
+    @property
+    def width(self) -> int:
+        """Addresses that one value takes."""
+        return 1 if self.is_bit else self.number.registers
+
+    def read(self) -> ReadBits | ReadRegisters:
+        """What reads it."""
+        count = self.width if self.count is None else self.count
+        return (ReadBits if self.is_bit else ReadRegisters)(self.first, count, self.table)
+
+    def decode(self, raw: Sequence[Any]) -> Any:
+        """Its value, or the tuple of a run."""
+        if self.count is not None:
+            return tuple(raw)
+        return raw[0] if self.is_bit else self.number.decode(raw)
+
+    def write(self, values: Sequence[Any], idempotent: bool = False) -> list[WriteCoils | WriteRegisters]:
+        """What writes the values here and behind, in as many exchanges as it takes. Raises InvalidCommand."""
+        if not values or (self.count is not None and len(values) != self.count):
+            wanted = "a value" if self.count is None else f"{self.count} values"
+            raise InvalidCommand(f"{self.table} {self.first} takes {wanted}, not {len(values)}")
+        if self.is_bit:
+            return [
+                WriteCoils(self.first + i, tuple(values[i : i + MOST_BITS_WRITTEN]), idempotent)
+                for i in range(0, len(values), MOST_BITS_WRITTEN)
+            ]
+        words = [word for value in values for word in self.number.encode(value)]
+        most = MOST_WRITTEN - MOST_WRITTEN % self.width  # a number is never torn
+        return [
+            WriteRegisters(self.first + i, tuple(words[i : i + most]), idempotent) for i in range(0, len(words), most)
+        ]
+
+
+def is_whole(item: str) -> bool:
+    """Return whether what an item names carries whole numbers alone."""
+    return not Place.parse(item).number.kind.startswith("float")
+
+
+class ModbusUnit(Handle):
+    """A Modbus unit, 1 to 247, or 0 to write to all. Addresses are those that are sent, 0 to 65535.
+
+        press = ModbusUnit(bus, 17)
+        speed = await press.read("holding:40:float32")
+        await press.write("holding:100", 215)
+        inputs = await press.read("discrete:0:16")
+
+    An item is a table (`coil`, `discrete`, `holding`, `input`), an address, and how to take what is there: nothing for
+    a bit or an unsigned register, a count for a run of them, or a kind of number (`int16 uint16 int32 uint32 float32
+    float64`), whose words come most significant first, or last with `:swapped`.
+    """
+
+    profile: ClassVar[Profile] = PROFILE
+
+    def point(self, item: str) -> Point[Any]:
+        """What an item names. That of a run takes as many values as it has. Inputs are read-only."""
+        place = Place.parse(item)
+
+        def encode(value: Any) -> WriteCoils | WriteRegisters:
+            return place.write((value,) if place.count is None else tuple(value))[0]
+
+        return Point(
+            self.node,
+            item,
+            place.read(),
+            decode=place.decode,
+            encode=encode if place.table in WRITABLE else None,
+        )
+
+    async def read(
+        self,
+        item: str,
+        *,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+    ) -> Any:
+        """What an item holds now. Raises Refused, with the exception's name, for what the unit does not have."""
+        return await self.point(item).read(priority=priority, start_within=start_within, retries=retries)
+
+    async def write(
+        self,
+        item: str,
+        *values: float,
+        verify: bool = False,
+        idempotent: bool = False,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+    ) -> None:
+        """Write values to an item and what lies behind it, acknowledged; at address 0 to all units: none answers.
+
+        More than 123 registers or 1968 coils go in several exchanges: if one fails, those before it are stored.
+        `verify` reads back, and raises VerifyFailed where a value differs. `idempotent` allows a retry after an unknown
+        outcome. Raises InvalidCommand, before anything is sent, for a value that does not fit.
+        """
+        commands = self._writes(item, values, idempotent)
+        for command in commands:
+            await self.node.request(command, priority=priority, start_within=start_within)
+        for command in commands if verify else ():
+            await self._verify(command, priority)
+
+    def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
+        """Consecutive places, in as few exchanges as they fit."""
+        self._writes(item, values)
+        return [lambda: self.write(item, *values, verify=verify)]
+
+    def run_items(self, item: str, count: int) -> tuple[str, ...]:
+        """What each value from an item on is called, each at its own address."""
+        place = Place.parse(item)
+        kind = "" if place.count is not None else item.partition(":")[2].partition(":")[2]
+        suffix = f":{kind}" if kind else ""
+        return tuple(f"{place.table}:{place.first + i * place.width}{suffix}" for i in range(count))
+
+    def _writes(self, item: str, values: Sequence[Any], idempotent: bool = False) -> list[WriteCoils | WriteRegisters]:
+        place = Place.parse(item)
+        if place.table not in WRITABLE:
+            raise InvalidCommand(f"{self.node.label}: {item} is read-only")
+        return place.write(values, idempotent)
+
+    async def _verify(self, written: WriteCoils | WriteRegisters, priority: Priority | None) -> None:
+        count = len(written.values)
+        check: ReadBits | ReadRegisters = (
+            ReadBits(written.first, count) if isinstance(written, WriteCoils) else ReadRegisters(written.first, count)
+        )
+        found: tuple[int, ...] = await self.node.request(check, priority=priority)
+        for place, (now, wanted) in enumerate(zip(found, written.values, strict=True), written.first):
+            if now != wanted:
+                raise VerifyFailed(
+                    f"{check.table} {place} reads {int(now)} after {int(wanted)} was written",
+                    node=self.node.label,
+                    command=str(check),
+                )

@@ -1,0 +1,42 @@
+"""MSC controllers (IB-11A002 rev E)."""
+
+from __future__ import annotations
+
+from busmaster.protocols.msc import codec
+from busmaster.protocols.msc.capture import MscDialect
+from busmaster.protocols.msc.codec import PROFILE
+from busmaster.protocols.msc.handle import MscController
+from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
+
+PROTOCOL = Protocol(
+    profile=PROFILE,
+    kinds=(
+        NodeKind(
+            "msc",
+            MscController,
+            device_of("busmaster.protocols.msc.device"),
+            items="2008 (a data address), 2008:32 (32 values from there on), flag:5, flags, status",
+            options=(
+                Option("symbols", "addresses", common=False),
+                Option("address_step", "whole", "addresses from one value to the next"),
+                Option("model", "text"),
+            ),
+            whole_numbers=everywhere,
+            capture_id=4,
+        ),
+    ),
+    commands={
+        "read_data": codec.DataRead,
+        "write_data": codec.DataWrite,
+        "read_block": codec.BlockRead,
+        "write_block": codec.BlockWrite,
+        "pick_data": codec.PickedData,
+        "read_flag": codec.ReadFlag,
+        "set_flag": codec.SetFlag,
+        "clear_flag": codec.ClearFlag,
+        "read_flags": codec.ReadFlags,
+        "pick_flags": codec.PickedFlags,
+        "read_status": codec.ReadStatus,
+    },
+    dialect=MscDialect,
+)

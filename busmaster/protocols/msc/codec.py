@@ -1,0 +1,337 @@
+"""MSC controllers (IB-11A002 rev E): data variables of 32 bits, 256 flags, the program's status word.
+
+Each command is one packet whose body is an ASCII name, a comma and binary values, most significant byte first.
+Writes are answered by an ACK alone; reads by an ACK and a packet of the same name. `msc_exchange` has the wire.
+
+Which data addresses and flags exist, and which may be written, is the controller's business: it says NAK.
+"""
+
+from __future__ import annotations
+
+import enum
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from busmaster.arguments import whole_number
+from busmaster.errors import InvalidCommand
+from busmaster.exchange import Command, FrameError, ReplyTiming, Timings
+from busmaster.profile import Batch, LineSettings, Profile
+from busmaster.protocols.msc.exchange import UNITS, PacketExchange, Reply, StalePacketListener, packet
+from busmaster.wire.readers import ACK
+
+T = TypeVar("T")
+
+BLOCK = 32
+"""Values of one BREAD or BWRITE: never more, never fewer."""
+FLAGS = 256
+HIGHEST_ADDRESS = 0xFFFF
+LOWEST_VALUE = -(2**31)
+HIGHEST_VALUE = 2**31 - 1
+
+
+class ProgramStatus(enum.IntFlag):
+    """The macroprogram status word, by the document's table of that name."""
+
+    PROGRAM_RUNNING = 1
+    BATTERY_LOW = 2
+    RAM_NOT_RELIABLE = 4
+    SYSTEM_RESET = 8
+    """The system has been reset, the program was cleared."""
+    RETURN_INTERRUPT = 16
+    FAULT_INTERRUPT = 32
+    AUTO_START_ENABLED = 64
+    """The program starts on power-up."""
+    SYSTEM_TEST = 128
+    LOAD_OVER_RUNNING_PROGRAM = 256
+    CHECKSUM_INCORRECT = 512
+    LOAD_IN_PROGRESS = 1024
+    LOAD_OUT_OF_SEQUENCE = 2048
+    BAD_OPCODE = 4096
+    STACK_OVERFLOW = 8192
+    STACK_UNDERFLOW = 16384
+    INTERRUPT_TABLE_FULL = 32768
+
+
+class _Reading:
+    __slots__ = ()
+    writes = False
+    idempotent = True
+
+
+class _Writing:
+    """A program may consume what was written, so no write may be repeated unasked."""
+
+    __slots__ = ()
+    writes = True
+    idempotent = False
+
+
+@dataclass(frozen=True, slots=True)
+class _AtAddress:
+    address: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "address", whole_number(self.address, 0, HIGHEST_ADDRESS, "a data address"))
+
+
+@dataclass(frozen=True, slots=True)
+class _OfFlag:
+    flag: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "flag", whole_number(self.flag, 0, FLAGS - 1, "a flag"))
+
+
+@dataclass(frozen=True, slots=True)
+class DataRead(_Reading, _AtAddress):
+    """DREAD: the signed 32-bit value at a data address, 0 to 65535 (see the data table of the program's listing)."""
+
+    def __str__(self) -> str:
+        return f"read data {self.address}"
+
+    def open(self, address: int, timings: Timings, /) -> PacketExchange[int]:
+        return _ask(address, timings, b"DREAD,", self.address.to_bytes(2, "big"), 4, _value_of)
+
+
+@dataclass(frozen=True, slots=True)
+class DataWrite(_Writing, _AtAddress):
+    """DWRITE: a signed 32-bit value into a data address."""
+
+    value: int
+
+    def __post_init__(self) -> None:
+        _AtAddress.__post_init__(self)
+        object.__setattr__(self, "value", _checked_value(self.value))
+
+    def __str__(self) -> str:
+        return f"write data {self.address} = {self.value}"
+
+    def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
+        return _tell(address, timings, b"DWRITE," + struct.pack(">Hi", self.address, self.value))
+
+
+@dataclass(frozen=True, slots=True)
+class BlockRead(_Reading, _AtAddress):
+    """BREAD: the 32 consecutive values from a data address on."""
+
+    def __str__(self) -> str:
+        return f"read {BLOCK} values from data {self.address}"
+
+    def open(self, address: int, timings: Timings, /) -> PacketExchange[tuple[int, ...]]:
+        return _ask(address, timings, b"BREAD,", self.address.to_bytes(2, "big"), 4 * BLOCK, _block_of)
+
+
+@dataclass(frozen=True, slots=True)
+class BlockWrite(_Writing, _AtAddress):
+    """BWRITE: 32 values from a data address on. Fewer are refused: padding would overwrite what lies behind them."""
+
+    values: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        _AtAddress.__post_init__(self)
+        object.__setattr__(self, "values", tuple(map(_checked_value, self.values)))
+        if len(self.values) != BLOCK:
+            raise InvalidCommand(f"a block is {BLOCK} values, not {len(self.values)}: write single values one by one")
+
+    def __str__(self) -> str:
+        return f"write {BLOCK} values from data {self.address}"
+
+    def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
+        return _tell(address, timings, b"BWRITE," + struct.pack(f">H{BLOCK}i", self.address, *self.values))
+
+
+@dataclass(frozen=True, slots=True)
+class SetFlag(_Writing, _OfFlag):
+    """SFLAG: an output flag or user flag, 0 to 255, on."""
+
+    def __str__(self) -> str:
+        return f"set flag {self.flag}"
+
+    def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
+        return _tell(address, timings, b"SFLAG," + self.flag.to_bytes(2, "big"))
+
+
+@dataclass(frozen=True, slots=True)
+class ClearFlag(_Writing, _OfFlag):
+    """CFLAG: an output flag or user flag, 0 to 255, off."""
+
+    def __str__(self) -> str:
+        return f"clear flag {self.flag}"
+
+    def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
+        return _tell(address, timings, b"CFLAG," + self.flag.to_bytes(2, "big"))
+
+
+@dataclass(frozen=True, slots=True)
+class ReadFlag(_Reading, _OfFlag):
+    """RFLAG: whether a flag (input, output, timer, motor status or user flag), 0 to 255, is on."""
+
+    def __str__(self) -> str:
+        return f"read flag {self.flag}"
+
+    def open(self, address: int, timings: Timings, /) -> PacketExchange[bool]:
+        return _ask(address, timings, b"RFLAG,", self.flag.to_bytes(2, "big"), 2, _state_of)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadFlags(_Reading):
+    """RFLAGS: the numbers of all flags that are on. Only MSC-850/32 and MSC-250 know it; others say NAK."""
+
+    def __str__(self) -> str:
+        return "read all flags"
+
+    def open(self, address: int, timings: Timings, /) -> PacketExchange[frozenset[int]]:
+        return _ask(address, timings, b"RFLAGS,", b"", FLAGS // 8, _flags_of)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadStatus(_Reading):
+    """RQSTAT: the macroprogram status word. What follows it in the reply is "not currently used": any is accepted."""
+
+    def __str__(self) -> str:
+        return "read program status"
+
+    def open(self, address: int, timings: Timings, /) -> PacketExchange[ProgramStatus]:
+        reply = Reply(address, b"RQSTAT,", 8, shortest=2)
+        return PacketExchange(packet(address, b"RQSTAT,"), timings, reply, _status_of)
+
+
+@dataclass(frozen=True, slots=True)
+class PickedData(_Reading, _AtAddress):
+    """Some of the 32 values of one BREAD, by their places 0 to 31: what several DREADs would have read."""
+
+    places: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        _AtAddress.__post_init__(self)
+        object.__setattr__(self, "places", tuple(whole_number(place, 0, BLOCK - 1, "a place") for place in self.places))
+
+    def __str__(self) -> str:
+        return f"read {len(self.places)} of the {BLOCK} values from data {self.address}"
+
+    def open(self, address: int, timings: Timings, /) -> PacketExchange[tuple[int, ...]]:
+        def pick(payload: bytes) -> tuple[int, ...]:
+            block = _block_of(payload)
+            return tuple(block[place] for place in self.places)
+
+        return _ask(address, timings, b"BREAD,", self.address.to_bytes(2, "big"), 4 * BLOCK, pick)
+
+
+@dataclass(frozen=True, slots=True)
+class PickedFlags(_Reading):
+    """Some of the flags of one RFLAGS: what several RFLAGs would have read."""
+
+    flags: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "flags", tuple(whole_number(flag, 0, FLAGS - 1, "a flag") for flag in self.flags))
+
+    def __str__(self) -> str:
+        return f"read {len(self.flags)} of all flags"
+
+    def open(self, address: int, timings: Timings, /) -> PacketExchange[tuple[bool, ...]]:
+        def pick(payload: bytes) -> tuple[bool, ...]:
+            on = _flags_of(payload)
+            return tuple(flag in on for flag in self.flags)
+
+        return _ask(address, timings, b"RFLAGS,", b"", FLAGS // 8, pick)
+
+
+@dataclass(frozen=True, slots=True)
+class Merging:
+    """A Profile's `merge`: neighbouring DREADs as one BREAD, RFLAGs as one RFLAGS.
+
+    `address_step` is what the address grows by from one value to the next; without it no DREADs are merged.
+    `all_flags` says that the controller knows RFLAGS (MSC-850/32, MSC-250). Raises InvalidCommand for a step of 0,
+    or one so large that no block has room.
+    """
+
+    address_step: int | None = None
+    all_flags: bool = False
+
+    def __post_init__(self) -> None:
+        if self.address_step is not None:
+            whole_number(self.address_step, 1, HIGHEST_ADDRESS // BLOCK, "address_step")
+
+    def __call__(self, commands: Sequence[Command[Any]]) -> Sequence[Batch]:
+        batches = [] if self.address_step is None else _data_batches(commands, self.address_step)
+        flags = {i: command.flag for i, command in enumerate(commands) if isinstance(command, ReadFlag)}
+        if self.all_flags and len(flags) > 1:
+            batches.append(Batch(PickedFlags(tuple(flags.values())), tuple(flags)))
+        return batches
+
+
+def _data_batches(commands: Sequence[Command[Any]], step: int) -> list[Batch]:
+    waiting = sorted((command.address, i) for i, command in enumerate(commands) if isinstance(command, DataRead))
+    batches = []
+    while waiting:
+        first = waiting[0][0]
+        reached = {
+            i: (address - first) // step
+            for address, i in waiting
+            if (address - first) % step == 0 and address - first < BLOCK * step
+        }
+        waiting = [(address, i) for address, i in waiting if i not in reached]
+        if len(reached) > 1 and first + (BLOCK - 1) * step <= HIGHEST_ADDRESS:
+            batches.append(Batch(PickedData(first, tuple(reached.values())), tuple(reached)))
+    return batches
+
+
+def _ask(
+    unit: int, timings: Timings, name: bytes, operands: bytes, payload: int, decode: Callable[[bytes], T]
+) -> PacketExchange[T]:
+    return PacketExchange(packet(unit, name + operands), timings, Reply(unit, name, payload), decode)
+
+
+def _tell(unit: int, timings: Timings, body: bytes) -> PacketExchange[None]:
+    return PacketExchange(packet(unit, body), timings, None, _nothing)
+
+
+def _nothing(payload: bytes) -> None:
+    return None
+
+
+def _value_of(payload: bytes) -> int:
+    return int.from_bytes(payload, "big", signed=True)
+
+
+def _block_of(payload: bytes) -> tuple[int, ...]:
+    return struct.unpack(f">{BLOCK}i", payload)
+
+
+def _state_of(payload: bytes) -> bool:
+    state = int.from_bytes(payload, "big")
+    if state > 1:
+        raise FrameError(f"a flag's state must be 0 or 1, not {state}", send=ACK)
+    return state == 1
+
+
+def _flags_of(payload: bytes) -> frozenset[int]:
+    """Byte B1 holds flags 7 to 0 in its bits 7 to 0, B2 flags 15 to 8, and so on."""
+    states = int.from_bytes(payload, "little")
+    return frozenset(flag for flag in range(FLAGS) if states >> flag & 1)
+
+
+def _status_of(payload: bytes) -> ProgramStatus:
+    return ProgramStatus(int.from_bytes(payload[:2], "big"))
+
+
+def _checked_value(value: int) -> int:
+    return whole_number(value, LOWEST_VALUE, HIGHEST_VALUE, "a value")
+
+
+_FIRST = ReplyTiming(0.05, 0.5, 1.0, 0.1)
+PROFILE = Profile(
+    name="msc",
+    title="MSC",
+    addresses=UNITS,
+    line=LineSettings(9600),
+    timings=Timings(read=_FIRST, write=_FIRST, packet=ReplyTiming(0.5, 1.0, 1.0, 0.1)),
+    probe=ReadStatus(),
+    checks=(ReadStatus(), ReadFlag(0)),
+    exchange_limit=2.0,
+    listen=StalePacketListener,
+)
+"""The document gives no times."""

@@ -1,0 +1,397 @@
+"""The handle of an MSC controller."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+
+from busmaster.errors import InvalidCommand, Refused, VerifyFailed
+from busmaster.exchange import Command, Timings
+from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.node import Node, Priority
+from busmaster.points import Point
+from busmaster.profile import Profile
+from busmaster.protocols.msc import codec as msc
+from busmaster.protocols.msc.blocks import Count, Part, Progress, place, reads, reads_back, writes
+from busmaster.protocols.msc.codec import (
+    BLOCK,
+    FLAGS,
+    BlockRead,
+    ClearFlag,
+    DataRead,
+    DataWrite,
+    Merging,
+    ProgramStatus,
+    ReadFlag,
+    ReadFlags,
+    ReadStatus,
+    SetFlag,
+)
+
+if TYPE_CHECKING:
+    from busmaster.bus import Bus
+
+MODELS_WITH_RFLAGS = frozenset({"MSC-250", "MSC-850/32"})
+ADDRESS_STEPS = (1, 4)
+"""The document does not say: addresses may count values or bytes."""
+FORM = "a data address or symbol, 2008:32 for a run of 32, flag:5, flags, or status"
+
+
+class MscController(Handle):
+    """An MSC controller: units 1-15. Data variables by address, or by name from `symbols`; flags; the program's status.
+
+        press = MscController(bus, 3, symbols={"count": 2008, "cam": 3000}, address_step=4, model="MSC-250")
+        count = await press.read("count")
+        await press.load_cam("cam", table)
+        if ProgramStatus.PROGRAM_RUNNING in await press.status(): ...
+
+    `symbols` is the data table of the program's listing. `address_step` is what the address grows by from one value to
+    the next; the document does not say, so give it or let `find_address_step` find it: until then no more than one
+    block of 32 values is transferred at once. Models "MSC-250" and "MSC-850/32" send all flags in one exchange. All
+    handles of a unit know its step and its model; `symbols` are each handle's own.
+    """
+
+    profile: ClassVar[Profile] = msc.PROFILE
+
+    def __init__(
+        self,
+        bus: Bus,
+        address: int,
+        *,
+        symbols: Mapping[str, int] | None = None,
+        address_step: int | None = None,
+        model: str | None = None,
+        timings: Timings | None = None,
+        retries: int | None = None,
+    ) -> None:
+        self.model = model
+        self.symbols = dict(symbols or {})
+        for name, symbol in self.symbols.items():
+            DataRead(symbol)
+            if not name or name in self.items() or name.isdigit() or set(name) & set(":=, "):
+                raise InvalidCommand(f"{name!r} cannot be the name of a symbol")
+        known = Merging(address_step, model in MODELS_WITH_RFLAGS)
+        profile = self.profile if known == Merging() else replace(self.profile, merge=known)
+        self.node: Node = bus.node(profile, address, timings=timings, retries=retries)
+
+    @property
+    def address_step(self) -> int | None:
+        """What the address grows by from one value to the next, for every handle of this unit; None: not known yet."""
+        return self._merging.address_step
+
+    @address_step.setter
+    def address_step(self, step: int) -> None:
+        self.node.merge_reads(replace(self._merging, address_step=step))
+
+    # points
+
+    @classmethod
+    def items(cls) -> tuple[str, ...]:
+        return ("flags", "status")
+
+    def point(self, item: str) -> Point[Any]:
+        """A value ("2008" or a symbol), a run of values ("2008:32"), "flag:5", "flags" or "status"."""
+        if item_text(item) == "status":
+            return Point(self.node, item, ReadStatus())
+        if item == "flags":
+            return Point(self.node, item, ReadFlags())
+        name, colon, number = item.partition(":")
+        if colon and not is_decimal(number):
+            raise unknown_item(item, (*self.items(), *self.symbols), FORM)
+        if name == "flag" and colon:
+            return self._flag_point(int(number))
+        if name not in self.symbols and not is_decimal(name):
+            raise unknown_item(item, (*self.items(), *self.symbols), FORM)
+        address = self.address_of(name)
+        if colon:
+            return Run.of(self, item, address, int(number))
+        return Point(self.node, item, DataRead(address), encode=lambda value: DataWrite(address, value))
+
+    def _flag_point(self, flag: int) -> Point[bool]:
+        def encode(on: bool) -> Command[None]:
+            if on not in (0, 1):
+                raise InvalidCommand(f"a flag is written 1 or 0, not {on!r}")
+            return SetFlag(flag) if on else ClearFlag(flag)
+
+        return Point(self.node, f"flag:{flag}", ReadFlag(flag), encode=encode)
+
+    def run_items(self, item: str, count: int) -> tuple[str, ...]:
+        """What each value of a run is called: its address, or the run's with the value's number where it is unknown."""
+        name = item.partition(":")[0]
+        if self.address_step is None:
+            return tuple(f"{name}[{i}]" for i in range(count))
+        address = self.address_of(name)
+        return tuple(str(address + i * self.address_step) for i in range(count))
+
+    async def read_item(self, item: str, **options: Any) -> Any:
+        """As `point(item).read()`; the flags of a model without RFLAGS one by one."""
+        try:
+            return await self.point(item).read()
+        except Refused:
+            if item != "flags":
+                raise
+            return await self.flags()
+
+    def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
+        """Consecutive data addresses, in blocks and one by one."""
+        if len(values) == 1:
+            return super().prepare_write(item, values, verify)
+        name, _, count = item.partition(":")
+        if count and count != str(len(values)):
+            raise InvalidCommand(f"{item} takes {count} values, not {len(values)}")
+        encoder(self.point(name))
+        writes(self.address_of(name), values, self.address_step)
+        return [lambda: self.write_block(name, values, verify=verify)]
+
+    def address_of(self, where: int | str) -> int:
+        """The data address of a symbol; an address is returned as it is. Raises InvalidCommand for no such symbol."""
+        if not isinstance(where, str):
+            return where
+        if where in self.symbols:
+            return self.symbols[where]
+        if not is_decimal(where):
+            raise unknown_item(where, self.symbols, "a data address or a symbol of this controller's program")
+        return int(where)
+
+    # values
+
+    async def read(
+        self,
+        where: int | str,
+        *,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+    ) -> int:
+        """The value at a data address or symbol, now. Raises Refused for an address outside the data area."""
+        command = DataRead(self.address_of(where))
+        return await self.node.request(command, priority=priority, start_within=start_within, retries=retries)
+
+    async def write(
+        self,
+        where: int | str,
+        value: int,
+        *,
+        verify: bool = False,
+        idempotent: bool = False,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+    ) -> None:
+        """Write one value, acknowledged.
+
+        `verify` reads it back, and raises VerifyFailed if it differs. `idempotent` allows a retry after an unknown
+        outcome: not where the program consumes what is written. Raises InvalidCommand, before anything is sent, for
+        what is no signed 32-bit number.
+        """
+        await self.write_block(
+            where, [value], verify=verify, idempotent=idempotent, priority=priority, start_within=start_within
+        )
+
+    async def read_block(
+        self,
+        where: int | str,
+        count: int,
+        *,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+    ) -> tuple[int, ...]:
+        """`count` consecutive values, 32 an exchange: not all of one moment, if they are more.
+
+        Where the last 32 would reach beyond the data area and are refused, the values are read one by one. Raises
+        InvalidCommand for more than 32 while the address step is unknown. `start_within` is for each exchange.
+        """
+        address = self.address_of(where)
+        values: list[int] = []
+        for part in reads(address, count, self.address_step):
+            values += await self._read_part(part, priority=priority, start_within=start_within, retries=retries)
+        return tuple(values)
+
+    async def write_block(
+        self,
+        where: int | str,
+        values: Iterable[int],
+        *,
+        verify: bool = False,
+        idempotent: bool = False,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        """Write consecutive values: whole blocks of 32, and what is left one by one, so that nothing else is touched.
+
+        If one exchange fails, what came before it is stored. `verify` reads all back when all are written, and raises
+        VerifyFailed at the first that differs. `progress` is told after each exchange how many values are done of how
+        many; those to be verified count twice. Raises InvalidCommand, before anything is sent, for a value that is no
+        signed 32-bit number, and for more than one exchange while the address step is unknown.
+        """
+        address = self.address_of(where)
+        wanted = tuple(values)
+        done = Count(progress, len(wanted) * (1 + verify))
+        for command, size in writes(address, wanted, self.address_step):
+            await self.node.request(
+                command, priority=priority, start_within=start_within, idempotent=idempotent or None
+            )
+            done.add(size)
+        if verify:
+            await self._verify(address, wanted, priority, done)
+
+    async def load_cam(
+        self,
+        where: int | str,
+        values: Iterable[int],
+        *,
+        progress: Progress | None = None,
+        priority: Priority | None = None,
+    ) -> None:
+        """Write a CAM table and verify it: `write_block` in the background of other traffic, repeated where uncertain.
+
+        Load it while the program does not use it. If this raises, part of the table is stored: load it again.
+        """
+        await self.write_block(
+            where,
+            values,
+            verify=True,
+            idempotent=True,
+            priority=Priority.BACKGROUND if priority is None else priority,
+            progress=progress,
+        )
+
+    async def find_address_step(self, where: int | str) -> int:
+        """Find what the address grows by from one value to the next, and keep it in `address_step`.
+
+        `where` is the first of a few values that differ and that nothing changes meanwhile: a block read from there
+        is compared with single reads. Raises InvalidCommand where they do not tell; then give the step.
+        """
+        address = self.address_of(where)
+        block = await self.node.request(BlockRead(address))
+        found = {step: await self._value_or_none(address + step) for step in ADDRESS_STEPS}
+        bytewise = found[4] == block[1]
+        valuewise = found[1] == block[1] and found[4] == block[4]
+        if bytewise == valuewise:
+            raise InvalidCommand(
+                f"{self.node.label}: the values from {address} on do not tell the address step: "
+                "point at some that differ, or give address_step"
+            )
+        step = 4 if bytewise else 1
+        self.address_step = step
+        return step
+
+    # flags and status
+
+    async def flag(self, number: int, *, priority: Priority | None = None) -> bool:
+        """Whether a flag (input, output, timer, motor status or user flag), 0 to 255, is on."""
+        return await self.node.request(ReadFlag(number), priority=priority)
+
+    async def set_flag(self, number: int, *, priority: Priority | None = None) -> None:
+        """Turn an output flag or user flag on. Raises Refused for another."""
+        await self.node.request(SetFlag(number), priority=priority)
+
+    async def clear_flag(self, number: int, *, priority: Priority | None = None) -> None:
+        """Turn an output flag or user flag off. Raises Refused for another."""
+        await self.node.request(ClearFlag(number), priority=priority)
+
+    async def flags(self, *, priority: Priority | None = None) -> frozenset[int]:
+        """The flags that are on: in one exchange where the model can, else in 256."""
+        if self._merging.all_flags:
+            return await self.node.request(ReadFlags(), priority=priority)
+        return frozenset([flag for flag in range(FLAGS) if await self.flag(flag, priority=priority)])
+
+    async def status(self, *, priority: Priority | None = None) -> ProgramStatus:
+        """The macroprogram status word."""
+        return await self.node.request(ReadStatus(), priority=priority)
+
+    # inside
+
+    @property
+    def _merging(self) -> Merging:
+        """What is known of the unit, whichever of its handles was told."""
+        merge = self.node.profile.merge
+        return merge if isinstance(merge, Merging) else Merging()
+
+    async def _read_part(self, part: Part, **options: Any) -> tuple[int, ...]:
+        step = self.address_step
+        try:
+            found = await self.node.request(part.command, **options)
+        except Refused:
+            if part.size in (1, BLOCK) or step is None:
+                raise
+            places = [place(part.at, i, step) for i in range(part.size)]
+            return tuple([await self.node.request(DataRead(at), **options) for at in places])
+        return found[: part.size] if isinstance(found, tuple) else (found,)
+
+    async def _verify(self, address: int, wanted: Sequence[int], priority: Priority | None, done: Count) -> None:
+        index = 0
+        for part in reads_back(address, len(wanted), self.address_step):
+            for found in await self._read_part(part, priority=priority):
+                if found != wanted[index]:
+                    raise VerifyFailed(
+                        f"value {index} from data {address} on reads {found} after {wanted[index]} was written",
+                        node=self.node.label,
+                    )
+                index += 1
+            done.add(part.size)
+
+    async def _value_or_none(self, address: int) -> int | None:
+        try:
+            return await self.read(address)
+        except Refused:
+            return None
+
+
+@dataclass(frozen=True, slots=True)
+class LongRun:
+    """Stands for a run of more than one block, which is more than one exchange and cannot be polled."""
+
+    address: int
+    count: int
+
+    writes: ClassVar[bool] = False
+    idempotent: ClassVar[bool] = True
+
+    def __str__(self) -> str:
+        return f"read {self.count} values from data {self.address}"
+
+    def open(self, address: int, timings: Timings, /) -> NoReturn:
+        raise InvalidCommand(f"a point that is polled has at most {BLOCK} values, not {self.count}: poll several")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run(Point[tuple[int, ...]]):
+    """Consecutive values as one point, of any length. One block of 32 at most can be polled."""
+
+    handle: MscController = field(compare=False)
+    address: int
+    count: int
+
+    @classmethod
+    def of(cls, handle: MscController, item: str, address: int, count: int) -> Run:
+        """Raises InvalidCommand for more than one block while the address step is unknown."""
+        reads(address, count, handle.address_step)
+        command = BlockRead(address) if count <= BLOCK else LongRun(address, count)
+        return cls(
+            node=handle.node,
+            item=item,
+            command=command,
+            decode=lambda block: block[:count],
+            handle=handle,
+            address=address,
+            count=count,
+        )
+
+    @property
+    def writable(self) -> bool:
+        return True
+
+    async def read(self, *, max_age: float | None = None, **options: Any) -> tuple[int, ...]:
+        """As `Point.read`; `MscController.read_block` where it is longer than a block."""
+        if self.count <= BLOCK:
+            return await Point.read(self, max_age=max_age, **options)
+        return await self.handle.read_block(self.address, self.count, **options)
+
+    async def write(self, value: Sequence[int], *, priority: Priority | None = None, **options: Any) -> None:
+        """As `MscController.write_block`. Raises InvalidCommand unless there are as many values as in the run."""
+        if len(value) != self.count:
+            raise InvalidCommand(f"{self.node.label}: {self.item} takes {self.count} values, not {len(value)}")
+        await self.handle.write_block(self.address, value, priority=priority, **options)

@@ -1,0 +1,169 @@
+"""What one protocol is to the rest of the package: a frozen object, made in the protocol's own folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Literal
+
+from busmaster.errors import InvalidCommand
+
+if TYPE_CHECKING:  # so that a master alone does not load the emulator
+    from busmaster.capture.decode import Dialect
+    from busmaster.emulator.device import Delay, Device
+    from busmaster.emulator.oracle import Oracle
+    from busmaster.exchange import Command
+    from busmaster.handle import Handle
+    from busmaster.profile import Profile
+
+NAME = re.compile(r"[a-z][a-z0-9_-]*")
+HIGHEST_CAPTURE_ID = 255
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """Describe one thing that can be said of nodes of one kind alone: an argument of that name, of their handle.
+
+    `help` is what the command line says of it; without one it can be said in LINE.toml alone. `common`: it may also be
+    said once for all nodes of the kind, in [protocols.NAME].
+    """
+
+    name: str
+    kind: Literal["flag", "whole", "text", "addresses"]
+    """A whole number is 1 or more. "addresses" is a table of names and the address that each stands for."""
+    help: str = ""
+    common: bool = True
+
+
+class DeviceMaker(typing.Protocol):
+    """Makes an emulated device.
+
+    `oracle`: every value is the oracle's, whose modulus must be one that the protocol can carry. `lively`: something
+    moves on it from the start. Raises InvalidCommand for an address that the device cannot have.
+    """
+
+    def __call__(self, address: int, /, *, delay: Delay, oracle: Oracle | None, lively: bool) -> Device: ...
+
+
+def device_of(module: str) -> DeviceMaker:
+    """Return the `make_device` of a module that is not imported before the first device is made."""
+
+    def make_device(address: int, /, *, delay: Delay, oracle: Oracle | None, lively: bool) -> Device:
+        device: Device = import_module(module).make_device(address, delay=delay, oracle=oracle, lively=lively)
+        return device
+
+    return make_device
+
+
+def everywhere(item: str) -> bool:
+    """Return True, whatever the item."""
+    return True
+
+
+def nowhere(item: str) -> bool:
+    """Return False, whatever the item."""
+    return False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NodeKind:
+    """Describe the nodes that go by one name: on the command line, in LINE.toml and in captures.
+
+    Most protocols have one kind, of the protocol's own name.
+    """
+
+    name: str
+    handle: type[Handle]
+    make_device: DeviceMaker
+    items: str
+    """What an ITEM of such a node looks like, for the command line's help; its words are wrapped there."""
+    options: tuple[Option, ...] = ()
+    """Arguments of its handle."""
+    read_options: tuple[Option, ...] = ()
+    """Arguments of its handle's `read_item`, for the command line."""
+    whole_numbers: Callable[[str], bool] = nowhere
+    """Whether the line carries whole numbers for an item: a value scaled by LINE.toml is then rounded to one."""
+    takes_decimals: bool = False
+    """Its handle has an argument `decimals`, digits by item, and scales or rounds by it: LINE.toml does not."""
+    capture_id: int = 0
+    """What the header of a captured frame calls it beside its name, for the dissector. 0: by its name alone."""
+    protocol: Protocol = field(init=False, repr=False)
+    """Set by the protocol that lists it."""
+
+    def __post_init__(self) -> None:
+        if not NAME.fullmatch(self.name):
+            raise InvalidCommand(f"{self.name!r} is no name of a protocol: use small letters, digits, - and _")
+        if not 0 <= self.capture_id <= HIGHEST_CAPTURE_ID:
+            raise InvalidCommand(f"{self.name}: a capture id is 0 to {HIGHEST_CAPTURE_ID}, not {self.capture_id}")
+
+    @property
+    def profile(self) -> Profile:
+        return self.protocol.profile
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Protocol:
+    """Hold all that the rest of the package knows of one protocol.
+
+    `kinds` are the kinds of nodes that speak it; the first is what its frames are taken to be from where nobody says.
+    `commands` are all its commands, by the names under which they are written down. `dialect` makes a reader of
+    captures.
+    """
+
+    profile: Profile
+    kinds: tuple[NodeKind, ...]
+    commands: Mapping[str, type[Command[Any]]]
+    dialect: Callable[[], Dialect]
+    shares_line_with: frozenset[str] = frozenset()
+    """The other protocols whose nodes may be on the same line."""
+
+    def __post_init__(self) -> None:
+        if not self.kinds:
+            raise InvalidCommand(f"{self.profile.name}: a protocol has at least one kind of node")
+        for kind in self.kinds:
+            object.__setattr__(kind, "protocol", self)
+
+    @property
+    def name(self) -> str:
+        return self.profile.name
+
+    def write_down(self, command: Command[Any]) -> dict[str, Any]:
+        """Return a command as plain values, which JSON can carry: its name, and what it does not say by default.
+
+        Raises InvalidCommand for a command that is not of this protocol.
+        """
+        for name, kind in self.commands.items():
+            if type(command) is kind:
+                return {"command": name, **_arguments_of(command)}
+        raise InvalidCommand(f"{self.name} has no command {type(command).__name__}")
+
+    def read_back(self, written: Mapping[str, Any]) -> Command[Any]:
+        """Build the command that was written down, and so check it again. Raises InvalidCommand."""
+        name = written.get("command")
+        kind = self.commands.get(str(name))
+        if kind is None:
+            raise InvalidCommand(f"{self.name} has no command {name!r}: use {', '.join(self.commands)}")
+        arguments = {key: _frozen(value) for key, value in written.items() if key != "command"}
+        for part in dataclasses.fields(kind):  # type: ignore[arg-type]  # every command is a dataclass
+            if isinstance(part.default, bool) and not isinstance(arguments.get(part.name, False), bool):
+                raise InvalidCommand(f"{self.name}: {name}: {part.name} is true or false, not {arguments[part.name]!r}")
+        try:
+            return kind(**arguments)
+        except InvalidCommand:
+            raise
+        except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
+            raise InvalidCommand(f"{self.name}: {name}: {error}") from None
+
+
+def _arguments_of(command: Any) -> dict[str, Any]:
+    given = ((part, getattr(command, part.name)) for part in dataclasses.fields(command) if part.init)
+    return {part.name: value for part, value in given if value != part.default}
+
+
+def _frozen(value: Any) -> Any:
+    """A list, which is what JSON makes of a tuple, as a tuple again."""
+    return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value

@@ -1,0 +1,32 @@
+"""CT-ANSI (Unidrive, Commander): parameters by menu and number, with the decimal points that the drive sends.
+
+    python examples/ct_ansi_hello.py [PORT]  such as /dev/ttyUSB0 or socket://10.0.0.5:4001; without one, emulated
+
+With a PORT it writes the preset reference 01.21 of drive 12.
+"""
+
+import sys
+
+import anyio
+
+from busmaster import Bus, CtAnsiDrive, Endpoint, MemoryPort, NoSuchParameter, endpoint
+from busmaster.emulator.line import Line
+from busmaster.registry import make_device
+
+
+async def main(port: Endpoint) -> None:
+    async with Bus(port) as bus:
+        drive = CtAnsiDrive(bus, 12, decimals={"1.21": 1})  # values written to 01.21 are rounded to one decimal
+        await drive.write("1.21", -47.64, verify=True)
+        print("01.21 is", await drive.read("1.21"))
+        print("01.21 to 01.23 are", await drive.read_run("1.21", 3))
+        try:
+            await drive.read("17.23")
+        except NoSuchParameter as error:
+            print(error)
+
+
+if __name__ == "__main__":
+    settings = CtAnsiDrive.profile.line  # 9600 7E1
+    emulated = MemoryPort(Line(settings, [make_device("ct-ansi", 12)]))
+    anyio.run(main, endpoint(sys.argv[1], defaults=settings) if sys.argv[1:] else emulated)

@@ -1,0 +1,193 @@
+"""CT-ANSI with decimal points: frames that the UD70 and UD78 guides print, and those of x328."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from busmaster import Bus, CtAnsiDrive, InvalidCommand, MemoryPort, NoSuchParameter, Refused, VerifyFailed
+from busmaster.capture.frames import Kind
+from busmaster.emulator.line import Line
+from busmaster.exchange import Done
+from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
+from busmaster.protocols.ct_ansi.device import EmulatedCtAnsi
+from busmaster.registry import find
+from busmaster.testing import Case, RoundTrip, Unseen, answers_of, check_protocol
+from busmaster.testing.virtual_time import run_in_virtual_time
+from tests.capture.hearing import hear, said
+from tests.emulator.lines import ask, line_of
+
+ACK, NAK, EOT = b"\x06", b"\x15", b"\x04"
+UD70_REPLY = bytes.fromhex("02 30 31 32 31 2D 34 37 2E 36 03 37")  # 01.21 = -47.6, as the UD70 guide prints it
+
+
+def parameter_named(command: Any, address: int) -> object:
+    """A telegram names its parameter and no drive."""
+    return "ACK" if command.writes else (command.menu, command.number)
+
+
+def test_ct_ansi_keeps_the_contract() -> None:
+    second = bytes.fromhex("02 30 31 32 32 35 03 37")
+    check_protocol(
+        PROFILE,
+        [
+            Case(Read(1, 21), 12, [UD70_REPLY], -47.6, request=bytes.fromhex("04 31 31 32 32 30 31 32 31 05")),
+            Case(Read(12, 34), 43, [bytes.fromhex("02 31 32 33 34 31 32 33 34 35 03 36")], 12345),
+            Case(Read(17, 23), 12, [EOT], raises=NoSuchParameter),
+            Case(Read(1, 19), 12, [NAK], raises=Refused),
+            Case(ReadRun(1, 21, 2), 12, [UD70_REPLY, second], (-47.6, 5)),
+            Case(
+                Write(1, 25, -34.5),
+                12,
+                [ACK],
+                request=bytes.fromhex("04 31 31 32 32 02 30 31 32 35 2D 33 34 2E 35 03 34"),
+            ),
+            Case(Write(12, 34, 56), 43, [ACK], request=bytes.fromhex("04 34 34 33 33 02 31 32 33 34 2B 35 36 03 2F")),
+            Case(Write(1, 21, 9999), 14, [NAK], raises=Refused),
+            Case(Write(17, 23, 1), 14, [EOT], raises=NoSuchParameter),
+            Case(Write(1, 21, 0.0), 0, []),
+        ],
+        names=parameter_named,
+        unseen=[Unseen(EOT, ACK, "one bit apart, and no more than one byte: 7E1 sees it by its parity")],
+        invalid=[
+            lambda: Read(100, 1),
+            lambda: Write(1, 100, 0),
+            lambda: Write(1, 21, math.nan),
+            lambda: Write(1, 21, 1e12),
+            lambda: Write(1, 21, 0.12345678901),
+            lambda: Write(1, 21, "1"),  # type: ignore[arg-type]  # that is what is refused
+            lambda: Read(1, 17).open(0, PROFILE.timings),
+        ],
+        round_trips=[
+            RoundTrip(14, lambda value: Write(1, 21, value), Read(1, 21), [i / 10 for i in range(-1000, 1001, 7)]),
+            RoundTrip(14, lambda value: Write(15, 60, value), Read(15, 60), [0, 9999, 10000, 65535]),
+            RoundTrip(14, lambda value: Write(4, 26, value), Read(4, 26), [True, False]),
+        ],
+        device=answers_of(EmulatedCtAnsi(14)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("data", "value"),
+    [
+        ("-47.6", -47.6),
+        ("-0047.6", -47.6),
+        ("+0476", 476),
+        ("  12.5", 12.5),
+        ("5", 5),
+        ("5.", 5.0),
+        (".5", 0.5),
+        ("X1F", 31),
+        ("-1234567.891", -1234567.891),
+    ],
+)
+def test_data_have_a_decimal_point_or_none(data: str, value: float) -> None:
+    covered = b"0121" + data.encode() + b"\x03"
+    check = 0
+    for byte in covered:
+        check ^= byte
+    reply = b"\x02" + covered + bytes((check if check >= 0x20 else check + 0x20,))
+    step = Read(1, 21).open(12, PROFILE.timings).feed(reply)
+    assert step == Done(value)
+    assert isinstance(step, Done)
+    assert type(step.value) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(-47.6, "-47.6"), (5, "+5"), (5.0, "+5"), (-0.0, "+0"), (100, "+100"), (0.001, "+0.001"), (1e6, "+1000000")],
+)
+def test_a_value_is_written_shortest_exact(value: float, text: str) -> None:
+    assert Write(1, 21, value).text == text
+
+
+def told(story: Callable[[CtAnsiDrive], Coroutine[Any, Any, None]], **options: Any) -> None:
+    async def main() -> None:
+        async with Bus(MemoryPort(Line(PROFILE.line, [EmulatedCtAnsi(12), EmulatedCtAnsi(13)]))) as bus:
+            await story(CtAnsiDrive(bus, 12, **options))
+
+    run_in_virtual_time(main())
+
+
+def test_values_are_read_and_written_in_their_own_unit() -> None:
+    async def story(drive: CtAnsiDrive) -> None:
+        await drive.write("1.21", -47.64, verify=True)  # one decimal is declared
+        assert await drive.read("1.21") == -47.6
+        await drive.point("1.22").write(12.5)
+        assert await drive.read_run("1.21", 2) == await drive.read_run("1.21", 2, chain=True) == (-47.6, 12.5)
+        assert await drive.point("1.21:2").read() == (-47.6, 12.5)
+        assert await drive.read_item("1.21:2") == (-47.6, 12.5)
+        with pytest.raises(NoSuchParameter):
+            await drive.read("17.23")
+        with pytest.raises(Refused):
+            await drive.write("1.21", 100.1)
+        with pytest.raises(Refused):
+            await drive.write("1.22", 1.25)  # finer than the parameter, and no decimals declared
+        everyone = CtAnsiDrive(drive.node.bus, 0)
+        await everyone.write("1.23", 1.5)
+        assert await drive.read("1.23") == 1.5
+
+    told(story, decimals={"1.21": 1})
+
+
+def test_a_value_that_differs_after_writing_is_told() -> None:
+    async def story(drive: CtAnsiDrive) -> None:
+        answers = iter((Done(None), Done(5.0)))
+
+        async def request(command: Any, **options: Any) -> Any:
+            return next(answers).value
+
+        drive.node.request = request  # type: ignore[method-assign]  # a drive that limits what it takes
+        with pytest.raises(VerifyFailed, match=r"1.21 reads 5.0 after \+6 was written"):
+            await drive.write("1.21", 6, verify=True)
+
+    told(story)
+
+
+@pytest.mark.parametrize("item", ["1", "1.2.3", "1.21:", "1.21:wide", "1.21:x", "1.21:200"])
+def test_an_item_that_does_not_exist_is_refused(item: str) -> None:
+    async def story(drive: CtAnsiDrive) -> None:
+        with pytest.raises(InvalidCommand):
+            drive.point(item)
+
+    told(story)
+
+
+@pytest.mark.parametrize("address", [1, 9, 10, 20, 90, 100])
+def test_an_address_that_means_a_group_or_nothing_is_no_drives_own(address: int) -> None:
+    with pytest.raises(InvalidCommand, match="use 11 to 99 without 20, 30, 40, 50, 60, 70, 80, 90, or 0"):
+        PROFILE.check_address(address)
+    with pytest.raises(InvalidCommand):
+        EmulatedCtAnsi(address)
+
+
+def test_an_emulated_drive_sends_as_the_guides_print_it() -> None:
+    filled = bytes.fromhex("02 30 31 32 31 2D 30 30 34 37 2E 36 03 37")  # "-0047.6", as the UD78 guide has it
+    for width, wanted in ((0, UD70_REPLY), (7, filled)):
+        drive = EmulatedCtAnsi(12, width=width)
+        drive.set_value(121, -476, 0.0)
+        assert bytes.fromhex(ask(line_of(drive), "04 31 31 32 32 30 31 32 31 05", 1.0)) == wanted
+    drive = EmulatedCtAnsi(12, plus=True)
+    assert bytes.fromhex(ask(line_of(drive), "04 31 31 32 32 30 34 32 36 05", 1.0)) == b"\x020426+0\x038"
+
+
+def test_a_listener_hears_decimal_points_and_makes_commands_of_this_protocol() -> None:
+    frames = hear(
+        "ct-ansi",
+        "04 31 31 32 32 02 30 31 32 35 2D 33 34 2E 35 03 34",
+        "06",
+        "04 31 31 32 32 30 31 32 31 05",
+        UD70_REPLY.hex(),
+    )
+    assert said(frames) == [
+        "host 12 write 01.25 = -34.5",
+        "node 12 ACK",
+        "host 12 read 01.21",
+        "node 12 01.21 = -47.6",
+    ]
+    dialect = find("ct-ansi").protocol.dialect()
+    commands = [dialect.command(frame, ()) for frame in frames if frame.kind in (Kind.READ, Kind.WRITE)]
+    assert commands == [Write(1, 25, -34.5), Read(1, 21)]

@@ -1,0 +1,436 @@
+"""Modbus RTU: it keeps the contract, and its device is not fooled by its own exchange.
+
+The frames are those of the Modbus application protocol, V1.1b3, sections 6.1 to 6.6, 6.11 and 6.12, as RTU.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Coroutine
+from itertools import combinations
+from typing import Any
+
+import pytest
+
+from busmaster import Bus, InvalidCommand, MemoryPort, ModbusUnit, Refused, VerifyFailed
+from busmaster.emulator.line import Line
+from busmaster.exchange import Done
+from busmaster.protocols.modbus.codec import (
+    EXCEPTIONS,
+    PROFILE,
+    ReadBits,
+    ReadRegisters,
+    WriteCoils,
+    WriteRegisters,
+    with_crc,
+)
+from busmaster.protocols.modbus.device import EmulatedModbus
+from busmaster.protocols.modbus.handle import is_whole
+from busmaster.protocols.modbus.numbers import Number
+from busmaster.testing import Case, Foreign, RoundTrip, answers_of, check_protocol
+from busmaster.testing.virtual_time import run_in_virtual_time
+from tests.capture.hearing import hear, said
+
+UNIT = 0x11
+
+
+def frame(text: str) -> bytes:
+    return with_crc(bytes.fromhex(text))
+
+
+CASES = [
+    Case(ReadRegisters(0x6B, 3), UNIT, [frame("11 03 06 022b 0000 0064")], (555, 0, 100)),
+    Case(ReadRegisters(7), UNIT, [bytes.fromhex("11 03 02 02 2b 38 f8")], (555,)),
+    Case(ReadRegisters(8, table="input"), UNIT, [frame("11 04 02 000a")], (10,), request=frame("11 04 0008 0001")),
+    Case(ReadRegisters(7), UNIT, [frame("11 83 02")], raises=Refused),
+    Case(
+        ReadBits(0x13, 19),
+        UNIT,
+        [frame("11 01 03 cd 6b 05")],
+        tuple(bit == "1" for bit in "1011001111010110101"),
+        request=frame("11 01 0013 0013"),
+    ),
+    Case(
+        ReadBits(0xC4, 22, "discrete"),
+        UNIT,
+        [frame("11 02 03 ac db 35")],
+        tuple(bit == "1" for bit in "0011010111011011101011"),
+        request=frame("11 02 00c4 0016"),
+    ),
+    Case(
+        WriteRegisters(1, (3,)),
+        UNIT,
+        [bytes.fromhex("11 06 00 01 00 03 9a 9b")],
+        request=bytes.fromhex("110600010003 9a9b"),
+    ),
+    Case(WriteRegisters(1, (3,)), UNIT, [frame("11 86 03")], raises=Refused),
+    Case(WriteRegisters(1, (10, 258)), UNIT, [frame("11 10 0001 0002")], request=frame("11 10 0001 0002 04 000a 0102")),
+    Case(WriteCoils(0xAC, (True,)), UNIT, [frame("11 05 00ac ff00")], request=frame("11 05 00ac ff00")),
+    Case(WriteCoils(0xAC, (False,)), UNIT, [frame("11 05 00ac 0000")], request=frame("11 05 00ac 0000")),
+    Case(
+        WriteCoils(0x13, tuple(bit == "1" for bit in "1011001110")),
+        UNIT,
+        [frame("11 0f 0013 000a")],
+        request=frame("11 0f 0013 000a 02 cd 01"),
+    ),
+    Case(WriteRegisters(1, (3,)), 0, []),
+    Case(WriteCoils(1, (True, False)), 0, []),
+]
+
+
+def what_a_reply_names(command: Any, address: int) -> object:
+    """A reply to a read names unit, function and size, not the places; one to a write all but the values."""
+    match command:
+        case ReadRegisters():
+            return address, command.table, command.count
+        case ReadBits():
+            return address, command.table, (command.count + 7) // 8
+        case _:
+            return address, type(command), command.first, len(command.values), command.values[1:] or command.values
+
+
+def test_modbus_keeps_the_contract() -> None:
+    numbers = [0, 1, 65535]
+    tally = check_protocol(
+        PROFILE,
+        CASES,
+        names=what_a_reply_names,
+        foreign=[
+            Foreign(ReadRegisters(7), UNIT, frame("12 03 02 02 2b"), "another unit's reply"),
+            Foreign(ReadRegisters(7), UNIT, frame("11 04 02 02 2b"), "a reply to another function"),
+        ],
+        invalid=[
+            lambda: ReadRegisters(65536),
+            lambda: ReadRegisters(0, 126),
+            lambda: ReadRegisters(65535, 2),
+            lambda: ReadRegisters(0, 1, "coil"),
+            lambda: ReadBits(0, 2001),
+            lambda: ReadBits(0, 1, "holding"),
+            lambda: WriteRegisters(0, ()),
+            lambda: WriteRegisters(0, (65536,)),
+            lambda: WriteRegisters(0, (1,) * 124),
+            lambda: WriteCoils(0, ()),
+            lambda: WriteCoils(0, (2,)),  # type: ignore[arg-type]  # that is what is refused
+            lambda: WriteCoils(0, (True,) * 1969),
+        ],
+        round_trips=[
+            RoundTrip(UNIT, lambda value: WriteRegisters(7, (value,)), ReadRegisters(7), numbers, lambda v: (v,)),
+            RoundTrip(UNIT, lambda values: WriteRegisters(7, values), ReadRegisters(7, 2), [(1, 2), (65535, 0)]),
+            RoundTrip(UNIT, lambda value: WriteCoils(7, (value,)), ReadBits(7), [True, False], lambda v: (v,)),
+            RoundTrip(
+                UNIT, lambda values: WriteCoils(7, values), ReadBits(7, 9), [(True, False, True) * 3, (False,) * 9]
+            ),
+        ],
+        device=answers_of(EmulatedModbus(UNIT)),
+    )
+    assert min(tally.values()) > 0
+
+
+@pytest.mark.parametrize(("code", "name"), [*EXCEPTIONS.items(), (7, "exception 7")])
+def test_an_exception_is_a_refusal_with_its_name(code: int, name: str) -> None:
+    exchange = ReadRegisters(7).open(UNIT, PROFILE.timings)
+    with pytest.raises(Refused, match=f"^refused: {name};"):
+        exchange.feed(with_crc(bytes((UNIT, 0x83, code))))
+
+
+def test_a_read_is_never_sent_to_all() -> None:
+    for command in (ReadRegisters(0), ReadBits(0)):
+        with pytest.raises(InvalidCommand, match="nobody answers"):
+            command.open(0, PROFILE.timings)
+
+
+def test_a_write_to_all_ends_without_an_answer_and_leaves_them_time() -> None:
+    exchange = WriteRegisters(1, (3,)).open(0, PROFILE.timings)
+    assert not exchange.answered
+    assert exchange.expired(False) == Done(None)
+    assert exchange.timing.turnaround >= PROFILE.timings.write.nominal
+
+
+# numbers
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "words"),
+    [
+        ("int16", -2, (0xFFFE,)),
+        ("uint16", 65535, (0xFFFF,)),
+        ("int32", -70000, (0xFFFE, 0xEE90)),
+        ("uint32", 0x12345678, (0x1234, 0x5678)),
+        ("float32", -12.5, (0xC148, 0x0000)),
+        ("float64", 1.1, (0x3FF1, 0x9999, 0x9999, 0x999A)),
+    ],
+)
+def test_a_number_takes_its_registers_most_significant_first_or_last(
+    kind: str, value: float, words: tuple[int, ...]
+) -> None:
+    for number, wanted in ((Number(kind), words), (Number(kind, swapped=True), words[::-1])):
+        assert number.encode(value) == wanted
+        assert number.decode(wanted) == value
+        assert number.registers == len(words)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        ("int16", 32768),
+        ("int16", -32769),
+        ("uint16", -1),
+        ("uint32", 2**32),
+        ("int32", 1.5),
+        ("uint16", True),
+        ("float32", 1e39),
+        ("float32", math.nan),
+        ("float64", math.inf),
+        ("float32", True),
+        ("float32", "1"),
+    ],
+)
+def test_a_number_that_does_not_fit_is_refused(kind: str, value: Any) -> None:
+    with pytest.raises(InvalidCommand):
+        Number(kind).encode(value)
+
+
+# the handle
+
+
+def told(story: Callable[[ModbusUnit, EmulatedModbus], Coroutine[Any, Any, None]]) -> None:
+    """With the handle of a unit, and the unit."""
+
+    async def main() -> None:
+        device = EmulatedModbus(UNIT, inputs=range(1000), read_only=frozenset({990}))
+        async with Bus(MemoryPort(Line(PROFILE.line, [device, EmulatedModbus(3)]))) as bus:
+            await story(ModbusUnit(bus, UNIT), device)
+
+    run_in_virtual_time(main())
+
+
+def test_items_are_read_and_written_in_their_tables() -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        await unit.write("holding:100", 7)
+        await unit.write("holding:101:int16", -2)
+        await unit.write("holding:102:float32:swapped", -12.5)
+        await unit.write("coil:5", 1)
+        assert device.registers[100:104] == [7, 0xFFFE, 0, 0xC148]
+        assert await unit.read("holding:100:4") == (7, 0xFFFE, 0, 0xC148)
+        assert await unit.read("holding:102:float32:swapped") == -12.5
+        assert await unit.read("coil:4:3") == (False, True, False)
+        assert await unit.read("input:999") == 999
+        assert await unit.read("discrete:0") is False
+        await unit.point("holding:100:2").write((1, 2))
+        assert device.registers[100:102] == [1, 2]
+
+    told(story)
+
+
+def test_many_values_go_in_as_many_exchanges_as_it_takes_and_no_number_is_torn() -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        await unit.write("holding:0:float32", *(i / 2 for i in range(100)), verify=True)
+        assert device.registers[:200] == [word for i in range(100) for word in Number("float32").encode(i / 2)]
+        await unit.write("coil:0", *(i % 3 == 0 for i in range(900)), verify=True)
+        assert device.coils[:900] == [i % 3 == 0 for i in range(900)]
+
+    told(story)
+
+
+def test_what_the_unit_does_not_have_or_take_is_refused_by_name() -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        with pytest.raises(Refused, match="illegal data address"):
+            await unit.read("holding:999:2")
+        with pytest.raises(Refused, match="illegal data value"):
+            await unit.write("holding:990", 1)
+        device.functions -= {4}
+        with pytest.raises(Refused, match="illegal function"):
+            await unit.read("input:0")
+
+    told(story)
+
+
+def test_a_value_that_differs_after_writing_is_told() -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        device.lively = True
+        with pytest.raises(VerifyFailed, match=r"holding 0 reads 3\d+ after 1 was written"):
+            await unit.write("holding:0", 1, verify=True)
+
+    told(story)
+
+
+def test_a_write_to_all_reaches_every_unit() -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        everyone = ModbusUnit(unit.node.bus, 0)
+        await everyone.write("holding:100", 5)
+        assert await unit.read("holding:100") == await ModbusUnit(unit.node.bus, 3).read("holding:100") == 5
+        with pytest.raises(InvalidCommand):
+            await everyone.read("holding:100")
+
+    told(story)
+
+
+@pytest.mark.parametrize(
+    "item",
+    [
+        *("100", "holding", "holding:", "holding:x", "holding:1.5", "registers:1"),
+        *("holding:1:int8", "coil:1:int16", "holding:1:swapped", "holding:1:float32:wrong"),
+        *("holding:65536", "input:65535:2", "holding:1:126", "holding:1:0"),
+    ],
+)
+def test_an_item_that_does_not_exist_is_refused(item: str) -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        with pytest.raises(InvalidCommand):
+            unit.point(item)
+
+    told(story)
+
+
+def test_inputs_are_read_only_and_a_run_takes_as_many_values_as_it_has() -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        for item in ("input:1", "discrete:1"):
+            assert not unit.point(item).writable
+            with pytest.raises(InvalidCommand, match="read-only"):
+                unit.prepare_write(item, (1,))
+        with pytest.raises(InvalidCommand, match="takes 3 values, not 2"):
+            unit.prepare_write("holding:1:3", (1, 2))
+
+    told(story)
+
+
+def test_each_of_several_values_has_its_own_item() -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        assert unit.run_items("holding:100:3", 3) == ("holding:100", "holding:101", "holding:102")
+        assert unit.run_items("holding:100:float32:swapped", 2) == (
+            "holding:100:float32:swapped",
+            "holding:102:float32:swapped",
+        )
+        assert unit.run_items("coil:9", 2) == ("coil:9", "coil:10")
+
+    told(story)
+
+
+def test_only_floats_are_not_rounded_when_they_are_scaled() -> None:
+    assert is_whole("holding:1")
+    assert is_whole("holding:1:int32:swapped")
+    assert not is_whole("holding:1:float64")
+
+
+# the emulated unit
+
+
+def heard_by(unit: EmulatedModbus, *chunks: tuple[float, bytes]) -> list[bytes]:
+    for start, chunk in chunks:
+        if unit.wakeup <= start:
+            unit.wake(unit.wakeup)
+        unit.hear(chunk, start)
+    if unit.wakeup < math.inf:
+        unit.wake(unit.wakeup)
+    return [said for _, said in unit.outbox]
+
+
+REQUEST = frame("11 03 0007 0001")
+
+
+@pytest.mark.parametrize("cut", range(1, len(REQUEST)))
+def test_a_request_in_two_pieces_is_one_and_a_cut_one_is_forgotten_after_a_silence(cut: int) -> None:
+    whole = heard_by(EmulatedModbus(UNIT), (0.0, REQUEST[:cut]), (0.0005, REQUEST[cut:]))
+    assert whole == heard_by(EmulatedModbus(UNIT), (0.0, REQUEST)) != []
+    assert heard_by(EmulatedModbus(UNIT), (0.0, REQUEST[:cut]), (0.1, REQUEST)) == whole
+
+
+def test_a_unit_lets_pass_what_is_for_others_even_where_its_own_address_stands_in_it() -> None:
+    reply_of_another = with_crc(b"\x12\x03\x08" + REQUEST)
+    assert heard_by(EmulatedModbus(UNIT), (1.0, reply_of_another)) == []
+    assert len(heard_by(EmulatedModbus(UNIT), (1.0, reply_of_another), (1.01, REQUEST))) == 1
+
+
+@pytest.mark.parametrize("bits", list(combinations(range(8), 2)))
+def test_damaged_requests_are_not_answered(bits: tuple[int, int]) -> None:
+    damaged = bytearray(REQUEST)
+    for bit in bits:
+        damaged[3] ^= 1 << bit
+    assert heard_by(EmulatedModbus(UNIT), (0.0, bytes(damaged))) == []
+
+
+@pytest.mark.parametrize(
+    ("request_", "answer"),
+    [
+        ("11 2b 0e 01 00", "11 ab 01"),  # a function that it does not have, of another length
+        ("11 07", "11 87 01"),
+        ("11 03 0000 0000", "11 83 03"),
+        ("11 03 0000 007e", "11 83 03"),
+        ("11 01 0000 07d1", "11 81 03"),
+        ("11 03 03e7 0002", "11 83 02"),
+        ("11 05 0000 0001", "11 85 03"),
+        ("11 05 03e8 ff00", "11 85 02"),
+        ("11 06 03e8 0000", "11 86 02"),
+        ("11 0f 0000 0009 01 ff", "11 8f 03"),
+        ("11 10 0000 0002 02 0001", "11 90 03"),
+        ("11 10 03e7 0002 04 0001 0002", "11 90 02"),
+    ],
+)
+def test_what_a_unit_lacks_or_cannot_take_is_an_exception(request_: str, answer: str) -> None:
+    assert heard_by(EmulatedModbus(UNIT), (0.0, frame(request_))) == [frame(answer)]
+
+
+def test_what_goes_to_all_is_done_and_not_answered() -> None:
+    unit = EmulatedModbus(UNIT)
+    assert heard_by(unit, (0.0, WriteRegisters(2, (7, 8)).open(0, PROFILE.timings).request)) == []
+    assert unit.registers[2:4] == [7, 8]
+
+
+def test_taken_whole_or_heard_byte_by_byte_a_request_gets_the_same_answer() -> None:
+    requests = [REQUEST, frame("11 04 0000 0001"), with_crc(struct.pack(">BBHH", UNIT, 3, 990, 11))]
+    for request in requests:
+        taking, hearing = EmulatedModbus(UNIT), EmulatedModbus(UNIT)
+        assert taking.take(request, 1.0)
+        hearing.hear(request, 1.0)
+        assert taking.outbox == hearing.outbox != []
+
+
+def test_a_request_that_only_silence_ends_is_heard_and_not_taken() -> None:
+    assert not EmulatedModbus(UNIT).take(frame("11 2b 0e 01 00"), 1.0)
+
+
+# a listener
+
+
+def test_a_listener_tells_requests_from_replies() -> None:
+    frames = hear(
+        "modbus",
+        frame("11 03 0064 0002").hex(),
+        frame("11 03 04 0001 ffff").hex(),
+        frame("11 06 0001 0003").hex(),
+        frame("11 06 0001 0003").hex(),
+        frame("11 0f 0013 000a 02 cd 01").hex(),
+        frame("11 8f 02").hex(),
+        frame("00 05 0001 ff00").hex(),
+        frame("11 01 0000 0018").hex(),
+        frame("11 01 03 05 00 80").hex(),  # eight bytes, as a request has
+        frame("11 04 0005 0001").hex(),
+        frame("11 04 0005 0001").hex(),  # asked again
+        frame("11 04 02 0007").hex(),
+    )
+    bits = ",".join("101" + "0" * 20 + "1")
+    assert said(frames) == [
+        "host 17 read holding:100:2",
+        "node 17 holding:100:2 = 1,65535",
+        "host 17 write holding:1 = 3",
+        "node 17 ACK",
+        "host 17 write coil:19:10 = 1,0,1,1,0,0,1,1,1,0",
+        "node 17 NAK",
+        "host 0 write coil:1 = 1",
+        "host 17 read coil:0:24",
+        f"node 17 coil:0:24 = {bits}",
+        "host 17 read input:5",
+        "host 17 read input:5",
+        "node 17 input:5 = 7",
+    ]
+
+
+def test_a_listener_says_what_is_wrong_with_a_frame() -> None:
+    request = "11 03 0064 0001"
+    assert said(hear("modbus", frame(request).hex(), "11 03 02 00 01 00 00", "|"))[1].endswith("[bad CRC]")
+    assert said(hear("modbus", frame("11 03 02 0001").hex(), "|"))[0].endswith("no frame]") is False
+    assert (
+        "it repeats another write"
+        in said(hear("modbus", frame("11 06 0001 0003").hex(), frame("11 06 0001 0004").hex()))[1]
+    )
+    assert "4 bytes of data, not 2" in said(hear("modbus", frame(request).hex(), frame("11 03 04 0001 0002").hex()))[1]
