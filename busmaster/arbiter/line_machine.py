@@ -448,8 +448,8 @@ class LineMachine:
     def _answer_stray(self, send: bytes, now: float) -> bool:
         """True if an answer was owed: then the line settles again."""
         if send:
-            self._wire.say(send, now)
             self._settle(now)
+            self._wire.say(send, now)  # after the settle, which forgets what echoes are to come
         return bool(send)
 
     def _strip_echo(self, data: bytes, now: float) -> bytes:
