@@ -46,13 +46,20 @@ class Bus:
     """One line and everything on it. Use it in `async with`: entering opens the port, leaving closes it.
 
     `capacity` bounds the requests that may wait in each priority class (R12). `seed` makes the jitter of probes and
-    reconnects repeatable. `tap` sees every byte (see busmaster.capture). Entering raises LineDown if the port cannot
+    reconnects repeatable. `strict`: an answer that could be another request's is held until that one would have come
+    (R15), at the line time that the README gives. `tap` sees every byte (see busmaster.capture). Entering raises LineDown if the port cannot
     be opened; once open, a lost port fails its callers at once and is opened again by itself, as soon as the same
     device is back (R13); `events` tells of attempts that fail.
     """
 
     def __init__(
-        self, endpoint: Endpoint, *, capacity: int = 1000, seed: int | None = None, tap: Tap | None = None
+        self,
+        endpoint: Endpoint,
+        *,
+        capacity: int = 1000,
+        seed: int | None = None,
+        tap: Tap | None = None,
+        strict: bool = False,
     ) -> None:
         capacity = whole_number(capacity, 1, MOST_CAPACITY, "a bus's capacity")
         if isinstance(endpoint, str):
@@ -70,6 +77,7 @@ class Bus:
             receive_latency=endpoint.receive_latency,
             capacity=capacity,
             jitter=self._random.random,
+            strict=strict,
         )
         self.pump = Pump(
             self._arbiter,

@@ -5,7 +5,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Hashable
 
-from busmaster.arbiter.events import Event, LatenessRaised, LineChange, LineChanged, NodeChanged, PortFailed, Strayed
+from busmaster.arbiter.events import (
+    Event,
+    LatenessLowered,
+    LatenessRaised,
+    LineChange,
+    LineChanged,
+    NodeChanged,
+    PortFailed,
+    Strayed,
+)
 from busmaster.arbiter.health import Health
 
 logger = logging.getLogger("busmaster")
@@ -37,6 +46,11 @@ class Logbook:
                 f"its lateness is now {event.lateness * 1000:.0f} ms"
             )
             self._write((event.node, LatenessRaised), logging.WARNING, text, now)
+        elif isinstance(event, LatenessLowered):
+            text = (
+                f"{event.node.label} has been prompt for an hour: its lateness is {event.lateness * 1000:.0f} ms again"
+            )
+            self._write((event.node, LatenessLowered), logging.INFO, text, now)
         elif isinstance(event, PortFailed):
             text = f"cannot reconnect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
             self._write((PortFailed, event.cause), logging.WARNING, text, now, event.bug)

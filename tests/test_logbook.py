@@ -6,7 +6,15 @@ import logging
 
 import pytest
 
-from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, NodeChanged, PortFailed, Strayed
+from busmaster.arbiter.events import (
+    LatenessLowered,
+    LatenessRaised,
+    LineChange,
+    LineChanged,
+    NodeChanged,
+    PortFailed,
+    Strayed,
+)
 from busmaster.arbiter.health import Health
 from busmaster.logbook import PAUSE, Logbook
 from tests.arbiter.bench import Bench
@@ -48,6 +56,11 @@ def test_r14_strays_are_counted_and_not_logged_but_a_collision_is(lines: pytest.
 def test_r14_a_raised_lateness_names_node_and_times(lines: pytest.LogCaptureFixture) -> None:
     Logbook("line").note(LatenessRaised(Bench().node(3), 0.14, 0.224), PAUSE)
     assert lines.messages == ["line: node 3 answered 140 ms after its request: its lateness is now 224 ms"]
+
+
+def test_r14_a_lateness_that_comes_down_again_names_node_and_time(lines: pytest.LogCaptureFixture) -> None:
+    Logbook("line").note(LatenessLowered(Bench().node(3), 0.15), PAUSE)
+    assert lines.messages == ["line: node 3 has been prompt for an hour: its lateness is 150 ms again"]
 
 
 def test_r13_a_failed_attempt_is_logged_with_what_to_try_and_a_bug_with_where(lines: pytest.LogCaptureFixture) -> None:

@@ -35,7 +35,7 @@ LONGEST_BUDGET_WAIT = 1.0
 CALM_LATENESS = 3600.0
 """Seconds of prompt replies after which a lateness that was raised comes down again."""
 SILENT = 2
-"""Attempts in a row without a byte after which a node that was heard before is not asked whether it is in step."""
+"""Attempts in a row without a byte after which a node is not asked whether it is in step."""
 MOST_ANSWERED = 3
 """Commands that are remembered of a node because it has answered them."""
 SLOWER, SLOWER_BY = 1.25, 0.001
@@ -141,8 +141,8 @@ class NodeRecord:
 
     @property
     def silent(self) -> bool:
-        """It does not answer, as far as is known: twice in a row, or never since it was first asked."""
-        return self.unheard >= (SILENT if self.last_reply > -inf else 1)
+        """It does not answer, as far as is known."""
+        return self.unheard >= SILENT
 
     def latest(self, unknown: float) -> float:
         """Seconds to the first byte of its replies that are no later than usual; `unknown` if none was timed."""

@@ -220,7 +220,7 @@ def _could_be(debt: Debt, answers: Sequence[bytes]) -> bool:
 
 def _is_silent(debt: Debt) -> bool:
     """Its node does not answer, as far as is known: another's answer must do. One that does is asked itself."""
-    return debt.node is None or debt.node.silent
+    return debt.node is None or debt.node.silent or debt.node.last_reply == -inf
 
 
 def _is(run: bytes, key: bytes) -> bool:

@@ -43,7 +43,7 @@ class ConfiguredLine:
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.file = file
-        self.bus = Bus(port or file.port, tap=tap)
+        self.bus = Bus(port or file.port, tap=tap, strict=file.strict)
         self.nodes: dict[str, Handle] = {name: self._handle(node) for name, node in file.nodes.items()}
         self.groups: dict[str, PollGroup] = {}
         self._points: dict[str, NamedPoint] = {}

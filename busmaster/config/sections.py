@@ -93,6 +93,7 @@ class LineFile:
     path: str
     title: str
     port: SerialPort | TcpPort
+    strict: bool
     nodes: Mapping[str, NodeSection]
     groups: Mapping[str, GroupSection]
     outputs: Outputs
@@ -108,12 +109,13 @@ def load(path: str | os.PathLike[str]) -> LineFile:
 def read(source: Source) -> LineFile:
     """Raises FileError, naming line and key."""
     top = Table(source)
-    top.only("title", "port", "protocols", "nodes", "groups", "outputs", "emulator")
+    top.only("title", "port", "strict", "protocols", "nodes", "groups", "outputs", "emulator")
     nodes = {node.name: node for node in _nodes(top, _defaults(top))}
     groups = {table.name: _group(table) for table in top.tables("groups")}
     file = LineFile(
         path=source.name,
         title=top.text("title", os.path.basename(source.name)),
+        strict=top.flag("strict", False),
         port=read_port(top, [node.profile for node in nodes.values()]),
         nodes=nodes,
         groups=groups,

@@ -45,6 +45,8 @@ LINE_COUNTS = {
     "stray_bytes": "Bytes that nobody had asked for",
     "tainted": "Replies that came sooner than the baud rate allows",
     "collisions": "Echoes that differ from what was sent",
+    "checks": "Reads that proved the line to be in step",
+    "doubted": "Answers that were not believed, as they could have been another request's",
     "settles": "Times the line was left to settle",
     "noisy": "Times the line would not be silent",
     "losses": "Times the port was lost",
