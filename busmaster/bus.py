@@ -46,10 +46,10 @@ class Bus:
     """One line and everything on it. Use it in `async with`: entering opens the port, leaving closes it.
 
     `capacity` bounds the requests that may wait in each priority class (R12). `seed` makes the jitter of probes and
-    reconnects repeatable. `strict`: an answer that could be another request's is held until that one would have come
-    (R15), at the line time that the README gives. `tap` sees every byte (see busmaster.capture). Entering raises LineDown if the port cannot
-    be opened; once open, a lost port fails its callers at once and is opened again by itself, as soon as the same
-    device is back (R13); `events` tells of attempts that fail.
+    reconnects repeatable. `tap` sees every byte (see busmaster.capture). `strict`: an answer that could be another
+    request's is held until that one would have come (R15), at the line time that the README gives. Entering raises
+    LineDown if the port cannot be opened; once open, a lost port fails its callers at once and is opened again by
+    itself, as soon as the same device is back (R13); `events` tells of attempts that fail.
     """
 
     def __init__(

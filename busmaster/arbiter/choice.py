@@ -37,33 +37,28 @@ class Choice:
 
         `silent`: for so many seconds nothing has come, so that an answer too many would have shown.
         """
-        first = self._open_next(now)
-        if first is None:
-            return None
-        in_step = self._in_step
-        answers = first[1].answers
-        if answers == in_step.last and not first[1].later:
-            in_step.alike = 0 if silent > first[1].timing.window else in_step.alike + 1
-            if in_step.alike >= LONGEST_ALIKE or in_step.alert:
-                return self._carefully(first, now)
-        elif in_step.alert:
-            return self._carefully(first, now)
-        else:
-            in_step.alike = 0
-        in_step.before, in_step.last = in_step.last, answers
-        return first
-
-    def _open_next(self, now: float) -> Chosen | None:
-        dispatcher = self._dispatcher
+        dispatcher, in_step = self._dispatcher, self._in_step
         while (transaction := dispatcher.next(now)) is not None:
             node = transaction.node
             try:
                 exchange = transaction.command.open(node.address, node.timings)
-                if exchange.answers is not None:  # a protocol may lack it: found out here, it fails this one alone
-                    return transaction, exchange
+                answers = exchange.answers  # a protocol may lack it: found out here, it fails this one alone
             except Exception as bug:
                 dispatcher.unsendable(transaction, bug, now)
-        return None
+            else:
+                break
+        else:
+            return None
+        if answers == in_step.last and not exchange.later:
+            in_step.alike = 0 if silent > exchange.timing.window else in_step.alike + 1
+            if in_step.alike >= LONGEST_ALIKE or in_step.alert:
+                return self._carefully((transaction, exchange), now)
+        elif in_step.alert:
+            return self._carefully((transaction, exchange), now)
+        else:
+            in_step.alike = 0
+        in_step.before, in_step.last = in_step.last, answers
+        return transaction, exchange
 
     def _carefully(self, first: Chosen, now: float) -> Chosen | float:
         """As `next`, where something is owed or doubted, or too many answers were alike."""

@@ -117,8 +117,7 @@ class Leg:
 
     def answered(self) -> None:
         """It was answered rightly, so it has left, whatever the baud rate says: the port is not paced."""
-        if self.end > self.begun_at:
-            self.end = self.out = self.begun_at
+        self.end = self.out = self.begun_at
 
     def quiet(self) -> float:
         """The silence, in seconds, after which nothing more of a frame can come."""

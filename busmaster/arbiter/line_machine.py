@@ -161,9 +161,12 @@ class LineMachine:
 
     def transmitted(self, now: float) -> None:
         """The port has taken only now what `poll_transmit` gave: whoever held the process up meanwhile."""
-        said_at = self._wire.output.said_at
-        late = self._wire.output.taken(now)
-        if late:
+        output = self._wire.output
+        said_at = output.said_at
+        late = now - said_at
+        if late > 0:
+            output.said_at = now
+            self._leg.shift(late)
             self._deadlines.line += late
             if self.state is SETTLING:
                 self._silent_at += late
@@ -291,7 +294,8 @@ class LineMachine:
         assert exchange is not None
         answered, leg = exchange.answered, self._leg
         if answered:
-            leg.answered()
+            if leg.end > leg.begun_at:
+                leg.answered()
             if self._in_step.alert or step.rest:
                 verdict = self._trust.weigh(self._wire, step, now)
                 if isinstance(verdict, str):

@@ -37,9 +37,10 @@ class OnWire:
         self.transaction = transaction
         self.exchange = exchange
         self.strayed = False
-        self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, now)
+        timing = exchange.timing
+        self._begin_leg(timing, exchange.sizes.longest, exchange.request, now)
         if not exchange.answered:
-            self._deadlines.line = self.leg.end + exchange.timing.turnaround
+            self._deadlines.line = self.leg.end + timing.turnaround
 
     def begin_reply(self, data: bytes, now: float) -> bytes:
         """Note that its reply begins with these bytes; returns them, without the noise that the profile tolerates."""

@@ -29,7 +29,8 @@ class Output:
         """Say this next."""
         self._bytes += data
         self.said_at = now
-        self._echo.sent(data)
+        if self._echo.declared:
+            self._echo.sent(data)
 
     def take(self) -> bytes:
         """Hand over what is to be sent."""
@@ -40,15 +41,6 @@ class Output:
         """What has not been handed over is not said, and what the port holds goes with it."""
         self._bytes = b""
         self.held = False
-
-    def taken(self, now: float) -> float:
-        """The port has it only now: its leg begins so many seconds later."""
-        late = now - self.said_at
-        if late <= 0:
-            return 0.0
-        self.said_at = now
-        self._leg.shift(late)
-        return late
 
     def unsent(self, count: int, now: float) -> float | None:
         """So many bytes have not left. Returns when to ask again; None if all have, inf if they have just left."""
