@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import inf
 
 from busmaster.arbiter.counters import LineStatistics
+from busmaster.arbiter.events import Event
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.schedule import Poll
@@ -22,6 +23,15 @@ class Arbiter(LineMachine):
     may lie in an adapter. `capacity`: requests of one class that may wait. `jitter` returns numbers from 0 to 1, by
     which probes are spread. `strict`: answers that could be another's are held until that one would have come (R15).
     """
+
+    @property
+    def byte_time(self) -> float:
+        """tau: seconds per byte of this line."""
+        return self._leg.byte_time
+
+    @byte_time.setter
+    def byte_time(self, seconds: float) -> None:
+        self._leg.byte_time = seconds
 
     def add_node(
         self, profile: Profile, address: int, now: float, timings: Timings | None = None, retries: int | None = None
@@ -76,6 +86,21 @@ class Arbiter(LineMachine):
         self.dispatcher.fail_all(now)
         if self.state is not EXCHANGE:
             self._go_offline(now)
+
+    # outputs, pumped in this order
+
+    def poll_transmit(self) -> bytes | None:
+        output = self._wire.output
+        data, output.waiting = output.waiting, b""
+        return data or None
+
+    def poll_event(self) -> Event | None:
+        if self.dispatcher.unnoted:
+            self.dispatcher.note_successes()
+        return self._events.popleft() if self._events else None
+
+    def poll_timeout(self) -> float:
+        return self._deadlines.earliest()
 
     def reset_statistics(self, now: float) -> None:
         self._counters.reset(self.state, now)

@@ -115,10 +115,6 @@ class Leg:
         self.taint_until += seconds
         self._limit += seconds
 
-    def answered(self) -> None:
-        """It was answered rightly, so it has left, whatever the baud rate says: the port is not paced."""
-        self.end = self.out = self.begun_at
-
     def quiet(self) -> float:
         """The silence, in seconds, after which nothing more of a frame can come."""
         return max(QUIET, self.timing.byte_gap) + self.latency + self.byte_time

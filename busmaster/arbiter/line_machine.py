@@ -46,7 +46,7 @@ from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.echo import Echo
-from busmaster.arbiter.events import Event, LineChange, LineChanged, Mark, Strayed
+from busmaster.arbiter.events import LineChange, LineChanged, Mark, Strayed
 from busmaster.arbiter.health import DOWN
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.leg import Leg
@@ -96,15 +96,6 @@ class LineMachine:
         self._up_at = -inf
         self._quarantine = -inf
         self._silent_at = -inf
-
-    @property
-    def byte_time(self) -> float:
-        """tau: seconds per byte of this line."""
-        return self._leg.byte_time
-
-    @byte_time.setter
-    def byte_time(self, seconds: float) -> None:
-        self._leg.byte_time = seconds
 
     # inputs
 
@@ -217,19 +208,6 @@ class LineMachine:
         elif self.state is READY:
             self._advance(now)
 
-    # outputs, pumped in this order
-
-    def poll_transmit(self) -> bytes | None:
-        return self._wire.output.take() or None
-
-    def poll_event(self) -> Event | None:
-        if self.dispatcher.unnoted:
-            self.dispatcher.note_successes()
-        return self._events.popleft() if self._events else None
-
-    def poll_timeout(self) -> float:
-        return self._deadlines.earliest()
-
     # one exchange
 
     def _advance(self, now: float) -> bool:
@@ -249,26 +227,39 @@ class LineMachine:
         if self.state is not EXCHANGE:
             self._enter(EXCHANGE, now)
         self._wire.begin(transaction, exchange, now)
-        if self._strays.watching:
+        if self._strays.unanswered_one is not None:
             self._strays.looked(now, self._deadlines.line)
         return True
 
     def _begin_reply(self, data: bytes, now: float) -> bytes:
         """The first bytes of a leg: returns those that may be its reply."""
-        exchange = self._wire.exchange
-        if now < self._leg.taint_until or self._wire.output.held:
+        wire, leg = self._wire, self._leg
+        transaction, exchange = wire.transaction, wire.exchange
+        assert transaction is not None
+        assert exchange is not None
+        if now < leg.taint_until or wire.output.held:
             self._counters.tainted += 1
             self._strays.last_byte = now
             self._attempt_failed(FrameError("bytes came before the request was out", heard=data), now)
             return b""
-        if exchange is not None and not exchange.answered:
-            self._strays.note(data, now, self._leg.quiet())
-            self._wire.strayed = True
+        if not exchange.answered:
+            self._strays.note(data, now, leg.quiet())
+            wire.strayed = True
             return b""
-        kept = self._wire.begin_reply(data, now)
-        self._counters.noise_bytes += len(data) - len(kept)
-        self._strays.last_byte = now
-        return kept
+        if transaction.node.profile.noise_tolerant:
+            kept = wire.without_noise(data)
+            self._counters.noise_bytes += len(data) - len(kept)
+            self._strays.last_byte = now
+            if not kept:
+                return b""
+            data = kept
+        leg.begun = True
+        leg.begun_at = now
+        if transaction.first_byte == -inf:
+            transaction.first_byte = now
+        if now > leg.late_after:
+            transaction.late = True
+        return data
 
     def _take(self, data: bytes | None, now: float) -> None:
         """Hand the reader these bytes, or the news (None) that none came in time, and do what it makes of them."""
@@ -294,8 +285,8 @@ class LineMachine:
         assert exchange is not None
         answered, leg = exchange.answered, self._leg
         if answered:
-            if leg.end > leg.begun_at:
-                leg.answered()
+            if leg.end > leg.begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
+                leg.end = leg.out = leg.begun_at
             if self._in_step.alert or step.rest:
                 verdict = self._trust.weigh(self._wire, step, now)
                 if isinstance(verdict, str):
@@ -379,7 +370,10 @@ class LineMachine:
             self._settle(now, begun=confirmed and certain)
 
     def _end_exchange(self, failed: bool = False) -> None:
-        self._wire.end(failed)
+        wire = self._wire
+        if failed and wire.exchange is not None:
+            self._leg.give_up(wire.exchange.later)
+        wire.transaction = wire.exchange = None
         self._trust.held = None
         self._counters.exchanges += 1
 

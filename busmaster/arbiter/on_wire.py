@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import inf
 from typing import Any, cast
 
 from busmaster.arbiter.deadlines import Deadlines
@@ -37,27 +36,15 @@ class OnWire:
         self.transaction = transaction
         self.exchange = exchange
         self.strayed = False
-        timing = exchange.timing
-        self._begin_leg(timing, exchange.sizes.longest, exchange.request, now)
+        self._begin_leg(exchange.timing, exchange.sizes.longest, exchange.request, now)
         if not exchange.answered:
-            self._deadlines.line = self.leg.end + timing.turnaround
+            self._deadlines.line = self.leg.end + exchange.timing.turnaround
 
-    def begin_reply(self, data: bytes, now: float) -> bytes:
-        """Note that its reply begins with these bytes; returns them, without the noise that the profile tolerates."""
-        transaction, exchange, leg = self.transaction, self.exchange, self.leg
-        assert transaction is not None
+    def without_noise(self, data: bytes) -> bytes:
+        """Return what is left of the first bytes of a reply where the profile tolerates noise before it."""
+        exchange = self.exchange
         assert exchange is not None
-        if transaction.node.profile.noise_tolerant:
-            data = data.lstrip(bytes(set(data) - set(exchange.starts)))
-            if not data:
-                return data
-        leg.begun = True
-        leg.begun_at = now
-        if transaction.first_byte == -inf:
-            transaction.first_byte = now
-        if now > leg.late_after:
-            transaction.late = True
-        return data
+        return data.lstrip(bytes(set(data) - set(exchange.starts)))
 
     def read(self, data: bytes | None, now: float) -> Step[Any]:
         """Hand the reader these bytes, or the news (None) that none came in time; go from leg to leg as it says.
@@ -76,13 +63,6 @@ class OnWire:
         """Say what closes an exchange, or answers a stray packet."""
         self.output.add(send, now)
         self.leg.say(len(send), now)
-
-    def end(self, failed: bool) -> None:
-        """Nothing is asked any more; after a failure its node may go on by itself."""
-        if failed and self.exchange is not None:
-            self.leg.give_up(self.exchange.later)
-        self.transaction = None
-        self.exchange = None
 
     def due_anew(self, now: float) -> float:
         """The deadline of the leg, where what was said has left only now."""

@@ -14,10 +14,11 @@ HELD_LOOK = 0.002
 class Output:
     """The bytes to be sent on one line, and the times of its leg that follow from when they leave."""
 
-    __slots__ = ("_bytes", "_echo", "_leg", "held", "said_at")
+    __slots__ = ("_echo", "_leg", "held", "said_at", "waiting")
 
     def __init__(self, leg: Leg, echo: Echo) -> None:
-        self._bytes = b""
+        self.waiting = b""
+        """What the port has not been handed yet."""
         self._leg = leg
         self._echo = echo
         self.held = False
@@ -27,19 +28,14 @@ class Output:
 
     def add(self, data: bytes, now: float) -> None:
         """Say this next."""
-        self._bytes += data
+        self.waiting += data
         self.said_at = now
         if self._echo.declared:
             self._echo.sent(data)
 
-    def take(self) -> bytes:
-        """Hand over what is to be sent."""
-        data, self._bytes = self._bytes, b""
-        return data
-
     def discard(self) -> None:
         """What has not been handed over is not said, and what the port holds goes with it."""
-        self._bytes = b""
+        self.waiting = b""
         self.held = False
 
     def unsent(self, count: int, now: float) -> float | None:

@@ -41,7 +41,8 @@ class Strays:
         self._counters = counters
         self._noise_since = inf
         self._listening = False
-        self._unanswered: tuple[NodeRecord, float, float] | None = None
+        self.unanswered_one: tuple[NodeRecord, float, float] | None = None
+        """The request that was not answered: its node, when it was out, its lateness. What comes may be its reply."""
 
     def note(self, data: bytes, now: float, quiet: float) -> None:
         """Count them; `quiet` is the silence, in seconds, after which a run of noise is over."""
@@ -69,15 +70,10 @@ class Strays:
 
     def unanswered(self, node: NodeRecord, asked: float, lateness: float) -> None:
         """A request, out since `asked`, got no reply within its window; what comes next may be its straggler."""
-        self._unanswered = (node, asked, lateness)
+        self.unanswered_one = (node, asked, lateness)
 
     def answered(self) -> None:
-        self._unanswered = None
-
-    @property
-    def watching(self) -> bool:
-        """A request was not answered: what comes next may be its straggler."""
-        return self._unanswered is not None
+        self.unanswered_one = None
 
     def looked(self, now: float, due: float) -> None:
         """Nothing lies unread now, and the line is looked at again by `due`: so well is a straggler's age known."""
@@ -86,19 +82,19 @@ class Strays:
 
     def look_before(self, due: float, now: float) -> float:
         """When to look at the line again, where nothing is to be done before `due`."""
-        if self._unanswered is not None and now - self._unanswered[1] > STRAGGLER_MEMORY:
-            self._unanswered = None
-        if self._unanswered is not None:
-            due = min(due, now + self._unanswered[2] / LOOKS)
+        if self.unanswered_one is not None and now - self.unanswered_one[1] > STRAGGLER_MEMORY:
+            self.unanswered_one = None
+        if self.unanswered_one is not None:
+            due = min(due, now + self.unanswered_one[2] / LOOKS)
             self.looked(now, due)
         return due
 
     def blame(self, first_byte: float) -> None:
         """A reply came long after its request: its node is slower than was believed, so its lateness is raised."""
-        if self._unanswered is None:
+        if self.unanswered_one is None:
             return
-        node, asked, lateness = self._unanswered
-        self._unanswered = None
+        node, asked, lateness = self.unanswered_one
+        self.unanswered_one = None
         stalled = first_byte > self._look_at + LOOK_SLACK  # it may have lain unread for as long
         age = (self._looked if stalled else first_byte) - asked
         raised = min(STRAGGLER_MARGIN * age, LONGEST_LATENESS)
