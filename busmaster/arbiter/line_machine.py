@@ -111,7 +111,7 @@ class LineMachine:
         self._events.append(LineChanged(LineChange.UP))
         lateness = max((node.lateness for node in self.dispatcher.nodes), default=UNKNOWN_LATENESS)
         self._up_at = now
-        self._quarantine = now + lateness + self._leg.latency + self.byte_time
+        self._quarantine = now + lateness + self._leg.latency + self._leg.byte_time
         self._settle(now)
 
     def line_down(self, cause: str, now: float) -> None:
