@@ -1,4 +1,11 @@
-"""The arbiter of one line: what its owner asks of it. What the line does is told in line_machine.py."""
+"""The arbiter of one line: what its owner asks of it. What the line does is told in line_machine.py.
+
+Time starts when bytes have left. `poll_transmit` hands them over; `transmitted` says when the port had taken them, and
+`unsent`, asked for when a deadline of the line falls due, how many have not left yet: until then, nothing runs out.
+
+What goes next is chosen in choice.py, by what is owed (in_step.py). What becomes of a failed attempt is dispatcher.py's
+business.
+"""
 
 from __future__ import annotations
 

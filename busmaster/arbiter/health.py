@@ -195,12 +195,11 @@ class ProbeBudget:
 
         One too short for a probe earns nothing: there a probe would delay what comes next.
         """
-        before = max(0.0, self._pause - self.probe)
-        self._pause += seconds
-        earned = BUDGET_IDLE_SHARE * (max(0.0, self._pause - self.probe) - before)
-        self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)
-        if over:
-            self._pause = 0.0
+        pause = self._pause + seconds
+        if pause > self.probe:
+            earned = BUDGET_IDLE_SHARE * (pause - max(self.probe, self._pause))
+            self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)
+        self._pause = 0.0 if over else pause
 
     def node_returned(self, now: float) -> None:
         self._earn(now)

@@ -42,13 +42,13 @@ class Leg:
     __slots__ = (
         "_follows",
         "_follows_until",
-        "_limit",
         "begun",
         "begun_at",
         "byte_time",
         "end",
         "late_after",
         "latency",
+        "limit",
         "out",
         "taint_until",
         "timing",
@@ -67,7 +67,7 @@ class Leg:
         self.byte_time = byte_time
         self._follows: ReplyTiming | None = None
         self._follows_until = -inf
-        self._limit = inf
+        self.limit = inf
         self.taint_until = -inf
         """What comes before cannot be its reply."""
         self.late_after = -inf
@@ -90,7 +90,7 @@ class Leg:
         latency = self.latency
         self.late_after = end + timing.nominal + latency
         due = end + timing.window + latency
-        self._limit = due + longest * byte_time + timing.byte_gap
+        self.limit = due + longest * byte_time + timing.byte_gap
         return due
 
     def taint(self, said: int, now: float) -> None:
@@ -100,7 +100,7 @@ class Leg:
     def gap_over(self, now: float) -> float:
         """When the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
         due = now + self.timing.byte_gap + self.latency + self.byte_time
-        return due if due < self._limit else self._limit
+        return due if due < self.limit else self.limit
 
     def echoed(self, now: float) -> float:
         """The last byte of its echo came: its times start here. When its reply must begin."""
@@ -113,7 +113,7 @@ class Leg:
         self.out += seconds
         self.late_after += seconds
         self.taint_until += seconds
-        self._limit += seconds
+        self.limit += seconds
 
     def quiet(self) -> float:
         """The silence, in seconds, after which nothing more of a frame can come."""

@@ -27,12 +27,6 @@ READY never lasts while something waits: whatever leads to READY starts the next
 An exchange ends in READY or HOLDOFF only when its outcome is certain: a reply that matches, with nothing behind it, or
 a NAK to a write. Everything else settles: until silence and past the lateness (leg.py has the times), or until silence
 alone where the reply is known to have begun.
-
-Time starts when bytes have left. `poll_transmit` hands them over; `transmitted` says when the port had taken them, and
-`unsent`, asked for when a deadline of the line falls due, how many have not left yet: until then, nothing runs out.
-
-What goes next is chosen in choice.py, by what is owed (in_step.py). What becomes of a failed attempt is dispatcher.py's
-business.
 """
 
 from __future__ import annotations
@@ -55,7 +49,7 @@ from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING,
 from busmaster.arbiter.strays import LOOK_SLACK, QUIET, Strays
 from busmaster.arbiter.trust import TWO_ANSWERS, Trust
 from busmaster.errors import BusError, LineDown, LineNoisy, Refused
-from busmaster.exchange import NO_REPLY, Done, FrameError, ReplyTiming
+from busmaster.exchange import NO_REPLY, Done, Expect, FrameError, ReplyTiming
 
 UNKNOWN_LATENESS = 0.150
 """Assumed of an earlier master's nodes while none is known."""
@@ -157,7 +151,12 @@ class LineMachine:
         late = now - said_at
         if late > 0:
             output.said_at = now
-            self._leg.shift(late)
+            leg = self._leg  # as leg.shift does: this is done for every request
+            leg.end += late
+            leg.out += late
+            leg.late_after += late
+            leg.taint_until += late
+            leg.limit += late
             self._deadlines.line += late
             if self.state is SETTLING:
                 self._silent_at += late
@@ -265,7 +264,11 @@ class LineMachine:
         """Hand the reader these bytes, or the news (None) that none came in time, and do what it makes of them."""
         no_reply = data is None and not self._leg.begun
         try:
-            step = self._wire.read(data, now)
+            exchange = self._wire.exchange
+            assert exchange is not None
+            step = exchange.expired(self._leg.begun) if data is None else exchange.feed(data)
+            if type(step) is Expect:
+                step = self._wire.follow(step, now)
         except FrameError as error:
             self._attempt_failed(error, now, no_reply=no_reply)
         except Refused as refusal:
@@ -384,7 +387,8 @@ class LineMachine:
         if self._closed:
             self._go_offline(now)
         elif hold or not self._advance(now):
-            free = max(now, self._leg.out) + hold
+            out = self._leg.out
+            free = (out if out > now else now) + hold
             held = free > now
             self._enter(HOLDOFF if held else READY, now)
             self._deadlines.line = free if held else inf

@@ -46,18 +46,15 @@ class OnWire:
         assert exchange is not None
         return data.lstrip(bytes(set(data) - set(exchange.starts)))
 
-    def read(self, data: bytes | None, now: float) -> Step[Any]:
-        """Hand the reader these bytes, or the news (None) that none came in time; go from leg to leg as it says.
-
-        Raises what the reader raises.
-        """
+    def follow(self, step: Expect, now: float) -> Step[Any]:
+        """Go from leg to leg for as long as the reader says so. Raises what the reader raises."""
         exchange = self.exchange
         assert exchange is not None
-        step = exchange.expired(self.leg.begun) if data is None else exchange.feed(data)
-        while type(step) is Expect:
-            self._next_leg(step, now)
-            step = exchange.feed(b"")
-        return step
+        following: Step[Any] = step
+        while type(following) is Expect:
+            self._next_leg(following, now)
+            following = exchange.feed(b"")
+        return following
 
     def say(self, send: bytes, now: float) -> None:
         """Say what closes an exchange, or answers a stray packet."""
@@ -77,8 +74,12 @@ class OnWire:
         said = len(send)
         self._deadlines.line = self.leg.begin(timing, said, longest, now)
         if send:
-            self.output.add(send, now)
-            if self.paced and not self._echo.declared:
+            output = self.output
+            output.waiting += send
+            output.said_at = now
+            if self._echo.declared:
+                self._echo.sent(send)
+            elif self.paced:
                 self.leg.taint(said, now)
 
     def _next_leg(self, step: Expect, now: float) -> None:
