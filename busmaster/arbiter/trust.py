@@ -38,7 +38,8 @@ class Trust:
             latest = leg.end + transaction.node.latest(leg.timing.window) + leg.latency
             if step.rest or leg.begun_at > latest:
                 return "its answer may be another's, said late or twice"
-            if self._strict or in_step.doubts(now):
+            may_wait = not step.send  # MSC says its packet again until that is acknowledged
+            if may_wait and (self._strict or in_step.doubts(now)):
                 self.held = step
                 return max(now, latest) + 2 * leg.byte_time
         in_step.answered(transaction.node, transaction.started, now, leg.timing.nominal)
