@@ -67,8 +67,9 @@ class InStep:
 
     __slots__ = ("_doubt_until", "_doubted", "_said", "alert", "alike", "before", "debts", "last")
 
-    def __init__(self) -> None:
-        self.alert = False
+    def __init__(self, strict: bool = False) -> None:
+        """`strict`: as if something had been said twice a moment ago, always."""
+        self.alert = strict
         """There is something to be careful of: nothing else here matters while this is False."""
         self.debts: list[Debt] = []
         self.last: Sequence[bytes] = ()
@@ -79,7 +80,7 @@ class InStep:
         """Exchanges in a row, before the last, whose answers are like its."""
         self._doubted: list[tuple[bytes, float]] = []
         self._said: deque[tuple[Sequence[bytes], float]] = deque(maxlen=256)
-        self._doubt_until = -inf
+        self._doubt_until = inf if strict else -inf
 
     # what is owed
 
@@ -187,7 +188,7 @@ class InStep:
 
     def said_twice(self, now: float) -> None:
         """More was answered than was asked."""
-        self._doubt_until = now + DOUBT_PERIOD
+        self._doubt_until = max(self._doubt_until, now + DOUBT_PERIOD)
         self.alert = True
 
     def said(self, answers: Sequence[bytes], now: float) -> None:

@@ -12,13 +12,12 @@ TWO_ANSWERS = "two answers came where one was due"
 
 
 class Trust:
-    """Of one line. `strict`: a doubtful answer is held until another could have come, not delivered at once."""
+    """Of one line. While things are said twice on it, a doubtful answer is held until another could have come."""
 
-    __slots__ = ("_in_step", "_strict", "held")
+    __slots__ = ("_in_step", "held")
 
-    def __init__(self, in_step: InStep, strict: bool) -> None:
+    def __init__(self, in_step: InStep) -> None:
         self._in_step = in_step
-        self._strict = strict
         self.held: Done[Any] | None = None
         """An answer that is delivered only if no other comes meanwhile."""
 
@@ -39,7 +38,7 @@ class Trust:
             if step.rest or leg.begun_at > latest:
                 return "its answer may be another's, said late or twice"
             may_wait = not step.send  # MSC says its packet again until that is acknowledged
-            if may_wait and (self._strict or in_step.doubts(now)):
+            if may_wait and in_step.doubts(now):
                 self.held = step
                 return max(now, latest) + 2 * leg.byte_time
         in_step.answered(transaction.node, transaction.started, now, leg.timing.nominal)

@@ -314,23 +314,28 @@ def test_r15_of_two_answers_in_one_chunk_neither_is_believed_though_nothing_is_o
     assert isinstance(asked.error, WriteUnconfirmed if command.writes else GarbledReply)
 
 
+def asked_alike(bench: Bench) -> tuple[Transaction, NodeRecord]:
+    """A read on the wire whose answer is like one that was delivered a moment ago."""
+    node = up(bench)
+    bench.arbiter._in_step.said((bytes.fromhex("023031"),), bench.now)
+    read = bench.ask(node, retries=0)
+    assert bench.sent() == request_of(1)
+    return read, node
+
+
 def test_r15_strictly_a_doubtful_answer_is_held_until_another_would_have_come() -> None:
     bench = Bench(strict=True)
-    read = bench.ask(overtaken(bench))
-    bench.until_sent()
-    bench.sent()
+    read, node = asked_alike(bench)
     asked = bench.now
     bench.hear(reply_of(1, 7), after=REQUEST + 0.002)
     assert not bench.ended(read)
-    bench.to(asked + REQUEST + 1.25 * 0.004 + 0.001 + 2 * TAU + 0.001)
+    bench.to(asked + REQUEST + node.latest(0.1) + 2 * TAU + 0.001)
     assert (read.value, bench.ended(read)) == (7.0, 1)
 
 
 def test_r15_strictly_a_second_answer_takes_the_first_one_with_it() -> None:
     bench = Bench(strict=True)
-    read = bench.ask(overtaken(bench))
-    bench.until_sent()
-    bench.sent()
+    read, _ = asked_alike(bench)
     bench.hear(reply_of(1, 55), after=REQUEST + 0.002)
     bench.hear(reply_of(1, 7), after=0.001)
     assert (read.value, doubted(bench)) == (None, 1)
