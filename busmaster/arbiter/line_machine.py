@@ -2,10 +2,9 @@
 
 Theory of operation
 -------------------
-One half-duplex line, many nodes, anonymous replies. The arbiter keeps one exchange on the line at most (R1), and
-between exchanges it makes sure that no byte of an earlier one can still come (R3). It is told the time with every
-call; it sends nothing itself: the owner pumps `poll_transmit`, then `poll_event`, then arms a timer for
-`poll_timeout`. Calls that come early or twice change nothing.
+One half-duplex line, many nodes, anonymous replies: at most one exchange is on the line (R1), and no byte of an earlier
+one can come when the next begins (R3). It is told the time with every call and sends nothing itself: its owner pumps
+`poll_transmit`, then `poll_event`, then arms a timer for `poll_timeout`. Early or repeated calls change nothing.
 
 The line is in one of five states; `_line_due` is when the state ends by itself.
 
@@ -152,8 +151,7 @@ class LineMachine:
         if late > 0:
             output.said_at = now
             leg = self._leg  # as leg.shift does: this is done for every request
-            leg.end += late
-            leg.out += late
+            leg.end, leg.out = leg.end + late, leg.out + late
             leg.late_after += late
             leg.taint_until += late
             leg.limit += late
@@ -405,7 +403,8 @@ class LineMachine:
             self._counters.settles += 1
             self._enter(SETTLING, now)
         self._echo.forget()
-        silent = max(self._strays.last_byte + self._leg.quiet(), self._quarantine, now)
+        last = max(self._strays.last_byte, self._leg.out)  # ours, too: who speaks on two wires does not hear
+        silent = max(last + self._leg.quiet(), self._quarantine, now)
         self._silent_at = silent if begun else max(silent, self._leg.past())
         self._deadlines.line = self._strays.look_before(self._silent_at, now)
 
@@ -448,10 +447,12 @@ class LineMachine:
             self.dispatcher.probes.alive(node, now)
 
     def _answer_stray(self, send: bytes, now: float) -> bool:
-        """True if an answer was owed: then the line settles again."""
+        """True if an answer was owed: then the line settles again, and what was said just now echoes."""
         if send:
+            self._wire.say(send, now)
+            owed = self._echo.owed
             self._settle(now)
-            self._wire.say(send, now)  # after the settle, which forgets what echoes are to come
+            self._echo.owed = owed
         return bool(send)
 
     def _strip_echo(self, data: bytes, now: float) -> bytes:
@@ -480,12 +481,11 @@ class LineMachine:
         self._enter(OFFLINE, now)
         self.noisy = False
         self._deadlines.line = inf
-        if transaction is not None:
-            self._wire.output.discard()
         self._echo.forget()
         self._strays.answered()
         self._strays.silent()
         if transaction is not None:
+            self._wire.output.discard()
             self._trust.owe(self._wire, heard=True)
             self._end_exchange(failed=True)
             self.dispatcher.cut_off(transaction, self._offline(), now)
