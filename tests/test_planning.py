@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 
 from busmaster import planning
-from busmaster.arbiter import backlog, strays
+from busmaster.arbiter import backlog, choice, strays
 from busmaster.arbiter.transaction import Priority
 from busmaster.errors import InvalidCommand
 from busmaster.exchange import Command, ReplyTiming, Timings
-from busmaster.planning import Bounds, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan
+from busmaster.planning import Bounds, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan, worst_case
 from busmaster.profile import LineSettings
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
@@ -42,6 +42,7 @@ def planned(*groups: PlannedGroup, **options: Any) -> Plan:
 def test_the_planner_reckons_with_what_the_arbiter_does() -> None:
     """It may not import them, so it repeats them."""
     assert (planning.SHARE, planning.QUIET, planning.NOISY_AFTER) == (backlog.SHARE, strays.QUIET, strays.NOISY_AFTER)
+    assert worst_case.MOST_BEFORE == choice.MOST_BEFORE
 
 
 # how busy

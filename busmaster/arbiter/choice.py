@@ -110,9 +110,8 @@ class Choice:
             if ends < inf:
                 return ends
             asked, silent = self._whom_to_ask(now)
-            if not (owing or asked) and (
-                first[0].writes or not first[0].attempts
-            ):  # all are silent: its own node as well as it itself
+            worth_it = first[0].writes or not first[0].attempts
+            if worth_it and not (owing or asked):  # all are silent: a check of its own node costs no more than it would
                 asked = [first[0].node]
             other = self._ask_check([*owing, *asked], now, clashes)
             if other is None and not any(_fit_checks(silent, clashes)):  # there is nothing unlike to ask

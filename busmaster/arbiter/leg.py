@@ -73,11 +73,9 @@ class Leg:
         self.late_after = -inf
         """A reply that begins then is late, and counts all the same."""
 
-    def say(self, count: int, now: float) -> float:
-        """Note that the host says so many bytes, behind what it has said already. Returns when they are out."""
-        out = self.out
-        self.out = out = (out if out > now else now) + count * self.byte_time
-        return out
+    def say(self, count: int, now: float) -> None:
+        """Note that the host says so many bytes, behind what it has said already."""
+        self.out = max(self.out, now) + count * self.byte_time
 
     def begin(self, timing: ReplyTiming, said: int, longest: int, now: float) -> float:
         """The host says `said` bytes, and the reply has at most `longest`. Returns when it must have begun."""

@@ -172,7 +172,7 @@ def peer() -> Iterator[Peer]:
 async def until(condition: Callable[[], bool]) -> None:
     """The kernel tells of an acknowledgement to nobody: it must be looked for."""
     async with asyncio.timeout(PATIENCE):
-        while not condition():  # noqa: ASYNC110
+        while not condition():  # noqa: ASYNC110  # the kernel announces it to nobody
             await asyncio.sleep(0.001)
 
 
@@ -203,10 +203,10 @@ def test_an_acknowledgement_within_the_usual_time_of_the_path_is_waited_for(peer
             transport.write(b"05\x05")
             usual = port._usual_acknowledgement()
             assert usual < LATER
-            port._usual_acknowledgement = lambda: 0.2  # type: ignore[method-assign]
+            port._usual_acknowledgement = lambda: 0.2  # type: ignore[method-assign]  # a slow path
             assert port.unsent(0.199) == 0
             assert port.unsent(0.201) == 3
-            port._usual_acknowledgement = lambda: 0.0  # type: ignore[method-assign]
+            port._usual_acknowledgement = lambda: 0.0  # type: ignore[method-assign]  # a quick one
             assert port.unsent(DELAYED_ACK - 0.001) == 0
             assert port.unsent(DELAYED_ACK + 0.001) == 3
         transport.abort()

@@ -148,7 +148,7 @@ def test_a_write_that_the_port_did_not_take_is_told_at_once_and_so_is_its_leavin
 def test_output_that_is_given_up_is_discarded_before_its_transport_is_aborted(ledger: Ledger) -> None:
     pump = pump_on(ledger)
     assert pump._port is not None
-    pump._port.discard_unsent = ledger.discard_unsent  # type: ignore[method-assign]
+    pump._port.discard_unsent = ledger.discard_unsent  # type: ignore[method-assign]  # it is noted
     ledger.is_due, ledger.has = True, 2
     pump._on_time()
     ledger.time = STUCK_AFTER - 0.1
