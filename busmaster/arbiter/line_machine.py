@@ -47,8 +47,9 @@ from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
 from busmaster.arbiter.strays import LOOK_SLACK, QUIET, Strays
 from busmaster.arbiter.trust import TWO_ANSWERS, Trust
+from busmaster.contract.exchange import NO_REPLY, Done, Expect, FrameError
+from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import BusError, LineDown, LineNoisy, Refused
-from busmaster.exchange import NO_REPLY, Done, Expect, FrameError, ReplyTiming
 
 UNKNOWN_LATENESS = 0.150
 """Assumed of an earlier master's nodes while none is known."""
