@@ -24,8 +24,7 @@ SETTLING   stray: silence starts  READY                    down: OFFLINE, all fa
 
 READY never lasts while something waits: whatever leads to READY starts the next transaction in the same call.
 An exchange ends in READY or HOLDOFF only when its outcome is certain: a reply that matches, with nothing behind it, or
-a NAK to a write. Everything else settles: until silence and past the lateness (leg.py has the times), or until silence
-alone where the reply is known to have begun.
+a NAK to a write. Everything else settles, to silence and past the lateness (leg.py has the times).
 """
 
 from __future__ import annotations
