@@ -1,0 +1,169 @@
+"""What may happen next in a world, when it may, and what it does."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import cast
+
+from busmaster.arbiter.state import OFFLINE
+from tests.proof import setups
+from tests.proof.instants import Instant
+from tests.proof.shipped import AnyTime, Asker
+from tests.proof.wire import SCRIPT, STRAY, Owed, Time
+from tests.proof.world import Action, World
+
+
+def actions(world: World) -> list[Action]:
+    """Return what may happen, whatever the time."""
+    setup, arbiter = world.setup, world.arbiter
+    if world.frozen:
+        return [("written",), *_bytes(world), *_strays(world)]
+    possible: list[Action] = []
+    if arbiter._deadlines.line != inf:
+        possible.append(("timer", "line"))
+    if arbiter._deadlines.health != inf:
+        possible.append(("timer", "health"))
+    possible += _bytes(world)
+    possible += _strays(world)
+    if world.unread:
+        possible += [("read", several) for several in {1, len(world.unread)}]
+    if world.held is not None:
+        possible.append(("leaves",))
+    on_wire = world.on_wire
+    if setup.may(setups.CANCELS) and world.cancels and on_wire is not None and on_wire.heard and on_wire.waiter:
+        possible.append(("cancel",))
+    up = arbiter.state is not OFFLINE
+    if setup.may(setups.URGENT) and world.urgent and up:
+        possible.append(("urgent",))
+    if setup.may(setups.LOSS):
+        possible.append(("down",) if up else ("up",))
+    if setup.may(setups.IDLE) and up and len(arbiter.dispatcher.backlog) < max(1, setup.depth):
+        possible += [("ask", place) for place in setup.commands]
+    return possible
+
+
+def _strays(world: World) -> list[Action]:
+    if not (world.setup.may(setups.STRAYS) and world.strays):
+        return []
+    return [("stray", bytes((byte,))) for byte in world.setup.stray_bytes]
+
+
+def _bytes(world: World) -> list[Action]:
+    """What the next byte of each reply may be. Whoever owes nothing any more is past his window: see `window`."""
+    setup = world.setup
+    possible: list[Action] = []
+    echoes = any(reply.kind == "echo" for reply in world.owed)
+    for place, reply in enumerate(world.owed):
+        if reply.kind == "echo":
+            possible.append(("echo", place, "right"))
+            if setup.may(setups.ECHO_FAULTS):
+                possible += [("echo", place, "wrong"), ("echo", place, "lost")]
+            continue
+        if echoes or (setup.beyond and place):  # the wire keeps order; so does a channel
+            continue
+        possible.append(("byte", place, "right"))
+        if reply.faults:
+            if setup.may(setups.FLIPS):
+                possible += [("byte", place, bit) for bit in setup.bits]
+            possible += [("byte", place, what) for what in (setups.LOST, setups.MARKS) if setup.may(what)]
+        if setup.may(setups.NAKS) and not reply.begun:
+            possible.append(("byte", place, "nak"))
+        if setup.beyond and not reply.begun:
+            possible.append(("never", place))
+    return possible
+
+
+def window(world: World, action: Action) -> tuple[list[Time], list[Time]]:
+    """Return what the action cannot be earlier than, and what it cannot be later than."""
+    setup, deadlines = world.setup, world.arbiter._deadlines
+    earliest: list[Time] = []
+    latest: list[Time] = []
+    what = action[0]
+    if not world.frozen:
+        slack = setup.stall if setup.may(setups.STALLS) else 0.0
+        latest = [due + slack for due in (deadlines.line, deadlines.health) if due != inf]
+        if world.unread:
+            latest.append(world.unread_by)
+    if what == "timer":
+        earliest.append(getattr(deadlines, action[1]))
+    elif what in ("byte", "echo"):
+        reply = world.owed[action[1]]
+        earliest.append(reply.lo)
+        latest.append(reply.hi)
+    return [t for t in earliest if type(t) is Instant], [t for t in latest if type(t) is Instant]
+
+
+def act(world: World, action: Action, now: Instant, later: Instant, script: tuple[int, ...]) -> None:
+    """Let it happen now; `later` is any time from now on. Raises Violation, or Outside."""
+    Asker.ask[0] = world.ask_one
+    Asker.saturated[0] = world.is_saturated
+    AnyTime.at[0] = cast("float", later)
+    world.now = now
+    world.said = b""
+    SCRIPT.begin(script)
+    arbiter, what = world.arbiter, action[0]
+    if what == "timer":
+        unread = bool(world.unread) and world.setup.may(setups.STALLS)
+        if arbiter.line_due(now):
+            world.tell_unsent_if(asked=True)
+        arbiter.handle_timeout(now, unread=unread)
+    elif what == "byte":
+        _byte(world, action[1], action[2])
+    elif what == "echo":
+        _echo(world, world.owed.pop(action[1]), action[2])
+    elif what == "stray":
+        world.strays = 0
+        world.hear(action[1], STRAY)
+    elif what == "read":
+        world.read_unread(action[1])
+    elif what == "never":
+        del world.owed[action[1]]
+    elif what == "written":
+        out, world.frozen = world.frozen, b""
+        world.wake()
+        world._write(out)
+    elif what == "leaves":
+        assert world.held is not None
+        (out, ticket), world.held = world.held, None
+        world.leaves(out, ticket, now)
+    elif what == "cancel":
+        world.cancel()
+    elif what == "urgent":
+        world.ask_urgently()
+    elif what == "ask":
+        world.ask(action[1])
+    elif what == "down":
+        arbiter.line_down("lost", now)
+        world.unread = ()
+        world.held = None
+    elif what == "up":
+        arbiter.line_up(now, paced=world.setup.paced)
+    if not world.frozen:
+        world.pump()
+
+
+def _byte(world: World, place: int, what: object) -> None:
+    reply = world.owed[place]
+    byte, reply.data = reply.data[:1], reply.data[1:]
+    if what == "nak":
+        byte, reply.data = world.refuse(reply), b""
+    elif what != "right":
+        reply.faults -= 1
+        reply.hurt = True
+        byte = b"" if what == setups.LOST else byte if what == setups.MARKS else bytes((byte[0] ^ 1 << int(str(what)),))
+    reply.begun = True
+    reply.lo, reply.hi = world.now + world.byte_time, world.now + reply.gap
+    if not reply.data:
+        del world.owed[place]
+        if reply.turnaround:
+            world.hold_until = world.now + reply.turnaround
+    if what == setups.MARKS:
+        world.mark()
+    elif byte:
+        world.hear(byte, reply.origin)
+
+
+def _echo(world: World, echo: Owed, what: str) -> None:
+    if what != "lost":
+        data = echo.data if what == "right" else bytes((echo.data[0] ^ 1,)) + echo.data[1:]
+        world.hear(data, echo.origin)
