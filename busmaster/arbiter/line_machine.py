@@ -286,8 +286,6 @@ class LineMachine:
         assert exchange is not None
         answered, leg = exchange.answered, self._leg
         if answered:
-            if leg.end > leg.begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
-                leg.end = leg.out = leg.begun_at
             if self._in_step.alert or step.rest:
                 verdict = self._trust.weigh(self._wire, step, now)
                 if isinstance(verdict, str):
@@ -296,6 +294,8 @@ class LineMachine:
                 if verdict is not None:
                     self._deadlines.line = verdict
                     return
+            if leg.end > leg.begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
+                leg.end = leg.out = leg.begun_at
             transaction.node.note_reply(exchange.answers, transaction.command, leg.begun_at - leg.end)
         if step.send:
             self._wire.say(step.send, now)

@@ -8,7 +8,8 @@ import pytest
 
 from busmaster.arbiter.state import LineState
 from busmaster.contract.timing import ReplyTiming, Timings
-from busmaster.errors import NoReply
+from busmaster.arbiter.transaction import Priority
+from busmaster.errors import NoReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
@@ -73,6 +74,21 @@ def checksum(telegram: str) -> int:
     for byte in bytes.fromhex(telegram)[1:]:
         check ^= byte
     return check + 0x20 if check < 0x20 else check
+
+
+def test_r3_an_answer_that_is_not_believed_proves_not_that_its_request_has_left() -> None:
+    """On an unpaced port a reply may come before the baud rate says; an earlier one, held up, too."""
+    bench = Bench()
+    node = up(bench)
+    bench.ask(node, hcp2.Write(1, (5.0,)))
+    bench.sent()
+    bench.wait(1.0)
+    disabled = bench.ask(node, hcp2.Write(1, (5.0,)), priority=Priority.URGENT)
+    said = len(bytes.fromhex(bench.sent())) * TAU
+    bench.hear(ACK, after=TAU)
+    assert isinstance(disabled.error, WriteUnconfirmed)
+    bench.ask(node)
+    assert bench.until_sent() == pytest.approx(said - TAU + LATENESS)
 
 
 # the silence
