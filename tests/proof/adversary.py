@@ -8,7 +8,7 @@ from typing import cast
 from busmaster.arbiter.state import OFFLINE
 from tests.proof import setups
 from tests.proof.instants import Instant
-from tests.proof.shipped import AnyTime, Asker
+from tests.proof.shipped import AnyTime, Asker, Decided
 from tests.proof.wire import SCRIPT, STRAY, Owed, Time
 from tests.proof.world import Action, World
 
@@ -27,7 +27,7 @@ def actions(world: World) -> list[Action]:
     possible += _strays(world)
     if world.unread:
         possible += [("read", several) for several in {1, len(world.unread)}]
-    if world.held is not None:
+    if world.held is not None and (arbiter._wire.output.held or not setup.assumptions.held_until_asked):
         possible.append(("leaves",))
     on_wire = world.on_wire
     if setup.may(setups.CANCELS) and world.cancels and on_wire is not None and on_wire.heard and on_wire.waiter:
@@ -95,6 +95,7 @@ def window(world: World, action: Action) -> tuple[list[Time], list[Time]]:
 
 def act(world: World, action: Action, now: Instant, later: Instant, script: tuple[int, ...]) -> None:
     """Let it happen now; `later` is any time from now on. Raises Violation, or Outside."""
+    Decided.by_answer[0] = False
     Asker.ask[0] = world.ask_one
     Asker.saturated[0] = world.is_saturated
     AnyTime.at[0] = cast("float", later)
@@ -106,7 +107,7 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
         unread = bool(world.unread) and world.setup.may(setups.STALLS)
         if arbiter.line_due(now):
             world.tell_unsent_if(asked=True)
-        arbiter.handle_timeout(now, unread=unread)
+        world.time_out(unread)
     elif what == "byte":
         _byte(world, action[1], action[2])
     elif what == "echo":
@@ -125,6 +126,7 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
     elif what == "leaves":
         assert world.held is not None
         (out, ticket), world.held = world.held, None
+        world.note("lets it go", out)
         world.leaves(out, ticket, now)
     elif what == "cancel":
         world.cancel()
@@ -133,11 +135,9 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
     elif what == "ask":
         world.ask(action[1])
     elif what == "down":
-        arbiter.line_down("lost", now)
-        world.unread = ()
-        world.held = None
+        world.go_down()
     elif what == "up":
-        arbiter.line_up(now, paced=world.setup.paced)
+        world.come_up()
     if not world.frozen:
         world.pump()
 

@@ -388,8 +388,11 @@ def simplify(world: World, zone: Zone, forgotten: list[Callable[[View], None]] |
         forget(view)
 
 
-def save(world: World, zone: Zone) -> tuple[bytes, Zone]:
-    """Return the key of a world that is simple already, and the zone of the instants that are in it. Instant 0 is now."""
+def save(world: World, zone: Zone, longest: float = LONGEST) -> tuple[bytes, Zone]:
+    """Return the key of a world that is simple already, and the zone of the instants that are in it. Instant 0 is now.
+
+    Beyond `longest`, in seconds, nothing is told apart.
+    """
     _PLACES.begin(zone, world.now)
     into = io.BytesIO()
     pickler = pickle.Pickler(into, 5)
@@ -400,7 +403,7 @@ def save(world: World, zone: Zone) -> tuple[bytes, Zone]:
         [FREE if zone[i][j] >= FREE else zone[i][j] + 2 * (a - b) for j, b in kept]
         for i, a in kept
     ]
-    return into.getvalue(), widened(small, ticks(LONGEST))
+    return into.getvalue(), widened(small, ticks(longest)) if longest < inf else small
 
 
 def restore(key: bytes) -> World:

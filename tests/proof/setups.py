@@ -56,6 +56,10 @@ class Assumptions:
     gap_to: str = "start bit"
     """What ends a pause within `byte_gap`: the next byte's "start bit", or its being a "received byte"."""
 
+    held_until_asked: bool = True
+    """Output that a port holds is held until the port is asked for it: one that lets go before, unseen, is not noticed,
+    and the lateness of what was asked counts from when it was written."""
+
     @property
     def edge(self) -> bool:
         return self.lateness_to == "start bit"
@@ -120,6 +124,8 @@ class Setup:
             parts.append(f"depth {self.depth}")
         if not (self.assumptions.edge and self.assumptions.gap_edge):
             parts.append(f"lateness to {self.assumptions.lateness_to}, gap to {self.assumptions.gap_to}")
+        if not self.assumptions.held_until_asked:
+            parts.append("let go unseen")
         if self.slowest != (0.0,):
             parts.append("learned")
         if self.lost_acknowledgements:

@@ -27,8 +27,7 @@ from busmaster.contract.exchange import Command
 from tests.proof.setups import HEALTH, HOLDS, NOISE, RAISED, Setup
 from tests.proof.wire import choose
 
-RAISED_TO = (1.6, 3.0)
-"""Times the lateness: up to LONGEST_LATENESS."""
+RAISED_TO = (0.25, LONGEST_LATENESS)
 PROBED_AFTER = 0.1
 
 
@@ -160,6 +159,8 @@ def set_aside(setup: Setup) -> Iterator[None]:
         setattr(owner, name, value)
 
     put(Dispatcher, "next", _asking(Dispatcher.next))
+    put(Dispatcher, "succeeded", _deciding(Dispatcher.succeeded))
+    put(Dispatcher, "refused", _deciding(Dispatcher.refused))
     if not setup.in_step:
         put(Choice, "next", _any_of_all)
         put(Strays, "babbling", _may_be_noisy if setup.may(NOISE) else _is_never_noisy)
@@ -171,6 +172,8 @@ def set_aside(setup: Setup) -> Iterator[None]:
     put(NodeRecord, "note_reply", _untimed(NodeRecord.note_reply) if setup.in_step else _notes_nothing)
     put(NodeRecord, "latest", _as_learned(NodeRecord.latest, setup.slowest))
     put(Strays, "blame", _may_raise if setup.may(RAISED) else _raises_nothing)
+    if not setup.may(RAISED):
+        put(Strays, "unanswered", _blames_nobody)
     put(health, "note_failure", _may_fail if setup.may(HEALTH) else _fails_nothing)
     if setup.may(HEALTH):
         put(health, "note_success", _may_be_up)
@@ -187,6 +190,20 @@ def _untimed(right: Callable[..., None]) -> Callable[..., None]:
         right(node, answers, command, 0.0)
 
     return note_reply
+
+
+class Decided:
+    """Whether an answer was taken for one in this step: a value, an acknowledgement, a refusal."""
+
+    by_answer: ClassVar[list[bool]] = [False]
+
+
+def _deciding(right: Callable[..., None]) -> Callable[..., None]:
+    def decide(*arguments: Any) -> None:
+        Decided.by_answer[0] = True
+        right(*arguments)
+
+    return decide
 
 
 class Asker:
@@ -252,8 +269,7 @@ def _may_raise(strays: Strays, first_byte: float) -> None:
     stalled = first_byte > strays._look_at + 0.005
     age = (strays._looked if stalled else first_byte) - asked
     if STRAGGLER_SHARE * lateness < age and age <= STRAGGLER_MEMORY:
-        higher = [min(share * lateness, LONGEST_LATENESS) for share in RAISED_TO]
-        higher = [raised for raised in higher if raised > lateness]
+        higher = [raised for raised in RAISED_TO if raised > lateness]
         if higher:
             node.raise_lateness(higher[choose(len(higher))], first_byte)
 
@@ -264,6 +280,10 @@ def _may_be_noisy(strays: Strays, now: float) -> bool:
 
 def _is_never_noisy(strays: Strays, now: float) -> bool:
     return False
+
+
+def _blames_nobody(strays: Strays, node: NodeRecord, asked: float, lateness: float) -> None:
+    """The line is not looked at while it settles, either: a look changes nothing else."""
 
 
 def _raises_nothing(strays: Strays, first_byte: float) -> None:

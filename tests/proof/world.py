@@ -16,7 +16,7 @@ from tests.proof import setups
 from tests.proof.instants import Instant
 from tests.proof.kinds import KINDS, WRITE, Kind
 from tests.proof.setups import Setup
-from tests.proof.shipped import ANY_STEP, BUDGET, NO_COUNTERS, no_jitter
+from tests.proof.shipped import ANY_STEP, BUDGET, NO_COUNTERS, Decided, no_jitter
 from tests.proof.wire import OLD, OWN, STRAY, Outside, Owed, Ticket, Time, Violation, choose
 
 Action: TypeAlias = tuple[Any, ...]
@@ -83,12 +83,19 @@ class World:
         """What the arbiter has said, and the process has not written yet."""
         self.said = b""
         """What left in this step."""
+        self.calls: list[tuple[Time, str, Any]] | None = None
+        """What was called and said, with its time, where a history is told."""
         arbiter.line_up(now, paced=setup.paced)
+
+    def note(self, what: str, detail: Any = None) -> None:
+        if self.calls is not None:
+            self.calls.append((self.now, what, detail))
 
     # what its owner does
 
     def ask(self, place: int, urgent: bool = False) -> None:
         """A caller submits one of the commands."""
+        self.note("asks urgently" if urgent else "asks", place)
         node, command = self.kind.commands[place]
         ticket = Ticket(node, command.writes)
         transaction = Transaction(self.nodes[node], command, waiter=ticket)
@@ -106,7 +113,9 @@ class World:
         """A caller submits something in the moment in which the line is free."""
         if self.is_saturated:
             commands = self.setup.commands
-            node, command = self.kind.commands[commands[choose(len(commands))]]
+            place = commands[choose(len(commands))]
+            self.note("asks", place)
+            node, command = self.kind.commands[place]
             self.live.append(Ticket(node, command.writes))
             self.arbiter.dispatcher.submit(Transaction(self.nodes[node], command, waiter=self.live[-1]), self.now)
 
@@ -114,9 +123,13 @@ class World:
         """Hand over what is to be sent, hear what has happened, ask anew: until nothing is left."""
         arbiter = self.arbiter
         by = self.by
+        if by == STRAY and Decided.by_answer[0]:
+            raise Outside  # a byte that nobody said was taken for an answer
         for _ in range(MOST_TURNS):
             out = arbiter.poll_transmit()
             if out:
+                self.note("says", out)
+                self.begin_exchange()
                 if self.setup.may(setups.FROZEN) and choose(2):
                     self.frozen = out
                 else:
@@ -194,6 +207,8 @@ class World:
             return
         for reply in old:
             if reply.hi > self.now:
+                if self.calls is not None:
+                    self.calls.append((reply.hi, "may still come until here", reply.data))
                 begun = "the rest of a reply" if reply.begun else "a reply"
                 raise Violation(f"R1: {begun} to an earlier request may still come as the next one leaves")
         if any(origin != STRAY for _, origin in self.unread):
@@ -212,7 +227,6 @@ class World:
     def _write(self, out: bytes) -> None:
         """The port is handed these bytes."""
         self.said += out
-        self.begin_exchange()
         transaction = self.arbiter._wire.transaction
         ticket = None if transaction is None else transaction.waiter
         if ticket is not None:
@@ -224,6 +238,7 @@ class World:
             self.held = (out, ticket)
         else:
             self.leaves(out, ticket, self.now + len(out) * self.byte_time)
+        self.note("has written")
         self.arbiter.transmitted(self.now)
 
     def begin_exchange(self) -> None:
@@ -282,6 +297,7 @@ class World:
         self.by = origin
         self.forged = self.forged or origin == STRAY
         self.tell_unsent_if(self.arbiter._wire.output.held)
+        self.note("hears", data)
         self.arbiter.data_received(data, self.now)
 
     def read_unread(self, several: int) -> None:
@@ -294,7 +310,9 @@ class World:
     def tell_unsent_if(self, asked: bool) -> None:
         """As the pump does: how much has not left yet."""
         if asked and self.setup.may(setups.HELD):
-            self.arbiter.unsent(0 if self.held is None else len(self.held[0]), self.now)
+            count = 0 if self.held is None else len(self.held[0])
+            self.note("has not sent", count)
+            self.arbiter.unsent(count, self.now)
 
     def refuse(self, reply: Owed) -> bytes:
         """The node says NAK in place of this reply: it has carried nothing out."""
@@ -315,7 +333,28 @@ class World:
         transaction = self.arbiter._wire.transaction
         assert transaction is not None
         self.live.remove(transaction.waiter)
+        self.note("cancels")
         self.arbiter.cancel(transaction, self.now)
 
+    def wake(self) -> None:
+        """The process goes on: what came meanwhile is read now."""
+        if self.unread:
+            self.unread_by = self.now
+
+    def time_out(self, unread: bool) -> None:
+        self.note("is due", unread)
+        self.arbiter.handle_timeout(self.now, unread=unread)
+
+    def go_down(self) -> None:
+        self.note("goes down")
+        self.arbiter.line_down("lost", self.now)
+        self.unread = ()
+        self.held = None
+
+    def come_up(self) -> None:
+        self.note("comes up")
+        self.arbiter.line_up(self.now, paced=self.setup.paced)
+
     def mark(self) -> None:
+        self.note("hears a damaged byte")
         self.arbiter.byte_marked(Mark.DAMAGED, self.now)
