@@ -374,6 +374,7 @@ class LineMachine:
         wire = self._wire
         if failed and wire.exchange is not None:
             self._leg.give_up(wire.exchange.later)
+            self._leg.strayed(self._strays.last_byte)  # what came in place of the reply may have been it, damaged
         wire.transaction = wire.exchange = None
         self._trust.held = None
         self._counters.exchanges += 1
@@ -458,10 +459,12 @@ class LineMachine:
     def _strip_echo(self, data: bytes, now: float) -> bytes:
         """Take the echo of what was sent off the front, byte for byte; a mismatch is a collision."""
         rest = self._echo.strip(data)
+        self._strays.last_byte = now  # where the echo is lost, this may be another's byte that looks like it
+        if self.state is not EXCHANGE:
+            self._leg.strayed(now)
         if rest is None:
             self._counters.collisions += 1
             self._events.append(Strayed(data, collision=True))
-            self._strays.last_byte = now
             if self.state is EXCHANGE:
                 what = "the echo differs from what was sent: a collision, or an adapter without echo"
                 self._attempt_failed(FrameError(what), now)

@@ -233,6 +233,21 @@ def test_r3_a_stray_byte_may_have_been_the_lost_ack_and_its_packet_is_waited_for
     assert bench.until_sent() == pytest.approx(1.0 + MSC_TAU)
 
 
+def test_r3_a_damaged_byte_in_place_of_the_ack_may_have_been_it_and_its_packet_is_waited_for_anew() -> None:
+    bench, timings = msc_line()
+    node = bench.node(1, msc.PROFILE, timings)
+    bench.wait(2.0)
+    bench.ask(node, msc.DataRead(2008), retries=0)
+    bench.ask(node, msc.DataRead(2012))
+    bench.sent()
+    bench.hear("07", after=MSC_REQUEST + 0.4)
+    heard = bench.now
+    bench.until_sent()
+    assert bench.sent() == ACK, "what was said in its place may be a packet"
+    bench.until_sent()
+    assert bench.now - heard == pytest.approx(1.0 + MSC_TAU)
+
+
 def test_r3_noise_does_not_use_up_the_knowledge_that_a_packet_follows_its_ack() -> None:
     """Noise at 0.6 s, the late ACK at 0.95 s, the packet 0.99 s after it: 18 bytes, and the line is not free before."""
     bench, timings = msc_line()

@@ -10,7 +10,10 @@ from tests.proof import setups
 from tests.proof.instants import Instant
 from tests.proof.shipped import AnyTime, Asker, Decided
 from tests.proof.wire import SCRIPT, STRAY, Owed, Time
+from tests.proof.msc_world import MscWorld
 from tests.proof.world import Action, World
+
+PACKETS = ("packet", "again")
 
 
 def actions(world: World) -> list[Action]:
@@ -55,12 +58,23 @@ def _bytes(world: World) -> list[Action]:
     echoes = any(reply.kind == "echo" for reply in world.owed)
     for place, reply in enumerate(world.owed):
         if reply.kind == "echo":
+            if any(other.kind == "echo" for other in world.owed[:place]):
+                continue
             possible.append(("echo", place, "right"))
             if setup.may(setups.ECHO_FAULTS):
                 possible += [("echo", place, "wrong"), ("echo", place, "lost")]
             continue
         if echoes or (setup.beyond and place):  # the wire keeps order; so does a channel
             continue
+        if reply.kind in PACKETS:
+            if any(other.begun and other.kind in PACKETS for other in world.owed[:place]):
+                continue  # two talkers at once garble each other: left out
+            possible.append(("all", place, None))
+            if reply.faults:
+                before = len(reply.packet) - len(reply.data)
+                possible += [("all", place, (at - before, bit)) for at, bit in setup.damage if at >= before]
+            if not setup.bytewise:
+                continue
         possible.append(("byte", place, "right"))
         if reply.faults:
             if setup.may(setups.FLIPS):
@@ -73,11 +87,12 @@ def _bytes(world: World) -> list[Action]:
     return possible
 
 
-def window(world: World, action: Action) -> tuple[list[Time], list[Time]]:
-    """Return what the action cannot be earlier than, and what it cannot be later than."""
+def window(world: World, action: Action) -> tuple[list[Time], list[Time], list[Time]]:
+    """Return what the action cannot be earlier than, what it cannot be later than, and what it must be before."""
     setup, deadlines = world.setup, world.arbiter._deadlines
     earliest: list[Time] = []
     latest: list[Time] = []
+    before: list[Time] = []
     what = action[0]
     if not world.frozen:
         slack = setup.stall if setup.may(setups.STALLS) else 0.0
@@ -86,11 +101,16 @@ def window(world: World, action: Action) -> tuple[list[Time], list[Time]]:
             latest.append(world.unread_by)
     if what == "timer":
         earliest.append(getattr(deadlines, action[1]))
-    elif what in ("byte", "echo"):
+    elif what in ("byte", "echo", "all"):
         reply = world.owed[action[1]]
-        earliest.append(reply.lo)
-        latest.append(reply.hi)
-    return [t for t in earliest if type(t) is Instant], [t for t in latest if type(t) is Instant]
+        more = len(reply.data) - 1 if what == "all" else 0
+        earliest.append(reply.lo + more * world.byte_time)
+        (latest if reply.kind == "echo" else before).append(reply.hi + more * reply.gap)
+    return _instants(earliest), _instants(latest), _instants(before)
+
+
+def _instants(times: list[Time]) -> list[Instant]:
+    return [time for time in times if type(time) is Instant]
 
 
 def act(world: World, action: Action, now: Instant, later: Instant, script: tuple[int, ...]) -> None:
@@ -112,6 +132,9 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
         _byte(world, action[1], action[2])
     elif what == "echo":
         _echo(world, world.owed.pop(action[1]), action[2])
+    elif what == "all":
+        assert isinstance(world, MscWorld)
+        world.hear_all(world.owed[action[1]], action[2])
     elif what == "stray":
         world.strays = 0
         world.hear(action[1], STRAY)
@@ -155,8 +178,7 @@ def _byte(world: World, place: int, what: object) -> None:
     reply.lo, reply.hi = world.now + world.byte_time, world.now + reply.gap
     if not reply.data:
         del world.owed[place]
-        if reply.turnaround:
-            world.hold_until = world.now + reply.turnaround
+        world.over(reply, refused=what == "nak", lost=what == setups.LOST)
     if what == setups.MARKS:
         world.mark()
     elif byte:

@@ -7,13 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from tests.proof.adversary import act, actions, window
-from tests.proof.instants import Bound, begin_run, instant, noted, set_unit, ticks
+from tests.proof.instants import Bound, Instant, begin_run, instant, noted, set_unit, ticks
 from tests.proof.key import restore, save, share, simplify
+from tests.proof.msc_world import MscWorld
 from tests.proof.setups import Setup
 from tests.proof.shipped import set_aside
 from tests.proof.wire import SCRIPT, Outside, Violation
 from tests.proof.world import Action, World
-from tests.proof.zones import Zone, at_most, copied, extended, opposite, origin, sample, tighten, within
+from tests.proof.zones import Zone, at_most, copied, extended, less_than, opposite, origin, sample, tighten, within
 
 Step = tuple[Action, tuple[int, ...]]
 """What happened, and what was chosen in it."""
@@ -53,7 +54,7 @@ class Explorer:
         with set_aside(setup):
             prepare(setup)
             began = time.perf_counter()
-            self._begin()
+            self._begin(setup)
             done = 0
             while done < len(self._states) and len(found.violations) < violations:
                 found.seconds = time.perf_counter() - began
@@ -70,10 +71,10 @@ class Explorer:
             self._check_progress()
         return found
 
-    def _begin(self) -> None:
+    def _begin(self, setup: Setup) -> None:
         begin_run([0])
         SCRIPT.begin(())
-        world = World(instant(0, 0))
+        world = world_of(setup)(instant(0, 0))
         world.pump()
         zone = origin()
         simplify(world, zone)
@@ -93,8 +94,8 @@ class Explorer:
         begin_run(sample(zone))
         world = restore(key)
         possible = [(action, *window(world, action)) for action in actions(world)]
-        for action, earliest, latest in possible:
-            begun = constrained(zone, earliest, latest)
+        for action, *bounds in possible:
+            begun = constrained(zone, *bounds)
             if begun is not None:
                 self._happen(place, key, begun, action)
 
@@ -151,16 +152,24 @@ def prepare(setup: Setup) -> None:
     share(World.kind.profile.checks)
 
 
-def constrained(zone: Zone, earliest: list, latest: list) -> Zone | None:
+def world_of(setup: Setup) -> type[World]:
+    return MscWorld if setup.kind.startswith("msc") else World
+
+
+def constrained(
+    zone: Zone, earliest: list[Instant], latest: list[Instant], before: list[Instant]
+) -> Zone | None:
     """Return the zone with two more instants: now, not before the last one (x_0) nor outside its bounds, and any time
     from now on. None if empty."""
     more = extended(extended(zone))
     now = len(zone)
     possible = tighten(more, 0, now, at_most(0))
-    for time_ in earliest:
-        possible = possible and tighten(more, time_.base, now, at_most(-time_.offset))
-    for time_ in latest:
-        possible = possible and tighten(more, now, time_.base, at_most(time_.offset))
+    for bound in earliest:
+        possible = possible and tighten(more, bound.base, now, at_most(-bound.offset))
+    for bound in latest:
+        possible = possible and tighten(more, now, bound.base, at_most(bound.offset))
+    for bound in before:
+        possible = possible and tighten(more, now, bound.base, less_than(bound.offset))
     possible = possible and tighten(more, now, now + 1, at_most(0))
     possible = possible and tighten(more, now + 1, now, at_most(ticks(World.setup.lapse)))
     return more if possible else None

@@ -12,7 +12,7 @@ from math import inf
 from typing import Any, TypeAlias
 
 from tests.proof.adversary import act, actions, window
-from tests.proof.explore import Step, constrained, prepare, split
+from tests.proof.explore import Step, constrained, prepare, split, world_of
 from tests.proof.instants import begin_run, instant, noted, seconds
 from tests.proof.key import past_waiting, restore, save, simplify
 from tests.proof.setups import Setup
@@ -35,7 +35,7 @@ def retell(setup: Setup, steps: Sequence[Step], problem: str) -> list[Call] | No
         prepare(setup)
         begin_run([0])
         SCRIPT.begin(())
-        world = World(instant(0, 0))
+        world = world_of(setup)(instant(0, 0))
         world.calls = []
         world.note("comes up")
         world.pump()

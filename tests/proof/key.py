@@ -239,7 +239,7 @@ def past_wire(view: View) -> None:
     """The adversary's own state: a reply that is too late never comes; what was heard is judged within its exchange;
     what an attempt was to be answered with, while it is on the wire."""
     world = view.world
-    world.owed = [reply for reply in world.owed if not view.past(reply.hi, strictly=True)]
+    world.owed = [reply for reply in world.owed if not view.past(reply.hi)]
     for reply in world.owed:
         if view.past(reply.lo):
             reply.lo = -inf
@@ -247,6 +247,8 @@ def past_wire(view: View) -> None:
         _past_words(world)
     if not world.unread:
         world.unread_by = -inf
+    if view.past(world.said_by):
+        world.said_by = -inf
     if view.past(world.hold_until):
         world.hold_until = -inf
     on_wire = world.arbiter._wire.transaction

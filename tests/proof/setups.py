@@ -108,6 +108,8 @@ class Setup:
     lost_acknowledgements: int = 0
     """Of an MSC's packets: how many closing ACKs of the host are lost in an exchange."""
     retransmissions: int = 1
+    bytewise: bool = False
+    """An MSC's packets come byte by byte too, not all at once alone."""
     damage: tuple[tuple[int, int | None], ...] = ()
     """Of an MSC's packets: (place, bit) of what may be flipped; None for a byte that is lost."""
 
@@ -130,6 +132,8 @@ class Setup:
             parts.append("learned")
         if self.lost_acknowledgements:
             parts.append(f"lost ACKs {self.lost_acknowledgements}")
+        parts += ["bytewise"] if self.bytewise else []
+        parts += ["damage"] if self.damage else []
         return "; ".join((*parts, *self.adversary))
 
     def may(self, feature: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any, Final, TypeAlias
 
 Time: TypeAlias = Any
@@ -55,8 +56,10 @@ class Owed:
         "lo",
         "own",
         "packet",
+        "packet_by",
         "ticket",
         "turnaround",
+        "unit",
     )
 
     def __init__(self, data: bytes, lo: Time, hi: Time, gap: float, *, kind: str = "reply", faults: int = 1) -> None:
@@ -76,8 +79,11 @@ class Owed:
         self.ticket: Ticket | None = None
         self.packet = b""
         """Of an MSC: the packet behind the ACK, or the whole one that may be said again."""
+        self.packet_by: Time = -inf
+        """When that begins at the latest, if the ACK is lost."""
         self.left = 0
         """How often that may be said again."""
+        self.unit = 0
 
     @property
     def origin(self) -> str:

@@ -85,6 +85,9 @@ class World:
         """What left in this step."""
         self.calls: list[tuple[Time, str, Any]] | None = None
         """What was called and said, with its time, where a history is told."""
+        self.losses = setup.lost_acknowledgements
+        self.said_by: Time = -inf
+        """Until then the host speaks."""
         arbiter.line_up(now, paced=setup.paced)
 
     def note(self, what: str, detail: Any = None) -> None:
@@ -229,7 +232,7 @@ class World:
         self.said += out
         transaction = self.arbiter._wire.transaction
         ticket = None if transaction is None else transaction.waiter
-        if ticket is not None:
+        if ticket is not None and self.is_request(out):
             self._judge_order(ticket)
             ticket.sent = True
             ticket.before = ticket.may_be_done
@@ -240,6 +243,14 @@ class World:
             self.leaves(out, ticket, self.now + len(out) * self.byte_time)
         self.note("has written")
         self.arbiter.transmitted(self.now)
+
+    def is_request(self, out: bytes) -> bool:
+        return True
+
+    def over(self, reply: Owed, refused: bool = False, lost: bool = False) -> None:
+        """A node has said all of this."""
+        if reply.turnaround:
+            self.hold_until = self.now + reply.turnaround
 
     def begin_exchange(self) -> None:
         """Nothing that was said before is anybody's answer now."""
