@@ -460,8 +460,6 @@ class LineMachine:
         """Take the echo of what was sent off the front, byte for byte; a mismatch is a collision."""
         rest = self._echo.strip(data)
         self._strays.last_byte = now  # where the echo is lost, this may be another's byte that looks like it
-        if self.state is not EXCHANGE:
-            self._leg.strayed(now)
         if rest is None:
             self._counters.collisions += 1
             self._events.append(Strayed(data, collision=True))
