@@ -8,9 +8,9 @@ from typing import cast
 from busmaster.arbiter.state import OFFLINE
 from tests.proof import setups
 from tests.proof.instants import Instant
+from tests.proof.msc_world import MscWorld
 from tests.proof.shipped import AnyTime, Asker, Decided
 from tests.proof.wire import SCRIPT, STRAY, Owed, Time
-from tests.proof.msc_world import MscWorld
 from tests.proof.world import Action, World
 
 PACKETS = ("packet", "again")
@@ -76,10 +76,13 @@ def _bytes(world: World) -> list[Action]:
             if not setup.bytewise:
                 continue
         possible.append(("byte", place, "right"))
-        if reply.faults:
+        read = world.words_are_read
+        if reply.faults and setup.may(setups.LOST) and (read or not setup.assumptions.whole_stragglers):
+            possible.append(("byte", place, setups.LOST))
+        if reply.faults and read:
             if setup.may(setups.FLIPS):
                 possible += [("byte", place, bit) for bit in setup.bits]
-            possible += [("byte", place, what) for what in (setups.LOST, setups.MARKS) if setup.may(what)]
+            possible += [("byte", place, what) for what in (setups.MARKS,) if setup.may(what)]
         if setup.may(setups.NAKS) and not reply.begun:
             possible.append(("byte", place, "nak"))
         if setup.beyond and not reply.begun:
@@ -121,11 +124,12 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
     AnyTime.at[0] = cast("float", later)
     world.now = now
     world.said = b""
+    world.ended = []
     SCRIPT.begin(script)
     arbiter, what = world.arbiter, action[0]
     if what == "timer":
         unread = bool(world.unread) and world.setup.may(setups.STALLS)
-        if arbiter.line_due(now):
+        if arbiter.line_due(world.now):
             world.tell_unsent_if(asked=True)
         world.time_out(unread)
     elif what == "byte":
@@ -172,7 +176,6 @@ def _byte(world: World, place: int, what: object) -> None:
         byte, reply.data = world.refuse(reply), b""
     elif what != "right":
         reply.faults -= 1
-        reply.hurt = True
         byte = b"" if what == setups.LOST else byte if what == setups.MARKS else bytes((byte[0] ^ 1 << int(str(what)),))
     reply.begun = True
     reply.lo, reply.hi = world.now + world.byte_time, world.now + reply.gap

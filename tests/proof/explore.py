@@ -156,9 +156,7 @@ def world_of(setup: Setup) -> type[World]:
     return MscWorld if setup.kind.startswith("msc") else World
 
 
-def constrained(
-    zone: Zone, earliest: list[Instant], latest: list[Instant], before: list[Instant]
-) -> Zone | None:
+def constrained(zone: Zone, earliest: list[Instant], latest: list[Instant], before: list[Instant]) -> Zone | None:
     """Return the zone with two more instants: now, not before the last one (x_0) nor outside its bounds, and any time
     from now on. None if empty."""
     more = extended(extended(zone))

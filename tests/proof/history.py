@@ -107,15 +107,15 @@ def as_test(setup: Setup, calls: Sequence[Call], problem: str) -> str:
         "def test_found_by_the_proof() -> None:",
         f'    """{problem}; in the world "{setup.name}"."""',
         f"    commands = KINDS[{setup.kind!r}]().commands",
-        f"    arbiter = Arbiter({kind}.PROFILE.line.byte_time, echo={setup.echo}, "
-        f"receive_latency={setup.receive_latency}, strict={setup.strict})",
+        f"    how = dict(echo={setup.echo}, receive_latency={setup.receive_latency}, strict={setup.strict})",
+        f"    arbiter = Arbiter({kind}.PROFILE.line.byte_time, **how)",
         f"    nodes = [arbiter.add_node({kind}.PROFILE, address, 0.0, retries={setup.retries}) for address in (1, 2)]",
     ]
     ways = {
         "comes up": "arbiter.line_up({time}, paced={paced})",
         "goes down": "arbiter.line_down('lost', {time})",
         "asks": "arbiter.submit(Transaction(nodes[commands[{detail}][0]], commands[{detail}][1]), {time})",
-        "asks urgently": "arbiter.submit(Transaction(nodes[commands[{detail}][0]], commands[{detail}][1], URGENT), {time})",
+        "asks urgently": "arbiter.submit(Transaction(nodes[0], commands[{detail}][1], URGENT), {time})",
         "hears": "arbiter.data_received(bytes.fromhex({words!r}), {time})",
         "hears a damaged byte": "arbiter.byte_marked(Mark.DAMAGED, {time})",
         "is due": "arbiter.handle_timeout({time}, unread={detail})",

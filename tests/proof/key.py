@@ -20,15 +20,14 @@ from busmaster.arbiter.schedule import Schedule
 from busmaster.arbiter.state import EXCHANGE, SETTLING, LineState
 from busmaster.arbiter.strays import QUIET, STRAGGLER_MEMORY
 from busmaster.arbiter.transaction import BACKGROUND, COMMAND, Phase, Priority, Transaction
-from busmaster.contract.exchange import ReplyTiming, Timings
 from busmaster.contract.profile import Profile
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import LineNoisy
 from tests.proof import setups
 from tests.proof.instants import Instant, Past, instant, past, ticks
 from tests.proof.wire import Time
 from tests.proof.world import World
 from tests.proof.zones import FREE, Zone, widened
-
 
 LONGEST = 1.5
 """Seconds beyond which it is not told apart how long ago something was, or is to be."""
@@ -199,12 +198,13 @@ def past_debts(view: View) -> None:
             debt.until = -inf
         if not (view.past(debt.asked, in_step.LAPSE, strictly=True) and view.past(debt.over)):
             continue
-        if type(debt.asked) is Instant and (on_wire is None or view.before(debt.over, on_wire.started)):
-            assert type(debt.over) is Instant
-            apart = debt.over - debt.asked
+        asked: Time = debt.asked
+        over: Time = debt.over
+        if type(asked) is Instant and (on_wire is None or view.before(over, on_wire.started)):
+            apart = over - asked
             if type(apart) is float:
-                debt.asked = past(0, 0)  # type: ignore[assignment]
-                debt.over = past(0, ticks(apart))  # type: ignore[assignment]
+                asked, over = past(0, 0), past(0, ticks(apart))
+                debt.asked, debt.over = asked, over
     book._doubted = [entry for entry in book._doubted if not view.past(entry[1])]
     if view.past(book._doubt_until):
         book._doubt_until = -inf
@@ -243,7 +243,7 @@ def past_wire(view: View) -> None:
     for reply in world.owed:
         if view.past(reply.lo):
             reply.lo = -inf
-    if world.arbiter.state is not EXCHANGE and not (world.setup.beyond or world.held or world.frozen):
+    if not world.words_are_read:
         _past_words(world)
     if not world.unread:
         world.unread_by = -inf
@@ -261,19 +261,14 @@ def past_wire(view: View) -> None:
             ticket.place = -1
             ticket.before = False
     world.said = b""
+    world.ended = []
 
 
 def _past_words(world: World) -> None:
-    """Of what comes between exchanges, nobody reads the words: only that it comes. Unless its echo is awaited, or a
-    listener reads packets, or R15 knows what was owed; and unless it may come in a later exchange, which R1 denies."""
-    arbiter = world.arbiter
-    if arbiter._echo.owed or arbiter._strays.listener is not None or world.setup.in_step:
-        return
+    """Where nobody reads the words, only that something comes makes a difference."""
     for reply in world.owed:
         if reply.kind == "reply":
             reply.data = bytes(len(reply.data))
-            reply.faults = 0
-            reply.hurt = False
             reply.ticket = None
 
 
@@ -398,13 +393,10 @@ def save(world: World, zone: Zone, longest: float = LONGEST) -> tuple[bytes, Zon
     _PLACES.begin(zone, world.now)
     into = io.BytesIO()
     pickler = pickle.Pickler(into, 5)
-    pickler.dispatch_table = _TABLE  # type: ignore[assignment]
+    pickler.dispatch_table = _TABLE
     pickler.dump(world)
     kept = _PLACES.kept
-    small = [
-        [FREE if zone[i][j] >= FREE else zone[i][j] + 2 * (a - b) for j, b in kept]
-        for i, a in kept
-    ]
+    small = [[FREE if zone[i][j] >= FREE else zone[i][j] + 2 * (a - b) for j, b in kept] for i, a in kept]
     return into.getvalue(), widened(small, ticks(longest)) if longest < inf else small
 
 

@@ -32,7 +32,7 @@ class Kind:
     commands: Sequence[tuple[int, Any]]
     """The node's place and the command."""
     answer: Callable[[bytes, int], bytes]
-    """The reply to a request, by the place of the value in `values`; of an MSC, the packet behind the ACK or nothing."""
+    """The reply to a request, by the place of the value in `values`; of an MSC, the packet behind the ACK."""
     values: tuple[Any, Any]
 
     @property

@@ -49,7 +49,9 @@ class MscWorld(World):
         self.said_by = at
         if self.setup.echo:
             self.owed.append(Owed(said, at, at + self.setup.late_echo, 0.0, kind="echo"))
-        for reply in [r for r in self.owed if r.kind != "echo"]:  # collisions are left out: nobody begins while the host speaks
+        for reply in [
+            r for r in self.owed if r.kind != "echo"
+        ]:  # collisions are left out: nobody begins while the host speaks
             if not reply.begun and (not isinstance(reply.lo, Instant) or reply.lo < at + self.byte_time):
                 reply.lo = at + self.byte_time
 

@@ -44,7 +44,10 @@ NOISE: Final = "noise"
 BEYOND: Final = "beyond"
 """Replies come after their lateness, in order, within `Setup.beyond`: only R15 is left to keep them apart."""
 
-ALL = (FLIPS, LOST, MARKS, NAKS, STRAYS, CANCELS, URGENT, IDLE, LOSS, STALLS, HELD, FROZEN, RAISED, HEALTH, HOLDS, NOISE)
+ALL = (
+    *(FLIPS, LOST, MARKS, NAKS, STRAYS, CANCELS, URGENT, IDLE),
+    *(LOSS, STALLS, HELD, FROZEN, RAISED, HEALTH, HOLDS, NOISE),
+)
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class Assumptions:
     gap_to: str = "start bit"
     """What ends a pause within `byte_gap`: the next byte's "start bit", or its being a "received byte"."""
 
+    whole_stragglers: bool = True
+    """No byte of a reply is lost once its exchange is over: two pauses would look like one."""
     held_until_asked: bool = True
     """Output that a port holds is held until the port is asked for it: one that lets go before, unseen, is not noticed,
     and the lateness of what was asked counts from when it was written."""
@@ -126,6 +131,8 @@ class Setup:
             parts.append(f"depth {self.depth}")
         if not (self.assumptions.edge and self.assumptions.gap_edge):
             parts.append(f"lateness to {self.assumptions.lateness_to}, gap to {self.assumptions.gap_to}")
+        if not self.assumptions.whole_stragglers:
+            parts.append("stragglers lose bytes")
         if not self.assumptions.held_until_asked:
             parts.append("let go unseen")
         if self.slowest != (0.0,):

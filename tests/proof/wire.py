@@ -50,7 +50,6 @@ class Owed:
         "faults",
         "gap",
         "hi",
-        "hurt",
         "kind",
         "left",
         "lo",
@@ -71,8 +70,6 @@ class Owed:
         self.kind = kind
         self.faults = faults
         """How many it may still have."""
-        self.hurt = False
-        """It has had one."""
         self.begun = False
         self.own = True
         self.turnaround = 0.0
@@ -105,7 +102,7 @@ class Script:
         if several < 2:
             return 0
         place = len(self.asked)
-        chosen = self.wanted[place] if place < len(self.wanted) else 0
+        chosen = self.wanted[place] % several if place < len(self.wanted) else 0
         self.asked.append((chosen, several))
         return chosen
 

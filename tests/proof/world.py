@@ -10,7 +10,7 @@ from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import Completed, Mark
 from busmaster.arbiter.state import EXCHANGE, OFFLINE
 from busmaster.arbiter.transaction import PARKED, URGENT, Transaction
-from busmaster.contract.exchange import ReplyTiming, Timings
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import LineDown, WriteUnconfirmed
 from tests.proof import setups
 from tests.proof.instants import Instant
@@ -83,6 +83,8 @@ class World:
         """What the arbiter has said, and the process has not written yet."""
         self.said = b""
         """What left in this step."""
+        self.ended: list[str] = []
+        """What callers were told in this step."""
         self.calls: list[tuple[Time, str, Any]] | None = None
         """What was called and said, with its time, where a history is told."""
         self.losses = setup.lost_acknowledgements
@@ -166,7 +168,8 @@ class World:
         if len(self.live) > sum(transaction.heard and transaction.waiter is not None for transaction in held):
             raise Violation("R8: a request is forgotten")
         if arbiter.state.name in ("EXCHANGE", "SETTLING", "HOLDOFF") and not self.frozen:
-            if type(arbiter._deadlines.line) is not Instant:
+            due: Time = arbiter._deadlines.line
+            if type(due) is not Instant:
                 raise Violation(f"progress: {arbiter.state.name} has no end")
         elif arbiter.state.name == "READY" and len(arbiter.dispatcher.backlog):
             raise Violation("progress: the line is READY while something waits")
@@ -181,6 +184,7 @@ class World:
             raise Violation("R8: a request ended twice")
         self.live.remove(ticket)
         error = transaction.error
+        self.ended.append(f"{transaction.value} {type(error).__name__}")
         if error is not None:
             if ticket.writes and ticket.may_be_done and not isinstance(error, WriteUnconfirmed):
                 if self.forged:
@@ -330,6 +334,16 @@ class World:
         if reply.ticket is not None and reply.own:
             reply.ticket.may_be_done = reply.ticket.before
         return NAK
+
+    @property
+    def words_are_read(self) -> bool:
+        """Whether it makes a difference what comes, not only that it does: in an exchange, where an echo is awaited, where
+        a listener reads packets and where R15 knows what was owed. What may come in a later exchange is read there; R1
+        denies that there is such, but for what the port holds and for replies `beyond` their lateness."""
+        arbiter, setup = self.arbiter, self.setup
+        unsaid = self.held is not None or bool(self.frozen) or setup.beyond
+        listens = arbiter._echo.owed or arbiter._strays.listener is not None or setup.in_step
+        return bool(arbiter.state is EXCHANGE or unsaid or listens)
 
     @property
     def on_wire(self) -> Transaction | None:
