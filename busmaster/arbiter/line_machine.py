@@ -366,6 +366,9 @@ class LineMachine:
         self._end_exchange()
         self.dispatcher.refused(transaction, refusal, certain, now)
         if transaction.writes and certain:
+            leg = self._leg
+            if leg.end > leg.begun_at:  # as where a value comes
+                leg.end = leg.out = leg.begun_at
             self._release(self._leg.timing.turnaround, now)
         else:
             self._settle(now, begun=confirmed and certain)

@@ -13,7 +13,7 @@ from busmaster.errors import NoReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import ACK, FIVE, LATENESS, QUIET, SEVEN, TAU, WRITE_5, Bench, up
+from tests.arbiter.bench import ACK, FIVE, LATENESS, NAK, QUIET, SEVEN, TAU, WRITE_5, Bench, up
 
 REQUEST = 8 * TAU
 JUST = 1e-6
@@ -74,6 +74,20 @@ def checksum(telegram: str) -> int:
     for byte in bytes.fromhex(telegram)[1:]:
         check ^= byte
     return check + 0x20 if check < 0x20 else check
+
+
+def test_what_was_refused_has_left_whatever_the_baud_rate_says() -> None:
+    """On an unpaced port, requests that are refused at once do not add up."""
+    bench = Bench()
+    node = up(bench)
+    for _ in range(20):
+        refused = bench.ask(node, hcp2.Write(1, (5.0,)))
+        while refused.error is None:
+            bench.sent()
+            bench.hear(NAK, after=JUST)
+    asked = bench.now
+    bench.ask(node, retries=0)
+    assert bench.arbiter.poll_timeout() - asked == pytest.approx(REQUEST + 0.100)
 
 
 def test_r3_an_answer_that_is_not_believed_proves_not_that_its_request_has_left() -> None:

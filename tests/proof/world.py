@@ -337,9 +337,9 @@ class World:
 
     @property
     def words_are_read(self) -> bool:
-        """Whether it makes a difference what comes, not only that it does: in an exchange, where an echo is awaited, where
-        a listener reads packets and where R15 knows what was owed. What may come in a later exchange is read there; R1
-        denies that there is such, but for what the port holds and for replies `beyond` their lateness."""
+        """Whether it makes a difference what comes, not only that it does: in an exchange, where an echo is awaited,
+        where a listener reads packets and where R15 knows what was owed. What may come in a later exchange is read there;
+        R1 denies that there is such, but for what the port holds and for replies `beyond` their lateness."""
         arbiter, setup = self.arbiter, self.setup
         unsaid = self.held is not None or bool(self.frozen) or setup.beyond
         listens = arbiter._echo.owed or arbiter._strays.listener is not None or setup.in_step
