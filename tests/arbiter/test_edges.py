@@ -80,7 +80,7 @@ def test_what_was_refused_has_left_whatever_the_baud_rate_says() -> None:
     """On an unpaced port, requests that are refused at once do not add up."""
     bench = Bench()
     node = up(bench)
-    for _ in range(20):
+    for _ in range(5):
         refused = bench.ask(node, hcp2.Write(1, (5.0,)))
         while refused.error is None:
             bench.sent()

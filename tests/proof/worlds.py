@@ -62,18 +62,20 @@ def quick() -> Iterator[Setup]:
 def lines() -> Iterator[Setup]:
     """Every kind of line, each with what breaks a wire."""
     for kind in ("hcp2", "hcp2, other checksums", "hcp", "mentor", "dc104", "dc104, other checksums", "msc"):
-        for adversary in ((), (FLIPS,), (LOST,), (NAKS,), (STRAYS,)):
+        hit = MARKS if kind == "mentor" else FLIPS  # its parity tells
+        for adversary in ((), (hit,), (LOST,), (NAKS,), (STRAYS,)):
             yield _line(kind, *adversary)
     for kind in ("hcp2", "mentor", "dc104", "msc"):
         for adversary in ((), (STRAYS,), (LOST,)):
             yield replace(_line(kind, *adversary), paced=True)
             yield replace(_line(kind, *adversary), receive_latency=0.016)
-        for faults in ((), (ECHO_FAULTS,), (ECHO_FAULTS, FLIPS)):
+        hit = MARKS if kind == "mentor" else FLIPS
+        for faults in ((), (ECHO_FAULTS,), (ECHO_FAULTS, hit)):
             yield replace(_line(kind, *faults), echo=True)
         if kind != "msc":
             yield replace(_line(kind, ECHO_FAULTS, STRAYS), echo=True)
         yield replace(_line(kind, ECHO_FAULTS), echo=True, receive_latency=0.016)
-        yield replace(_line(kind, FLIPS), assumptions=Assumptions("received byte", "received byte"))
+        yield replace(_line(kind, hit), assumptions=Assumptions("received byte", "received byte"))
     for kind in ("hcp2", "mentor", "msc"):
         for adversary in ((), (LOST,), (NAKS,)):
             yield _line(kind, *adversary, commands=(READ, WRITE_THERE))
