@@ -77,7 +77,7 @@ def _bytes(world: World) -> list[Action]:
                 continue
         possible.append(("byte", place, "right"))
         read = world.words_are_read
-        if reply.faults and setup.may(setups.LOST) and (read or not setup.assumptions.whole_stragglers):
+        if reply.faults and setup.may(setups.LOST) and (read or not setup.assumptions.pauses_hold_the_lost):
             possible.append(("byte", place, setups.LOST))
         if reply.faults and read:
             if setup.may(setups.FLIPS):
@@ -178,7 +178,9 @@ def _byte(world: World, place: int, what: object) -> None:
         reply.faults -= 1
         byte = b"" if what == setups.LOST else byte if what == setups.MARKS else bytes((byte[0] ^ 1 << int(str(what)),))
     reply.begun = True
-    reply.lo, reply.hi = world.now + world.byte_time, world.now + reply.gap
+    reply.lo = world.now + world.byte_time
+    if what != setups.LOST or not world.setup.assumptions.pauses_hold_the_lost:
+        reply.hi = world.now + reply.gap
     if not reply.data:
         del world.owed[place]
         world.over(reply, refused=what == "nak", lost=what == setups.LOST)

@@ -25,6 +25,8 @@ Call: TypeAlias = tuple[float, str, Any]
 """When, in seconds; what; and with what."""
 UNSEEN = ("may still come until here", "lets it go")
 """What the arbiter does not notice."""
+JUST = 1e-9
+"""Seconds between two things that happen at once in a test: floats are not exact."""
 MOST_RUNS = 20_000
 
 
@@ -104,6 +106,13 @@ def as_test(setup: Setup, calls: Sequence[Call], problem: str) -> str:
     kind = setup.kind.split(",")[0]
     calls = [call for call in calls if call[1] not in UNSEEN]
     lines = [
+        "from busmaster.arbiter.arbiter import Arbiter",
+        "from busmaster.arbiter.events import Mark",
+        "from busmaster.arbiter.transaction import URGENT, Transaction",
+        f"from busmaster.protocols.{kind} import codec as {kind}",
+        "from tests.proof.kinds import KINDS",
+        "",
+        "",
         "def test_found_by_the_proof() -> None:",
         f'    """{problem}; in the world "{setup.name}"."""',
         f"    commands = KINDS[{setup.kind!r}]().commands",
@@ -118,7 +127,7 @@ def as_test(setup: Setup, calls: Sequence[Call], problem: str) -> str:
         "asks urgently": "arbiter.submit(Transaction(nodes[0], commands[{detail}][1], URGENT), {time})",
         "hears": "arbiter.data_received(bytes.fromhex({words!r}), {time})",
         "hears a damaged byte": "arbiter.byte_marked(Mark.DAMAGED, {time})",
-        "is due": "arbiter.handle_timeout({time}, unread={detail})",
+        "is due": "arbiter.handle_timeout(max({time}, arbiter.poll_timeout()), unread={detail})",
         "has not sent": "arbiter.unsent({detail}, {time})",
         "cancels": "arbiter.cancel(arbiter._wire.transaction, {time})",
         "says": "assert arbiter.poll_transmit() == bytes.fromhex({words!r})",
@@ -129,7 +138,8 @@ def as_test(setup: Setup, calls: Sequence[Call], problem: str) -> str:
         if number == len(calls) - 1 and what == "says":
             lines.append(f"    assert arbiter.poll_transmit() is None, {problem!r}")
         else:
-            way = ways[what].format(time=round(time, 9), words=words, detail=detail, paced=setup.paced)
+            when = round(time + number * JUST, 12)
+            way = ways[what].format(time=when, words=words, detail=detail, paced=setup.paced)
             lines.append(f"    {way}")
     return "\n".join(lines)
 

@@ -35,6 +35,10 @@ class Kind:
     """The reply to a request, by the place of the value in `values`; of an MSC, the packet behind the ACK."""
     values: tuple[Any, Any]
 
+    def right_value(self, command: Any, place: int) -> float:
+        """What a read of the reply with that place makes."""
+        return float(place if isinstance(command, msc.ReadFlag) else self.values[place])
+
     @property
     def check(self) -> Any:
         """A read by which a node proves that the line is in step."""

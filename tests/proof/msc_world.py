@@ -21,6 +21,8 @@ SAID_AGAIN_BY = 1.0
 class MscWorld(World):
     """`Owed.kind` is "ack", "packet" or "again"; `packet` is what the unit says behind its ACK, or would say again."""
 
+    has_one_leg = False
+
     def begin_exchange(self) -> None:
         """What is said is sorted out in `leaves`: the host's ACKs begin nothing."""
 

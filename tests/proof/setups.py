@@ -59,8 +59,9 @@ class Assumptions:
     gap_to: str = "start bit"
     """What ends a pause within `byte_gap`: the next byte's "start bit", or its being a "received byte"."""
 
-    whole_stragglers: bool = True
-    """No byte of a reply is lost once its exchange is over: two pauses would look like one."""
+    pauses_hold_the_lost: bool = True
+    """A pause within a reply ends within `byte_gap`, whatever was lost in it; so does the time before its first byte
+    end within the lateness. Else two pauses look like one."""
     held_until_asked: bool = True
     """Output that a port holds is held until the port is asked for it: one that lets go before, unseen, is not noticed,
     and the lateness of what was asked counts from when it was written."""
@@ -131,8 +132,8 @@ class Setup:
             parts.append(f"depth {self.depth}")
         if not (self.assumptions.edge and self.assumptions.gap_edge):
             parts.append(f"lateness to {self.assumptions.lateness_to}, gap to {self.assumptions.gap_to}")
-        if not self.assumptions.whole_stragglers:
-            parts.append("stragglers lose bytes")
+        if not self.assumptions.pauses_hold_the_lost:
+            parts.append("lost bytes lengthen pauses")
         if not self.assumptions.held_until_asked:
             parts.append("let go unseen")
         if self.slowest != (0.0,):

@@ -32,6 +32,8 @@ class World:
     setup: ClassVar[Setup]
     """Of the world that is being explored."""
     kind: ClassVar[Kind]
+    has_one_leg: ClassVar[bool] = True
+    """All that is heard in an exchange is its one reply."""
     byte_time: ClassVar[float]
 
     @classmethod
@@ -128,8 +130,8 @@ class World:
         """Hand over what is to be sent, hear what has happened, ask anew: until nothing is left."""
         arbiter = self.arbiter
         by = self.by
-        if by == STRAY and Decided.by_answer[0]:
-            raise Outside  # a byte that nobody said was taken for an answer
+        if Decided.by_answer[0] and (by == STRAY or (self.forged and self.has_one_leg)):
+            raise Outside  # a byte that nobody said was taken for an answer, or made one
         for _ in range(MOST_TURNS):
             out = arbiter.poll_transmit()
             if out:
@@ -197,7 +199,7 @@ class World:
             raise Violation("R5: a success though nothing was heard")
         value = transaction.value
         value = value[0] if isinstance(value, tuple) else value
-        right = ticket.writes or float(value) == float(self.kind.values[ticket.place])
+        right = ticket.writes or float(value) == self.kind.right_value(transaction.command, ticket.place)
         if by == OLD:
             what = "a write is confirmed" if ticket.writes else "a value is made"
             raise Violation(f"R3: {what} by a byte of an earlier reply")
@@ -261,7 +263,7 @@ class World:
         if self.held is not None:
             raise Violation("R1: a request is said while an earlier one has not left")
         replies = [reply for reply in self.owed if reply.kind != "echo"]
-        if self.setup.echo and len(replies) < len(self.owed):
+        if any(echo.hi > self.now for echo in self.owed if echo.kind == "echo"):
             raise Violation("R1: the echo of an earlier request is still to come as the next one leaves")
         self._judge_request(replies)
         for reply in replies:
@@ -338,8 +340,9 @@ class World:
     @property
     def words_are_read(self) -> bool:
         """Whether it makes a difference what comes, not only that it does: in an exchange, where an echo is awaited,
-        where a listener reads packets and where R15 knows what was owed. What may come in a later exchange is read there;
-        R1 denies that there is such, but for what the port holds and for replies `beyond` their lateness."""
+        where a listener reads packets and where R15 knows what was owed. What comes in a later exchange is read there;
+        R1 denies that there is such, but for what the port holds and for replies `beyond` their lateness.
+        """
         arbiter, setup = self.arbiter, self.setup
         unsaid = self.held is not None or bool(self.frozen) or setup.beyond
         listens = arbiter._echo.owed or arbiter._strays.listener is not None or setup.in_step
