@@ -29,7 +29,7 @@ def actions(world: World) -> list[Action]:
     possible += _bytes(world)
     possible += _strays(world)
     if world.unread:
-        possible += [("read", several) for several in {1, len(world.unread)}]
+        possible += [("read", several) for several in {1 if setup.cuts else len(world.unread), len(world.unread)}]
     if world.held is not None and (arbiter._wire.output.held or not setup.assumptions.held_until_asked):
         possible.append(("leaves",))
     on_wire = world.on_wire

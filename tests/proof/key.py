@@ -25,7 +25,7 @@ from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import LineNoisy
 from tests.proof import setups
 from tests.proof.instants import Instant, Past, instant, past, ticks
-from tests.proof.wire import Time
+from tests.proof.wire import OLD, STRAY, Time
 from tests.proof.world import World
 from tests.proof.zones import FREE, Zone, widened
 
@@ -265,7 +265,10 @@ def past_wire(view: View) -> None:
 
 
 def _past_words(world: World) -> None:
-    """Where nobody reads the words, only that something comes makes a difference."""
+    """Where nobody reads the words, only that something comes makes a difference, and whether a node has said it."""
+    if world.unread:
+        said = {origin for _, origin in world.unread} - {STRAY}
+        world.unread = ((0, OLD if said else STRAY),)
     for reply in world.owed:
         if reply.kind == "reply":
             reply.data = bytes(len(reply.data))

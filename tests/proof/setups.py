@@ -114,6 +114,8 @@ class Setup:
     lost_acknowledgements: int = 0
     """Of an MSC's packets: how many closing ACKs of the host are lost in an exchange."""
     retransmissions: int = 1
+    cuts: bool = False
+    """What lies in an adapter or the kernel may be read in two pieces; else all of it is read at once."""
     bytewise: bool = False
     """An MSC's packets come byte by byte too, not all at once alone."""
     damage: tuple[tuple[int, int | None], ...] = ()
@@ -140,6 +142,7 @@ class Setup:
             parts.append("learned")
         if self.lost_acknowledgements:
             parts.append(f"lost ACKs {self.lost_acknowledgements}")
+        parts += ["cuts"] if self.cuts else []
         parts += ["bytewise"] if self.bytewise else []
         parts += ["damage"] if self.damage else []
         return "; ".join((*parts, *self.adversary))

@@ -79,6 +79,8 @@ def lines() -> Iterator[Setup]:
     for kind in ("hcp2", "mentor", "msc"):
         for adversary in ((), (LOST,), (NAKS,)):
             yield _line(kind, *adversary, commands=(READ, WRITE_THERE))
+    yield replace(_line(commands=(WRITE,)), receive_latency=0.016, cuts=True)
+    yield replace(_line("dc104"), receive_latency=0.016, cuts=True)
     yield replace(_line(commands=(READ, WRITE_THERE)), second_timing=True)
     yield replace(_line("hcp2", LOST, commands=(READ, WRITE_THERE)), second_timing=True)
     yield replace(_line("hcp2", NAKS, commands=(READ, WRITE, READ_UNLIKE)), retries=1)
