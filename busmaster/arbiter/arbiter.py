@@ -107,7 +107,15 @@ class Arbiter(LineMachine):
         return self._events.popleft() if self._events else None
 
     def poll_timeout(self) -> float:
-        return self._deadlines.earliest()
+        deadlines = self._deadlines
+        earliest = deadlines.line
+        if deadlines.schedule < earliest:
+            earliest = deadlines.schedule
+        if deadlines.expiry < earliest:
+            earliest = deadlines.expiry
+        if deadlines.health < earliest:
+            earliest = deadlines.health
+        return earliest
 
     def reset_statistics(self, now: float) -> None:
         self._counters.reset(self.state, now)

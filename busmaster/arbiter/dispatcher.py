@@ -87,7 +87,7 @@ class Dispatcher:
         if waiting >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return False
-        if not self._may_ask(transaction, now):
+        if (node.health is DOWN or now < node.suspended_until) and not self._may_ask(transaction, now):
             return False
         if transaction.writes:
             node.writes.append(transaction)
