@@ -19,7 +19,7 @@ from busmaster.arbiter.backlog import Backlog
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.endings import make_error, name_error, not_started
-from busmaster.arbiter.events import Completed, Event, LatenessLowered, NodeChanged, Polled, Sampled
+from busmaster.arbiter.events import Event, LatenessLowered, NodeChanged, Polled, Sampled
 from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
 from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.schedule import Poll, Schedule
@@ -464,7 +464,7 @@ class Dispatcher:
                 self.events.append(Polled(poll))
         elif transaction.heard:
             self.counters.completed += 1
-            self.events.append(Completed(transaction))
+            self.events.append(transaction)
 
     def _waits(self, transaction: Transaction) -> None:
         """What the line has counted so far is not what it waits for."""

@@ -196,9 +196,10 @@ class ProbeBudget:
 
         One too short for a probe earns nothing: there a probe would delay what comes next.
         """
-        pause = self._pause + seconds
-        if pause > self.probe:
-            earned = BUDGET_IDLE_SHARE * (pause - max(self.probe, self._pause))
+        before, probe = self._pause, self.probe
+        pause = before + seconds
+        if pause > probe and self.tokens < BUDGET_CAPACITY:
+            earned = BUDGET_IDLE_SHARE * (pause - max(probe, before))
             self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)
         self._pause = 0.0 if over else pause
 

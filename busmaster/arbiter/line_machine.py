@@ -493,7 +493,7 @@ class LineMachine:
     def _enter(self, state: LineState, now: float) -> None:
         spent = self._counters.spend(self.state, now)
         if self.state is READY:
-            self.dispatcher.probes.budget.idle(spent, over=state is not READY)
+            self.dispatcher.probes.budget.idle(spent, state is not READY)
         self.state = state
 
     def _offline(self) -> BusError:
