@@ -37,19 +37,25 @@ def main() -> None:
     parser.add_argument(
         "--session", type=Path, help="the file of verdicts (mutation-SEED.jsonl, not in the repository)"
     )
+    parser.add_argument(
+        "--near", action="store_true", help="run only the tests nearest to each room: quick, a lower bound"
+    )
     parser.add_argument("--report", action="store_true", help="only print what the session's file holds")
     options = parser.parse_args()
     session = options.session or ROOT / f"mutation-{options.seed}.jsonl"
     if not options.report:
         mutants = drawn(ROOT, options.count, options.seed, frozenset(options.rooms.split(",")))
         known = {key_of(verdict) for verdict in read(session)}
-        try_all([mutant for mutant in mutants if key_of(mutant.as_fields()) not in known], session, options.jobs)
+        try_all([mutant for mutant in mutants if key_of(mutant.as_fields()) not in known], session, options)
     report(read(session))
 
 
-def try_all(mutants: list[Mutant], session: Path, jobs: int) -> None:
+def try_all(mutants: list[Mutant], session: Path, options: argparse.Namespace) -> None:
     """Try them, some at once, each process in a copy of its own, and write each verdict as it comes."""
-    with tempfile.TemporaryDirectory() as folder, multiprocessing.Pool(jobs, start_in_a_copy, (Path(folder),)) as pool:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        multiprocessing.Pool(options.jobs, start_in_a_copy, (Path(folder), options.near)) as pool,
+    ):
         for number, (mutant, verdict) in enumerate(pool.imap_unordered(judged, mutants), 1):
             fields = mutant.as_fields() | {"outcome": verdict.outcome, "seconds": verdict.seconds, "diff": verdict.diff}
             with session.open("a") as file:
@@ -57,18 +63,18 @@ def try_all(mutants: list[Mutant], session: Path, jobs: int) -> None:
             say(f"{number}/{len(mutants)} {verdict.outcome:8} {verdict.seconds:6.0f} s  {mutant.module}:{mutant.line}")
 
 
-COPY: list[Path] = []
-"""The copy of this process."""
+COPY: list[tuple[Path, bool]] = []
+"""The copy of this process, and whether only the nearest tests are run in it."""
 
 
-def start_in_a_copy(folder: Path) -> None:
+def start_in_a_copy(folder: Path, near: bool) -> None:
     """Make a process its copy."""
-    COPY.append(copied(ROOT, folder / multiprocessing.current_process().name))
+    COPY.append((copied(ROOT, folder / multiprocessing.current_process().name), near))
 
 
 def judged(mutant: Mutant) -> tuple[Mutant, Verdict]:
     """Try it in this process's copy."""
-    return mutant, tried(mutant, COPY[0])
+    return mutant, tried(mutant, *COPY[0])
 
 
 def read(session: Path) -> list[dict[str, Any]]:

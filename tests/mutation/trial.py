@@ -54,14 +54,14 @@ def holds_tests(path: Path) -> bool:
     return path.name.startswith("test_") if path.is_file() else any(path.rglob("test_*.py"))
 
 
-def tried(mutant: Mutant, copy: Path) -> Verdict:
-    """Change the copy, run its tests to the first failure, and change it back."""
+def tried(mutant: Mutant, copy: Path, near: bool) -> Verdict:
+    """Change the copy, run its tests (`near`: only the room's) to the first failure, and change it back."""
     os.chdir(copy)
     os.environ["PYTHONPATH"] = str(copy)
     os.environ["CI"] = "true"
     start = time.monotonic()
     spec = MutationSpec(mutant.module, mutant.operator, mutant.occurrence, (mutant.line, 0), (mutant.line, 1))
-    paths = shlex.join(order_of_tests(mutant.room, copy))
+    paths = shlex.join(FIRST[mutant.room] if near else order_of_tests(mutant.room, copy))
     command = f"{shlex.quote(sys.executable)} -m pytest -q -x -p no:cacheprovider {paths}"
     result = mutate_and_test([spec], command, LONGEST)
     if result.worker_outcome is not WorkerOutcome.NORMAL:
