@@ -102,8 +102,8 @@ class Arbiter(LineMachine):
         return data or None
 
     def poll_event(self) -> Event | None:
-        if self.dispatcher.unnoted:
-            self.dispatcher.note_successes()
+        if self.dispatcher.unnoted is not None:
+            self.dispatcher.note_success()
         return self._events.popleft() if self._events else None
 
     def poll_timeout(self) -> float:

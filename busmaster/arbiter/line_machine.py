@@ -299,7 +299,8 @@ class LineMachine:
             transaction.node.note_reply(exchange.answers, transaction.command, begun_at - leg.end)
         if step.send:
             wire.say(step.send, now)
-        self._end_exchange()
+        wire.transaction = wire.exchange = self._trust.held = None
+        self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, step.value, now)
         if step.rest:
             self._strays.note(step.rest, now, leg.quiet())
@@ -374,8 +375,7 @@ class LineMachine:
         wire = self._wire
         if failed and wire.exchange is not None:
             self._leg.give_up(wire.exchange.later)
-        wire.transaction = wire.exchange = None
-        self._trust.held = None
+        wire.transaction = wire.exchange = self._trust.held = None
         self._counters.exchanges += 1
 
     # the line between exchanges

@@ -16,7 +16,7 @@ from busmaster.contract.exchange import Abandonable, Exchange, Expect, Step
 class OnWire:
     """Of one line. `transaction` and `exchange` are None while nothing is asked; `leg` and `output` outlive them."""
 
-    __slots__ = ("_deadlines", "_urgent_waits", "exchange", "leg", "output", "strayed", "transaction")
+    __slots__ = ("_deadlines", "_echo", "_urgent_waits", "exchange", "leg", "output", "strayed", "transaction")
 
     def __init__(self, leg: Leg, echo: Echo, deadlines: Deadlines, urgent_waits: Callable[[], bool]) -> None:
         self.transaction: Transaction | None = None
@@ -25,6 +25,7 @@ class OnWire:
         self.output = Output(leg, echo)
         self.strayed = False
         """Bytes came though no answer was due (a broadcast's)."""
+        self._echo = echo
         self._deadlines = deadlines
         self._urgent_waits = urgent_waits
 
@@ -36,7 +37,11 @@ class OnWire:
         request, timing = exchange.request, exchange.timing
         due = self.leg.begin(timing, len(request), exchange.sizes.longest, now)
         self._deadlines.line = due if exchange.answered else self.leg.end + timing.turnaround
-        self.output.add(request, now)
+        output = self.output  # as output.add does: this is done for every request
+        output.waiting += request
+        output.said_at = now
+        if self._echo.declared:
+            self._echo.sent(request)
 
     def without_noise(self, data: bytes) -> bytes:
         """Return what is left of the first bytes of a reply where the profile tolerates noise before it."""
