@@ -11,9 +11,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from math import inf
 from typing import Any, TypeAlias
 
+from busmaster.arbiter.alike import Alike
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import UP, NodeRecord
-from busmaster.arbiter.in_step import LONGEST_ALIKE, InStep
+from busmaster.arbiter.in_step import InStep
+from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.transaction import URGENT, Transaction
 from busmaster.exchange import Command, Exchange
 
@@ -25,11 +27,12 @@ Chosen: TypeAlias = tuple[Transaction, Exchange[Any]]
 
 
 class Choice:
-    """Chooses for one line, from what its dispatcher has waiting, by what `in_step` says is owed."""
+    """Chooses for one line, from what its dispatcher has waiting, by what `in_step` says is owed; `wire` has times."""
 
-    def __init__(self, dispatcher: Dispatcher, in_step: InStep) -> None:
+    def __init__(self, dispatcher: Dispatcher, in_step: InStep, wire: OnWire) -> None:
         self._dispatcher = dispatcher
         self._in_step = in_step
+        self._alike = Alike(wire)
         self._gone_before = 0
 
     def next(self, now: float, silent: float) -> Chosen | float | None:
@@ -37,7 +40,7 @@ class Choice:
 
         `silent`: for so many seconds nothing has come, so that an answer too many would have shown.
         """
-        dispatcher, in_step = self._dispatcher, self._in_step
+        dispatcher, in_step, alike = self._dispatcher, self._in_step, self._alike
         while (transaction := dispatcher.next(now)) is not None:
             node = transaction.node
             try:
@@ -50,18 +53,19 @@ class Choice:
         else:
             return None
         if answers == in_step.last and not exchange.later:
-            in_step.alike = 0 if silent > exchange.timing.window else in_step.alike + 1
-            if in_step.alike >= LONGEST_ALIKE or in_step.alert:
-                return self._carefully((transaction, exchange), now)
+            too_many = alike.another(len(exchange.request), silent > exchange.timing.window)
+            if too_many or in_step.alert:
+                return self._carefully((transaction, exchange), now, too_many)
         elif in_step.alert:
             return self._carefully((transaction, exchange), now)
         else:
-            in_step.alike = 0
+            alike.count = 0
+        alike.node = node
         in_step.before, in_step.last = in_step.last, answers
         return transaction, exchange
 
-    def _carefully(self, first: Chosen, now: float) -> Chosen | float:
-        """As `next`, where something is owed or doubted, or too many answers were alike."""
+    def _carefully(self, first: Chosen, now: float, too_many: bool = False) -> Chosen | float:
+        """As `next`, where something is owed or doubted, or `too_many` answers were alike."""
         in_step = self._in_step
         in_step.lapse(now)
         chosen: Chosen | float = first
@@ -73,10 +77,10 @@ class Choice:
             chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
         elif in_step.clashes(answers, now):
             chosen = self._instead_of(first, now)
-        elif in_step.alike >= LONGEST_ALIKE:
+        elif too_many:
             unlike = self._another(first, now, answers.__eq__)
             chosen = unlike or self._ask_check(self._whom_to_ask(now)[0], now, answers.__eq__) or first
-            in_step.alike = 0
+            self._alike.count = 0
         elif in_step.doubts(now) and answers == in_step.last:
             chosen = self._another(first, now, answers.__eq__) or first
         if chosen is first:
@@ -87,7 +91,8 @@ class Choice:
             if chosen[0] is not transaction:
                 self._dispatcher.backlog.restore(transaction)
             if chosen[1].answers != in_step.last:
-                in_step.alike = 0
+                self._alike.count = 0
+            self._alike.node = chosen[0].node
             in_step.before, in_step.last = in_step.last, chosen[1].answers
         return chosen
 

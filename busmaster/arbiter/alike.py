@@ -1,0 +1,73 @@
+"""The run of answers that are alike, and when one too many would have shown in it (R15).
+
+Where everything that is asked is answered alike, one doubled reply leaves every later answer one exchange behind: it is
+taken for the answer to the next request, whose own is taken for that of the one after it, and so on, with nothing owed
+and no stray byte to be seen. A read whose answer is unlike shows it, and costs an exchange; a pause shows it.
+
+Times show it too, on a port whose bytes leave at the baud rate. In step, a node has heard its request when it begins to
+think of the answer. One exchange behind, what comes is the answer to the request before, and that node was free to
+think of it no later than when the answer before was taken: at which moment this request began to leave. So what comes
+is sooner than it would be in step, by the time that the request needs on the wire. Nodes with delays of their own show
+each other's; over a run that cancels out, and the answers are sooner by that time on average.
+
+So an answer is *hasty* if it is sooner than its node's usual one by half of that time. A run in which one was is checked
+as if there were no times; one in which none was may go on for longer. Times can only be seen too late: a process or a
+driver that stands still hides the haste of one answer, and of those behind it none. Nothing is concluded from how long
+an answer took, and no answer vouches for another. A run goes on for ever all the same only if it is checked in the end:
+a device that waits for a silent line, and only then begins to think, is never hasty.
+"""
+
+from __future__ import annotations
+
+from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.on_wire import OnWire
+
+LONGEST_ALIKE = 31
+"""Answers alike behind a first one, some of them hasty, after which an unlike one is asked: 32 in all."""
+LONGEST_STEADY = 127
+"""The same, where none was hasty."""
+USUAL_SHARE = 1 / 16
+"""How much of a node's usual time the last answer is."""
+
+
+class Alike:
+    """Of one line. `node` is the one that was asked last."""
+
+    __slots__ = ("_hasty", "_wire", "count", "node")
+
+    def __init__(self, wire: OnWire) -> None:
+        self._wire = wire
+        self._hasty = False
+        self.count = 0
+        """Exchanges in a row, before the last, whose answers are like its."""
+        self.node: NodeRecord | None = None
+
+    def another(self, said: int, paused: bool) -> bool:
+        """Count one more, with a request of `said` bytes. Returns whether one that is unlike is to go first.
+
+        `paused`: the line has been silent for so long that an answer too many would have come.
+        """
+        if paused:
+            self.count = 0
+            return False
+        self.count += 1
+        hasty = self._was_hasty(said)
+        if self.count == 1:  # the one before it was unlike: whatever its time, it was its own
+            self._hasty = False
+        elif hasty:
+            self._hasty = True
+        return self.count >= (LONGEST_ALIKE if self._hasty else LONGEST_STEADY)
+
+    def _was_hasty(self, said: int) -> bool:
+        """Whether the last answer could be the one before's, as far as times tell; what they do not tell, it could."""
+        wire, node = self._wire, self.node
+        leg = wire.leg
+        took = leg.begun_at - leg.end
+        if not wire.paced or node is None or took < 0:  # below 0: there was none
+            return True
+        usual = node.usual
+        if usual is None:
+            node.usual = took
+            return True
+        node.usual = usual + USUAL_SHARE * (took - usual)
+        return took < usual - said * leg.byte_time / 2
