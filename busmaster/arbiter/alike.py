@@ -19,8 +19,11 @@ a device that waits for a silent line, and only then begins to think, is never h
 
 from __future__ import annotations
 
+from typing import Any
+
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.on_wire import OnWire
+from busmaster.exchange import Exchange
 
 LONGEST_ALIKE = 31
 """Answers alike behind a first one, some of them hasty, after which an unlike one is asked: 32 in all."""
@@ -42,32 +45,32 @@ class Alike:
         """Exchanges in a row, before the last, whose answers are like its."""
         self.node: NodeRecord | None = None
 
-    def another(self, said: int, paused: bool) -> bool:
-        """Count one more, with a request of `said` bytes. Returns whether one that is unlike is to go first.
+    def another(self, exchange: Exchange[Any], last_byte: float, now: float) -> bool:
+        """Count one more exchange. Returns whether one that is unlike is to go first.
 
-        `paused`: the line has been silent for so long that an answer too many would have come.
+        `last_byte`: when that of the last answer came.
         """
-        if paused:
+        leg = self._wire.leg
+        if now - last_byte - leg.latency > exchange.timing.window:  # in this pause an answer too many would have come
             self.count = 0
             return False
         self.count += 1
-        hasty = self._was_hasty(said)
+        hasty = self._was_hasty(last_byte - leg.end, len(exchange.request) * leg.byte_time)
         if self.count == 1:  # the one before it was unlike: whatever its time, it was its own
             self._hasty = False
         elif hasty:
             self._hasty = True
         return self.count >= (LONGEST_ALIKE if self._hasty else LONGEST_STEADY)
 
-    def _was_hasty(self, said: int) -> bool:
-        """Whether the last answer could be the one before's, as far as times tell; what they do not tell, it could."""
-        wire, node = self._wire, self.node
-        leg = wire.leg
-        took = leg.begun_at - leg.end
-        if not wire.paced or node is None or took < 0:  # below 0: there was none
+    def _was_hasty(self, took: float, asking: float) -> bool:
+        """Whether the last answer, which `took` so long to its end, could be the one before's, as far as times tell:
+        what they do not tell, it could. A request is on the wire for `asking` seconds."""
+        node = self.node
+        if not self._wire.paced or node is None or took < 0:  # below 0: there was none
             return True
         usual = node.usual
         if usual is None:
             node.usual = took
             return True
         node.usual = usual + USUAL_SHARE * (took - usual)
-        return took < usual - said * leg.byte_time / 2
+        return took < usual - asking / 2

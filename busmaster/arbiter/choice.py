@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 from busmaster.arbiter.alike import Alike
 from busmaster.arbiter.dispatcher import Dispatcher
-from busmaster.arbiter.health import UP, NodeRecord
+from busmaster.arbiter.health import SILENT, UP, NodeRecord
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.transaction import URGENT, Transaction
@@ -24,6 +24,8 @@ MOST_BEFORE = 3
 planning, count them."""
 
 Chosen: TypeAlias = tuple[Transaction, Exchange[Any]]
+Unfit: TypeAlias = Callable[[Sequence[bytes], NodeRecord], bool]
+"""Whether what would answer an exchange of that node proves nothing."""
 
 
 class Choice:
@@ -35,10 +37,10 @@ class Choice:
         self._alike = Alike(wire)
         self._gone_before = 0
 
-    def next(self, now: float, silent: float) -> Chosen | float | None:
+    def next(self, now: float, last_byte: float) -> Chosen | float | None:
         """The transaction to be sent now, with its exchange. None if none waits; a time if none may go before it.
 
-        `silent`: for so many seconds nothing has come, so that an answer too many would have shown.
+        `last_byte`: when the last one came.
         """
         dispatcher, in_step, alike = self._dispatcher, self._in_step, self._alike
         while (transaction := dispatcher.next(now)) is not None:
@@ -53,7 +55,7 @@ class Choice:
         else:
             return None
         if answers == in_step.last and not exchange.later:
-            too_many = alike.another(len(exchange.request), silent > exchange.timing.window)
+            too_many = alike.another(exchange, last_byte, now)
             if too_many or in_step.alert:
                 return self._carefully((transaction, exchange), now, too_many)
         elif in_step.alert:
@@ -71,18 +73,24 @@ class Choice:
         chosen: Chosen | float = first
         transaction, exchange = first
         answers = exchange.answers
+
+        def alike(other: Sequence[bytes], node: NodeRecord) -> bool:
+            return other == answers
+
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
         elif transaction.probe and in_step.clashes(answers, now, transaction.node):
             chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
         elif in_step.clashes(answers, now):
             chosen = self._instead_of(first, now)
+        elif in_step.clashes(answers, now, transaction.node):
+            chosen = self._ask_itself(first, now) or first
         elif too_many:
-            unlike = self._another(first, now, answers.__eq__)
-            chosen = unlike or self._ask_check(self._whom_to_ask(now)[0], now, answers.__eq__) or first
+            unlike = self._another(first, now, alike)
+            chosen = unlike or self._ask_check(self._whom_to_ask(now)[0], now, alike) or first
             self._alike.count = 0
         elif in_step.doubts(now) and answers == in_step.last:
-            chosen = self._another(first, now, answers.__eq__) or first
+            chosen = self._another(first, now, alike) or first
         if chosen is first:
             self._gone_before = 0
         if isinstance(chosen, float):
@@ -102,7 +110,10 @@ class Choice:
         if self._gone_before >= MOST_BEFORE:
             return first
 
-        def clashes(answers: Sequence[bytes]) -> bool:
+        def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
+            return in_step.clashes(answers, now, node)
+
+        def proves_nothing(answers: Sequence[bytes], node: NodeRecord) -> bool:
             return in_step.clashes(answers, now)
 
         owing = dict.fromkeys(in_step.owing(answers, now))
@@ -119,7 +130,7 @@ class Choice:
             if worth_it and not (owing or asked):  # all are silent: a check of its own node costs no more than it would
                 asked = [first[0].node]
             other = self._ask_check([*owing, *asked], now, clashes)
-            if other is None and not any(_fit_checks(silent, clashes)):  # there is nothing unlike to ask
+            if other is None and not any(_fit_checks(silent, proves_nothing)):  # there is nothing unlike to ask
                 over = in_step.over(answers)
                 if now < over:
                     return over
@@ -128,6 +139,15 @@ class Choice:
             return first
         self._gone_before += 1
         return other
+
+    def _ask_itself(self, first: Chosen, now: float) -> Chosen | None:
+        """A check of a node that owes what it is to be asked for: its answer would not be believed. None for one that
+        is likely to be dead."""
+        node = first[0].node
+        if node.unheard > SILENT or self._gone_before >= MOST_BEFORE:
+            return None
+        self._gone_before += 1
+        return self._ask_check([node], now, lambda answers, node: self._in_step.clashes(answers, now, node))
 
     def _other_probe(self, probe: Transaction, now: float) -> Chosen | None:
         """The same dead node asked for something that is not owed."""
@@ -140,7 +160,7 @@ class Choice:
         return None
 
     def _another(
-        self, first: Chosen, now: float, unfit: Callable[[Sequence[bytes]], bool], of: NodeRecord | None = None
+        self, first: Chosen, now: float, unfit: Unfit, of: NodeRecord | None = None
     ) -> Chosen | None:
         """One of the same class, `of` this node if one is given. No read overtakes a write to its node, and no write
         anything that is for its node."""
@@ -152,7 +172,7 @@ class Choice:
             in_order = other.node not in (passed if other.writes else written)
             if in_order and of in (None, other.node) and self._dispatcher.may_go(other, now):
                 exchange = _opened(other)
-                if exchange is not None and exchange.answered and not unfit(exchange.answers):
+                if exchange is not None and exchange.answered and not unfit(exchange.answers, other.node):
                     opened.append(exchange)
                     return True
             passed.add(other.node)
@@ -164,7 +184,7 @@ class Choice:
         return None if transaction is None else (transaction, opened[0])
 
     def _ask_check(
-        self, nodes: Iterable[NodeRecord], now: float, unfit: Callable[[Sequence[bytes]], bool]
+        self, nodes: Iterable[NodeRecord], now: float, unfit: Unfit
     ) -> Chosen | None:
         """A read of the first of these nodes that has one whose answer is fit to prove something."""
         for node, command, exchange in _fit_checks(nodes, unfit):
@@ -184,13 +204,13 @@ class Choice:
 
 
 def _fit_checks(
-    nodes: Iterable[NodeRecord], unfit: Callable[[Sequence[bytes]], bool]
+    nodes: Iterable[NodeRecord], unfit: Unfit
 ) -> Iterator[tuple[NodeRecord, Command[Any], Exchange[Any]]]:
     """The reads of these nodes whose answers are fit to prove something."""
     for node in nodes:
         for command in checks_of(node):
             exchange = command.open(node.address, node.timings)
-            if not unfit(exchange.answers):
+            if not unfit(exchange.answers, node):
                 yield node, command, exchange
 
 

@@ -212,7 +212,7 @@ class LineMachine:
         if now < self._quarantine:
             self._settle(now)
             return True
-        chosen = self._choice.next(now, now - self._strays.last_byte - self._leg.latency)
+        chosen = self._choice.next(now, self._strays.last_byte)
         if chosen is None:
             return False
         if type(chosen) is not tuple:
