@@ -10,11 +10,12 @@ think of it no later than when the answer before was taken: at which moment this
 is sooner than it would be in step, by the time that the request needs on the wire. Nodes with delays of their own show
 each other's; over a run that cancels out, and the answers are sooner by that time on average.
 
-So an answer is *hasty* if it is sooner than its node's usual one by half of that time. A run in which one was is checked
-as if there were no times; one in which none was may go on for longer. Times can only be seen too late: a process or a
-driver that stands still hides the haste of one answer, and of those behind it none. Nothing is concluded from how long
-an answer took, and no answer vouches for another. A run goes on for ever all the same only if it is checked in the end:
-a device that waits for a silent line, and only then begins to think, is never hasty.
+So an answer is *untimely* if it differs from its node's usual one by more than half of that time. A run in which one
+was is checked as if there were no times: one that came sooner may have been the one before's; one that came later says
+that the usual times are not what they were, or that the process or a driver stood still, which hides how soon an answer
+was. It hides that of one answer, not of those behind it: nothing is concluded from how long an answer took, and none
+vouches for another. A run of timely answers alone is checked too, in the end: a device that waits for a silent line,
+and only then begins to think, answers no sooner one exchange behind.
 """
 
 from __future__ import annotations
@@ -26,21 +27,21 @@ from busmaster.arbiter.on_wire import OnWire
 from busmaster.exchange import Exchange
 
 LONGEST_ALIKE = 31
-"""Answers alike behind a first one, some of them hasty, after which an unlike one is asked: 32 in all."""
+"""Answers alike behind a first one, some of them untimely, after which an unlike one is asked: 32 in all."""
 LONGEST_STEADY = 127
-"""The same, where none was hasty."""
-USUAL_SHARE = 1 / 16
+"""As many where all of them were timely."""
+USUAL_SHARE = 1 / 8
 """How much of a node's usual time the last answer is."""
 
 
 class Alike:
     """Of one line. `node` is the one that was asked last."""
 
-    __slots__ = ("_hasty", "_wire", "count", "node")
+    __slots__ = ("_untimely", "_wire", "count", "node")
 
     def __init__(self, wire: OnWire) -> None:
         self._wire = wire
-        self._hasty = False
+        self._untimely = False
         self.count = 0
         """Exchanges in a row, before the last, whose answers are like its."""
         self.node: NodeRecord | None = None
@@ -55,16 +56,16 @@ class Alike:
             self.count = 0
             return False
         self.count += 1
-        hasty = self._was_hasty(last_byte - leg.end, len(exchange.request) * leg.byte_time)
+        untimely = self._was_untimely(last_byte - leg.end, len(exchange.request) * leg.byte_time)
         if self.count == 1:  # the one before it was unlike: whatever its time, it was its own
-            self._hasty = False
-        elif hasty:
-            self._hasty = True
-        return self.count >= (LONGEST_ALIKE if self._hasty else LONGEST_STEADY)
+            self._untimely = False
+        elif untimely:
+            self._untimely = True
+        return self.count >= (LONGEST_ALIKE if self._untimely else LONGEST_STEADY)
 
-    def _was_hasty(self, took: float, asking: float) -> bool:
-        """Whether the last answer, which `took` so long to its end, could be the one before's, as far as times tell:
-        what they do not tell, it could. A request is on the wire for `asking` seconds."""
+    def _was_untimely(self, took: float, asking: float) -> bool:
+        """Whether times fail to show that the last answer was its own. It came `took` seconds after its request, which
+        needed `asking` on the wire."""
         node = self.node
         if not self._wire.paced or node is None or took < 0:  # below 0: there was none
             return True
@@ -73,4 +74,4 @@ class Alike:
             node.usual = took
             return True
         node.usual = usual + USUAL_SHARE * (took - usual)
-        return took < usual - asking / 2
+        return abs(took - usual) > asking / 2
