@@ -17,7 +17,7 @@ from busmaster.arbiter.health import SILENT, UP, NodeRecord
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.transaction import URGENT, Transaction
-from busmaster.exchange import Command, Exchange
+from busmaster.contract.exchange import Command, Exchange
 
 MOST_BEFORE = 3
 """Exchanges that may go before one that is held back; then it goes, and its answer is doubted. The bounds of R9, in

@@ -21,10 +21,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar
 
+from busmaster.bus.points import Point
+from busmaster.bus.polling import Sample, Snapshot
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.settings import Settings
-from busmaster.points import Point
-from busmaster.polling import Sample, Snapshot
 
 Formatted = TypeVar("Formatted")
 
@@ -84,8 +84,13 @@ def reason(error: BaseException) -> str:
 
 
 def check_folder(path: str) -> None:
-    """Raises InvalidCommand where no file can ever be made: that is better said before anything starts."""
+    """Raise InvalidCommand where no file can ever be made: that is better said before anything starts.
+
+    Folders whose names hold fields of a date are made when their time comes.
+    """
     folder = os.path.dirname(path)
+    while "%" in folder:
+        folder = os.path.dirname(folder)
     if folder and not os.path.isdir(folder):
         raise InvalidCommand(f"{path}: there is no folder {folder}")
 
