@@ -24,7 +24,7 @@ from typing import Any
 
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.on_wire import OnWire
-from busmaster.exchange import Exchange
+from busmaster.contract.exchange import Exchange
 
 LONGEST_ALIKE = 31
 """Answers alike behind a first one, some of them untimely, after which an unlike one is asked: 32 in all."""

@@ -41,6 +41,7 @@ class Saturated:
         self.nodes = [up(self.bench, address) for address in range(1, len(delays) + 1)]
         for node in self.nodes:
             node.usual = None
+        self.bench.wait(0.2)
         self.delays = delays
         self.patient = patient
         self.twice = twice
