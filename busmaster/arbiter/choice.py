@@ -159,9 +159,7 @@ class Choice:
                 return probe, exchange
         return None
 
-    def _another(
-        self, first: Chosen, now: float, unfit: Unfit, of: NodeRecord | None = None
-    ) -> Chosen | None:
+    def _another(self, first: Chosen, now: float, unfit: Unfit, of: NodeRecord | None = None) -> Chosen | None:
         """One of the same class, `of` this node if one is given. No read overtakes a write to its node, and no write
         anything that is for its node."""
         opened: list[Exchange[Any]] = []
@@ -183,9 +181,7 @@ class Choice:
         transaction = self._dispatcher.backlog.pick(first[0].priority, suits)
         return None if transaction is None else (transaction, opened[0])
 
-    def _ask_check(
-        self, nodes: Iterable[NodeRecord], now: float, unfit: Unfit
-    ) -> Chosen | None:
+    def _ask_check(self, nodes: Iterable[NodeRecord], now: float, unfit: Unfit) -> Chosen | None:
         """A read of the first of these nodes that has one whose answer is fit to prove something."""
         for node, command, exchange in _fit_checks(nodes, unfit):
             return self._dispatcher.check(node, command, now), exchange
@@ -203,9 +199,7 @@ class Choice:
         return alive, [node for node in nodes if node.silent]
 
 
-def _fit_checks(
-    nodes: Iterable[NodeRecord], unfit: Unfit
-) -> Iterator[tuple[NodeRecord, Command[Any], Exchange[Any]]]:
+def _fit_checks(nodes: Iterable[NodeRecord], unfit: Unfit) -> Iterator[tuple[NodeRecord, Command[Any], Exchange[Any]]]:
     """The reads of these nodes whose answers are fit to prove something."""
     for node in nodes:
         for command in checks_of(node):
