@@ -87,6 +87,7 @@ class NodeRecord:
         "timings",
         "unheard",
         "up_since",
+        "usual",
         "waiter",
         "writes",
     )
@@ -128,6 +129,8 @@ class NodeRecord:
         """Attempts in a row that brought nothing."""
         self.slowest = 0.0
         """Seconds to the first byte of about the slowest of its last replies."""
+        self.usual: float | None = None
+        """Seconds to the first byte of its usual reply, in runs of answers that are alike; None until there was one."""
         self.lateness_until = inf
         """When a lateness that was raised comes down again, if all replies are prompt until then."""
         self._before_raised: Timings | None = None
