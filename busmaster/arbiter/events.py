@@ -9,6 +9,8 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
+from busmaster.errors import BusError
+
 if TYPE_CHECKING:
     from busmaster.arbiter.health import Health, NodeRecord
     from busmaster.arbiter.schedule import Poll
@@ -20,6 +22,17 @@ class Completed:
     """A caller's transaction has ended: its `value` or its `error` is set."""
 
     transaction: Transaction
+
+
+@dataclass(slots=True)
+class Overdue:
+    """A transaction's `finish_by` has passed while it was on the wire: its caller gets this error now.
+
+    The exchange runs out as if its caller had been cancelled (R6), and no Completed follows.
+    """
+
+    transaction: Transaction
+    error: BusError
 
 
 @dataclass(slots=True)
@@ -109,5 +122,14 @@ class Strayed:
 
 
 Event: TypeAlias = (
-    Completed | Sampled | Polled | NodeChanged | LatenessRaised | LatenessLowered | LineChanged | PortFailed | Strayed
+    Completed
+    | Overdue
+    | Sampled
+    | Polled
+    | NodeChanged
+    | LatenessRaised
+    | LatenessLowered
+    | LineChanged
+    | PortFailed
+    | Strayed
 )

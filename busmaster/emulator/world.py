@@ -12,7 +12,7 @@ from itertools import count
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, Event, LineChanged, NodeChanged
+from busmaster.arbiter.events import Completed, Event, LineChanged, NodeChanged, Overdue
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.exchange import Command
@@ -180,6 +180,8 @@ def told(event: Event) -> str:
         case Completed(transaction):
             outcome = transaction.value if transaction.error is None else repr(transaction.error)
             return f"{transaction.node.label}: {transaction.command} -> {outcome}"
+        case Overdue(transaction, error):
+            return f"{transaction.node.label}: {transaction.command} -> {error!r}"
         case LineChanged(change, cause):
             return f"line {change.value} {cause}".rstrip()
         case NodeChanged(node, before, after):

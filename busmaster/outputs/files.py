@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from busmaster.bus.polling import Snapshot
 from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
 from busmaster.outputs.settings import FileSettings
-from busmaster.outputs.values import cycle_fields, json_line, value_text
+from busmaster.outputs.values import cycle_fields, json_line, micros, value_text
 
 COLUMNS = ("time", "group", "cycle", "node", "item", "value", "unit", "quality", "error")
 
@@ -24,10 +24,9 @@ class FileOutput(BatchOutput[bytes]):
         self,
         kind: str,
         settings: FileSettings,
-        clock: Callable[[], float] = time.monotonic,
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(kind, settings, clock, say)
+        super().__init__(kind, settings, say)
         check_folder(time.strftime(settings.path))
         self._pattern = settings.path
         self._path = ""
@@ -70,12 +69,12 @@ class CsvOutput(FileOutput):
     def head(self) -> bytes:
         return csv_lines([COLUMNS])
 
-    def format(self, item: Item, time_of: Callable[[float], float]) -> bytes | None:
+    def format(self, item: Item) -> bytes | None:
         if isinstance(item, Happening):
             return None
         return csv_lines(
             (
-                utc(time_of(sample.finished)),
+                utc(micros(sample.wall)),
                 item.group,
                 item.cycle,
                 point.key.partition("/")[0],
@@ -92,11 +91,11 @@ class CsvOutput(FileOutput):
 class JsonlOutput(FileOutput):
     """A line a cycle, as `busmaster run --json` prints it, and a line an event. Times are seconds since 1970."""
 
-    def format(self, item: Item, time_of: Callable[[float], float]) -> bytes:
+    def format(self, item: Item) -> bytes:
         if isinstance(item, Snapshot):
-            fields = cycle_fields(item, time_of)
+            fields = cycle_fields(item, item.wall_at)
         else:
-            fields = {"event": item.text, "node": item.node or None, "time": time_of(item.time)}
+            fields = {"event": item.text, "node": item.node or None, "time": item.time}
         return json_line(**fields).encode() + b"\n"
 
 
