@@ -126,8 +126,8 @@ class NoSuchParameter(Refused):
 
 
 class WriteUnconfirmed(BusError):
-    """A write was sent, and its answer never came, or was garbled, or had not come when `finish_within` ran out: the node
-    may or may not have taken it, or a part of it."""
+    """A write was sent, and its answer never came, or was garbled, or had not come when `finish_within` ran out: all or
+    a part of it may have been carried out."""
 
     hint = "read the value back before you write again"
 

@@ -213,7 +213,7 @@ class Bus:
         Raises InvalidCommand for a name that is in use, and for times and priorities that are none.
         """
         self.check_loop()
-        if not self.running:
+        if self._line.closed or not self.running:
             raise self._line.not_open()
         period = seconds(period, f"poll group {name!r}: a period")
         if phase is not None:

@@ -30,9 +30,16 @@ class Handle(ABC):
     profile: ClassVar[Profile]
 
     def __init__(
-        self, bus: NodeSource, address: int, *, timings: Timings | None = None, retries: int | None = None
+        self,
+        bus: NodeSource,
+        address: int,
+        *,
+        timings: Timings | None = None,
+        retries: int | None = None,
+        profile: Profile | None = None,
     ) -> None:
-        self.node = bus.node(self.profile, address, timings=timings, retries=retries)
+        self.bus = bus
+        self.node = bus.node(profile or self.profile, address, timings=timings, retries=retries)
 
     @abstractmethod
     def point(self, item: str) -> Point[Any]:

@@ -12,6 +12,7 @@ import pytest
 
 from busmaster import Bus, Hcp2Controller, LineDown, MemoryPort, NoReply, SerialPort, TcpPort, WriteUnconfirmed
 from busmaster.arbiter.events import LineChange, LineChanged
+from busmaster.bus.node import Node
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryTransport
@@ -173,11 +174,12 @@ def test_a_request_held_back_is_waited_for_and_nothing_else_is_sent_meanwhile(he
             began = bus.now()
             reading = asyncio.gather(first.read(1, retries=0), second.read(1, retries=0))
             await asyncio.sleep(held)
-            assert transport_of(bus).get_write_buffer_size() == len(hcp2.Read(1).open(1, first.node.timings).request)
+            request = hcp2.Read(1).open(1, Node.of(first).timings).request
+            assert transport_of(bus).get_write_buffer_size() == len(request)
             transport_of(bus).release()
             assert tuple(await reading) == (11, 22)
             assert held + 0.18 < bus.now() - began < held + 0.3
-            assert first.node.statistics().no_reply == 0
+            assert Node.of(first).statistics().no_reply == 0
 
     run_in_virtual_time(main())
 

@@ -51,8 +51,8 @@ class MentorDrive(Handle):
         timings: Timings | None = None,
         retries: int | None = None,
     ) -> None:
-        self._bus = bus
-        self.node = bus.node(mentor.CHAINED if chained else mentor.PROFILE, address, timings=timings, retries=retries)
+        profile = mentor.CHAINED if chained else mentor.PROFILE
+        super().__init__(bus, address, timings=timings, retries=retries, profile=profile)
         self._decimals = {
             parse_parameter(text): whole_number(digits, 0, MOST_DECIMALS, f"the decimals of {text}")
             for text, digits in (decimals or {}).items()
@@ -163,7 +163,7 @@ class MentorDrive(Handle):
     ) -> None:
         """Write a parameter of every drive on the line at once (address 0). None answers."""
         menu, number = parse_parameter(parameter)
-        everyone = self._bus.node(mentor.PROFILE, 0)
+        everyone = self.bus.node(mentor.PROFILE, 0)
         command = self._write(menu, number, value, wide=wide, high_resolution=high_resolution)
         await everyone.request(command, **options)
 

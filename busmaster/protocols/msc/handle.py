@@ -71,7 +71,7 @@ class MscController(Handle):
                 raise InvalidCommand(f"{name!r} cannot be the name of a symbol")
         known = Merging(address_step, model in MODELS_WITH_RFLAGS)
         profile = self.profile if known == Merging() else replace(self.profile, merge=known)
-        self.node = bus.node(profile, address, timings=timings, retries=retries)
+        super().__init__(bus, address, timings=timings, retries=retries, profile=profile)
 
     @property
     def address_step(self) -> int | None:
