@@ -103,14 +103,14 @@ class Bus:
         self._check_not_closed()
         if self.running:
             raise InvalidCommand(f"the bus on {self.endpoint.name} is open already: enter it once, and share it")
-        self._line.open(asyncio.get_running_loop())
+        self._line.bind(asyncio.get_running_loop())
         self._arbiter.reset_statistics(self.now())
         connection = Connection(self.endpoint, self.pump, on_failed=self._on_failed, jitter=self._random)
         self._connection = connection
         try:
             await connection.open()
         except BaseException as error:
-            self._line.running = False
+            self._line.unbind()
             await connection.close()
             if isinstance(error, BusError):
                 error.line = self.endpoint.name
@@ -137,7 +137,7 @@ class Bus:
     async def _let_go(self) -> None:
         """Nothing is on the wire, or nobody waits for its end."""
         assert self._connection is not None
-        self._line.running = False
+        self._line.unbind()
         try:
             await self._connection.close()
         finally:
@@ -245,7 +245,7 @@ class Bus:
 
     @property
     def running(self) -> bool:
-        """Whether it is open."""
+        """Whether it is open, though its line may be down."""
         return self._line.running
 
     @property

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Hashable
 from dataclasses import replace
 from math import inf
+from threading import get_ident
 from typing import Any, Protocol, TypeVar, Unpack
 
 from busmaster.arbiter.counters import NodeStatistics
@@ -139,6 +140,8 @@ class Node:
         What is None was left open: a profile's `merge` too.
         """
         own = self.profile
+        if profile is own and timings is None and retries is None:
+            return
         wanted = {
             "other timings": timings not in (None, self.timings),
             "other retries": retries not in (None, self.record.retries),
@@ -172,7 +175,7 @@ class Node:
         Raises a BusError subclass. Cancelling it frees the caller at once and never disturbs the line (R6).
         """
         chosen = self._options(options) if options else ORDINARY
-        transaction, future = self._start(command, chosen, touches=touches, stops_seen=stops_seen)
+        transaction, future = self._start(command, chosen, False, touches, stops_seen)
         try:
             value: T = await future
         except asyncio.CancelledError:
@@ -199,7 +202,6 @@ class Node:
         self,
         command: Command[Any],
         options: RequestOptions,
-        *,
         probe: bool = False,
         touches: Command[Any] | None = None,
         stops_seen: int | None = None,
@@ -209,9 +211,10 @@ class Node:
             raise InvalidCommand(
                 f"{self.profile.name}: address {self.address} is for writes to all; nobody answers a read"
             )
-        if not line.running:
-            raise line.not_open(record=record, command=str(command))
-        line.check_loop()
+        if get_ident() != line.thread or not line.loop_runs():  # as check_loop does: this is done for every request
+            if not line.running:
+                raise line.not_open(record=record, command=str(command))
+            line.check_loop()
         if type(command) not in self.kinds:
             if not hasattr(command, "open"):
                 raise InvalidCommand(f"{self.label}: {command!r} is no command; read it through a handle, or its point")

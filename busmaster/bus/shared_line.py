@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Callable
 from math import inf
 from threading import current_thread, get_ident
 from typing import Any
@@ -24,15 +25,17 @@ CLOCK_WAS_SET = 0.005
 
 
 class SharedLine:
-    """The line of one bus. `name` is its port's. `running` is True while the bus is open."""
+    """The line of one bus. `name` is its port's."""
 
     def __init__(self, name: str, arbiter: Arbiter) -> None:
         self.name = name
         self.arbiter = arbiter
         self.pump: Pump
         self.logbook = Logbook(name)
-        self.running = False
         self.closed = False
+        self.thread = 0
+        """In which its loop runs; 0 while the bus is not open."""
+        self.loop_runs: Callable[[], bool] = lambda: False
         self.latest_of: dict[str, Snapshot] = {}
         """The latest snapshot of each poll group, by the group's name."""
         self.last_touched = -inf
@@ -40,16 +43,22 @@ class SharedLine:
         self._all_touched = -inf
         self._touched: dict[object, float] = {}
         self._written: dict[NodeRecord, float] = {}
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._thread = 0
         self._wall_offset = inf
 
-    def open(self, loop: asyncio.AbstractEventLoop) -> None:
-        """The bus is used from this thread, by this loop, from now on."""
-        self._loop = loop
-        self._thread = get_ident()
+    @property
+    def running(self) -> bool:
+        """Whether the bus is open, though its line may be down."""
+        return self.thread != 0
+
+    def bind(self, loop: asyncio.AbstractEventLoop) -> None:
+        """The bus is open from now on, and used from this thread, by this loop."""
+        self.loop_runs = loop.is_running
         self.pump.bind(loop)
-        self.running = True
+        self.thread = get_ident()
+
+    def unbind(self) -> None:
+        """It is open no longer."""
+        self.thread = 0
 
     # time
 
@@ -123,12 +132,12 @@ class SharedLine:
 
     def check_loop(self) -> None:
         """Raise InvalidCommand where an open bus is used from another thread, or from another event loop."""
-        if self.running and (get_ident() != self._thread or self._loop is None or not self._loop.is_running()):
+        if self.running and (get_ident() != self.thread or not self.loop_runs()):
             self._check_elsewhere()
 
     def _check_elsewhere(self) -> None:
         """Its loop does not run here: right only in its own thread, between two runs of the loop."""
-        if get_ident() != self._thread or is_any_loop_running():
+        if get_ident() != self.thread or is_any_loop_running():
             raise InvalidCommand(
                 f"the bus on {self.name} was used from thread {current_thread().name!r} outside the "
                 "event loop that opened it: hand the call to that loop, with portal.call (anyio.from_thread) or "
