@@ -84,9 +84,6 @@ class Dispatcher:
         if waiting >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return False
-        if transaction.finish_by <= now:
-            self._end(transaction, now, too_late(transaction, now))
-            return False
         if not self._may_ask(transaction, now):
             return False
         if transaction.writes:
