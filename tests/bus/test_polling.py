@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from itertools import pairwise
 from typing import Any
 
@@ -401,5 +402,26 @@ def test_two_tasks_may_share_a_stream() -> None:
         stream = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")]).subscribe()
         first, second = await asyncio.gather(anext(stream), anext(stream))
         assert {first.cycle, second.cycle} == {1, 2}
+
+    on_a_bus(story)
+
+
+def test_samples_carry_the_time_of_day_which_follows_a_clock_that_was_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(bus: Bus) -> None:
+        def machine(seconds: float) -> None:
+            monkeypatch.setattr(time, "time", lambda: bus.now() + seconds)
+
+        axis = Hcp2Controller(bus, 1)
+        points = [axis.element(1), axis.element(2)]
+        group = bus.poll_group("g", period=0.1, points=points)
+        found = []
+        for offset in (1000.0, 1000.002, 5000.0, 400.0):
+            machine(offset)
+            [_, snapshot] = await cycles(group, 2)
+            found.append({round(snapshot[point].wall - snapshot[point].finished, 6) for point in points})
+            assert snapshot.wall_at(snapshot.finished) == snapshot.wall
+            assert snapshot.wall_at(snapshot.due) == pytest.approx(snapshot.wall - (snapshot.finished - snapshot.due))
+            assert bus.wall_time() - bus.now() == pytest.approx(min(found[-1]))
+        assert found == [{1000.0}, {1000.0}, {5000.0}, {400.0}]  # 2 ms is two clocks read one after the other
 
     on_a_bus(story)

@@ -90,8 +90,9 @@ async def test_a_verified_write_reads_every_element_back(controller: CommsHandle
 @pytest.mark.asyncio
 async def test_a_write_that_reads_back_otherwise_is_told(controller: CommsHandle, line: CommsArray) -> None:
     line.answer = lambda command: None if command.writes else 5.0
-    with pytest.raises(VerifyFailed, match=r"node 5: element 11 reads 5\.0 after 6 was written"):
+    with pytest.raises(VerifyFailed, match=r"node 5: element 11 reads 5\.0 after 6 was written") as caught:
         await controller.write(10, 5, 6, verify=True)
+    assert (caught.value.line, caught.value.label, caught.value.address) == ("a fake line", "node 5", 5)
 
 
 @pytest.mark.asyncio
