@@ -77,6 +77,10 @@ class Arbiter(LineMachine):
         """It is told to stop."""
         node.stops += 1
 
+    def answer_counts(self, now: float) -> bool:
+        """A caller's time is over while something is on the wire: what has come is to be handed over first."""
+        return self.state is EXCHANGE and now >= self._deadlines.expiry
+
     def submit(self, transaction: Transaction, now: float) -> bool:
         """False if it waits and nothing else has changed: then there is nothing to pump."""
         waits = self.dispatcher.submit(transaction, now)

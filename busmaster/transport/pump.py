@@ -233,9 +233,12 @@ class Pump(asyncio.Protocol):
         self._armed = inf
         now = self.clock()
         unread = False
-        if self._port is not None and self.arbiter.line_due(now):
-            unread = self._port.unread()
-            self._check_output(now)
+        if self._port is not None:
+            line_due = self.arbiter.line_due(now)
+            if line_due or self.arbiter.answer_counts(now):
+                unread = self._port.unread()
+            if line_due:
+                self._check_output(now)
         self.arbiter.handle_timeout(now, unread=unread)
         self.turn()
 

@@ -98,6 +98,21 @@ def test_an_answer_that_is_handed_over_before_the_timer_is_known_and_so_is_what_
     assert (bench.ended(asked), asked.error, told(bench, asked)) == (1, None, [])
 
 
+def test_an_answer_that_lies_unread_when_the_timer_comes_first_is_waited_for() -> None:
+    bench = Bench()
+    asked = bench.ask(heard(bench), REPEATED, finish_by=bench.now + 0.030)
+    bench.sent()
+    assert not bench.arbiter.answer_counts(bench.now)
+    bench.now += 0.080
+    assert bench.arbiter.answer_counts(bench.now)
+    bench.arbiter.handle_timeout(bench.now, unread=True)
+    bench.listen()
+    assert (bench.ended(asked), told(bench, asked)) == (0, [])
+    bench.arbiter.data_received(bytes.fromhex(ACK), bench.now)
+    bench.listen()
+    assert (bench.ended(asked), asked.error, told(bench, asked)) == (1, None, [])
+
+
 def test_a_success_that_is_not_noted_yet_is_one() -> None:
     bench = Bench()
     asked = bench.ask(heard(bench), finish_by=bench.now + 0.030)

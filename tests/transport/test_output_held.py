@@ -50,6 +50,7 @@ class Ledger:
         self.notes: list[tuple[Any, ...]] = []
         self.has = 0
         self.is_due = False
+        self.is_over = False
 
     # the port
 
@@ -88,6 +89,9 @@ class Ledger:
 
     def line_due(self, _now: float) -> bool:
         return self.is_due
+
+    def answer_counts(self, _now: float) -> bool:
+        return self.is_over
 
     def unsent(self, count: int, now: float) -> None:
         self.notes.append(("unsent", count, now))
@@ -129,6 +133,16 @@ def test_what_has_not_left_is_asked_for_only_when_a_deadline_of_the_line_is_due(
     pump._on_time()
     timeout = ("timeout", 0.0, False)
     assert ledger.notes == [timeout, ("unsent", 2, 0.0), timeout, ("unsent", 0, 0.0), timeout]
+
+
+def test_what_lies_unread_is_looked_for_when_a_callers_time_is_over(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    assert pump._port is not None
+    pump._port.unread = lambda: True  # type: ignore[method-assign]  # something does
+    pump._on_time()
+    ledger.is_over = True
+    pump._on_time()
+    assert ledger.notes == [("timeout", 0.0, False), ("timeout", 0.0, True)]
 
 
 def test_a_write_that_the_port_did_not_take_is_told_at_once_and_so_is_its_leaving(ledger: Ledger) -> None:

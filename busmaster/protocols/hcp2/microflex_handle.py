@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Unpack
 
 import anyio
 
-from busmaster.bus.requester import Priority, ReadOptions
+from busmaster.bus.requester import CommandOptions, Priority, ReadOptions
 from busmaster.contract.arguments import seconds
 from busmaster.contract.profile import Profile
 from busmaster.errors import BusClosed, BusError, VerifyFailed, WriteUnconfirmed
@@ -74,9 +74,9 @@ class MicroFlexDrive(CommsHandle):
         """The status word."""
         return await self.status_word.read(**options)
 
-    async def check_firmware(self) -> int:
+    async def check_firmware(self, **options: Unpack[ReadOptions]) -> int:
         """The drive's firmware build. Raises VerifyFailed if it is too old to have this map."""
-        build = await self.firmware.read()
+        build = await self.firmware.read(**options)
         if build < microflex.FIRST_FIRMWARE:
             raise VerifyFailed(
                 f"firmware build {build} is older than {microflex.FIRST_FIRMWARE}, which brought the element map",
@@ -133,13 +133,13 @@ class MicroFlexDrive(CommsHandle):
         await _to_the_end(self._clear_cancel(command))
         return await self.status()
 
-    async def set_speed_reference(self, percent: float) -> None:
+    async def set_speed_reference(self, percent: float, **options: Unpack[CommandOptions]) -> None:
         """In % of the application's maximum speed. Raises Refused unless in speed control with the host as source."""
-        await self.speed_reference.write(percent)
+        await self.speed_reference.write(percent, **options)
 
-    async def set_torque_reference(self, percent: float) -> None:
+    async def set_torque_reference(self, percent: float, **options: Unpack[CommandOptions]) -> None:
         """In % of the rated current. Raises Refused unless in current control with the host as source."""
-        await self.torque_reference.write(percent)
+        await self.torque_reference.write(percent, **options)
 
     async def _command(
         self, word: CommandWord, priority: Priority | None = None, stops_seen: int | None = None
