@@ -260,7 +260,7 @@ def test_an_answer_that_is_held_until_it_can_be_believed_is_not_waited_for_longe
 
 @pytest.mark.parametrize("seed", range(12))
 def test_whatever_happens_each_caller_is_told_once_in_time_and_truly(seed: int) -> None:
-    """Writes of a value each, on a line that loses, delays and cuts: what is not started was never on the wire."""
+    """Writes of a value each, on a line that loses, delays, cuts and goes away: what is not started was never sent."""
     chance = random.Random(seed)
     sent: list[str] = []
     faults = Faults(lost=0.1, late=0.1, truncated=0.05)
@@ -288,6 +288,8 @@ def test_whatever_happens_each_caller_is_told_once_in_time_and_truly(seed: int) 
 
     for number in range(400):
         world.at(1.0 + 0.05 * number, lambda number=number: ask(number))  # type: ignore[misc]  # bound now
+    world.at(8.02, world.unplug)  # while something is on the wire, whether or not anybody waits for it
+    world.at(8.5, world.plug)
     world.run(30.0)
     on_line = [line for line in sent if " > " in line]
     kinds = set()
