@@ -17,9 +17,10 @@ import anyio
 
 from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import Mark
-from busmaster.contract.exchange import Command, Done, Exchange, Expect, FrameError
+from busmaster.contract.driver import Driver, Ending
+from busmaster.contract.exchange import Command, Exchange, FrameError
 from busmaster.contract.profile import Profile
-from busmaster.contract.timing import ReplyTiming, Timings
+from busmaster.contract.timing import Timings
 from busmaster.errors import LineDown, Refused
 from busmaster.outputs.values import value_text
 from busmaster.transport.clock import clock_of
@@ -197,61 +198,46 @@ class _Attempt:
 
     def __init__(self, command: Command[Any], exchange: Exchange[Any], end: float) -> None:
         self.start: float | None = None
-        self.over = False
         self._command = command
-        self._exchange = exchange
-        self._timing: ReplyTiming = exchange.timing
+        self._driver = Driver(exchange)
         self._end = end
         self._raw = b""
-        self._outcome = Outcome.GARBLED
-        self._text = "cut short"
-        self._again = b""
+
+    @property
+    def over(self) -> bool:
+        return self._driver.ending is not None
 
     def take(self, now: float, data: bytes, say: Callable[[bytes], float]) -> float:
         """Returns until when to wait for more."""
+        driver = self._driver
         self._hear(now, data)
-        wait = self._timing.byte_gap
-        try:
-            step = self._exchange.feed(data)
-            while isinstance(step, Expect):
-                self._timing = step.timing
-                wait = step.timing.lateness
-                if step.send:
-                    now = say(step.send)
-                step = self._exchange.feed(b"")
-        except FrameError as error:
-            if error.send:
-                say(error.send)
-            self._finish(Outcome.GARBLED, error.what)
-        except Refused as refusal:
-            self._finish(Outcome.ANSWERED, f"{self._command}: {refusal.what}")
-        else:
-            if isinstance(step, Done):
-                if step.send:
-                    say(step.send)
-                self._again = step.rest
-                self._finish(Outcome.ANSWERED, f"{self._command}: {value_text(step.value)}")
-        return now + wait
+        driver.said.clear()
+        driver.feed(data)
+        for send in driver.said:
+            now = say(send)
+        if driver.ending is not None and driver.ending.send:
+            say(driver.ending.send)
+        return now + (driver.timing.byte_gap if driver.begun else driver.timing.lateness)
 
     def fail(self, what: str, data: bytes) -> None:
         self._hear(self._end, data)
-        self._finish(Outcome.GARBLED, what)
+        self._driver.fail(FrameError(what))
 
     def probe(self, rest: bytes) -> Probe:
         """`rest` came after all was over."""
         if self.start is None:
             return Probe(Outcome.SILENT)
-        again = self._again + rest
-        if self._outcome is Outcome.GARBLED:
-            return Probe(self._outcome, self.start, self._text, self._raw + again)
-        return Probe(self._outcome, self.start, self._text, self._raw, again)
+        ending = self._driver.ending or Ending(error=FrameError("cut short"))
+        if isinstance(ending.error, FrameError):
+            return Probe(Outcome.GARBLED, self.start, ending.error.what, self._raw + rest)
+        if isinstance(ending.error, Refused):
+            return Probe(Outcome.ANSWERED, self.start, f"{self._command}: {ending.error.what}", self._raw, rest)
+        if ending.error is not None:
+            raise ending.error
+        text = f"{self._command}: {value_text(ending.value)}"
+        return Probe(Outcome.ANSWERED, self.start, text, self._raw, ending.rest + rest)
 
     def _hear(self, now: float, data: bytes) -> None:
         if self.start is None:
             self.start = now - self._end
         self._raw += data
-
-    def _finish(self, outcome: Outcome, text: str) -> None:
-        self.over = True
-        self._outcome = outcome
-        self._text = text
