@@ -9,6 +9,8 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
+from busmaster.arbiter.tap import Attempt
+
 if TYPE_CHECKING:
     from busmaster.arbiter.health import Health, NodeRecord
     from busmaster.arbiter.schedule import Poll
@@ -109,5 +111,14 @@ class Strayed:
 
 
 Event: TypeAlias = (
-    Completed | Sampled | Polled | NodeChanged | LatenessRaised | LatenessLowered | LineChanged | PortFailed | Strayed
+    Completed
+    | Sampled
+    | Polled
+    | NodeChanged
+    | LatenessRaised
+    | LatenessLowered
+    | LineChanged
+    | PortFailed
+    | Strayed
+    | Attempt
 )

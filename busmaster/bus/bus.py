@@ -21,6 +21,7 @@ from busmaster.arbiter.events import Event, NodeChanged, PortFailed, Strayed
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import SLICE, Poll
 from busmaster.arbiter.state import LineState
+from busmaster.arbiter.tap import Tap
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.bus.logbook import Logbook
 from busmaster.bus.node import Node, checked_priority, checked_retries
@@ -33,7 +34,7 @@ from busmaster.errors import BusClosed, InvalidCommand, LineDown
 from busmaster.planning import Plan, PlannedGroup, Read, bounds, plan_steps
 from busmaster.planning.merging import Merge, at_once
 from busmaster.transport.endpoints import Endpoint, is_paced
-from busmaster.transport.pump import Pump, Tap
+from busmaster.transport.pump import Pump
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
 
@@ -78,6 +79,7 @@ class Bus:
             capacity=capacity,
             jitter=self._random.random,
             strict=strict,
+            tapped=tap is not None,
         )
         self.pump = Pump(
             self._arbiter,

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
-from busmaster.contract.exchange import Done, Exchange, Expect, FrameError, Step
+from busmaster.contract.exchange import Abandonable, Done, Exchange, Expect, FrameError, Step
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import Refused
 
@@ -25,8 +25,8 @@ class EndlessExchange(Exception):
 def follow(exchange: Exchange[Any], step: Expect, begin: Callable[[Expect, float], object], now: float) -> Step[Any]:
     """Go from leg to leg for as long as the reader says so, and return what it says then.
 
-    `begin` is called with each leg, and with `now`; it says what the host says first. Raises what it and the reader
-    raise, and EndlessExchange.
+    `begin` is called with each leg, and with `now`; it says what the host says first. Raises what `begin` and the
+    reader raise, and EndlessExchange.
     """
     for _ in range(MOST_LEGS):
         begin(step, now)
@@ -37,14 +37,23 @@ def follow(exchange: Exchange[Any], step: Expect, begin: Callable[[Expect, float
     raise EndlessExchange(f"another leg after {MOST_LEGS} of one chunk")
 
 
+def without_noise(exchange: Exchange[Any], data: bytes) -> bytes:
+    """Return what is left of the first bytes of a reply, for a profile that tolerates noise before it."""
+    return data.lstrip(bytes(set(data) - set(exchange.starts)))
+
+
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """How an exchange ended: with `value`, or with `error`. `send` is what the host says last; `rest` came after."""
+    """How an exchange ended: with `value`, or with `error`. `send` is what the host says last; `rest` came after.
+
+    `silent`: it failed because nothing came of the leg that was awaited.
+    """
 
     value: Any = None
     send: bytes = b""
     rest: bytes = b""
     error: Exception | None = None
+    silent: bool = False
 
     @property
     def delivered(self) -> bool:
@@ -75,11 +84,14 @@ class Driver:
     """One fresh exchange, as a host drives it that has no clock: somebody else knows when a window or gap is over.
 
     `said` is what the host says after the request, leg by leg. `timing` is that of the leg which is awaited, and
-    `begun` tells whether a byte of it has come. `ending` is how it ended, None until it has.
+    `begun` tells whether a byte of it has come. `ending` is how it ended, None until it has. `noise_tolerant` is the
+    profile's: bytes that begin no reply are left out before one.
     """
 
-    def __init__(self, exchange: Exchange[Any]) -> None:
+    def __init__(self, exchange: Exchange[Any], *, noise_tolerant: bool = False) -> None:
         self.exchange = exchange
+        self._noise_tolerant = noise_tolerant
+        self._silent = False
         self.timing: ReplyTiming = exchange.timing
         self.said: list[bytes] = []
         self.begun = False
@@ -90,8 +102,11 @@ class Driver:
         for chunk in chunks:
             ending = self.ending
             if ending is None:
-                self.begun = self.begun or bool(chunk)
-                self._take(self.exchange.feed, chunk)
+                data = chunk if self.begun or not self._noise_tolerant else without_noise(self.exchange, chunk)
+                self.begun = self.begun or bool(data)
+                self._silent = False
+                if data or not chunk:
+                    self._take(self.exchange.feed, data)
             elif ending.delivered:
                 self.ending = replace(ending, rest=ending.rest + chunk)
         return self
@@ -99,6 +114,7 @@ class Driver:
     def expire(self) -> None:
         """Tell that the window of the leg is over, or the byte gap where it has begun."""
         if self.ending is None:
+            self._silent = not self.begun
             self._take(self.exchange.expired, self.begun)
 
     def run_out(self) -> Ending:
@@ -110,8 +126,14 @@ class Driver:
         return Ending(error=EndlessExchange(f"another leg after {MOST_LEGS} that expired"))
 
     def fail(self, error: Exception) -> None:
-        """End it with an error of the host's own: what the exchange would say then is not heard."""
-        self.ending = Ending(error=error, send=error.send if isinstance(error, FrameError) else b"")
+        """End it with an error, the host's own too: whatever is still heard does not count."""
+        send = error.send if isinstance(error, FrameError) else b""
+        self.ending = Ending(error=error, send=send, silent=self._silent)
+
+    def abandon(self) -> None:
+        """End it where it would say something again, which is then not said (see `Abandonable`)."""
+        self.said.clear()
+        self.fail(cast("Abandonable", self.exchange).abandon())
 
     def _take(self, call: Callable[[Any], Step[Any]], argument: object) -> None:
         try:
@@ -131,4 +153,4 @@ class Driver:
             self.said.append(leg.send)
 
 
-__all__ = ["MOST_LEGS", "Driver", "Ending", "EndlessExchange", "follow"]
+__all__ = ["MOST_LEGS", "Driver", "Ending", "EndlessExchange", "follow", "without_noise"]
