@@ -173,7 +173,7 @@ class Assembler:
         exchange = self._exchange
         if asks and exchange.request is None:
             exchange.request = frame
-        packet = Packet(self._micros(frame.time), self._name, frame.sender, frame.raw, frame.node)
+        packet = Packet(self._micros(frame.time), self._name, frame.sender, frame.raw, frame.node, joined=frame.joined)
         unasked = self._told and self._asked is None and not from_host
         if not (unasked or exchange.released):
             self._mark(packet)

@@ -10,7 +10,8 @@ what no byte of an anonymous reply tells; numbers are big-endian:
     4-5    node; FFFF where unknown or the protocol has none
     6-9    the request to which the frame belongs, numbered from 1 in the order in which they began (a cycle of a poll
            anew); 0 where it belongs to none (a stray) or nobody knows (a line that was only listened to)
-    10-11  which attempt at that request it is, from 1; 0 likewise
+    10     which attempt at that request it is, from 1; 0 likewise
+    11     1 where the frame came in one piece with the end of the one before, else 0
 
 Version 1 ends before byte 6. The protocol's name is the description of the packet's interface: a file has an interface
 for each protocol on the line, all named for the port. In the oldest files, which have one interface without a
@@ -38,7 +39,7 @@ LINK_TYPE = 157
 HEADER_VERSION = 2
 NO_NODE = 0xFFFF
 
-_HEADERS = {1: struct.Struct(">BBBBH"), HEADER_VERSION: struct.Struct(">BBBBHIH")}
+_HEADERS = {1: struct.Struct(">BBBBH"), HEADER_VERSION: struct.Struct(">BBBBHIBB")}
 _SECTION, _INTERFACE, _PACKET, _STATISTICS = 0x0A0D0D0A, 1, 6, 5
 _BYTE_ORDER = 0x1A2B3C4D
 _COMMENT, _FLAGS, _DROPPED = 1, 2, 4
@@ -86,6 +87,8 @@ class Packet:
     transaction: int = 0
     attempt: int = 0
     """To which request of the master, and which attempt at it, the frame belongs; 0 where that is not known."""
+    joined: bool = False
+    """It came in one piece with the end of the frame before."""
 
 
 class PcapngWriter:
@@ -103,7 +106,7 @@ class PcapngWriter:
         node = NO_NODE if packet.node is None else packet.node
         capture_id = find(packet.protocol).capture_id if packet.protocol else 0
         head = (HEADER_VERSION, capture_id, packet.direction, packet.outcome, node)
-        of = (packet.transaction & 0xFFFFFFFF, packet.attempt & 0xFFFF)
+        of = (packet.transaction & 0xFFFFFFFF, min(packet.attempt, 0xFF), packet.joined)
         data = _HEADERS[HEADER_VERSION].pack(*head, *of) + packet.frame
         comments = (packet.comment, *packet.notes) if packet.notes or packet.comment else ()
         options = _options(
@@ -176,7 +179,7 @@ def _packet(micros: int, protocol: str, data: bytes, options: list[tuple[int, by
     header = _HEADERS.get(data[0]) if data else None
     if header is None or len(data) < header.size:
         raise CaptureError("a packet without our header, or of a later version")
-    _, capture_id, direction, outcome, node, *of = header.unpack_from(data)
+    _, capture_id, direction, outcome, node, transaction, attempt, joined = (*header.unpack_from(data), 0, 0, 0)[:8]
     comment, *notes = [value.decode(errors="replace") for code, value in options if code == _COMMENT] or [""]
     dropped = dict(options).get(_DROPPED)
     try:
@@ -190,7 +193,9 @@ def _packet(micros: int, protocol: str, data: bytes, options: list[tuple[int, by
             comment,
             0 if dropped is None else struct.unpack(f"{order}Q", dropped)[0],
             tuple(notes),
-            *of,
+            transaction,
+            attempt,
+            bool(joined),
         )
     except (KeyError, ValueError) as error:
         raise CaptureError(f"a packet with a header that means nothing: {data[: header.size].hex(' ')}") from error

@@ -100,7 +100,9 @@ class _Run:
         exchange = command.open(asked.frame.node or 0, profile.timings)
         self._driver = Driver(exchange, noise_tolerant=profile.noise_tolerant)
         self._abandonable = profile.exchange_limit is not None
-        self._heard = False
+        self._answered = False
+        self._heard = b""
+        """What came in one piece, and may go on."""
         self._unsaid = b""
         """What the host is to say next."""
         self._closed = False
@@ -128,16 +130,17 @@ class _Run:
             return
         self.note(heard)
         self._given_up = None
-        self._heard = self._heard or bool(heard.packet.frame)
-        if heard.packet.frame and not self._differs and not self._over:
-            self._driver.feed(heard.packet.frame)
-            self._gather()
+        if not heard.packet.joined:
+            self._hand_over()
+        self._heard += heard.packet.frame
+        self._answered = self._answered or bool(heard.packet.frame)
 
     def host_says(self, heard: _Heard) -> bool:
         """Return whether it is what this exchange says at this point; else the exchange is over."""
         if self._over or self._differs:
             return False
         frame = heard.packet.frame
+        self._hand_over()
         if not self._unsaid:
             self._driver.expire()
             self._gather()
@@ -152,19 +155,27 @@ class _Run:
 
     def end(self) -> Replayed:
         """Return what was recorded, and what comes of it now."""
+        self._hand_over()
         self._abandon()
         now = Result(Outcome.NONE, self._differs) if self._differs else result_of(self._driver.run_out())
         recorded, lead = self._recorded, f"{self._command}: "
         if self._given_up is not None and recorded.outcome is self._given_up.outcome:
             now = self._given_up  # time decided it, which is not replayed
-        if self._heard and recorded.outcome in FAILED and now.outcome in FAILED:
-            now.outcome = recorded.outcome  # whether a later leg had begun was a matter of chunks, which no capture has
+        if self._answered and recorded.outcome in FAILED and now.outcome in FAILED:
+            now.outcome = recorded.outcome  # in pieces of what size a later leg began is not recorded
         if recorded.outcome is Outcome.OK:
             recorded.values = self._values
             recorded.text = recorded.text.removeprefix(lead) if recorded.text.startswith(lead) else ""
         elif recorded.outcome is Outcome.DOUBTED and now.outcome is Outcome.OK:
             now = Result(Outcome.DOUBTED, f"{now.text}, which was not believed")
         return _replayed(self.asked, str(self._command), recorded, now)
+
+    def _hand_over(self) -> None:
+        """Let the reader hear what came, in the pieces in which it came."""
+        heard, self._heard = self._heard, b""
+        if heard and not self._differs and not self._over:
+            self._driver.feed(heard)
+            self._gather()
 
     def _gather(self) -> None:
         """Take what the exchange wants to say."""

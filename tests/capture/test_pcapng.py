@@ -34,13 +34,15 @@ def test_the_head_of_a_file() -> None:
 
 
 def test_a_packet_byte_by_byte() -> None:
-    ack = Packet(0x0006_2345_6789_ABCD, "hcp2", Direction.NODE, b"\x06", 5, Outcome.OK, "done", 3, ("late",), 7, 2)
+    ack = Packet(
+        0x0006_2345_6789_ABCD, "hcp2", Direction.NODE, b"\x06", 5, Outcome.OK, "done", 3, ("late",), 7, 2, True
+    )
     assert written(ack, port="COM")[len(HEAD) :] == bytes.fromhex(
         "01000000 30000000 9d00 0000 00000000 0200 0300 434f4d00 0300 0400 68637032"  # interface 1: port, protocol
         "0900 0100 06000000 00000000 30000000"
         "06000000 58000000 01000000"  # enhanced packet block, interface 1
         "45230600 cdab8967 0d000000 0d000000"  # time, captured and original length
-        "02 02 01 01 0005 00000007 0002 06 000000"  # our header (HCP2, a node, ok, node 5, request 7, attempt 2), ACK
+        "02 02 01 01 0005 00000007 02 01 06 000000"  # our header (HCP2, a node, ok, node 5, request 7.2, joined), ACK
         "0100 0400 646f6e65  0100 0400 6c617465"  # comments
         "0200 0400 01000000  0400 0800 0300000000000000  00000000"  # inbound, dropped, end
         "58000000"
@@ -69,7 +71,8 @@ packets = st.builds(
     dropped=st.integers(0, 2**40),
     notes=st.lists(st.text(max_size=10), max_size=3).map(tuple),
     transaction=st.integers(0, 2**32 - 1),
-    attempt=st.integers(0, 2**16 - 1),
+    attempt=st.integers(0, 255),
+    joined=st.booleans(),
 )
 
 
