@@ -18,6 +18,7 @@ HEAD = bytes.fromhex(
     "01000000 28000000 9d00 0000 00000000 0200 0300 434f4d00 0900 0100 06000000 00000000 28000000"
 )
 """Section header and interface description of the pcapng format: little-endian, link type 157, microseconds."""
+NODE = Direction.NODE
 EMPTY = Packet(0, "", Direction.HOST, b"")
 
 
@@ -34,9 +35,7 @@ def test_the_head_of_a_file() -> None:
 
 
 def test_a_packet_byte_by_byte() -> None:
-    ack = Packet(
-        0x0006_2345_6789_ABCD, "hcp2", Direction.NODE, b"\x06", 5, Outcome.OK, "done", 3, ("late",), 7, 2, True
-    )
+    ack = Packet(0x0006_2345_6789_ABCD, "hcp2", NODE, b"\x06", 5, Outcome.OK, "done", 3, ("late",), 7, 2, True)
     assert written(ack, port="COM")[len(HEAD) :] == bytes.fromhex(
         "01000000 30000000 9d00 0000 00000000 0200 0300 434f4d00 0300 0400 68637032"  # interface 1: port, protocol
         "0900 0100 06000000 00000000 30000000"
