@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import count
+from pathlib import Path
 from typing import TypeAlias
 
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.assemble import Assembler
 from busmaster.capture.frames import Direction
-from busmaster.capture.pcapng import Outcome, Packet
+from busmaster.capture.pcapng import Outcome, Packet, read_packets
 from busmaster.capture.replay import Replayed, replay
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
@@ -178,6 +179,21 @@ def test_a_request_that_no_command_sends_is_a_change_if_it_was_answered() -> Non
     one = only(overheard((WRITE, "07 30 30 02 30 30 05 07"), (NODE, NAK)))
     assert "1 to 255" in str(one.now)
     assert one.changed
+
+
+def test_a_file_of_the_first_version_which_numbers_no_requests_replays() -> None:
+    with (Path(__file__).parent / "version1.pcapng").open("rb") as file:
+        exchanges = list(replay(read_packets(file)))
+    assert not any(one.changed for one in exchanges)
+    assert all(one.judged for one in exchanges)
+    assert len(exchanges) == 13
+    assert [(one.packet, one.node, str(one.recorded)[:30]) for one in exchanges[:5]] == [
+        (1, 1, "ok: ok"),
+        (3, 1, "ok: -2.0"),
+        (5, 7, "ok: 64.0"),
+        (7, 2, "refused"),
+        (9, 2, "refused: write element 100 = 3"),
+    ]
 
 
 def test_strays_and_what_comes_before_the_first_request_are_left_out() -> None:
