@@ -10,18 +10,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 from busmaster.arbiter.tap import Attempt
+from busmaster.arbiter.transaction import Transaction
 
 if TYPE_CHECKING:
     from busmaster.arbiter.health import Health, NodeRecord
     from busmaster.arbiter.schedule import Poll
-    from busmaster.arbiter.transaction import Transaction
-
-
-@dataclass(slots=True)
-class Completed:
-    """A caller's transaction has ended: its `value` or its `error` is set."""
-
-    transaction: Transaction
 
 
 @dataclass(slots=True)
@@ -110,8 +103,9 @@ class Strayed:
     collision: bool = False
 
 
+# A caller's transaction is told itself when it has ended: its `value` or its `error` is set then.
 Event: TypeAlias = (
-    Completed
+    Transaction
     | Sampled
     | Polled
     | NodeChanged
