@@ -177,7 +177,7 @@ class World:
                 if data is None:
                     return
                 continue
-            if isinstance(event, Attempt):
+            if type(event) is Attempt:
                 if self.tap is not None:
                     self.tap.attempted(event)
                 continue
