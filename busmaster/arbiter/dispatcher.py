@@ -23,6 +23,7 @@ from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
 from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.schedule import Poll, Schedule
 from busmaster.arbiter.state import SETTLING
+from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.errors import (
@@ -47,6 +48,9 @@ NOT_DONE = (Refused, Superseded)
 
 class Dispatcher:
     """The transactions of one line. Times are the caller's clock, in seconds."""
+
+    attempt: Attempt | None = None
+    """What is on the wire, where somebody taps the line (tapped.py)."""
 
     def __init__(
         self, deadlines: Deadlines, counters: LineCounters, now: float, capacity: int, jitter: Callable[[], float]

@@ -19,6 +19,7 @@ from busmaster.arbiter.events import Event, NodeChanged, PortFailed, Strayed
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import SLICE
 from busmaster.arbiter.state import LineState
+from busmaster.arbiter.tap import Tap
 from busmaster.arbiter.transaction import Phase, Priority
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
@@ -32,7 +33,7 @@ from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.planning import Plan, PlannedGroup, Read, bounds, plan_steps
 from busmaster.planning.merging import Merge, at_once
 from busmaster.transport.endpoints import Endpoint, is_paced
-from busmaster.transport.pump import Pump, Tap
+from busmaster.transport.pump import Pump
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
 
@@ -78,6 +79,7 @@ class Bus:
             capacity=capacity,
             jitter=self._random.random,
             strict=strict,
+            tapped=tap is not None,
         )
         self._arbiter.name = endpoint.name
         self._line = line = SharedLine(endpoint.name, self._arbiter)

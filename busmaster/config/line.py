@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import Any
 
+from busmaster.arbiter.tap import Tap
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
 from busmaster.bus.node import Node
@@ -22,7 +23,6 @@ from busmaster.outputs.fan import Fan
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
 from busmaster.transport.endpoints import Endpoint
-from busmaster.transport.pump import Tap
 
 
 class ConfiguredLine:
