@@ -42,8 +42,8 @@ from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
 from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from busmaster.protocols.mentor.handle import MentorDrive
 from busmaster.protocols.modbus.handle import ModbusUnit
-from busmaster.protocols.msc.codec import ProgramStatus
 from busmaster.protocols.msc.handle import MscController
+from busmaster.protocols.msc.status import ProgramStatus
 from busmaster.transport.endpoints import Endpoint, endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal
 
+from busmaster.contract.items import Item
 from busmaster.errors import InvalidCommand
 
 if TYPE_CHECKING:  # so that a master alone does not load the emulator
@@ -81,6 +82,8 @@ class NodeKind:
     make_device: DeviceMaker
     items: str
     """What an ITEM of such a node looks like, for the command line's help; its words are wrapped there."""
+    documented: tuple[Item, ...] = ()
+    """What the protocol's document says of items, one by one."""
     options: tuple[Option, ...] = ()
     """Arguments of its handle."""
     read_options: tuple[Option, ...] = ()
@@ -118,8 +121,6 @@ class Protocol:
     kinds: tuple[NodeKind, ...]
     commands: Mapping[str, type[Command[Any]]]
     dialect: Callable[[], Dialect]
-    shares_line_with: frozenset[str] = frozenset()
-    """The other protocols whose nodes may be on the same line."""
 
     def __post_init__(self) -> None:
         if not self.kinds:

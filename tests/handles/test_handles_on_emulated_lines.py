@@ -34,7 +34,7 @@ from busmaster.protocols.dc104 import device as dc104
 from busmaster.protocols.mentor import device as mentor
 from busmaster.protocols.msc import codec as msc_commands
 from busmaster.protocols.msc import device as msc
-from busmaster.protocols.msc.codec import ProgramStatus
+from busmaster.protocols.msc.status import ProgramStatus
 from busmaster.testing.virtual_time import run_in_virtual_time
 
 Story = Callable[[], Coroutine[Any, Any, None]]

@@ -16,7 +16,7 @@ from busmaster.outputs import sqlite
 from busmaster.outputs.base import Happening
 from busmaster.outputs.settings import SqliteSettings
 from busmaster.outputs.sqlite import DAY, SqliteOutput, column
-from busmaster.protocols.msc.codec import ProgramStatus
+from busmaster.protocols.msc.status import ProgramStatus
 from tests.outputs.cycles import cycle, settled, until
 
 

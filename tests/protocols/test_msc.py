@@ -22,13 +22,13 @@ from busmaster.protocols.msc.codec import (
     Merging,
     PickedData,
     PickedFlags,
-    ProgramStatus,
     ReadFlag,
     ReadFlags,
     ReadStatus,
     SetFlag,
 )
 from busmaster.protocols.msc.exchange import packet
+from busmaster.protocols.msc.status import ProgramStatus
 from tests.protocols.asking import vectors
 
 FRAMES = vectors("MSC")

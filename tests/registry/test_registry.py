@@ -52,8 +52,8 @@ def test_every_protocol_goes_by_a_name_of_its_own() -> None:
 def test_who_may_share_a_line_is_said_by_both() -> None:
     by_name = {protocol.name: protocol for protocol in protocols()}
     for protocol in protocols():
-        for other in protocol.shares_line_with:
-            assert protocol.name in by_name[other].shares_line_with
+        for other in protocol.profile.shares_line_with:
+            assert protocol.name in by_name[other].profile.shares_line_with
 
 
 def test_a_protocol_that_does_not_exist_is_refused_with_those_that_do() -> None:

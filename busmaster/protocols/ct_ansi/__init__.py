@@ -6,6 +6,7 @@ from busmaster.protocols.ct_ansi.capture import CtAnsiDialect
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
 from busmaster.protocols.mentor import CHAIN
+from busmaster.protocols.mentor.parameters import ANY
 from busmaster.registry import NodeKind, Protocol, device_of
 
 PROTOCOL = Protocol(
@@ -18,10 +19,10 @@ PROTOCOL = Protocol(
             items="1.21 (menu and parameter), 1.21:8 (8 parameters from there on)",
             read_options=(CHAIN,),
             takes_decimals=True,
+            documented=(ANY,),
             capture_id=8,
         ),
     ),
     commands={"read": Read, "read_run": ReadRun, "write": Write},
     dialect=CtAnsiDialect,
-    shares_line_with=frozenset({"mentor"}),
 )

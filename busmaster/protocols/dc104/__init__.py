@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from busmaster.contract.items import Item
 from busmaster.protocols.dc104.capture import Dc104Dialect
 from busmaster.protocols.dc104.codec import PROFILE, Read, Write
 from busmaster.protocols.dc104.handle import Dc104Drive
@@ -17,6 +18,7 @@ PROTOCOL = Protocol(
             items="a parameter, 1 to 255",
             options=(Option("maximum", "whole"), Option("allow_zero", "flag")),
             whole_numbers=everywhere,
+            documented=(Item("1-255", "1-255", "a parameter, 0 to 65535", access="read/write"),),
             capture_id=6,
         ),
     ),

@@ -5,7 +5,8 @@ from __future__ import annotations
 from busmaster.protocols.mentor.capture import MentorDialect
 from busmaster.protocols.mentor.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.mentor.handle import MentorDrive
-from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
+from busmaster.protocols.mentor.parameters import ITEMS, NAMED, is_whole
+from busmaster.registry import NodeKind, Option, Protocol, device_of
 
 CHAIN = Option("chain", "flag", "read a run in one exchange, where no other drive can mistake it")
 
@@ -16,15 +17,16 @@ PROTOCOL = Protocol(
             "mentor",
             MentorDrive,
             device_of("busmaster.protocols.mentor.device"),
-            items="1.17 (menu and parameter), 15.60:wide, 1.17:hires, 1.17:20 (20 parameters from there on)",
+            items="1.17 (menu and parameter), 15.60:wide, 1.17:hires, 1.17:20 (20 parameters from there on), or a "
+            f"name: {' '.join(NAMED)}",
             options=(Option("chained", "flag"),),
             read_options=(CHAIN,),
-            whole_numbers=everywhere,
+            whole_numbers=is_whole,
             takes_decimals=True,
+            documented=ITEMS,
             capture_id=5,
         ),
     ),
     commands={"read": Read, "read_run": ReadRun, "write": Write},
     dialect=MentorDialect,
-    shares_line_with=frozenset({"ct-ansi"}),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from busmaster.contract.items import Item
 from busmaster.protocols.modbus.capture import ModbusDialect
 from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
 from busmaster.protocols.modbus.handle import ModbusUnit, is_whole
@@ -18,6 +19,17 @@ PROTOCOL = Protocol(
             "from there on); holding:100:float32 (int16 uint16 int32 uint32 float32 float64, most significant word "
             "first; :swapped behind it for the other order)",
             whole_numbers=is_whole,
+            documented=(
+                Item("coil:0-65535", "0-65535", "a bit, read by function 1, written by 5 and 15", access="read/write"),
+                Item("discrete:0-65535", "0-65535", "an input bit, read by function 2", access="read"),
+                Item(
+                    "holding:0-65535",
+                    "0-65535",
+                    "a register of 16 bits, read by function 3, written by 6 and 16",
+                    access="read/write",
+                ),
+                Item("input:0-65535", "0-65535", "an input register of 16 bits, read by function 4", access="read"),
+            ),
             capture_id=7,
         ),
     ),

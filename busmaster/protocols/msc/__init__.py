@@ -6,6 +6,7 @@ from busmaster.protocols.msc import codec
 from busmaster.protocols.msc.capture import MscDialect
 from busmaster.protocols.msc.codec import PROFILE
 from busmaster.protocols.msc.handle import MscController
+from busmaster.protocols.msc.items import ITEMS
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
 PROTOCOL = Protocol(
@@ -22,6 +23,7 @@ PROTOCOL = Protocol(
                 Option("model", "text"),
             ),
             whole_numbers=everywhere,
+            documented=ITEMS,
             capture_id=4,
         ),
     ),
