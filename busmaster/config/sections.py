@@ -13,8 +13,9 @@ from busmaster.config.names import NODE_NAME, POINT_NAME, expanded
 from busmaster.config.ports import read_port
 from busmaster.config.recording import Outputs, read_outputs
 from busmaster.config.source import Source
-from busmaster.config.table import Table, nearest
+from busmaster.config.table import Table
 from busmaster.config.timing import read_timings
+from busmaster.contract.arguments import nearest
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.emulator.device import Delay

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
 from busmaster.config.source import FileError, Key, Source
+from busmaster.contract.arguments import nearest
 from busmaster.errors import InvalidCommand
 
 T = TypeVar("T")
@@ -129,15 +129,6 @@ class Table:
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise self.error(f"must be {meant}, not {shown(value)}", key)
         return value
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """What may have been meant."""
-    known = tuple(known)
-    near = difflib.get_close_matches(name, known, n=1)
-    if near:
-        return f"did you mean {near[0]!r}?"
-    return f"there are {', '.join(known)}" if known else "there are none"
 
 
 def shown(value: object) -> str:

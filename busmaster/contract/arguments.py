@@ -1,11 +1,14 @@
-"""What callers hand in as numbers: taken for what it is, or refused in words before anything is sent.
+"""What callers hand in: a number is taken for what it is, or refused in words before anything is sent; and of a name
+that is none, the nearest is told.
 
 True is no number here, although Python lets it pass for 1: it is what a mistyped call leaves behind.
 """
 
 from __future__ import annotations
 
+import difflib
 import operator
+from collections.abc import Iterable
 from math import inf, nan
 from numbers import Real
 from typing import SupportsIndex
@@ -32,3 +35,12 @@ def seconds(value: object, what: str) -> float:
     if not 0 <= number < inf:
         raise InvalidCommand(f"{what} is a time of 0 s or more, not {value!r}")
     return number
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return what may have been meant by a name that is not known: "did you mean 'hcp2'?", or else all that are."""
+    known = tuple(known)
+    near = difflib.get_close_matches(name, known, n=1)
+    if near:
+        return f"did you mean {near[0]!r}?"
+    return f"there are {', '.join(known)}" if known else "there are none"

@@ -11,6 +11,7 @@ from importlib.metadata import EntryPoint, entry_points
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from busmaster.contract.arguments import nearest
 from busmaster.errors import InvalidCommand
 from busmaster.registry.protocol import NodeKind, Option, Protocol
 
@@ -53,7 +54,7 @@ def find(name: str) -> NodeKind:
     """Return the kind of node that goes by a name. Raises InvalidCommand if there is none."""
     kind = kinds().get(name)
     if kind is None:
-        raise InvalidCommand(f"no such protocol {name!r}: use {', '.join(kinds())}")
+        raise InvalidCommand(f"no such protocol {name!r}; {nearest(name, kinds())}")
     return kind
 
 

@@ -32,7 +32,7 @@ def axis_elements(axis: int) -> list[Element[object]]:
     """The parameters of one axis."""
     first = FIRST_AXIS_ELEMENT + ELEMENTS_PER_AXIS * axis
     return [
-        Element(f"axis{axis}.{name}", number, decode, f"{meaning}, axis {axis}", keyword=f"{keyword}({axis})")
+        Element(f"axis{axis}.{name}", number, decode, meaning, keyword=f"{keyword}({axis})")
         for number, (name, decode, meaning, keyword) in enumerate(AXIS, first)
     ]
 
