@@ -11,7 +11,7 @@ from busmaster.cli.arguments import json_option
 from busmaster.cli.output import columns, emit, emit_all, json_line, note
 from busmaster.cli.parsing import option_type
 from busmaster.cli.protocols import parse_protocol
-from busmaster.contract.arguments import nearest
+from busmaster.contract.arguments import meant
 from busmaster.contract.items import Bit, Item
 from busmaster.registry import NodeKind, find
 
@@ -48,7 +48,7 @@ def text_of(item: Item) -> str:
 
 def guess(words: Sequence[str], kind: NodeKind) -> str:
     """The item that may have been meant."""
-    return nearest(words[0], (item.item for item in kind.documented))
+    return meant(words[0], (item.item for item in kind.documented))
 
 
 def page(items: Iterable[Item]) -> Iterator[str]:

@@ -15,7 +15,7 @@ from busmaster.bus.polling import PollGroup
 from busmaster.config.names import expanded, listed
 from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
-from busmaster.contract.arguments import nearest
+from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.fan import Fan
 from busmaster.outputs.settings import MqttSettings
@@ -135,7 +135,7 @@ class ConfiguredLine:
             raise InvalidCommand(f"a point is written NODE/ITEM, not {text!r}")
         for node in (name for part in listed(nodes) for name in expanded(part, self.nodes)):
             if node not in self.nodes:
-                raise InvalidCommand(f"no such node {node!r}; {nearest(node, self.nodes)}")
+                raise InvalidCommand(f"no such node {node!r}; {meant(node, self.nodes)}")
             section = self.file.nodes[node]
             known = {*section.points, *section.options.get("symbols", ())}
             for item in (name for part in listed(items) for name in expanded(part, known)):

@@ -15,7 +15,7 @@ from busmaster.config.recording import Outputs, read_outputs
 from busmaster.config.source import Source
 from busmaster.config.table import Table
 from busmaster.config.timing import read_timings
-from busmaster.contract.arguments import nearest
+from busmaster.contract.arguments import meant
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.emulator.device import Delay
@@ -292,7 +292,7 @@ def _emulator(table: Table, nodes: Mapping[str, NodeSection]) -> EmulatorSection
             names = list(expanded(one.name, nodes))
         for name in names:
             if name not in nodes:
-                raise one.error(f"no such node {name!r}; {nearest(name, nodes)}")
+                raise one.error(f"no such node {name!r}; {meant(name, nodes)}")
             delays[name] = _delay(one, delays[name])
             faults[name] = _faults(one.table("faults"), shared.data)
     return EmulatorSection(
