@@ -19,11 +19,11 @@ PROTOCOL = Protocol(
             device_of("busmaster.protocols.mentor.device"),
             items="1.17 (menu and parameter), 15.60:wide, 1.17:hires, 1.17:20 (20 parameters from there on), or a "
             f"name: {' '.join(NAMED)}",
+            documented=ITEMS,
             options=(Option("chained", "flag"),),
             read_options=(CHAIN,),
             whole_numbers=is_whole,
             takes_decimals=True,
-            documented=ITEMS,
             capture_id=5,
         ),
     ),
