@@ -75,6 +75,7 @@ def fields(item: Item) -> dict[str, Any]:
         "item": item.item,
         "number": item.number or None,
         "unit": item.unit or None,
+        "decimals": item.decimals,
         "access": item.access or None,
         "meaning": item.meaning,
         "keyword": item.keyword or None,

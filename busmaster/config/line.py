@@ -155,8 +155,8 @@ class ConfiguredLine:
             source = _known(handle, name, node.points)
             return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
         decimals = 0 if node.kind.takes_decimals else section.decimals
-        rounds = node.kind.takes_decimals and section.decimals  # the handle does, to those
-        whole = not rounds and node.kind.whole_numbers(section.item)
+        rounds = node.kind.takes_decimals and (section.decimals or node.kind.decimals(section.item))
+        whole = not rounds and node.kind.whole_numbers(section.item)  # else the handle rounds, to its decimals
         scale = Scale.of(section.factor, section.offset, decimals, whole=whole)
         return NamedPoint.of(handle.point(section.item), where=where, name=name, unit=section.unit, scale=scale)
 

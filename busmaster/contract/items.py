@@ -28,7 +28,7 @@ class Item:
 
     `item` is what is written where an ITEM is asked for; 1-99 stands for each of them, as in LINE.toml. `number` is
     what the document calls it by, `keyword` its name in the device's own language. `access` is empty where the
-    document does not say it.
+    document does not say it. `decimals`: how many of the last digits on the line are decimals of its unit.
     """
 
     item: str
@@ -38,6 +38,7 @@ class Item:
     access: Access = ""
     keyword: str = ""
     bits: tuple[Bit, ...] = ()
+    decimals: int = 0
 
 
 def bits_of(

@@ -107,6 +107,11 @@ class NodeKind:
     def profile(self) -> Profile:
         return self.protocol.profile
 
+    def decimals(self, item: str) -> int:
+        """Return how many of an item's last digits on the line are decimals, as the document has it; else 0."""
+        name = item.partition(":")[0]
+        return next((one.decimals for one in self.documented if one.item == name), 0)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Protocol:

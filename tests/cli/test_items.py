@@ -44,6 +44,7 @@ def test_json_is_an_object_a_line_with_nulls_for_what_is_not_said(busmaster: Com
         "item": "speed_reference_1",
         "number": "1.17",
         "unit": "%",
+        "decimals": 1,
         "access": "read/write",
         "meaning": "speed reference 1, of the maximum speed",
         "keyword": None,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from busmaster.protocols.mentor.capture import MentorDialect
 from busmaster.protocols.mentor.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.mentor.handle import MentorDrive
-from busmaster.protocols.mentor.parameters import ITEMS, NAMED, is_whole
-from busmaster.registry import NodeKind, Option, Protocol, device_of
+from busmaster.protocols.mentor.parameters import ITEMS, NAMED
+from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
 CHAIN = Option("chain", "flag", "read a run in one exchange, where no other drive can mistake it")
 
@@ -22,7 +22,7 @@ PROTOCOL = Protocol(
             documented=ITEMS,
             options=(Option("chained", "flag"),),
             read_options=(CHAIN,),
-            whole_numbers=is_whole,
+            whole_numbers=everywhere,
             takes_decimals=True,
             capture_id=5,
         ),

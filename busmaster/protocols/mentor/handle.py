@@ -219,8 +219,8 @@ class MentorDrive(Handle):
     def _place(self, text: str) -> Place:
         """Where a parameter is, by number or name; a name brings the guide's decimals unless others are declared."""
         where = place_of(text)
-        decimals = NAMED[text].decimals if text in NAMED else None
-        return Place(*where, self._decimals.get(where, decimals))
+        decimals = NAMED[text].decimals if text in NAMED else 0
+        return Place(*where, self._decimals.get(where, decimals or None))
 
     def _values(self, run: ReadRun, sent: Sequence[int]) -> tuple[float, ...]:
         parameters = _parameters(run)

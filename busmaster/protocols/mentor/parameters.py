@@ -21,7 +21,7 @@ class Parameter:
     name: str = ""
     unit: str = ""
     access: Access = ""
-    decimals: int | None = None
+    decimals: int = 0
     wide: bool = False
 
     @property
@@ -33,7 +33,7 @@ class Parameter:
     def item(self) -> Item:
         """What the document says of it, as lists show it."""
         number = f"{self.menu}.{self.number:02d}"
-        return Item(self.name or number, number, self.meaning, self.unit, self.access)
+        return Item(self.name or number, number, self.meaning, self.unit, self.access, decimals=self.decimals)
 
 
 SPEED_REFERENCE_1 = Parameter(
@@ -53,9 +53,3 @@ WIDE = frozenset(parameter.place for parameter in PARAMETERS if parameter.wide)
 ANY = Item("0-99.0-99", "0.00-99.99", "a parameter, by menu and number: see the drive's own list")
 """For drives of this family: what most parameters are is not in the documents of the serial interface."""
 ITEMS = (*(parameter.item for parameter in PARAMETERS), ANY)
-
-
-def is_whole(item: str) -> bool:
-    """Return whether the values of an item are whole numbers, unless decimals are declared for it."""
-    named = NAMED.get(item.partition(":")[0])
-    return named is None or named.decimals is None
