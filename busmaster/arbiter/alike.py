@@ -67,7 +67,7 @@ class Alike:
         """Whether times fail to show that the last answer was its own. It came `took` seconds after its request, which
         needed `asking` on the wire."""
         node = self.node
-        if not self._wire.paced or node is None or took < 0:  # below 0: there was none
+        if not self._wire.leg.paced or node is None or took < 0:  # below 0: there was none
             return True
         usual = node.usual
         if usual is None:
