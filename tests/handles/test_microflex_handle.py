@@ -40,11 +40,11 @@ class Drive(FakeBus):
             known = {108: float(self.command), 109: float(self.status)}
             return {**self.elements, **known}[command.element]
         assert isinstance(command, Write)
-        assert command.idempotent
         value = command.values[0]
         if command.element != 108:
             self.elements[command.element] = value
             return None
+        assert command.idempotent
         failure = next(self.failures, None)
         self.words.append(int(value))
         if not isinstance(failure, Superseded):
