@@ -186,7 +186,7 @@ class LineMachine:
         deadlines = self._deadlines
         if now >= deadlines.schedule:
             self.dispatcher.release_polls(now)
-        if now >= deadlines.expiry:
+        if now >= deadlines.expiry and not unread:
             self.dispatcher.expire(now)
         if now >= deadlines.health:
             self._enter(self.state, now)
