@@ -31,6 +31,9 @@ class Arbiter(LineMachine):
     which probes are spread. `strict`: answers that could be another's are held until that one would have come (R15).
     """
 
+    name = ""
+    """What errors call the line."""
+
     @property
     def byte_time(self) -> float:
         """tau: seconds per byte of this line."""
@@ -50,12 +53,33 @@ class Arbiter(LineMachine):
             address,
             profile.timings if timings is None else timings,
             profile.retries if retries is None else retries,
+            self.name,
         )
         self.dispatcher.nodes.append(node)
         if profile.listen is not None and self._strays.listener is None:
             self._strays.listener = profile.listen()
         self._quarantine = max(self._quarantine, self._up_at + node.lateness + self._leg.latency + self.byte_time)
         return node
+
+    def name_node(self, node: NodeRecord, label: str) -> None:
+        """Have messages call it so."""
+        node.label = label
+
+    def change_profile(self, node: NodeRecord, profile: Profile) -> None:
+        """Go by another profile of its protocol from now on: one that merges otherwise."""
+        node.profile = profile
+
+    def expect_hook(self, node: NodeRecord, expected: bool) -> None:
+        """Hold its polls when it comes back until `Dispatcher.release_node`, or do not."""
+        node.has_hook = expected
+
+    def note_stop(self, node: NodeRecord) -> None:
+        """It is told to stop."""
+        node.stops += 1
+
+    def answer_counts(self, now: float) -> bool:
+        """A caller's time is over while something is on the wire: what has come is to be handed over first."""
+        return self.state is EXCHANGE and now >= self._deadlines.expiry
 
     def submit(self, transaction: Transaction, now: float) -> bool:
         """False if it waits and nothing else has changed: then there is nothing to pump."""

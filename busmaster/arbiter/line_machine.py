@@ -82,7 +82,7 @@ class LineMachine:
         self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency, byte_time)
         self._wire = OnWire(self._leg, self._echo, self._deadlines, self.dispatcher.urgent_waits)
         self._in_step = InStep(strict)
-        self._choice = Choice(self.dispatcher, self._in_step)
+        self._choice = Choice(self.dispatcher, self._in_step, self._wire)
         self._trust = Trust(self._in_step)
         # the line
         self._strays = Strays(self._events, self._counters)
@@ -185,7 +185,7 @@ class LineMachine:
         deadlines = self._deadlines
         if now >= deadlines.schedule:
             self.dispatcher.release_polls(now)
-        if now >= deadlines.expiry:
+        if now >= deadlines.expiry and not unread:
             self.dispatcher.expire(now)
         if now >= deadlines.health:
             self._enter(self.state, now)
@@ -210,7 +210,7 @@ class LineMachine:
         if now < self._quarantine:
             self._settle(now)
             return True
-        chosen = self._choice.next(now, now - self._strays.last_byte - self._leg.latency)
+        chosen = self._choice.next(now, self._strays.last_byte)
         if chosen is None:
             return False
         if type(chosen) is not tuple:

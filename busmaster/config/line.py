@@ -10,6 +10,7 @@ from typing import Any
 
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
+from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.config.names import expanded, listed
@@ -93,7 +94,7 @@ class ConfiguredLine:
             PlannedGroup(
                 group.name,
                 group.period,
-                [(point.node.planned(), point.command) for point in self._wanted[group.name]],
+                [(Node.of(point).planned(), point.command) for point in self._wanted[group.name]],
                 phase=group.phase,
                 priority=group.priority,
             )
@@ -111,10 +112,11 @@ class ConfiguredLine:
         with node.table.at():
             make: Callable[..., Handle] = node.kind.handle
             handle = make(self.bus, node.address, timings=node.timings, retries=node.retries, **options)
+            own = Node.of(handle)
             if node.reply_time is not None:
-                handle.node.record.reply_time = node.reply_time  # until it is measured
+                own.reply_time = node.reply_time  # until it is measured
             if not node.name.isdigit():
-                handle.node.record.label = node.name  # what messages and the screen call it
+                own.rename(node.name)  # what messages and the screen call it
         for point in node.points.values():
             with point.table.at(*(["item"] if "item" in point.table else [])):
                 handle.point(point.item)
@@ -125,7 +127,7 @@ class ConfiguredLine:
             with group.table.at("points", number):
                 for name in self._names(text):
                     point = self._point(*name)
-                    point.command.open(point.node.address, point.node.record.timings)
+                    point.command.open(point.node.address, Node.of(point).timings)
                     yield point
 
     def _names(self, text: str) -> Iterator[tuple[str, str]]:

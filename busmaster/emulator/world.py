@@ -12,7 +12,7 @@ from itertools import count
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Event, LineChanged, NodeChanged
+from busmaster.arbiter.events import Event, LineChanged, NodeChanged, Overdue
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.exchange import Command
@@ -180,6 +180,8 @@ def told(event: Event) -> str:
         case Transaction():
             outcome = event.value if event.error is None else repr(event.error)
             return f"{event.node.label}: {event.command} -> {outcome}"
+        case Overdue(transaction, error):
+            return f"{transaction.node.label}: {transaction.command} -> {error!r}"
         case LineChanged(change, cause):
             return f"line {change.value} {cause}".rstrip()
         case NodeChanged(node, before, after):

@@ -17,7 +17,7 @@ import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import DriverErrors
-from busmaster.arbiter.events import Event, Mark, Polled, Sampled
+from busmaster.arbiter.events import Event, Mark, Overdue, Polled, Sampled
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Transaction
@@ -58,7 +58,7 @@ class Pump(asyncio.Protocol):
         on_sample: Callable[[Poll, Transaction], None],
         on_cycle: Callable[[Poll], None],
         on_event: Callable[[Event], None],
-        on_written: Callable[[Transaction], None] = lambda _: None,
+        on_written: Callable[[Transaction, float], None] = lambda *_: None,
         paced: Callable[[asyncio.BaseTransport], bool] = lambda _: False,
         tap: Tap | None = None,
         name: str = "the port",
@@ -122,6 +122,8 @@ class Pump(asyncio.Protocol):
                 self._on_sample(event.poll, event.transaction)
             elif type(event) is Polled:
                 self._on_cycle(event.poll)
+            elif type(event) is Overdue:
+                self._give_up_on(event)
             else:
                 self._on_event(event)
         due = arbiter.poll_timeout()
@@ -204,7 +206,7 @@ class Pump(asyncio.Protocol):
         if self.tap is not None:
             self.tap.completed(transaction)
         if transaction.writes and transaction.attempts:
-            self._on_written(transaction)
+            self._on_written(transaction, transaction.ended_at)
         future = transaction.waiter
         if future is None or future.done():
             return
@@ -212,6 +214,15 @@ class Pump(asyncio.Protocol):
             future.set_result(transaction.value)
         else:
             future.set_exception(transaction.error)
+
+    def _give_up_on(self, late: Overdue) -> None:
+        """Its caller goes, the exchange stays: a write that is on the wire is over before anything else can be read."""
+        transaction = late.transaction
+        if transaction.writes:
+            self._on_written(transaction, self.clock())
+        future = transaction.waiter
+        if future is not None and not future.done():
+            future.set_exception(late.error)
 
     def _arm(self, due: float) -> None:
         if self._alarm is not None:
@@ -222,9 +233,12 @@ class Pump(asyncio.Protocol):
         self._armed = inf
         now = self.clock()
         unread = False
-        if self._port is not None and self.arbiter.line_due(now):
-            unread = self._port.unread()
-            self._check_output(now)
+        if self._port is not None:
+            line_due = self.arbiter.line_due(now)
+            if line_due or self.arbiter.answer_counts(now):
+                unread = self._port.unread()
+            if line_due:
+                self._check_output(now)
         self.arbiter.handle_timeout(now, unread=unread)
         self.turn()
 

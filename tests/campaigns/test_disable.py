@@ -14,6 +14,7 @@ import pytest
 
 from busmaster import Bus, BusError, MicroFlexDrive, Priority, WriteUnconfirmed
 from busmaster.arbiter.transaction import Transaction
+from busmaster.bus.node import Node
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
@@ -100,7 +101,7 @@ def trial(
             except BusError:
                 confirmed = False
             await asyncio.gather(write, return_exceptions=True)
-            request = DISABLE.open(1, drives[0].node.timings).request
+            request = DISABLE.open(1, Node.of(drives[0]).timings).request
             obeyed = not devices[0].command_word
             return Trial(sent.first(request, called) - called, bound, confirmed, obeyed)
 

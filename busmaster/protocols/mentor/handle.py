@@ -6,10 +6,11 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, Unpack
 
 from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
 from busmaster.bus.points import Point
+from busmaster.bus.requester import CommandOptions, NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
@@ -17,10 +18,6 @@ from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.mentor.codec import Read, ReadRun, Write, parse_parameter
-
-if TYPE_CHECKING:
-    from busmaster.bus.bus import Bus
-    from busmaster.bus.node import Node, Priority
 
 T = TypeVar("T")
 
@@ -46,7 +43,7 @@ class MentorDrive(Handle):
 
     def __init__(
         self,
-        bus: Bus,
+        bus: NodeSource,
         address: int,
         *,
         decimals: Mapping[str, int] | None = None,
@@ -54,9 +51,8 @@ class MentorDrive(Handle):
         timings: Timings | None = None,
         retries: int | None = None,
     ) -> None:
-        self.node: Node = bus.node(
-            mentor.CHAINED if chained else mentor.PROFILE, address, timings=timings, retries=retries
-        )
+        profile = mentor.CHAINED if chained else mentor.PROFILE
+        super().__init__(bus, address, timings=timings, retries=retries, profile=profile)
         self._decimals = {
             parse_parameter(text): whole_number(digits, 0, MOST_DECIMALS, f"the decimals of {text}")
             for text, digits in (decimals or {}).items()
@@ -98,23 +94,20 @@ class MentorDrive(Handle):
         decimals = tuple(self._decimals.get(parameter) for parameter in _parameters(run))
         return ScaledPoint(self.node, item, run, decode=lambda sent: self._values(run, sent), decimals=decimals)
 
-    async def read(
-        self,
-        parameter: str,
-        *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> float:
+    @classmethod
+    def items(cls) -> tuple[str, ...]:
+        return ()
+
+    async def read(self, parameter: str, **options: Unpack[ReadOptions]) -> float:
         """A parameter's value; a bit is 0 or 1. Raises NoSuchParameter, or InvalidCommand at address 0."""
         self._check_readable()
         menu, number = parse_parameter(parameter)
         command = Read(menu, number)
-        found = await self.node.request(command, priority=priority, start_within=start_within, retries=retries)
+        found = await self.node.request(command, **options)
         return from_line(found, self._decimals.get((menu, number)))
 
     async def read_run(
-        self, parameter: str, count: int, *, chain: bool = False, priority: Priority | None = None
+        self, parameter: str, count: int, *, chain: bool = False, **options: Unpack[ReadOptions]
     ) -> tuple[float, ...]:
         """`count` parameters of one menu, from `parameter` on.
 
@@ -126,9 +119,9 @@ class MentorDrive(Handle):
         menu, number = parse_parameter(parameter)
         run = ReadRun(menu, number, count)
         if chain:
-            return self._values(run, await self.node.request(run, priority=priority))
-        singles = [Read(menu, number + i) for i in range(count)]
-        return self._values(run, [await self.node.request(single, priority=priority) for single in singles])
+            return self._values(run, await self.node.request(run, **options))
+        requests = SeveralRequests(self.node, options)
+        return self._values(run, [await requests.request(Read(menu, number + i)) for i in range(count)])
 
     async def write(
         self,
@@ -137,10 +130,7 @@ class MentorDrive(Handle):
         *,
         wide: bool = False,
         high_resolution: bool = False,
-        verify: bool = False,
-        idempotent: bool = False,
-        priority: Priority | None = None,
-        start_within: float | None = None,
+        **options: Unpack[WriteOptions],
     ) -> None:
         """Write a parameter, acknowledged; at address 0 to all drives, which do not answer.
 
@@ -149,27 +139,33 @@ class MentorDrive(Handle):
         differs. Raises InvalidCommand, before anything is sent, for a value that does not fit.
         """
         menu, number = parse_parameter(parameter)
-        command = self._write(menu, number, value, wide=wide, high_resolution=high_resolution, idempotent=idempotent)
-        if verify:
+        command = self._write(menu, number, value, wide=wide, high_resolution=high_resolution)
+        requests = SeveralRequests(self.node, options)
+        if requests.verify:
             self._check_readable()
-        await self.node.request(command, priority=priority, start_within=start_within)
-        if verify:
+        await requests.request(command)
+        if requests.verify:
             check = Read(menu, number)
-            found = await self.node.request(check, priority=priority)
+            found = await requests.read_back(check)
             if abs(found * 10 - command.value) >= 10 if high_resolution else found != command.value:
                 raise VerifyFailed(
-                    f"{parameter} reads {found} after {command.text} was written",
-                    node=self.node.label,
-                    command=str(check),
+                    f"{parameter} reads {found} after {command.text} was written", node=self.node, command=str(check)
                 )
 
     async def write_all(
-        self, parameter: str, value: float, *, wide: bool = False, high_resolution: bool = False
+        self,
+        parameter: str,
+        value: float,
+        *,
+        wide: bool = False,
+        high_resolution: bool = False,
+        **options: Unpack[CommandOptions],
     ) -> None:
         """Write a parameter of every drive on the line at once (address 0). None answers."""
         menu, number = parse_parameter(parameter)
-        everyone = self.node.bus.node(mentor.PROFILE, 0)
-        await everyone.request(self._write(menu, number, value, wide=wide, high_resolution=high_resolution))
+        everyone = self.bus.node(mentor.PROFILE, 0)
+        command = self._write(menu, number, value, wide=wide, high_resolution=high_resolution)
+        await everyone.request(command, **options)
 
     async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
         """As `point(item).read()`; a run without `chain` parameter by parameter, which is always safe."""
@@ -195,12 +191,11 @@ class MentorDrive(Handle):
         *,
         wide: bool = False,
         high_resolution: bool = False,
-        idempotent: bool = False,
     ) -> Write:
         decimals = self._decimals.get((menu, number))
         if decimals is not None:
             decimals += high_resolution
-        return Write(menu, number, to_line(value, decimals), wide, high_resolution, idempotent)
+        return Write(menu, number, to_line(value, decimals), wide, high_resolution)
 
     def _values(self, run: ReadRun, sent: Sequence[int]) -> tuple[float, ...]:
         parameters = _parameters(run)
