@@ -89,8 +89,7 @@ class Reading(TelegramReader[float]):
     longest = LONGEST_NUMBER
     sizes: ClassVar[Sizes] = telegram_sizes(echo=2, typical=7, longest=LONGEST_NUMBER)
 
-    def parse(self, field: bytes) -> float:
-        return parse_number(field)
+    parse = staticmethod(parse_number)
 
 
 class Writing(AcknowledgeReader):
