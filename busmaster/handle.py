@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
+from busmaster.arguments import guess, is_decimal
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.points import Point
 from busmaster.profile import Profile
@@ -92,11 +92,6 @@ def encoder(point: Point[Any]) -> Callable[[Any], Command[None]]:
     return point.encode
 
 
-def is_decimal(text: str) -> bool:
-    """Return whether a text is a whole number without a sign, in digits as the command line takes them."""
-    return text.isascii() and text.isdigit()
-
-
 def item_text(item: str) -> str:
     """The item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
     if not isinstance(item, str):
@@ -106,6 +101,4 @@ def item_text(item: str) -> str:
 
 def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
     """The error for an item that does not exist: what would do, and the nearest name."""
-    near = difflib.get_close_matches(str(item), list(known), n=1)
-    guess = f"; did you mean {near[0]!r}?" if near else ""
-    return InvalidCommand(f"no such item {item!r}: use {form}{guess}")
+    return InvalidCommand(f"no such item {item!r}: use {form}{guess(str(item), known)}")

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import Any
 
+from busmaster.arguments import is_decimal, meant, nearest
 from busmaster.bus import Bus
 from busmaster.config.names import expanded, listed
 from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
-from busmaster.config.table import nearest
 from busmaster.errors import InvalidCommand
 from busmaster.handle import Handle
 from busmaster.outputs.fan import Fan
@@ -107,13 +106,13 @@ class ConfiguredLine:
     def _handle(self, node: NodeSection) -> Handle:
         options = dict(node.options)
         if node.kind.takes_decimals:
-            options["decimals"] = _decimals(node)
+            options["decimals"] = decimals_of(node)
         with node.table.at():
             make: Callable[..., Handle] = node.kind.handle
             handle = make(self.bus, node.address, timings=node.timings, retries=node.retries, **options)
             if node.reply_time is not None:
                 handle.node.record.reply_time = node.reply_time  # until it is measured
-            if not node.name.isdigit():
+            if not is_decimal(node.name):
                 handle.node.record.label = node.name  # what messages and the screen call it
         for point in node.points.values():
             with point.table.at(*(["item"] if "item" in point.table else [])):
@@ -135,7 +134,7 @@ class ConfiguredLine:
             raise InvalidCommand(f"a point is written NODE/ITEM, not {text!r}")
         for node in (name for part in listed(nodes) for name in expanded(part, self.nodes)):
             if node not in self.nodes:
-                raise InvalidCommand(f"no such node {node!r}; {nearest(node, self.nodes)}")
+                raise InvalidCommand(f"no such node {node!r}; {meant(node, self.nodes)}")
             section = self.file.nodes[node]
             known = {*section.points, *section.options.get("symbols", ())}
             for item in (name for part in listed(items) for name in expanded(part, known)):
@@ -180,14 +179,17 @@ def _known(handle: Handle, item: str, points: Iterable[str]) -> Point[Any]:
     try:
         return handle.point(item)
     except InvalidCommand:
-        near = difflib.get_close_matches(item, list(points), n=1)
+        near = nearest(item, points)
         if near:
-            raise InvalidCommand(f"no such item {item!r}: did you mean {near[0]!r}?") from None
+            raise InvalidCommand(f"no such item {item!r}: did you mean {near!r}?") from None
         raise
 
 
-def _decimals(node: NodeSection) -> dict[str, int]:
-    """Of each quantity the digits, where the handle rounds by them. What is behind a colon only says how it is sent."""
+def decimals_of(node: NodeSection) -> dict[str, int]:
+    """Return the digits of each quantity whose points have decimals, for a handle that scales or rounds by them.
+
+    What is behind a colon only says how it is sent.
+    """
     decimals: dict[str, int] = {}
     for point in node.points.values():
         parameter = point.item.partition(":")[0]

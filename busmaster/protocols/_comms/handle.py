@@ -6,9 +6,10 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, overload
 
+from busmaster.arguments import is_decimal
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command
-from busmaster.handle import Handle, Send, is_decimal, item_text, unknown_item
+from busmaster.handle import Handle, Send, item_text, unknown_item
 from busmaster.points import Point
 from busmaster.protocols._comms.codec import ReadElement, WriteElements, is_read_back, telegrams
 from busmaster.protocols._comms.elements import Element

@@ -5,8 +5,8 @@ from __future__ import annotations
 from busmaster.protocols.ct_ansi.capture import CtAnsiDialect
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
-from busmaster.protocols.mentor import CHAIN
-from busmaster.registry import NodeKind, Protocol, device_of
+from busmaster.protocols.mentor import CHAIN, EMULATED
+from busmaster.registry import NodeKind, Option, Protocol, device_of
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -18,6 +18,7 @@ PROTOCOL = Protocol(
             items="1.21 (menu and parameter), 1.21:8 (8 parameters from there on)",
             read_options=(CHAIN,),
             takes_decimals=True,
+            emulated=(*EMULATED, Option("plus", "flag"), Option("width", "whole")),
             capture_id=8,
         ),
     ),

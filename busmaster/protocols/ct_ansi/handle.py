@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from decimal import ROUND_HALF_UP, Decimal
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from busmaster.arguments import is_decimal
 from busmaster.errors import InvalidCommand, VerifyFailed
-from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.points import Point
 from busmaster.profile import Profile
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from busmaster.arguments import is_decimal
 from busmaster.errors import VerifyFailed
 from busmaster.exchange import Command, Timings
-from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.points import Point
 from busmaster.profile import Profile
 from busmaster.protocols.dc104 import codec as dc104

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from busmaster.protocols._comms import EMULATED
 from busmaster.protocols.hcp.capture import HcpDialect
 from busmaster.protocols.hcp.codec import PROFILE, Read, Write
 from busmaster.protocols.hcp.handle import HcpController
@@ -15,6 +16,7 @@ PROTOCOL = Protocol(
             HcpController,
             device_of("busmaster.protocols.hcp.device"),
             items="a comms element, 1 to 99",
+            emulated=EMULATED,
             capture_id=1,
         ),
     ),

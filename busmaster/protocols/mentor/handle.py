@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from busmaster.arguments import whole_number
+from busmaster.arguments import is_decimal, whole_number
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.exchange import Command, Timings
-from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.points import Point
 from busmaster.profile import Profile
 from busmaster.protocols.mentor import codec as mentor

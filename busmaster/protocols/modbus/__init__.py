@@ -5,7 +5,7 @@ from __future__ import annotations
 from busmaster.protocols.modbus.capture import ModbusDialect
 from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
 from busmaster.protocols.modbus.handle import ModbusUnit, is_whole
-from busmaster.registry import NodeKind, Protocol, device_of
+from busmaster.registry import NodeKind, Option, Protocol, device_of
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -18,6 +18,7 @@ PROTOCOL = Protocol(
             "from there on); holding:100:float32 (int16 uint16 int32 uint32 float32 float64, most significant word "
             "first; :swapped behind it for the other order)",
             whole_numbers=is_whole,
+            emulated=(Option("size", "whole"), Option("functions", "numbers"), Option("read_only", "numbers")),
             capture_id=7,
         ),
     ),

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from busmaster.arguments import is_decimal
 from busmaster.errors import InvalidCommand, VerifyFailed
-from busmaster.handle import Handle, Send, is_decimal, item_text, unknown_item
+from busmaster.handle import Handle, Send, item_text, unknown_item
 from busmaster.points import Point
 from busmaster.profile import Profile
 from busmaster.protocols.modbus.codec import (

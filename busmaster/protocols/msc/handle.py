@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
+from busmaster.arguments import is_decimal
 from busmaster.errors import InvalidCommand, Refused, VerifyFailed
 from busmaster.exchange import Command, Timings
-from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.node import Node, Priority
 from busmaster.points import Point
 from busmaster.profile import Profile
@@ -69,7 +70,7 @@ class MscController(Handle):
         self.symbols = dict(symbols or {})
         for name, symbol in self.symbols.items():
             DataRead(symbol)
-            if not name or name in self.items() or name.isdigit() or set(name) & set(":=, "):
+            if not name or name in self.items() or is_decimal(name) or set(name) & set(":=, "):
                 raise InvalidCommand(f"{name!r} cannot be the name of a symbol")
         known = Merging(address_step, model in MODELS_WITH_RFLAGS)
         profile = self.profile if known == Merging() else replace(self.profile, merge=known)
