@@ -14,8 +14,8 @@ from typing import Any, TextIO
 
 import click
 
-from busmaster.arguments import meant
 from busmaster.cli.ending import Ending
+from busmaster.contract.arguments import meant
 from busmaster.errors import BusError, InvalidCommand, NoReply
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130

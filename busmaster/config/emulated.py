@@ -5,15 +5,15 @@ from __future__ import annotations
 import random
 from dataclasses import replace
 
-from busmaster.arguments import guess
 from busmaster.config.line import decimals_of
 from busmaster.config.names import expanded
 from busmaster.config.points import Scale
 from busmaster.config.sections import LineFile, NodeSection, PointSection
+from busmaster.contract.arguments import guess
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Echo, Line
 from busmaster.errors import InvalidCommand
-from busmaster.profile import LineSettings
 from busmaster.registry import make_device
 from busmaster.transport.serial_port import SerialPort
 

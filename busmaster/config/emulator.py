@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from busmaster.arguments import meant
 from busmaster.config.names import expanded
 from busmaster.config.options import check_keys, read_delay, read_options
 from busmaster.config.table import Table
+from busmaster.contract.arguments import meant
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import NAMES, Faults
 from busmaster.registry import NodeKind

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator
 from typing import Any, Literal, TypeAlias, get_args
 
-from busmaster.arguments import meant
 from busmaster.config.table import Table
+from busmaster.contract.arguments import meant
 from busmaster.outputs.settings import (
     BUFFER,
     FileSettings,

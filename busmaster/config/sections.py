@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from busmaster.arbiter.transaction import Priority
-from busmaster.arguments import is_decimal
 from busmaster.config.emulator import EmulatorSection, read_emulator
 from busmaster.config.names import NODE_NAME, POINT_NAME, expanded
 from busmaster.config.options import check_keys, read_options
@@ -17,9 +16,10 @@ from busmaster.config.recording import Outputs, read_outputs
 from busmaster.config.source import Source
 from busmaster.config.table import Table
 from busmaster.config.timing import read_timings
+from busmaster.contract.arguments import is_decimal
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import Timings
-from busmaster.profile import Profile
 from busmaster.registry import NodeKind, find, kinds
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort

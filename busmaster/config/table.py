@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
-from busmaster.arguments import meant
 from busmaster.config.source import FileError, Key, Source
+from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
 
 T = TypeVar("T")

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from busmaster.emulator.device import Chance, Device
-from busmaster.profile import LineSettings
+from busmaster.contract.profile import LineSettings
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import Device
 
 IDLE = 1
 START = 0

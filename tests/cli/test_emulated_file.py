@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
+from busmaster.bus.samples import Sample
 from busmaster.cli.lines import other_port
 from busmaster.config import ConfiguredLine, load
-from busmaster.samples import Sample
 from busmaster.transport.serial_port import SerialPort
 from tests.cli.conftest import ROOT, started
 from tests.config.test_emulated import HEAD, VALUES

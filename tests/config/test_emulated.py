@@ -11,6 +11,7 @@ from busmaster.config import ConfiguredLine, FileError, emulated_line
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.emulator.device import Delay
+from busmaster.emulator.memory import MemoryPort
 from busmaster.protocols._comms import EMULATED
 from busmaster.protocols._comms.mint import PROGRAMS
 from busmaster.protocols.dc104.device import EmulatedDc104
@@ -18,7 +19,6 @@ from busmaster.protocols.mentor.device import EmulatedMentor
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import NodeKind, Option, kinds, make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
-from busmaster.transport.memory import MemoryPort
 
 HEAD = 'port = "socket://127.0.0.1:5020?baudrate=57600"\n'
 

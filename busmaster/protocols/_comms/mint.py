@@ -6,7 +6,7 @@ import struct
 from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
-from busmaster.arguments import is_decimal
+from busmaster.contract.arguments import is_decimal
 from busmaster.emulator.device import NEVER, Delay, held
 from busmaster.emulator.motion import Axis, Motion
 from busmaster.emulator.oracle import Oracle

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from busmaster.arguments import is_decimal
+from busmaster.contract.arguments import is_decimal
 from busmaster.emulator.device import NEVER, Delay, held
 from busmaster.emulator.motion import Ramp
 from busmaster.emulator.oracle import Oracle

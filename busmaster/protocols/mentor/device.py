@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from busmaster.emulator.device import NAK, Chance, Delay, Device, held
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import NAK, Delay, Device, held
 from busmaster.emulator.motion import Ramp
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand

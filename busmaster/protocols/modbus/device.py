@@ -11,7 +11,8 @@ import struct
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from busmaster.emulator.device import NEVER, Chance, Delay, Device, held
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import NEVER, Delay, Device, held
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from busmaster.arguments import is_decimal
-from busmaster.emulator.device import NAK, NEVER, Chance, Delay, Device, held
+from busmaster.contract.arguments import is_decimal
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import NAK, NEVER, Delay, Device, held
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import sum16

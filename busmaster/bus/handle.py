@@ -1,0 +1,105 @@
+"""What every handle shares: a node, and points by name."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+
+from busmaster.bus.points import Point
+from busmaster.contract.arguments import guess, is_decimal
+from busmaster.contract.profile import Profile
+from busmaster.errors import InvalidCommand, VerifyFailed
+
+if TYPE_CHECKING:
+    from busmaster.bus.bus import Bus
+    from busmaster.contract.exchange import Command
+    from busmaster.contract.timing import Timings
+
+Send: TypeAlias = Callable[[], Awaitable[None]]
+"""Sends what was prepared."""
+
+
+class Handle:
+    """An awaitable handle of one node: thin and typed, over `Node.request`.
+
+    Raises InvalidCommand for an address that the protocol does not have. Handles of one protocol and address share the
+    node, whatever their kind (a controller and a drive that speak alike): what one leaves out, of timings, retries and
+    options of the protocol, is as the first said, and anything else than that raises InvalidCommand. Another protocol
+    at the same address is another node.
+    """
+
+    profile: ClassVar[Profile]
+
+    def __init__(self, bus: Bus, address: int, *, timings: Timings | None = None, retries: int | None = None) -> None:
+        self.node = bus.node(self.profile, address, timings=timings, retries=retries)
+
+    def point(self, item: str) -> Point[Any]:
+        """The point that ITEM names on the command line. Raises InvalidCommand for one that does not exist."""
+        raise NotImplementedError
+
+    @classmethod
+    def items(cls) -> tuple[str, ...]:
+        """The names (not the numbers) that `point` knows."""
+        return ()
+
+    @classmethod
+    def names_of_items(cls) -> Mapping[str, str]:
+        """Return the names of those items that have one, by what a listener reads from the line."""
+        return {}
+
+    # what ITEM and VALUE mean where a person writes them
+
+    async def read_item(self, item: str, **options: Any) -> Any:
+        """Read what ITEM names on the command line, in the way that is best for a single reading."""
+        return await self.point(item).read()
+
+    def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
+        """Return what writes the values to ITEM and those after it, once it is sure that all of them can be sent.
+
+        With `verify` they are read back, and VerifyFailed is raised where they differ. Raises InvalidCommand.
+        """
+        names = self.run_items(item, len(values)) if len(values) > 1 else (item,)
+        return [self.prepare_one(name, value, verify) for name, value in zip(names, values, strict=True)]
+
+    def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
+        """Return what writes one value to ITEM. Raises InvalidCommand for one that cannot be sent."""
+        point = self.point(item)
+        encoder(point)(value)
+
+        async def send() -> None:
+            await point.write(value)
+            if verify and (found := await point.read()) != value:
+                raise VerifyFailed(f"{item} reads {found!r} after {value!r} was written", node=self.node.label)
+
+        return send
+
+    def run_items(self, item: str, count: int) -> tuple[str, ...]:
+        """Return what each of `count` values from ITEM on is called: 1.17, 1.18, ... Raises InvalidCommand."""
+        first, colon, kind = item.partition(":")
+        suffix = f":{kind}" if colon and not is_decimal(kind) else ""
+        menu, dot, number = first.rpartition(".")
+        if not is_decimal(number):
+            raise InvalidCommand(f"several values begin at a number, not at {item!r}")
+        return tuple(f"{menu}{dot}{int(number) + i:0{len(number)}d}{suffix}" for i in range(count))
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.node.label}>"
+
+
+def encoder(point: Point[Any]) -> Callable[[Any], Command[None]]:
+    """Return what makes the command that writes a value. Raises InvalidCommand for a point that is read-only."""
+    if point.encode is None:
+        raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
+    return point.encode
+
+
+def item_text(item: str) -> str:
+    """The item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
+    if not isinstance(item, str):
+        raise InvalidCommand(f"an item is text, such as {str(item)!r}, not {item!r}")
+    return item
+
+
+def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
+    """The error for an item that does not exist: what would do, and the nearest name."""
+    return InvalidCommand(f"no such item {item!r}: use {form}{guess(str(item), known)}")

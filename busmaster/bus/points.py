@@ -1,0 +1,96 @@
+"""Points: the named readable, perhaps writable, quantities of a node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import inf
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from busmaster.contract.arguments import seconds
+from busmaster.contract.exchange import Command
+from busmaster.errors import GarbledReply, InvalidCommand
+
+if TYPE_CHECKING:
+    from busmaster.bus.node import Node, Priority
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Point(Generic[T]):
+    """One quantity of one node: how it is read, what its value means, and how it is written if it may be.
+
+    `item` names it as the command line does ("axis0.position", "1.17"); `command` is the exchange behind it;
+    `decode` makes its value of what the command returns (a number into an IntFlag, a scaled integer into a
+    float); `encode` builds the write command of a value and raises InvalidCommand for one out of range.
+    Two points are equal if node, item and command are, so a point may be made anew each time it is asked for.
+    """
+
+    node: Node
+    item: str
+    command: Command[Any]
+    unit: str = field(default="", compare=False)
+    decode: Callable[[Any], T] | None = field(default=None, compare=False, repr=False)
+    encode: Callable[[T], Command[None]] | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def key(self) -> str:
+        """ "5/axis0.position": node and item, as JSON output names a sample."""
+        return f"{self.node.address}/{self.item}"
+
+    @property
+    def quantity(self) -> tuple[Node, Command[Any]]:
+        """What it reads, by whatever name: a write to one point makes every point of its quantity stale."""
+        return self.node, self.command
+
+    def value_of(self, raw: Any) -> T:
+        """The value that stands for what its command returned. Raises GarbledReply for what means nothing."""
+        if self.decode is None:
+            value: T = raw
+            return value
+        try:
+            return self.decode(raw)
+        except Exception as bad:  # a decoder may be the application's own
+            raise GarbledReply(
+                f"{raw!r} is no value of {self.item}: {bad}", node=self.node.label, command=str(self.command)
+            ) from bad
+
+    @property
+    def writable(self) -> bool:
+        return self.encode is not None
+
+    async def read(
+        self,
+        *,
+        max_age: float | None = None,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+    ) -> T:
+        """Its value now, or, with `max_age` in seconds, a poll group's latest sample if that is young enough."""
+        if max_age is not None:
+            if max_age != inf:
+                max_age = seconds(max_age, f"{self.node.label}: max_age")
+            sample = self.node.bus.latest(self)
+            if sample is not None and sample.error is None and sample.age(self.node.bus.now()) <= max_age:
+                value: T = sample.value
+                return value
+        return self.value_of(
+            await self.node.request(self.command, priority=priority, start_within=start_within, retries=retries)
+        )
+
+    async def write(
+        self,
+        value: T,
+        *,
+        priority: Priority | None = None,
+        start_within: float | None = None,
+        retries: int | None = None,
+    ) -> None:
+        """Raises InvalidCommand, before anything is sent, if it is read-only or the value cannot be sent."""
+        if self.encode is None:
+            raise InvalidCommand(f"{self.node.label}: {self.item} is read-only")
+        await self.node.request(
+            self.encode(value), priority=priority, start_within=start_within, retries=retries, touches=self
+        )

@@ -1,0 +1,223 @@
+"""The contract between the protocols and the arbiter.
+
+A `Command` is an immutable value ("read element 100"). For each attempt it opens a fresh `Exchange`: the bytes to
+send and a reader for what comes back. The arbiter owns the clock and the line; an exchange owns only its frame.
+
+One exchange has one or more *legs*: something is said by the host, something is awaited. Most protocols need one.
+MSC needs two (ACK, then the packet) and more when a packet must be sent again.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeAlias, TypeVar
+
+from busmaster.contract.timing import ReplyTiming, Timings
+from busmaster.errors import Refused
+
+T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Sizes:
+    """Bytes of one reply leg: `typical` for planning, `longest` for the published bounds."""
+
+    typical: int
+    longest: int
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """One later leg of an undisturbed exchange, for planning: what the host says first, then what is awaited."""
+
+    timing: ReplyTiming
+    sizes: Sizes
+    sent: int = 0
+
+
+class Need(enum.Enum):
+    """`MORE`: not a whole frame yet; the byte gap is re-armed."""
+
+    MORE = "more"
+
+
+MORE = Need.MORE
+
+
+@dataclass(slots=True)
+class Expect:
+    """This leg is over and another follows: MSC's packet after its ACK, a NAKed packet sent again.
+
+    The arbiter sends `send`, then calls `feed(b"")` at once, for bytes that came in the same chunk.
+    """
+
+    timing: ReplyTiming
+    sizes: Sizes
+    send: bytes = b""
+
+
+@dataclass(slots=True)
+class Done(Generic[T_co]):
+    """The reply is complete.
+
+    `rest` is what came after the reply: those bytes are strays and the line settles. `send` is the host's closing ACK
+    (MSC): the line is free when it has left.
+    """
+
+    value: T_co
+    rest: bytes = b""
+    send: bytes = b""
+
+
+Step: TypeAlias = Need | Expect | Done[T_co]
+
+
+class FrameError(Exception):
+    """This is no reply: the attempt failed. Never reaches a caller.
+
+    `whole` is True only for a whole frame with the right echo and a bad checksum: its reply has begun, so the line
+    need not wait for stragglers, only for silence (R3). `send` is a closing ACK owed to the device all the same
+    (MSC), else it retransmits into other exchanges. `heard` is all that came in place of the reply, where it may be
+    another request's: it pays what is owed (R15).
+    """
+
+    def __init__(self, what: str, *, whole: bool = False, send: bytes = b"", heard: bytes = b"") -> None:
+        super().__init__(what)
+        self.what = what
+        self.whole = whole
+        self.send = send
+        self.heard = heard
+
+
+class Exchange(Protocol[T_co]):
+    """One attempt at one command: the bytes to send and a reader for what comes back. Fresh per attempt."""
+
+    @property
+    def request(self) -> bytes: ...
+
+    @property
+    def timing(self) -> ReplyTiming:
+        """Of the first leg."""
+        ...
+
+    @property
+    def sizes(self) -> Sizes:
+        """Of the first reply leg."""
+        ...
+
+    @property
+    def later(self) -> Sequence[Leg]:
+        """The legs after the first, when nothing goes wrong. Empty for most protocols."""
+        ...
+
+    @property
+    def closing(self) -> int:
+        """Bytes of the host's closing ACK. 0 for most protocols."""
+        ...
+
+    @property
+    def starts(self) -> bytes:
+        """The legal first bytes of the first reply leg; anything else is a FrameError."""
+        ...
+
+    @property
+    def answers(self) -> tuple[bytes, ...]:
+        """What its good replies begin with, or are where they are one byte: one for each reply that decides.
+
+        Two exchanges that share one could be taken for each other (R15). Empty for a broadcast.
+        """
+        ...
+
+    @property
+    def owed(self) -> tuple[bytes, ...]:
+        """What its node may still say if the attempt ends now, unheard: of the same kind as `answers` (R15)."""
+        ...
+
+    @property
+    def answered(self) -> bool:
+        """False for a broadcast: no reply will come, and `expired(False)` is called when the line is free again."""
+        ...
+
+    def feed(self, data: bytes, /) -> Step[T_co]:
+        """Take the next bytes of the line. Raises FrameError or Refused; anything else is a bug."""
+        ...
+
+    def expired(self, started: bool, /) -> Expect | Done[T_co]:
+        """The window (`started` False) or a byte gap (True) ran out.
+
+        Raises FrameError to fail the attempt, or returns Expect (NAK a cut packet) or Done (a broadcast).
+        """
+        ...
+
+
+class Abandonable(Protocol):
+    """An exchange that can be ended where it would say something again: needed where a profile has an
+    `exchange_limit` (R9)."""
+
+    def abandon(self) -> FrameError | Refused:
+        """What to fail the attempt with in place of the last Expect's `send`, which is then not sent.
+
+        A FrameError's own `send` leaves the node with nothing unacknowledged.
+        """
+        ...
+
+
+class Command(Protocol[T_co]):
+    """What to ask of a node: an immutable, hashable value, checked when it is built (InvalidCommand).
+
+    Encoding cannot fail. `str(command)` is how messages name it: "read element 100".
+    """
+
+    @property
+    def writes(self) -> bool:
+        """True if it changes the node: then it is never retried unasked, and never overtakes another write."""
+        ...
+
+    @property
+    def idempotent(self) -> bool:
+        """It may be repeated without asking the caller: reads yes; Comms writes no; levels (a reference) yes."""
+        ...
+
+    def open(self, address: int, timings: Timings, /) -> Exchange[T_co]: ...
+
+
+class Listener(Protocol):
+    """A reader for what arrives while nothing is asked (MSC: a stale packet is ACKed and dropped)."""
+
+    def feed(self, data: bytes, /) -> Need | Done[None]:
+        """Raises FrameError for what cannot be a stale packet; its `send` is honoured too."""
+        ...
+
+    def expired(self) -> Done[None]:
+        """A byte gap ran out in mid-frame."""
+        ...
+
+
+NO_REPLY = "no reply"
+
+
+def no_reply() -> FrameError:
+    """The one failure that every exchange shares: the window ran out before a byte came."""
+    return FrameError(NO_REPLY)
+
+
+__all__ = [
+    "MORE",
+    "NO_REPLY",
+    "Abandonable",
+    "Command",
+    "Done",
+    "Exchange",
+    "Expect",
+    "FrameError",
+    "Leg",
+    "Listener",
+    "Need",
+    "Refused",
+    "Sizes",
+    "Step",
+    "no_reply",
+]

@@ -1,0 +1,100 @@
+"""What a protocol says of itself, as data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from busmaster.contract.exchange import Command, Listener
+from busmaster.contract.timing import Timings
+from busmaster.errors import InvalidCommand
+
+START_BIT = 1
+
+
+@dataclass(frozen=True, slots=True)
+class LineSettings:
+    """Baud rate and framing of a line."""
+
+    baudrate: int
+    bytesize: int = 8
+    parity: str = "N"
+    stopbits: float = 1
+
+    def __post_init__(self) -> None:
+        rate: object = self.baudrate
+        if not isinstance(rate, int) or isinstance(rate, bool) or rate <= 0:
+            raise InvalidCommand(f"baudrate must be a whole number above 0, not {rate!r}")
+        if self.bytesize not in (5, 6, 7, 8) or self.parity not in tuple("NEOMS") or self.stopbits not in (1, 1.5, 2):
+            raise InvalidCommand(
+                f"no such framing: {self.bytesize}{self.parity}{self.stopbits:g}; use for example 8N1 or 7E1"
+            )
+
+    @property
+    def byte_time(self) -> float:
+        """tau: seconds per byte on the wire."""
+        bits = START_BIT + self.bytesize + (self.parity != "N") + self.stopbits
+        return bits / self.baudrate
+
+    @property
+    def framing(self) -> str:
+        return f"{self.bytesize}{self.parity}{self.stopbits:g}"
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """A cheaper exchange that serves several commands.
+
+    `command` returns a sequence with one value for each index in `serves`, in that order.
+    """
+
+    command: Command[Sequence[Any]]
+    serves: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What the arbiter, the planner and the handles need to know of a protocol.
+
+    `probe` is its cheapest read, asked of a node that may be dead. `merge` proposes cheaper exchanges for commands of
+    one node; a poll group and the planner weigh them by line time. `listen` reads what arrives while nothing is
+    asked. `checks` are further cheap reads that harm no node and whose answers differ: where an answer could be
+    another request's, one of those is asked that cannot be (R15); a node that refuses one is asked another.
+    `exchange_limit` bounds one exchange as a whole, in seconds (MSC: past it a bad packet is ACKed away); its
+    exchanges are `Abandonable`.
+    """
+
+    name: str
+    title: str
+    addresses: Sequence[int]
+    """In rising order."""
+    line: LineSettings
+    timings: Timings
+    probe: Command[Any]
+    checks: Sequence[Command[Any]] = ()
+    broadcast: int | None = None
+    addressed: bool = True
+    retries: int = 2
+    noise_tolerant: bool = False
+    exchange_limit: float | None = None
+    listen: Callable[[], Listener] | None = field(default=None, compare=False)
+    merge: Callable[[Sequence[Command[Any]]], Sequence[Batch]] | None = field(default=None, compare=False)
+
+    def label(self, address: int) -> str:
+        """How messages name a node: "node 5", or "the drive" where the protocol has no address."""
+        return f"node {address}" if self.addressed else "the drive"
+
+    def check_address(self, address: int) -> None:
+        """Raises InvalidCommand unless `address` is a node's, or the broadcast, address."""
+        if isinstance(address, bool) or not isinstance(address, int):
+            raise InvalidCommand(f"{self.name}: an address is a whole number, not {address!r}")
+        if address in self.addresses or address == self.broadcast:
+            return
+        lowest, highest = self.addresses[0], self.addresses[-1]
+        gaps = [str(gap) for gap in range(lowest, highest) if gap not in self.addresses]
+        raise InvalidCommand(
+            f"{self.name}: address {address} does not exist; use {lowest} to {highest}"
+            + (f" without {', '.join(gaps)}" if gaps else "")
+            + ("" if self.broadcast is None else f", or {self.broadcast} to write to all")
+        )

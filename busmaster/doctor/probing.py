@@ -1,0 +1,257 @@
+"""Asking nodes with the raw bytes in sight: what the arbiter discards while it settles is what a doctor wants to see.
+
+One request at a time and nobody else on the port, so no arbiter is needed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import enum
+from collections import Counter, deque
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import anyio
+
+from busmaster.arbiter.echo import Echo
+from busmaster.arbiter.events import Mark
+from busmaster.contract.exchange import Command, Done, Exchange, Expect, FrameError
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import ReplyTiming, Timings
+from busmaster.errors import LineDown, Refused
+from busmaster.outputs.values import value_text
+from busmaster.transport.clock import clock_of
+from busmaster.transport.endpoints import Endpoint, is_paced
+from busmaster.transport.kernel import OpenPort, open_port
+from busmaster.transport.pump import Tap
+
+QUIET = 0.02
+"""Seconds of silence, at least, after which nothing more is expected."""
+BABBLE = 1.0
+"""Seconds after which a line that does not fall silent is left alone."""
+MUCH = 16384
+"""Bytes after which it is as well: more than comes in that time at any usual rate."""
+
+
+class Wire(asyncio.Protocol):
+    """An open port: bytes go out, and come in with the time at which they came, in seconds of `clock`."""
+
+    def __init__(self, endpoint: Endpoint, tap: Tap | None) -> None:
+        self.clock = clock_of(asyncio.get_running_loop())
+        self.latency = endpoint.receive_latency
+        self.paced = False
+        self.transport: asyncio.Transport | None = None
+        self.port: OpenPort | None = None
+        self.marked: Counter[Mark] = Counter()
+        self.closed = anyio.Event()
+        self._tap = tap
+        self._cause: Exception | None = None
+        self._chunks: deque[tuple[float, bytes]] = deque()
+        self._arrived = anyio.Event()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self.transport = transport
+        self.port = open_port(transport)
+
+    def byte_marked(self, byte: bytes, mark: Mark) -> None:
+        """What is damaged is heard all the same: whoever looks for what is wrong wants to see it."""
+        self.marked[mark] += 1
+        self.data_received(byte)
+
+    def data_received(self, data: bytes) -> None:
+        now = self.clock()
+        if self._tap is not None:
+            self._tap.received(now, data)
+        self._chunks.append((now, data))
+        self._arrived.set()
+
+    def connection_lost(self, cause: Exception | None) -> None:
+        self._cause = cause
+        self.closed.set()
+        self._arrived.set()
+
+    def say(self, data: bytes) -> float:
+        """Returns when it was handed to the port. Raises LineDown if that is gone."""
+        if self.transport is None or self.closed.is_set():
+            raise self._loss()
+        self.transport.write(data)
+        now = self.clock()
+        if self._tap is not None:
+            self._tap.transmitted(now, data)
+        return now
+
+    async def hear(self, until: float) -> tuple[float, bytes] | None:
+        """The next bytes and their time; None if nothing has come by `until`. Raises LineDown if the port is lost."""
+        while not self._chunks:
+            if self.closed.is_set():
+                raise self._loss()
+            left = until - self.clock()
+            if left <= 0:
+                return None
+            self._arrived = anyio.Event()
+            with anyio.move_on_after(left):
+                await self._arrived.wait()
+        return self._chunks.popleft()
+
+    async def hear_all(self, within: float, quiet: float = QUIET) -> bytes:
+        """What begins to come `within` so many seconds, up to a silence of `quiet` seconds.
+
+        Of what does not fall silent, BABBLE seconds or MUCH.
+        """
+        heard = b""
+        until = self.clock() + within
+        end = until + BABBLE
+        while len(heard) < MUCH and (chunk := await self.hear(min(until, end))) is not None:
+            heard += chunk[1]
+            until = chunk[0] + quiet
+        return heard
+
+    def _loss(self) -> LineDown:
+        cause = self._cause
+        what = cause.what if isinstance(cause, LineDown) else str(cause or "it was closed by the other end")
+        return LineDown(what, hint="start again when it is back")
+
+
+@asynccontextmanager
+async def opened(endpoint: Endpoint, tap: Tap | None = None) -> AsyncIterator[Wire]:
+    """The port, until the end of the block. Raises LineDown."""
+    wire = Wire(endpoint, tap)
+    transport = await endpoint.open(lambda: wire)
+    wire.paced = is_paced(endpoint, transport)
+    try:
+        yield wire
+    finally:
+        transport.close()
+        with anyio.CancelScope(shield=True):
+            await wire.closed.wait()
+
+
+class Outcome(enum.Enum):
+    """What came of a request. A refusal is an answer."""
+
+    ANSWERED = "answered"
+    SILENT = "silent"
+    GARBLED = "garbled"
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """One request and what was heard of it, without an echo.
+
+    `start`: seconds from the request's end on the wire to the first byte, None if there was none. `text` is the command
+    and its value or refusal, or what was wrong. `again`: bytes that came after the reply, to which nobody was entitled.
+    """
+
+    outcome: Outcome
+    start: float | None = None
+    text: str = ""
+    raw: bytes = b""
+    again: bytes = b""
+
+
+class Prober:
+    """Asks a protocol's cheapest read. `byte_time` in seconds; `echo`: what is sent is received too."""
+
+    def __init__(self, wire: Wire, profile: Profile, timings: Timings, byte_time: float, echo: bool) -> None:
+        self._wire = wire
+        self._profile = profile
+        self._timings = timings
+        self.byte_time = byte_time
+        self._echo = Echo(echo)
+
+    async def ask(self, address: int, *, patience: float | None = None, alone: bool = False) -> Probe:
+        """`patience`: seconds to wait for the first byte, the lateness by default. Raises LineDown.
+
+        `alone`: whatever still comes within the lateness is this node's doing, and not left for the next request.
+        """
+        exchange: Exchange[Any] = self._profile.probe.open(address, self._timings)
+        self._echo.forget()
+        end = self._say(exchange.request)
+        wait = exchange.timing.lateness if patience is None else patience
+        attempt = _Attempt(self._profile.probe, exchange, end)
+        until = end + wait + self._wire.latency
+        while (chunk := await self._wire.hear(until)) is not None:
+            data = self._echo.strip(chunk[1])
+            if data is None:
+                attempt.fail("what came back differs from what was sent: a collision", chunk[1])
+            elif data:
+                until = attempt.take(chunk[0], data, self._say) + self._wire.latency
+            if attempt.over:
+                break
+        rest = b""
+        if attempt.start is not None:
+            rest = await self._wire.hear_all(wait if alone else max(QUIET, exchange.timing.byte_gap))
+        return attempt.probe(self._echo.strip(rest) or b"")
+
+    def _say(self, data: bytes) -> float:
+        """Returns when it will have left: at once, where nobody knows how long it takes."""
+        self._echo.sent(data)
+        return self._wire.say(data) + (len(data) * self.byte_time if self._wire.paced else 0.0)
+
+
+class _Attempt:
+    """What an exchange makes of the bytes that come."""
+
+    def __init__(self, command: Command[Any], exchange: Exchange[Any], end: float) -> None:
+        self.start: float | None = None
+        self.over = False
+        self._command = command
+        self._exchange = exchange
+        self._timing: ReplyTiming = exchange.timing
+        self._end = end
+        self._raw = b""
+        self._outcome = Outcome.GARBLED
+        self._text = "cut short"
+        self._again = b""
+
+    def take(self, now: float, data: bytes, say: Callable[[bytes], float]) -> float:
+        """Returns until when to wait for more."""
+        self._hear(now, data)
+        wait = self._timing.byte_gap
+        try:
+            step = self._exchange.feed(data)
+            while isinstance(step, Expect):
+                self._timing = step.timing
+                wait = step.timing.lateness
+                if step.send:
+                    now = say(step.send)
+                step = self._exchange.feed(b"")
+        except FrameError as error:
+            if error.send:
+                say(error.send)
+            self._finish(Outcome.GARBLED, error.what)
+        except Refused as refusal:
+            self._finish(Outcome.ANSWERED, f"{self._command}: {refusal.what}")
+        else:
+            if isinstance(step, Done):
+                if step.send:
+                    say(step.send)
+                self._again = step.rest
+                self._finish(Outcome.ANSWERED, f"{self._command}: {value_text(step.value)}")
+        return now + wait
+
+    def fail(self, what: str, data: bytes) -> None:
+        self._hear(self._end, data)
+        self._finish(Outcome.GARBLED, what)
+
+    def probe(self, rest: bytes) -> Probe:
+        """`rest` came after all was over."""
+        if self.start is None:
+            return Probe(Outcome.SILENT)
+        again = self._again + rest
+        if self._outcome is Outcome.GARBLED:
+            return Probe(self._outcome, self.start, self._text, self._raw + again)
+        return Probe(self._outcome, self.start, self._text, self._raw, again)
+
+    def _hear(self, now: float, data: bytes) -> None:
+        if self.start is None:
+            self.start = now - self._end
+        self._raw += data
+
+    def _finish(self, outcome: Outcome, text: str) -> None:
+        self.over = True
+        self._outcome = outcome
+        self._text = text

@@ -1,0 +1,141 @@
+"""An emulated line in this process: bytes that take their time, without a port."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+from busmaster.contract.profile import LineSettings
+from busmaster.emulator.line import Line
+from busmaster.transport.clock import clock_of
+from busmaster.transport.identity import Identity
+
+
+@dataclass(frozen=True, slots=True)
+class MemoryPort:
+    """The host's end of an emulated line; one host at a time.
+
+    In real time, replies arrive up to a millisecond late (the loop rounds its timers up); under a loop that keeps
+    virtual time they are exact.
+    """
+
+    line: Line
+
+    @property
+    def name(self) -> str:
+        return "the emulated line"
+
+    @property
+    def settings(self) -> LineSettings:
+        return self.line.settings
+
+    @property
+    def echo(self) -> bool:
+        return self.line.echo is not None
+
+    @property
+    def receive_latency(self) -> float:
+        return self.line.latency
+
+    @property
+    def paced(self) -> bool:
+        return self.line.paced
+
+    def presence(self) -> None:
+        """It never goes away."""
+        return None
+
+    async def open(
+        self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
+    ) -> MemoryTransport:
+        """Never fails."""
+        return MemoryTransport(asyncio.get_running_loop(), protocol_factory(), self.line)
+
+
+class MemoryTransport(asyncio.Transport):
+    """Sends to the line at once, and gives the protocol what the line has for it when it is due."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, protocol: asyncio.Protocol, line: Line) -> None:
+        super().__init__()
+        self._loop = loop
+        self._clock = clock_of(loop)
+        self._protocol = protocol
+        self._line = line
+        self._closing = False
+        self._held: bytes | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._armed = inf
+        line.prompt = True
+        line.receive(self._clock())  # what was said to nobody
+        protocol.connection_made(self)
+        self._arm(line.next_event())
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        """`line` is the emulated line."""
+        return self._line if name == "line" else default
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Never waits, unless it is held: the line takes everything, and sends it byte by byte."""
+        if self._closing:
+            return
+        if self._held is None:
+            self._line.send(bytes(data), self._clock())
+            self._arm(self._line.next_event())
+            return
+        self._held += bytes(data)
+        self._protocol.pause_writing()
+
+    def get_write_buffer_size(self) -> int:
+        """What is held."""
+        return len(self._held or b"")
+
+    def hold(self) -> None:
+        """As if flow control stopped the port: what is written waits."""
+        if self._held is None:
+            self._held = b""
+
+    def release(self) -> None:
+        """Let what waited leave now."""
+        held, self._held = self._held, None
+        if held and not self._closing:
+            self.write(held)
+            self._protocol.resume_writing()
+
+    def is_closing(self) -> bool:
+        return self._closing
+
+    def close(self) -> None:
+        self.lose(None)
+
+    def abort(self) -> None:
+        self.lose(None)
+
+    def lose(self, cause: Exception | None) -> None:
+        """As if the port were unplugged: the protocol is told at the next turn of the loop, once."""
+        if self._closing:
+            return
+        self._closing = True
+        if self._timer is not None:
+            self._timer.cancel()
+        self._loop.call_soon(self._protocol.connection_lost, cause)
+
+    def _arm(self, due: float) -> None:
+        """One timer, left alone if it comes sooner."""
+        if due >= self._armed or self._closing:
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._armed = due
+        self._timer = self._loop.call_at(self._loop.time() + max(0.0, due - self._clock()), self._on_time)
+
+    def _on_time(self) -> None:
+        self._timer = None
+        self._armed = inf
+        now = self._clock()
+        data = self._line.receive(now)
+        if data:
+            self._protocol.data_received(data)
+        self._arm(self._line.next_event())

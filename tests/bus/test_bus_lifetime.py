@@ -1,0 +1,210 @@
+"""A bus is opened once and closed once, whatever happens to whoever does it."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+import anyio
+import pytest
+from anyio.from_thread import start_blocking_portal
+
+from busmaster.bus.bus import Bus
+from busmaster.bus.polling import PollGroup
+from busmaster.contract.profile import LineSettings
+from busmaster.emulator.device import Delay
+from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
+from busmaster.errors import BusClosed, InvalidCommand
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.testing.virtual_time import run_in_virtual_time
+
+
+def slow_bus() -> Bus:
+    """On a line whose one controller takes 80 ms to answer."""
+    line = Line(LineSettings(57600), [EmulatedMint(1, delay=Delay(0.080))], chance=random.Random(1))
+    return Bus(MemoryPort(line), seed=1)
+
+
+def test_a_bus_that_was_closed_is_not_opened_again() -> None:
+    async def story() -> None:
+        bus = slow_bus()
+        async with bus:
+            axis = Hcp2Controller(bus, 1)
+        with pytest.raises(BusClosed):
+            async with bus:
+                pass
+        with pytest.raises(BusClosed):
+            bus.poll_group("late", period=1.0, points=[axis.point("1")])
+        with pytest.raises(BusClosed):
+            bus.events()
+
+    run_in_virtual_time(story())
+
+
+def test_a_bus_that_is_being_closed_takes_nothing_new() -> None:
+    async def story() -> None:
+        bus = slow_bus()
+        await bus.__aenter__()
+        axis = Hcp2Controller(bus, 1)
+        await axis.read(1)
+        reading = asyncio.create_task(axis.read(1))
+        await asyncio.sleep(0.01)
+        closing = asyncio.create_task(bus.__aexit__(None, None, None))
+        await asyncio.sleep(0.01)
+        assert not closing.done()
+        with pytest.raises(BusClosed, match="the bus was closed"):
+            await axis.read(2)
+        with pytest.raises(BusClosed, match="the bus was closed"):
+            bus.poll_group("late", period=1.0, points=[axis.element(1)])
+        await closing
+        assert await reading == 0.0
+
+    run_in_virtual_time(story())
+
+
+def test_closing_ends_even_if_whoever_closes_is_cancelled_meanwhile() -> None:
+    """The exchange on the wire may run out, for 80 ms; the owner's patience ends within them."""
+
+    async def story() -> None:
+        bus = slow_bus()
+
+        async def own() -> None:
+            async with bus:
+                reading = asyncio.create_task(Hcp2Controller(bus, 1).read(1))
+                await asyncio.sleep(0.5)
+                reading.cancel()
+                following = asyncio.create_task(Hcp2Controller(bus, 1).read(1))
+                await asyncio.sleep(0.01)
+                following.cancel()
+
+        owner = asyncio.create_task(own())
+        await asyncio.sleep(0.52)
+        owner.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await owner
+        assert not bus.running
+        await asyncio.sleep(0)
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+
+    run_in_virtual_time(story())
+
+
+def test_a_closed_bus_sets_no_timer() -> None:
+    async def story() -> None:
+        async with slow_bus() as bus:
+            dead = Hcp2Controller(bus, 9)
+            bus.poll_group("dead", period=0.5, points=[dead.point("1")])
+            await asyncio.sleep(3.0)
+        dead.node.suspend(5.0)
+        with pytest.raises(RuntimeError, match="no timer is set"):
+            await asyncio.Event().wait()
+
+    with pytest.raises(RuntimeError, match="no timer is set"):
+        run_in_virtual_time(story())
+
+
+def test_a_bus_that_was_not_entered_says_so_and_is_entered_once() -> None:
+    async def story() -> None:
+        bus = slow_bus()
+        axis = Hcp2Controller(bus, 1)
+        for use in (axis.read(1), axis.write(1, 2.0), axis.node.timed_request(hcp2.Read(1)), axis.node.request(READ)):
+            with pytest.raises(BusClosed, match=r"node 1: the bus is not open .*; use the bus inside `async with`"):
+                await use
+        with pytest.raises(BusClosed, match="the bus is not open"):
+            bus.poll_group("early", period=1.0, points=[axis.element(1)])
+        async with bus:
+            with pytest.raises(InvalidCommand, match="the bus on the emulated line is open already: enter it once"):
+                await bus.__aenter__()
+            assert await axis.read(1) == 0.0
+        with pytest.raises(BusClosed, match=r"node 1: the bus was closed .*; make a new Bus"):
+            await axis.read(1)
+
+    run_in_virtual_time(story())
+
+
+READ = hcp2.Read(1)
+USES: dict[str, Callable[[Hcp2Controller, PollGroup], Any]] = {
+    "a request": lambda axis, _: axis.read(1),
+    "a write": lambda axis, _: axis.write(1, 2.0),
+    "a point": lambda axis, _: axis.element(1).read(),
+    "a timed request": lambda axis, _: axis.node.timed_request(READ),
+    "a probe": lambda axis, _: axis.node.probe(),
+    "a node's statistics": lambda axis, _: axis.node.statistics(),
+    "suspend": lambda axis, _: axis.node.suspend(1.0),
+    "a new node": lambda axis, _: Hcp2Controller(axis.node.bus, 2),
+    "a new group": lambda axis, _: axis.node.bus.poll_group("other", period=1.0, points=[]),
+    "a group's points": lambda axis, group: group.add(axis.element(2)),
+    "a group's statistics": lambda _, group: group.statistics(),
+    "demand": lambda _, group: group.demand(),
+    "subscribe": lambda _, group: group.subscribe(),
+    "close": lambda _, group: group.close(),
+    "statistics": lambda axis, _: axis.node.bus.statistics(),
+    "resetting statistics": lambda axis, _: axis.node.bus.reset_statistics(),
+    "plan": lambda axis, _: axis.node.bus.plan(),
+    "the longest wait": lambda axis, _: axis.node.bus.worst_case_wait(),
+    "events": lambda axis, _: axis.node.bus.events(),
+    "leaving": lambda axis, _: axis.node.bus.__aexit__(None, None, None),
+}
+
+
+def in_a_loop_of_its_own(name: str, use: Callable[[], Any]) -> None:
+    """What `asyncio.run` in another thread does with a bus of this one."""
+
+    async def main() -> None:
+        found = use()
+        if asyncio.iscoroutine(found):
+            await found
+
+    asyncio.run(main())
+    pytest.fail(f"{name} was let pass")
+
+
+def test_a_bus_used_from_another_thread_says_at_once_what_to_do_instead() -> None:
+    with start_blocking_portal() as portal, portal.wrap_async_context_manager(slow_bus()) as bus:
+        axis = portal.call(Hcp2Controller, bus, 1)
+        group = portal.call(lambda: bus.poll_group("group", period=100.0, phase=50.0, points=[axis.element(1)]))
+        for name, use in USES.items():
+            with pytest.raises(InvalidCommand, match=r"used from thread .* hand the call to that loop, with portal"):
+                in_a_loop_of_its_own(name, partial(use, axis, group))
+        assert portal.call(bus.statistics).exchanges == 0
+        assert portal.call(axis.read, 1) == 0.0
+
+
+def test_without_any_loop_it_says_so_too_and_what_it_advises_works() -> None:
+    async def story() -> None:
+        async with slow_bus() as bus:
+            axis, loop = Hcp2Controller(bus, 1), asyncio.get_running_loop()
+
+            def other_thread() -> float:
+                with pytest.raises(InvalidCommand, match=threading.current_thread().name):
+                    bus.statistics()
+                with pytest.raises(InvalidCommand, match="run_coroutine_threadsafe"):
+                    axis.read(1).send(None)
+                return asyncio.run_coroutine_threadsafe(axis.read(1), loop).result(10.0)
+
+            with ThreadPoolExecutor(1) as threads:
+                assert await loop.run_in_executor(threads, other_thread) == 0.0
+            assert await anyio.to_thread.run_sync(lambda: anyio.from_thread.run(axis.read, 1)) == 0.0
+
+    asyncio.run(story())
+
+
+def test_another_loop_of_the_same_thread_is_told_so_and_a_loop_that_pauses_is_not() -> None:
+    first, second = asyncio.new_event_loop(), asyncio.new_event_loop()
+    bus = slow_bus()
+    first.run_until_complete(bus.__aenter__())
+    axis = Hcp2Controller(bus, 1)
+    with pytest.raises(InvalidCommand, match="outside the event loop that opened it"):
+        second.run_until_complete(axis.read(1))
+    assert first.run_until_complete(axis.read(1)) == 0.0
+    first.run_until_complete(bus.__aexit__(None, None, None))
+    first.close()
+    second.close()

@@ -1,0 +1,75 @@
+"""Logs speak on state changes only, rate-limited (R14)."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from busmaster.arbiter.events import (
+    LatenessLowered,
+    LatenessRaised,
+    LineChange,
+    LineChanged,
+    NodeChanged,
+    PortFailed,
+    Strayed,
+)
+from busmaster.arbiter.health import Health
+from busmaster.bus.logbook import PAUSE, Logbook
+from tests.arbiter.bench import Bench
+
+
+@pytest.fixture
+def lines(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
+    caplog.set_level(logging.INFO, "busmaster")
+    return caplog
+
+
+def test_r14_a_node_that_goes_down_is_a_warning_with_its_port(lines: pytest.LogCaptureFixture) -> None:
+    Logbook("/dev/line").note(NodeChanged(Bench().node(5), Health.SUSPECT, Health.DOWN), 0.0)
+    assert [(r.levelname, r.message) for r in lines.records] == [("WARNING", "/dev/line: node 5 is down (was suspect)")]
+
+
+def test_r14_what_happens_again_and_again_is_one_line_with_a_count(lines: pytest.LogCaptureFixture) -> None:
+    logbook = Logbook("line")
+    for second in range(25):
+        logbook.note(LineChanged(LineChange.NOISY), float(second))
+    assert lines.messages[1:] == ["line: the line is noisy (9 more since the last such line)"] * 2
+    assert len(lines.messages) == 3
+
+
+def test_r14_each_node_is_limited_by_itself(lines: pytest.LogCaptureFixture) -> None:
+    logbook, bench = Logbook("line"), Bench()
+    for address in (1, 2, 3):
+        logbook.note(NodeChanged(bench.node(address), Health.UP, Health.DOWN), 0.0)
+    assert len(lines.messages) == 3
+
+
+def test_r14_strays_are_counted_and_not_logged_but_a_collision_is(lines: pytest.LogCaptureFixture) -> None:
+    logbook = Logbook("line")
+    logbook.note(Strayed(b"\x15"), 0.0)
+    logbook.note(Strayed(b"\x07\x31", collision=True), 0.0)
+    assert lines.messages == ["line: the echo differs from what was sent: a collision (07 31)"]
+
+
+def test_r14_a_raised_lateness_names_node_and_times(lines: pytest.LogCaptureFixture) -> None:
+    Logbook("line").note(LatenessRaised(Bench().node(3), 0.14, 0.224), PAUSE)
+    assert lines.messages == ["line: node 3 answered 140 ms after its request: its lateness is now 224 ms"]
+
+
+def test_r14_a_lateness_that_comes_down_again_names_node_and_time(lines: pytest.LogCaptureFixture) -> None:
+    Logbook("line").note(LatenessLowered(Bench().node(3), 0.15), PAUSE)
+    assert lines.messages == ["line: node 3 has been prompt for an hour: its lateness is 150 ms again"]
+
+
+def test_r13_a_failed_attempt_is_logged_with_what_to_try_and_a_bug_with_where(lines: pytest.LogCaptureFixture) -> None:
+    logbook = Logbook("line")
+    logbook.note(PortFailed("line is in use by gpsd", "end that first"), 0.0)
+    logbook.note(PortFailed("line is in use by gpsd", "end that first"), 1.0)
+    logbook.note(PortFailed("cannot open line: ValueError: odd", bug=ValueError("odd")), 2.0)
+    assert lines.messages == [
+        "line: cannot reconnect: line is in use by gpsd; end that first",
+        "line: cannot reconnect: cannot open line: ValueError: odd",
+    ]
+    assert [record.exc_info is None for record in lines.records] == [True, False]

@@ -1,0 +1,403 @@
+"""Poll groups in virtual time: what consumers get, what a write makes stale, what is merged."""
+
+from __future__ import annotations
+
+import asyncio
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from busmaster.bus.bus import Bus
+from busmaster.bus.points import Point
+from busmaster.bus.polling import Quality
+from busmaster.contract.profile import LineSettings
+from busmaster.emulator.device import Delay
+from busmaster.errors import GarbledReply, NoReply, Refused
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.mentor.device import EmulatedMentor
+from busmaster.protocols.mentor.handle import MentorDrive as MentorHandle
+from busmaster.protocols.msc.device import EmulatedMsc
+from busmaster.protocols.msc.handle import MscController
+from tests.stories import cycles, on_a_bus
+
+# consumers
+
+
+def test_two_consumers_of_a_group_cost_one_wire_read() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        group = bus.poll_group("g", period=0.1, points=[point])
+        first, second = await asyncio.gather(cycles(group, 5), cycles(group, 5))
+        assert [s.cycle for s in first] == [s.cycle for s in second]
+        assert point.node.statistics().attempts == first[-1].cycle
+
+    on_a_bus(story)
+
+
+def test_a_slow_consumer_loses_the_oldest_and_knows_how_many() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")])
+        slow = group.subscribe(buffer=3)
+        await cycles(group, 10)
+        assert slow.dropped == 7
+        assert [(await anext(slow)).cycle for _ in range(3)] == [8, 9, 10]
+
+    on_a_bus(story)
+
+
+def test_r10_snapshots_come_on_the_grid_and_say_when_they_were_due() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")])
+        snapshots = await cycles(group, 6)
+        assert [b.due - a.due for a, b in pairwise(snapshots)] == pytest.approx([0.1] * 5)
+        assert all(s.started is not None and s.started - s.due < 0.001 for s in snapshots[1:])
+
+    on_a_bus(story)
+
+
+def test_points_come_and_go_while_it_runs() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        group = bus.poll_group("g", period=0.1, points=[axis.point("7")])
+        await cycles(group, 2)
+        group.add(axis.point("8"), axis.point("7"))
+        assert set((await cycles(group, 2))[-1]) == {axis.point("7"), axis.point("8")}
+        group.remove(axis.point("7"))
+        assert set((await cycles(group, 2))[-1]) == {axis.point("8")}
+
+    on_a_bus(story)
+
+
+def test_a_pause_and_a_demand() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=10.0, points=[Hcp2Controller(bus, 1).point("7")])
+        await cycles(group, 1)
+        asked = bus.now()
+        group.demand()
+        assert (await cycles(group, 1))[0].due == asked
+        group.pause()
+        await asyncio.sleep(35.0)
+        assert group.statistics().cycles == 2
+        group.resume()
+        snapshot = (await cycles(group, 1))[0]
+        assert snapshot.missed == 0
+        assert snapshot.due - asked > 35.0
+
+    on_a_bus(story)
+
+
+def test_statistics_say_what_was_asked_and_what_was_had() -> None:
+    async def story(bus: Bus) -> None:
+        points = [Hcp2Controller(bus, address).point("7") for address in (1, 2)]
+        group = bus.poll_group("g", period=0.1, points=points)
+        await cycles(group, 21)
+        counts = group.statistics()
+        assert (counts.cycles, counts.missed, counts.good, counts.bad) == (21, 0, 42, 0)
+        assert counts.period == 0.1
+        assert counts.achieved == pytest.approx(0.1, rel=0.01)
+        assert counts.cycle_time.count == 21
+        assert counts.cycle_time.p50 == pytest.approx(0.009, abs=0.002)
+        bus.reset_statistics()
+        assert group.statistics().cycles == 0
+        assert (await cycles(group, 2))[-1].cycle == 23
+        assert group.statistics().good == 4
+
+    on_a_bus(story)
+
+
+def test_a_sample_says_what_it_waited_for() -> None:
+    """Node 2 is dead: its failed request, and the settle after it, is what the poll waited for."""
+
+    async def story(bus: Bus) -> None:
+        dead = bus.node(hcp2.PROFILE, 9)
+        group = bus.poll_group("g", period=0.5, points=[Hcp2Controller(bus, 1).point("7")])
+        due = (await cycles(group, 2))[-1].due + 0.5
+        await asyncio.sleep(due - bus.now() - 0.010)
+        with pytest.raises(NoReply):
+            await dead.request(hcp2.Read(1), retries=0)
+        sample = (await cycles(group, 1))[0][Hcp2Controller(bus, 1).point("7")]
+        assert sample.due == pytest.approx(due)
+        assert sample.started is not None
+        assert sample.started - sample.due == pytest.approx(0.150 - 0.010, abs=0.002)
+        assert sample.timeline.exchanges_ahead == 1
+        assert sample.timeline.settling_ahead == pytest.approx(0.050, abs=0.001)
+        assert group.statistics().exchanges_ahead > 0
+        assert group.statistics().settling_ahead > 0
+
+    on_a_bus(story)
+
+
+# stale
+
+
+def test_a_sample_read_before_a_write_to_its_point_ended_is_stale() -> None:
+    """The write goes between two reads of one cycle: what was read before it is marked, what comes after is not."""
+
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        before, after, other = axis.point("1"), axis.point("99"), Hcp2Controller(bus, 2).point("1")
+        between = [axis.point(str(element)) for element in range(10, 30)]
+        group = bus.poll_group("g", period=1.0, points=[before, other, *between, after])
+        await cycles(group, 1)
+        group.demand()
+        await asyncio.sleep(0.030)
+        await before.write(5.0)
+        await after.write(6.0)
+        snapshot = (await cycles(group, 1))[0]
+        assert snapshot[before].quality is Quality.STALE
+        assert snapshot[before].value == 0.0
+        assert snapshot[after].quality is Quality.GOOD
+        assert snapshot[after].value == 6.0
+        assert snapshot[other].quality is Quality.GOOD
+        assert group.statistics().stale == 1
+        fresh = (await cycles(group, 1))[0]
+        assert (fresh[before].value, fresh[before].quality) == (5.0, Quality.GOOD)
+
+    on_a_bus(story)
+
+
+def test_a_write_that_names_no_point_makes_all_of_its_node_stale() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        mine, other = [axis.point(str(e)) for e in range(1, 20)], Hcp2Controller(bus, 2).point("1")
+        group = bus.poll_group("g", period=1.0, points=[other, *mine])
+        await cycles(group, 1)
+        group.demand()
+        await asyncio.sleep(0.040)
+        await axis.node.request(hcp2.Write(50, (1.0,)))
+        snapshot = (await cycles(group, 1))[0]
+        assert snapshot[other].quality is Quality.GOOD
+        assert snapshot[mine[0]].quality is Quality.STALE
+        assert snapshot[mine[-1]].quality is Quality.GOOD
+
+    on_a_bus(story)
+
+
+def test_a_read_that_starts_as_the_write_ends_is_not_stale() -> None:
+    """It starts in the same moment, before the writer has even woken up."""
+
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("1")
+        group = bus.poll_group("g", period=1.0, points=[point])
+        await cycles(group, 1)
+        writing = asyncio.create_task(point.write(5.0))
+        await asyncio.sleep(0)
+        group.demand()
+        sample = (await cycles(group, 1))[0][point]
+        await writing
+        assert (sample.value, sample.quality) == (5.0, Quality.GOOD)
+        assert sample.timeline.exchanges_ahead == 1
+
+    on_a_bus(story)
+
+
+def test_a_write_whose_caller_gave_up_on_the_wire_makes_stale_too() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("1")
+        group = bus.poll_group("g", period=1.0, points=[point])
+        await cycles(group, 1)
+        writing = asyncio.create_task(point.write(5.0))
+        await asyncio.sleep(0)
+        assert bus.latest(point) is not None
+        writing.cancel()
+        await asyncio.sleep(0)
+        assert bus.latest(point) is None
+
+    on_a_bus(story)
+
+
+def test_a_write_that_was_never_sent_makes_nothing_stale() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        point = axis.point("1")
+        group = bus.poll_group("g", period=1.0, points=[point])
+        await cycles(group, 1)
+        reading = asyncio.create_task(axis.read(9))
+        await asyncio.sleep(0)
+        writing = asyncio.create_task(point.write(5.0))
+        await asyncio.sleep(0)
+        writing.cancel()
+        await reading
+        assert bus.latest(point) is not None
+
+    on_a_bus(story)
+
+
+def test_a_broadcast_makes_every_drive_stale() -> None:
+    async def story(bus: Bus) -> None:
+        point = MentorHandle(bus, 11).point("1.17")
+        group = bus.poll_group("g", period=5.0, points=[point])
+        await cycles(group, 1)
+        assert bus.latest(point) is not None
+        await bus.node(mentor.PROFILE, 0).request(mentor.Write(1, 17, 100))
+        assert bus.latest(point) is None
+
+    on_a_bus(story, EmulatedMentor(11), settings=mentor.PROFILE.line)
+
+
+def test_reading_with_a_greatest_age_takes_the_polled_sample_until_a_write_makes_it_stale() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("1")
+        group = bus.poll_group("g", period=1.0, points=[point])
+        await cycles(group, 1)
+        asked = point.node.statistics().attempts
+        assert await point.read(max_age=0.5) == 0.0
+        assert point.node.statistics().attempts == asked
+        await point.write(5.0)
+        assert await point.read(max_age=0.5) == 5.0
+        await asyncio.sleep(0.6)
+        await point.read(max_age=0.5)
+        assert point.node.statistics().attempts == asked + 3
+
+    on_a_bus(story)
+
+
+# cheaper exchanges
+
+
+def mscs(values: int = 40, **options: Any) -> tuple[EmulatedMsc, LineSettings]:
+    """An MSC with values from 100 up at the addresses from 2000 on."""
+    device = EmulatedMsc(3, delay=Delay(0.005), packet_delay=Delay(0.005), **options)
+    device.set_value(2000, *range(100, 100 + values))
+    return device, LineSettings(9600)
+
+
+def test_neighbouring_values_come_in_one_exchange_and_points_stay_what_they_are() -> None:
+    async def story(bus: Bus) -> None:
+        press = MscController(bus, 3, address_step=4, model="MSC-250")
+        points = [press.point(str(2000 + 4 * n)) for n in range(8)]
+        flags = [press.point(f"flag:{n}") for n in (3, 5)]
+        group = bus.poll_group("g", period=1.0, points=[*points, *flags])
+        snapshot = (await cycles(group, 1))[0]
+        assert [snapshot[point].value for point in points] == [100 + n for n in range(8)]
+        assert [snapshot[flag].value for flag in flags] == [True, False]
+        assert press.node.statistics().attempts == 2
+        merged = bus.plan().groups[0].merged
+        assert [m.serves for m in merged] == [8, 2]
+
+    device, settings = mscs()
+    device.flags.add(3)
+    on_a_bus(story, device, settings=settings)
+
+
+def test_what_is_merged_is_weighed_again_when_reply_times_are_known() -> None:
+    """Three values: one block while replies are thought to be slow, three reads when they turn out to be quick."""
+
+    async def story(bus: Bus) -> None:
+        press = MscController(bus, 3, address_step=4)
+        group = bus.poll_group("g", period=1.0, points=[press.point(str(2000 + 4 * n)) for n in range(3)])
+        assert bus.plan().groups[0].exchanges == 1
+        await cycles(group, 9)
+        assert press.node.statistics().attempts == 8 + 3
+        assert bus.plan().groups[0].exchanges == 3
+
+    device, settings = mscs()
+    on_a_bus(story, device, settings=settings)
+
+
+def test_a_refused_batch_falls_back_to_single_reads_in_the_same_period() -> None:
+    """The block would reach past the last address that exists: the controller says NAK, and no snapshot shows it."""
+
+    async def story(bus: Bus) -> None:
+        press = MscController(bus, 3, address_step=4)
+        points = [press.point(str(2000 + 4 * n)) for n in range(6)]
+        group = bus.poll_group("g", period=4.0, points=points)
+        started = bus.now()
+        snapshots = await cycles(group, 3)
+        assert [[s[point].value for point in points] for s in snapshots] == [[100 + n for n in range(6)]] * 3
+        assert snapshots[0].finished - started < 4.0
+        assert bus.plan().groups[0].merged == ()
+
+    device, settings = mscs(values=6, addresses=2024)
+    on_a_bus(story, device, settings=settings)
+
+
+def test_a_refused_value_that_stands_alone_is_refused() -> None:
+    async def story(bus: Bus) -> None:
+        press = MscController(bus, 3, address_step=4)
+        point = press.point("60000")
+        group = bus.poll_group("g", period=4.0, points=[point])
+        assert isinstance((await cycles(group, 1))[0][point].error, Refused)
+
+    device, settings = mscs()
+    on_a_bus(story, device, settings=settings)
+
+
+def test_runs_of_parameters_are_chained_only_by_those_who_opt_in() -> None:
+    async def story(bus: Bus) -> None:
+        drive = MentorHandle(bus, 11)
+        points = [drive.point(f"1.{number}") for number in (17, 18, 19)]
+        single = bus.poll_group("single", period=1.0, points=points)
+        chained = bus.poll_group("chained", period=1.0, points=points, merge=[mentor.merge_runs])
+        first, second = await asyncio.gather(cycles(single, 2), cycles(chained, 2))
+        assert [first[1][p].value for p in points] == [second[1][p].value for p in points]
+        one, other = bus.plan().groups
+        assert (one.exchanges, other.exchanges) == (3, 1)
+        assert other.merged[0].saved > 0
+
+    on_a_bus(story, EmulatedMentor(11), settings=mentor.PROFILE.line)
+
+
+# points of one quantity, made by several hands
+
+
+def test_a_write_makes_the_same_quantity_stale_by_whatever_name_it_is_polled() -> None:
+    async def story(bus: Bus) -> None:
+        drive = MentorHandle(bus, 11)
+        polled = [drive.point("1.17"), drive.point("01.17"), drive.point("1.17:hires")]
+        other = drive.point("1.18")
+        group = bus.poll_group("g", period=5.0, points=[*polled, other])
+        await cycles(group, 1)
+        await drive.point("1.17:wide").write(7)
+        assert [bus.latest(point) for point in polled] == [None] * 3
+        assert bus.latest(other) is not None
+
+    on_a_bus(story, EmulatedMentor(11), settings=mentor.PROFILE.line)
+
+
+def test_two_handles_that_scale_a_parameter_differently_have_different_points() -> None:
+    async def story(bus: Bus) -> None:
+        raw, scaled = MentorHandle(bus, 11), MentorHandle(bus, 11, decimals={"1.17": 1})
+        await raw.write("1.17", 476)
+        items = ("1.17", "1.17:2")
+        points = [handle.point(item) for item in items for handle in (raw, scaled)]
+        group = bus.poll_group("g", period=1.0, points=points)
+        snapshot = (await cycles(group, 1))[0]
+        assert [snapshot[point].value for point in points[:2]] == [476, 47.6]
+        assert [snapshot[point].value[0] for point in points[2:]] == [476, 47.6]
+        assert await scaled.point("1.17").read(max_age=1.0) == 47.6
+        assert MentorHandle(bus, 11, decimals={"1.17": 1}).point("1.17") == points[1]
+
+    on_a_bus(story, EmulatedMentor(11), settings=mentor.PROFILE.line)
+
+
+# values that mean nothing
+
+
+def test_a_value_that_cannot_be_decoded_is_an_error_of_its_point_alone() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        good = axis.point("7")
+        bad = Point(axis.node, "colour", hcp2.Read(7), decode={1.0: "red"}.__getitem__)
+        group = bus.poll_group("g", period=0.1, points=[good, bad])
+        snapshot = (await cycles(group, 2))[-1]
+        assert snapshot[good].value == 0.0
+        assert (snapshot[bad].value, snapshot[bad].quality) == (None, Quality.BAD)
+        assert isinstance(snapshot[bad].error, GarbledReply)
+        assert bus.statistics().losses == 0
+        with pytest.raises(GarbledReply, match="colour"):
+            await bad.read()
+
+    on_a_bus(story)
+
+
+def test_two_tasks_may_share_a_stream() -> None:
+    async def story(bus: Bus) -> None:
+        stream = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")]).subscribe()
+        first, second = await asyncio.gather(anext(stream), anext(stream))
+        assert {first.cycle, second.cycle} == {1, 2}
+
+    on_a_bus(story)

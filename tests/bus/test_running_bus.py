@@ -1,0 +1,226 @@
+"""A bus that runs, in virtual time: its plan, its bounds, and dead nodes as an application sees them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from dataclasses import replace
+
+import pytest
+
+from busmaster.arbiter.events import Event, NodeChanged
+from busmaster.arbiter.health import Health
+from busmaster.arbiter.schedule import line_time
+from busmaster.bus.bus import Bus
+from busmaster.bus.node import Node, Priority
+from busmaster.bus.polling import PollGroup
+from busmaster.emulator.device import Delay
+from busmaster.errors import BusError, InvalidCommand, NodeDown, NoReply
+from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from tests.stories import cycles, on_a_bus
+
+# plans and bounds of the running bus
+
+
+def test_the_plan_of_a_running_bus_is_what_it_does() -> None:
+    """With reply times as measured, whatever the values' lengths: within 2 percentage points."""
+
+    async def story(bus: Bus) -> None:
+        axes = [Hcp2Controller(bus, address) for address in (1, 2)]
+        for period in (0.2, 0.5):
+            bus.poll_group(f"{period}", period=period, points=[a.point(str(e)) for a in axes for e in range(1, 6)])
+        await asyncio.sleep(5.0)
+        bus.reset_statistics()
+        await asyncio.sleep(20.0)
+        prediction = bus.plan()
+        assert bus.statistics().utilisation == pytest.approx(prediction.utilisation, abs=0.02)
+        assert prediction.fits
+        for group, planned in zip(bus.groups, prediction.groups, strict=True):
+            assert group.statistics().cycle_time.mean == pytest.approx(planned.cycle, rel=0.1)
+            assert group.statistics().cycle_time.highest <= planned.worst_cycle
+
+    devices = [EmulatedMint(address, delay=Delay(0.001, 0.009)) for address in (1, 2)]
+    devices[0].comms = [-1234567.8912] * 100
+    on_a_bus(story, *devices)
+
+
+def test_a_plan_of_what_might_be_added() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        group = bus.poll_group("now", period=0.1, points=[axis.point("1")])
+        await cycles(group, 10)
+        greedy = PollGroup(
+            bus,
+            "greedy",
+            0.05,
+            [axis.point(str(e)) for e in range(1, 40)],
+            phase=None,
+            priority=Priority.POLL,
+            merge=(),
+        )
+        assert bus.plan().fits
+        assert not bus.plan(greedy.planned()).fits
+
+    on_a_bus(story)
+
+
+def test_r9_the_worst_case_wait_of_the_line_at_hand() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        await axis.read(1)
+        hold = bus.worst_case_wait(Priority.COMMAND) / (1 + 4 + 3)  # with three exchanges before each (R15)
+        reading = [asyncio.create_task(axis.read(e)) for e in range(1, 10)]
+        await asyncio.sleep(0)
+        assert bus.worst_case_wait(Priority.COMMAND) == pytest.approx(hold * (1 + 4 * (8 + 2) + 3))
+        assert bus.worst_case_wait(Priority.URGENT) == pytest.approx(hold)
+        await asyncio.gather(*reading)
+        group = bus.poll_group("g", period=0.5, points=[axis.point(str(e)) for e in range(1, 5)])
+        await cycles(group, 1)
+        assert bus.worst_case_wait(Priority.POLL) == pytest.approx(0.5 + 4 * 8 * 5 * hold)
+        with pytest.raises(NoReply):
+            await bus.node(hcp2.PROFILE, 9).request(hcp2.Read(1), retries=0)
+        assert bus.worst_case_wait(Priority.POLL) == pytest.approx(0.5 + 4 * 16 * 5 * hold)
+
+    on_a_bus(story)
+
+
+# dead nodes, seen by an application
+
+
+def test_r11_the_hook_of_a_node_that_returns_runs_before_its_polls_and_health_is_told() -> None:
+    device = EmulatedMint(1)
+
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        order: list[str] = []
+
+        async def restore(node: Node) -> None:
+            order.append("hook begins")
+            await asyncio.sleep(1.0)
+            await point.write(42.0)
+            order.append("hook ends")
+
+        point.node.on_return = restore
+        health = bus.events()
+        group = bus.poll_group("g", period=0.1, points=[point])
+        await cycles(group, 3)
+        device.faults.dead = 1.0
+        await asyncio.sleep(10.0)
+        assert isinstance(group.latest[point].error if group.latest else None, NodeDown)
+        device.faults.dead = 0.0
+        async for snapshot in group:
+            if snapshot[point].error is None:
+                break
+        order.append("polled")
+        assert snapshot[point].value == 42.0
+        assert order == ["hook begins", "hook ends", "polled"]
+        assert [h async for h in until_back(health)] == [Health.UP, Health.SUSPECT, Health.DOWN, Health.UP]
+
+    on_a_bus(story, device)
+
+
+def test_r11_a_node_that_returns_again_while_its_hook_runs_gets_another_run_after_it() -> None:
+    device = EmulatedMint(1)
+
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        order: list[str] = []
+
+        async def restore(node: Node) -> None:
+            order.append("begins")
+            await asyncio.sleep(20.0)
+            order.append("ends")
+
+        point.node.on_return = restore
+        group = bus.poll_group("g", period=0.5, points=[point])
+        await cycles(group, 3)
+
+        async def wait_for(health: Health) -> None:
+            while point.node.health is not health:
+                await cycles(group, 1)
+                with contextlib.suppress(BusError):
+                    await point.read()
+
+        for _ in range(2):
+            device.faults.dead = 1.0
+            await wait_for(Health.DOWN)
+            device.faults.dead = 0.0
+            await wait_for(Health.UP)
+        assert order == ["begins"]
+        while (await cycles(group, 1))[0][point].error is not None:
+            pass
+        assert order == ["begins", "ends", "begins", "ends"]
+
+    on_a_bus(story, device)
+
+
+async def until_back(events: AsyncIterator[Event]) -> AsyncIterator[Health]:
+    """The changes of health up to a return from DOWN."""
+    async for event in events:
+        if isinstance(event, NodeChanged):
+            yield event.after
+            if event.before is Health.DOWN:
+                return
+
+
+def test_a_suspended_node_rests_and_comes_back_by_itself() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        group = bus.poll_group("g", period=0.1, points=[point])
+        await cycles(group, 1)
+        point.node.suspend(for_=2.0)
+        with pytest.raises(NodeDown, match="suspended"):
+            await point.read()
+        assert isinstance((await cycles(group, 3))[-1][point].error, NodeDown)
+        await asyncio.sleep(2.0)
+        assert (await cycles(group, 1))[0][point].error is None
+
+    on_a_bus(story)
+
+
+def test_what_a_cycle_takes_is_a_guess_until_it_is_measured() -> None:
+    """The phases of groups that are added later rest on it."""
+
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        group = bus.poll_group("g", period=0.1, points=[axis.point("1")])
+        guessed = group.poll.cost
+        await cycles(group, 5)
+        bus.poll_group("h", period=0.1, points=[axis.point("2")])
+        read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
+        assert guessed == pytest.approx(line_time(read, bus.byte_time))
+        assert group.poll.cost == pytest.approx(0.002 + (8 + 6) * bus.byte_time, abs=0.0005)
+
+    on_a_bus(story)
+
+
+def test_a_refused_probe_of_a_suspect_is_an_answer_and_a_request_that_was_not_sent_is_none() -> None:
+    async def story(bus: Bus) -> None:
+        node = Hcp2Controller(bus, 1).node
+        await node.request(hcp2.Read(1))
+        assert await node.probe()
+        node.suspend(10.0)
+        assert not await node.probe()
+        node.suspend(0.0)
+        node.record.health = Health.SUSPECT
+        node.record.profile = replace(hcp2.PROFILE, probe=hcp2.Read(105))
+        node.record.failures = 1
+        node.record.failed_at = bus.now()
+        assert await node.probe()
+
+    on_a_bus(story, EmulatedMint(1, axes=0, refuse_reserved=True))
+
+
+def test_a_second_handle_with_the_same_timings_is_welcome_after_lateness_was_raised() -> None:
+    async def story(bus: Bus) -> None:
+        timings = hcp2.PROFILE.timings.with_window(0.12)
+        first = Hcp2Controller(bus, 1, timings=timings)
+        first.node.record.timings = timings.with_lateness(0.3)
+        assert Hcp2Controller(bus, 1, timings=timings).node is first.node
+        with pytest.raises(InvalidCommand, match="other timings"):
+            Hcp2Controller(bus, 1, timings=hcp2.PROFILE.timings)
+
+    on_a_bus(story)

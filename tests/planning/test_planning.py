@@ -1,0 +1,279 @@
+"""Does this schedule fit this line? What the planner says, reckoned by hand where that can be done."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given, settings
+
+from busmaster import planning
+from busmaster.arbiter import backlog, choice, strays
+from busmaster.arbiter.transaction import Priority
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import LineSettings
+from busmaster.contract.timing import ReplyTiming, Timings
+from busmaster.errors import InvalidCommand
+from busmaster.planning import Bounds, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan, worst_case
+from busmaster.protocols.dc104 import codec as dc104
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
+
+LINE = LineSettings(57600)
+TAU = LINE.byte_time
+NODE = PlannedNode(hcp2.PROFILE, 1, reply_time=0.002)
+EXCHANGE = (8 + 12) * TAU + 0.002
+"""One HCP2 read: 8 bytes there, 12 typical ones back."""
+URGENT, COMMAND, POLL, BACKGROUND = Priority
+
+
+def group(name: str, period: float, count: int, *, node: PlannedNode = NODE, **options: Any) -> PlannedGroup:
+    return PlannedGroup(name, period, [(node, hcp2.Read(element + 1)) for element in range(count)], **options)
+
+
+def planned(*groups: PlannedGroup, **options: Any) -> Plan:
+    return plan(groups, line=LINE, **options)
+
+
+def test_the_planner_reckons_with_what_the_arbiter_does() -> None:
+    """It may not import them, so it repeats them."""
+    assert (planning.SHARE, planning.QUIET, planning.NOISY_AFTER) == (backlog.SHARE, strays.QUIET, strays.NOISY_AFTER)
+    assert worst_case.MOST_BEFORE == choice.MOST_BEFORE
+
+
+# how busy
+
+
+def test_utilisation_is_line_time_over_period_summed_over_the_groups() -> None:
+    prediction = planned(group("fast", 0.1, 3), group("slow", 1.0, 20))
+    assert prediction.utilisation == pytest.approx(3 * EXCHANGE / 0.1 + 20 * EXCHANGE / 1.0)
+    assert [g.utilisation for g in prediction.groups] == pytest.approx([30 * EXCHANGE, 20 * EXCHANGE])
+    assert prediction.fits
+    assert prediction.advice == ()
+
+
+def test_an_unknown_reply_time_is_taken_as_half_the_nominal_one() -> None:
+    """HCP2: "normally within 50ms"."""
+    unknown = planned(group("g", 1.0, 1, node=PlannedNode(hcp2.PROFILE, 1)))
+    assert unknown.groups[0].line_time == pytest.approx(EXCHANGE - 0.002 + 0.025)
+
+
+def test_two_points_with_one_command_behind_them_cost_one_exchange() -> None:
+    twice = PlannedGroup("g", 1.0, [(NODE, hcp2.Read(1)), (NODE, hcp2.Read(1))])
+    assert planned(twice).groups[0].exchanges == 1
+
+
+def test_an_empty_line_and_an_empty_group_ask_for_nothing() -> None:
+    assert planned().utilisation == 0
+    assert planned().fits
+    idle = planned(group("idle", 1.0, 0)).groups[0]
+    assert (idle.cycle, idle.longest_cycle, idle.missed, idle.fitting_period) == (0.0, 0.0, 0.0, None)
+
+
+def test_a_period_that_cannot_be_is_refused() -> None:
+    with pytest.raises(InvalidCommand):
+        planned(group("g", 0.0, 1))
+
+
+# how late
+
+
+def test_a_lone_group_takes_its_line_time_and_misses_nothing() -> None:
+    lone = planned(group("lone", 0.1, 10)).groups[0]
+    assert lone.cycle == pytest.approx(10 * EXCHANGE)
+    assert lone.longest_cycle == pytest.approx(10 * EXCHANGE)
+    assert (lone.missed, lone.achieved) == (0.0, 0.1)
+
+
+def test_groups_that_are_due_together_wait_for_each_other() -> None:
+    both = planned(group("a", 0.1, 5, phase=0.0), group("b", 0.2, 5, phase=0.0)).groups
+    assert both[0].longest_cycle == pytest.approx(5 * EXCHANGE)
+    assert both[1].longest_cycle == pytest.approx(10 * EXCHANGE)
+
+
+def test_the_group_that_misses_is_named_with_what_it_will_achieve() -> None:
+    """22 ms of work every 20 ms: each second cycle cannot start."""
+    count = round(0.022 / EXCHANGE)
+    prediction = planned(group("greedy", 0.020, count), group("modest", 10.0, 1))
+    greedy = prediction.groups[0]
+    assert not prediction.fits
+    assert greedy.missed == pytest.approx(0.5, abs=0.02)
+    assert greedy.achieved == pytest.approx(0.040, abs=0.002)
+    assert any("'greedy' will miss 50% of its cycles" in line for line in prediction.advice)
+    assert not any("'modest' will miss" in line for line in prediction.advice)
+
+
+def test_a_group_in_background_gets_what_the_others_leave_and_an_eighth() -> None:
+    prediction = planned(
+        group("main", 0.05, round(0.045 / EXCHANGE)),
+        group("more", 0.05, round(0.045 / EXCHANGE)),
+        group("history", 1.0, 10, priority=BACKGROUND),
+    )
+    history = prediction.groups[2]
+    assert history.missed == 0.0
+    assert history.cycle == pytest.approx(8 * 10 * EXCHANGE, rel=0.05)
+
+
+def test_a_group_without_time_to_spare_is_named_although_it_fits() -> None:
+    tight = planned(group("tight", 11 * EXCHANGE, 10, phase=0.0), group("easy", 5.0, 1))
+    assert tight.fits
+    assert any("'tight' has no time to spare" in line for line in tight.advice)
+    assert not any("'easy'" in line and "spare" in line for line in tight.advice)
+
+
+# what would fit
+
+
+def fitting(prediction: Plan, groups: Sequence[PlannedGroup], line: LineSettings = LINE) -> float:
+    return plan(groups, line=line).utilisation
+
+
+def test_a_longer_period_that_fits_is_offered_and_does() -> None:
+    groups = [group("a", 0.05, 8), group("b", 0.5, 30)]
+    prediction = planned(*groups)
+    longer = prediction.groups[0].fitting_period
+    assert prediction.utilisation > 1
+    assert longer is not None
+    assert fitting(prediction, [replace(groups[0], period=longer), groups[1]]) <= 0.9
+    assert fitting(prediction, [replace(groups[0], period=0.93 * longer), groups[1]]) > 0.9
+
+
+def test_no_period_is_offered_for_a_group_that_cannot_help() -> None:
+    prediction = planned(group("a", 0.02, 8), group("b", 10.0, 1))
+    assert prediction.groups[1].fitting_period is None
+
+
+def test_the_lowest_baud_rate_that_fits_is_offered() -> None:
+    slow = LineSettings(9600)
+    groups = [group("a", 0.1, 10)]
+    rate = plan(groups, line=slow).fitting_baudrate
+    assert rate is not None
+    assert fitting(plan(groups, line=slow), groups, LineSettings(rate)) <= 0.9
+    lower = planning.BAUDRATES[planning.BAUDRATES.index(rate) - 1]
+    assert lower == 9600 or fitting(plan(groups, line=slow), groups, LineSettings(lower)) > 0.9
+
+
+def test_no_baud_rate_is_offered_where_the_replies_alone_take_too_long() -> None:
+    assert planned(group("a", 0.02, 8, node=PlannedNode(hcp2.PROFILE, 1, reply_time=0.01))).fitting_baudrate is None
+
+
+def test_merged_reads_are_told_with_what_they_save() -> None:
+    node = PlannedNode(mentor.PROFILE, 4, reply_time=0.01)
+    reads = [(node, mentor.Read(1, number)) for number in range(1, 9)]
+    line = mentor.PROFILE.line
+    single = PlannedGroup("drive", 1.0, reads)
+    merged = plan([replace(single, merge=[mentor.merge_runs])], line=line).groups[0]
+    alone = plan([single], line=line, could_merge=[mentor.merge_runs]).groups[0]
+    assert [(m.node, m.command, m.serves) for m in merged.merged] == [("node 4", "read 01.01 to 01.08", 8)]
+    assert merged.exchanges == 1
+    assert alone.merged == ()
+    assert alone.could_save == pytest.approx(merged.merged[0].saved) == pytest.approx(7 * 9 * line.byte_time)
+    assert merged.line_time == pytest.approx(alone.line_time - alone.could_save)
+    assert merged.could_save == 0.0
+
+
+def test_merges_of_the_profile_need_no_asking() -> None:
+    profile = replace(msc.PROFILE, merge=msc.Merging(address_step=4))
+    node = PlannedNode(profile, 1, reply_time=0.005)
+    reads = [(node, msc.DataRead(2000 + 4 * n)) for n in range(8)]
+    assert plan([PlannedGroup("press", 1.0, reads)], line=msc.PROFILE.line).groups[0].exchanges == 1
+
+
+# the worst case
+
+
+def test_r9_the_longest_hold_of_a_read() -> None:
+    """8 bytes; 150 ms lateness; a reply of at most 25 bytes that trickles in, 20 ms a byte; 20 ms of silence. Each of
+    these times is to a start bit, and the byte is received a byte time later."""
+    hold = longest_hold(hcp2.Read(1).open(1, hcp2.PROFILE.timings), TAU)
+    assert hold == pytest.approx(8 * TAU + 0.150 + TAU + 25 * (0.020 + TAU) + 0.020 + TAU)
+
+
+def test_r9_a_trickle_ends_where_the_line_counts_as_noisy() -> None:
+    tau = msc.PROFILE.line.byte_time
+    hold = longest_hold(msc.DataWrite(2000, 1).open(1, msc.PROFILE.timings), tau)
+    assert hold == pytest.approx(21 * tau + 1.0 + tau + (1.0 + 0.1 + tau) + 0.1 + tau)
+
+
+def test_r9_each_leg_can_last_its_window_and_only_the_last_has_its_lateness() -> None:
+    tau = mentor.PROFILE.line.byte_time
+    one, three = (longest_hold(mentor.ReadRun(1, 1, n).open(1, mentor.PROFILE.timings), tau) for n in (1, 3))
+    size = 1 + 4 + 5 + 1 + 1
+    leg = 0.150 + 0.050 + size * tau
+    assert three == pytest.approx(one + 2 * (leg + tau))
+
+
+def test_r9_the_receive_latency_of_an_adapter_counts_once_a_leg_and_in_every_silence() -> None:
+    read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
+    assert longest_hold(read, TAU, 0.016) == pytest.approx(longest_hold(read, TAU) + (1 + 25 + 1) * 0.016)
+
+
+def test_r9_an_exchange_with_a_limit_may_be_repeated_until_then_but_not_while_urgent_waits() -> None:
+    node = PlannedNode(msc.PROFILE, 1)
+    bound = bounds([(node, msc.DataRead(2000))], msc.PROFILE.line.byte_time)
+    assert bound.hold == pytest.approx(bound.urgent_hold + 2.0)
+
+
+def test_r9_every_nodes_probe_counts_but_a_broadcast_has_none() -> None:
+    tau = mentor.PROFILE.line.byte_time
+    broadcast = (PlannedNode(mentor.PROFILE, 0), mentor.Write(1, 17, 0))
+    alone = bounds([broadcast], tau)
+    drive = (PlannedNode(mentor.PROFILE, 1), mentor.Write(1, 17, 0))
+    assert bounds([broadcast, drive], tau).hold > alone.hold
+
+
+def test_r9_the_waits_of_the_four_classes() -> None:
+    """Before each, three others may go (R15)."""
+    bound = Bounds(hold=1.0, urgent_hold=0.5, polls=10, background=0)
+    assert [bound.wait(URGENT, ahead=n) for n in (0, 1, 5)] == [0.5, 0.5 * 5, 0.5 * 21]
+    assert [bound.wait(COMMAND, ahead=n) for n in (0, 6, 7, 13)] == [
+        1 + 4 * turns + 3 for turns in (0 + 1, 6 + 1, 7 + 2, 13 + 2)
+    ]
+    assert bound.wait(POLL, patience=0.25) == 0.25 + 4 * 8 * 10
+    both = replace(bound, background=3)
+    assert both.wait(POLL, patience=0.25) == 0.25 + 4 * 16 * 10
+    assert both.wait(BACKGROUND, patience=2.0) == 2.0 + 4 * 16 * 3
+
+
+def test_the_plan_tells_the_waits_of_every_class_and_of_every_group() -> None:
+    prediction = planned(group("a", 0.5, 4), group("b", 20.0, 2))
+    hold = longest_hold(hcp2.Read(1).open(1, hcp2.PROFILE.timings), TAU)
+    assert prediction.typical_wait == pytest.approx(EXCHANGE)
+    assert prediction.dead_wait == pytest.approx(8 * TAU + 0.150)
+    assert prediction.worst_waits[URGENT] == pytest.approx(hold)
+    assert prediction.worst_waits[COMMAND] == pytest.approx((1 + 4 + 3) * hold)
+    assert [g.worst_wait for g in prediction.groups] == pytest.approx([0.5 + 4 * 8 * 6 * hold, 10.0 + 4 * 8 * 6 * hold])
+    assert prediction.groups[0].worst_cycle == pytest.approx(prediction.groups[0].worst_wait + hold)
+
+
+def test_what_else_may_be_asked_counts_in_the_worst_case() -> None:
+    slow = Timings.uniform(ReplyTiming(0.1, 1.0, 2.0, 0.02))
+    others = [(PlannedNode(hcp2.PROFILE, 9, slow), hcp2.Write(1, (1.0,)))]
+    assert planned(group("a", 0.5, 4), others=others).worst_waits[COMMAND] > 4.0
+
+
+COMMANDS: list[tuple[PlannedNode, Command[Any]]] = [
+    (PlannedNode(hcp.PROFILE, 1), hcp.Read(1)),
+    (PlannedNode(hcp2.PROFILE, 1), hcp2.Write(1, (1.5, 2.5))),
+    (PlannedNode(mentor.PROFILE, 1), mentor.ReadRun(1, 1, 8)),
+    (PlannedNode(msc.PROFILE, 1), msc.BlockRead(2000)),
+    (PlannedNode(dc104.PROFILE, dc104.PROFILE.addresses[0]), dc104.PROFILE.probe),
+]
+
+
+@given(st.lists(st.tuples(st.sampled_from(COMMANDS), st.floats(0.05, 30.0)), max_size=6))
+@settings(max_examples=40)
+def test_any_plan_adds_up(wanted: list[tuple[tuple[PlannedNode, Command[Any]], float]]) -> None:
+    groups = [PlannedGroup(str(n), period, [read]) for n, (read, period) in enumerate(wanted)]
+    prediction = plan(groups, line=LineSettings(9600))
+    assert prediction.utilisation == pytest.approx(sum(g.line_time / g.period for g in prediction.groups))
+    assert prediction.fits or prediction.advice
+    for one in prediction.groups:
+        assert one.line_time <= one.cycle <= one.longest_cycle or one.cycle == pytest.approx(one.line_time)
+        assert one.achieved >= one.period
+        assert one.worst_wait > one.line_time
