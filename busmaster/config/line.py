@@ -14,7 +14,7 @@ from busmaster.bus.polling import PollGroup
 from busmaster.config.names import expanded, listed
 from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
-from busmaster.contract.arguments import is_decimal, meant, nearest
+from busmaster.contract.arguments import guess, is_decimal, nearest
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.fan import Fan
 from busmaster.outputs.settings import MqttSettings
@@ -134,7 +134,7 @@ class ConfiguredLine:
             raise InvalidCommand(f"a point is written NODE/ITEM, not {text!r}")
         for node in (name for part in listed(nodes) for name in expanded(part, self.nodes)):
             if node not in self.nodes:
-                raise InvalidCommand(f"no such node {node!r}; {meant(node, self.nodes)}")
+                raise InvalidCommand(f"no such node {node!r}; {nearest(node, self.nodes)}")
             section = self.file.nodes[node]
             known = {*section.points, *section.options.get("symbols", ())}
             for item in (name for part in listed(items) for name in expanded(part, known)):
@@ -166,7 +166,7 @@ class ConfiguredLine:
                     with table.at("allow_commands", number):
                         writable |= {point.key: point for point in map(self._writable, self._names(text))}
             with table.at():
-                self.outputs.add(kind, settings, title=self.file.title, commands=writable)
+                self.outputs.add(kind, settings, commands=writable)
 
     def _writable(self, name: tuple[str, str]) -> Point[Any]:
         point = self._point(*name)
@@ -179,9 +179,8 @@ def _known(handle: Handle, item: str, points: Iterable[str]) -> Point[Any]:
     try:
         return handle.point(item)
     except InvalidCommand:
-        near = nearest(item, points)
-        if near:
-            raise InvalidCommand(f"no such item {item!r}: did you mean {near!r}?") from None
+        if near := guess(item, points):
+            raise InvalidCommand(f"no such item {item!r}{near}") from None
         raise
 
 

@@ -17,6 +17,7 @@ import anyio
 
 from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import Mark
+from busmaster.arbiter.strays import QUIET
 from busmaster.contract.exchange import Command, Done, Exchange, Expect, FrameError
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import ReplyTiming, Timings
@@ -27,8 +28,6 @@ from busmaster.transport.endpoints import Endpoint, is_paced
 from busmaster.transport.kernel import OpenPort, open_port
 from busmaster.transport.pump import Tap
 
-QUIET = 0.02
-"""Seconds of silence, at least, after which nothing more is expected."""
 BABBLE = 1.0
 """Seconds after which a line that does not fall silent is left alone."""
 MUCH = 16384
