@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Literal
 
 from busmaster.errors import InvalidCommand
@@ -25,17 +26,34 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileSettings(Settings):
-    """`path` may hold fields of a date (line-%Y-%m-%d.csv): a new file begins when the name changes."""
+    """`path` may hold fields of a date (%Y/line-%m-%d.csv): a new file begins when the name changes.
+
+    `mode` is what a new file may be used for and by whom, narrowed by the process's umask. `sync_every`: after so many
+    seconds at most what was written survives a loss of power too; 0 for after each batch.
+    """
 
     path: str
+    mode: int = 0o640
+    sync_every: float = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SqliteSettings(Settings):
-    """Values older than `keep_days` are deleted; None keeps all."""
+    """What is older than `keep_days` is deleted, and the oldest of more than `keep_mb` megabytes; None keeps all.
+
+    `mode` is that of a new file, narrowed by the process's umask.
+    """
 
     path: str
     keep_days: float | None = None
+    keep_mb: float | None = None
+    mode: int = 0o640
+
+    def __post_init__(self) -> None:
+        for name in ("keep_days", "keep_mb"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < inf:
+                raise InvalidCommand(f"{name} is more than 0, not {value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
