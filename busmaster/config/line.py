@@ -162,7 +162,7 @@ class ConfiguredLine:
             table = self.file.table.table("outputs").table(kind)
             writable: dict[str, Point[Any]] = {}
             if isinstance(settings, MqttSettings):
-                for number, text in enumerate(settings.allow):
+                for number, text in enumerate(settings.allow_commands):
                     with table.at("allow_commands", number):
                         writable |= {point.key: point for point in map(self._writable, self._names(text))}
             with table.at():
