@@ -15,7 +15,7 @@ from typing import Any, TextIO
 import click
 
 from busmaster.cli.ending import Ending
-from busmaster.contract.arguments import nearest
+from busmaster.contract.arguments import meant
 from busmaster.errors import BusError, InvalidCommand, NoReply
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
@@ -31,6 +31,7 @@ COMMANDS = (
     "monitor",
     "doctor",
     "replay",
+    "items",
 )
 """One module of this package each, which defines `command`; imported only when it is asked for."""
 
@@ -51,7 +52,7 @@ class Commands(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         known = self.list_commands(ctx)
         if args and not args[0].startswith("-") and args[0] not in known:
-            raise click.UsageError(f"no such command {args[0]!r}; {nearest(args[0], known)}", ctx)
+            raise click.UsageError(f"no such command {args[0]!r}; {meant(args[0], known)}", ctx)
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:

@@ -76,6 +76,6 @@ def _scale(node: NodeSection, point: PointSection | None, item: str) -> Scale:
     whole = node.kind.whole_numbers(item)
     decimals = 0 if point is None else point.decimals
     if node.kind.takes_decimals:
-        decimals = decimals_of(node).get(item.partition(":")[0], 0) if whole else 0
+        decimals = decimals_of(node).get(item.partition(":")[0], node.kind.decimals(item)) if whole else 0
     factor, offset = (1.0, 0.0) if point is None else (point.factor, point.offset)
     return Scale.of(factor, offset, decimals, whole)

@@ -9,7 +9,7 @@ from typing import Any
 from busmaster.config.names import expanded
 from busmaster.config.options import check_keys, read_delay, read_options
 from busmaster.config.table import Table
-from busmaster.contract.arguments import nearest
+from busmaster.contract.arguments import meant
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import NAMES, Faults
 from busmaster.registry import NodeKind
@@ -57,7 +57,7 @@ def read_emulator(table: Table, nodes: Mapping[str, NodeKind]) -> EmulatorSectio
             names = list(expanded(one.name, nodes))
         for name in names:
             if name not in nodes:
-                raise one.error(f"no such node {name!r}; {nearest(name, nodes)}")
+                raise one.error(f"no such node {name!r}; {meant(name, nodes)}")
             sections[name] = _changed(sections[name], one, nodes[name], shared)
     return EmulatorSection(paced=table.flag("paced", True), seed=table.whole("seed", 1), nodes=sections)
 

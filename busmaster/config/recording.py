@@ -7,7 +7,7 @@ from functools import partial
 from typing import TypeAlias
 
 from busmaster.config.table import Readers, Table
-from busmaster.contract.arguments import nearest
+from busmaster.contract.arguments import meant
 from busmaster.outputs.settings import (
     FileSettings,
     MetricsSettings,
@@ -41,7 +41,7 @@ def _groups(table: Table, key: str, known: Collection[str]) -> tuple[str, ...]:
     chosen = table.texts(key, ())
     for number, name in enumerate(chosen):
         if name not in known:
-            raise table.error(f"no such group {name!r}; {nearest(name, known)}", key, number)
+            raise table.error(f"no such group {name!r}; {meant(name, known)}", key, number)
     return chosen
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from busmaster.arbiter.transaction import Priority
+from busmaster.bus.suitability import check_company
 from busmaster.config.emulator import EmulatorSection, read_emulator
 from busmaster.config.names import NODE_NAME, POINT_NAME, expanded
 from busmaster.config.options import check_keys, read_options
@@ -136,8 +137,12 @@ def _defaults(top: Table) -> dict[str, Table]:
 def _nodes(top: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSection]:
     taken: dict[tuple[str, int], str] = {}
     names: set[str] = set()
+    profiles: dict[str, Profile] = {}
     for table in top.tables("nodes"):
         for node in _several(table, defaults):
+            with table.at("protocol"):
+                check_company(node.profile, profiles.values())
+            profiles.setdefault(node.profile.name, node.profile)
             if node.name in names:
                 raise table.error(f"there are two nodes {node.name!r}")
             names.add(node.name)

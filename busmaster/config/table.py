@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
 
 from busmaster.config.source import FileError, Key, Source
-from busmaster.contract.arguments import nearest
+from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
 
 T = TypeVar("T")
@@ -44,7 +44,7 @@ class Table:
         """Raises FileError for a key that is none of these."""
         for key in self.data:
             if key not in known:
-                raise self.error(f"no such key; {nearest(key, known)}", key)
+                raise self.error(f"no such key; {meant(key, known)}", key)
 
     def error(self, text: str, *way: str | int) -> FileError:
         return self.source.error((*self.key, *way), text)
@@ -106,7 +106,7 @@ class Table:
         known = tuple(known)
         value = self.text(key, default)
         if key in self.data and value not in known:
-            raise self.error(f"no such {key} {value!r}; {nearest(str(value), known)}", key)
+            raise self.error(f"no such {key} {value!r}; {meant(str(value), known)}", key)
         return value
 
     def texts(self, key: str, default: T | _Required = REQUIRED) -> tuple[str, ...] | T:

@@ -1,5 +1,4 @@
-"""What callers hand in: a number is taken for what it is, or refused in words before anything is sent; and of a name
-that is none, the nearest is told.
+"""What callers hand in, numbers and names: taken for what it is, or refused in words before anything is sent.
 
 True is no number here, although Python lets it pass for 1: it is what a mistyped call leaves behind.
 """
@@ -49,16 +48,21 @@ def is_decimal(text: str) -> bool:
     return text.isascii() and text.isdigit()
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return what may have been meant by a name that is not known: "did you mean 'hcp2'?", or else all that are."""
-    known = tuple(known)
-    near = difflib.get_close_matches(name, known, n=1)
-    if near:
-        return f"did you mean {near[0]!r}?"
-    return f"there are {', '.join(known)}" if known else "there are none"
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Return that of the known names which may have been meant, or None if none is near."""
+    return next(iter(difflib.get_close_matches(name, list(known), n=1)), None)
 
 
 def guess(name: str, known: Iterable[str]) -> str:
-    """Return "; did you mean 'hcp2'?" for the end of a message, or nothing where no known name is near."""
-    near = difflib.get_close_matches(name, tuple(known), n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+    """Return "; did you mean 'x'?" for the end of a message, or nothing if no known name is near."""
+    near = nearest(name, known)
+    return "" if near is None else f"; did you mean {near!r}?"
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """Return "did you mean 'x'?" or, if no known name is near, "there are x, y"."""
+    known = tuple(known)
+    near = nearest(name, known)
+    if near is not None:
+        return f"did you mean {near!r}?"
+    return f"there are {', '.join(known)}" if known else "there are none"

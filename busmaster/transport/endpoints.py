@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Protocol
 from urllib.parse import parse_qsl, urlsplit
 
-from busmaster.contract.arguments import nearest
+from busmaster.contract.arguments import meant
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
 from busmaster.transport.identity import USB, Identity
@@ -123,7 +123,7 @@ def _options(query: str, known: Mapping[str, Callable[[str], object]]) -> dict[s
     options: dict[str, Any] = {}
     for key, text in parse_qsl(query, keep_blank_values=True):
         if key not in known:
-            raise InvalidCommand(f"no such port option {key!r}; {nearest(key, known)}")
+            raise InvalidCommand(f"no such port option {key!r}; {meant(key, known)}")
         try:
             options[key] = known[key](text)
         except (ValueError, KeyError):

@@ -190,6 +190,11 @@ VALUES: list[tuple[str, str, dict[str, Any]]] = [
         {"ref": -47.6, "1.17": -47.6, "7.05": 9, "1.18:3": (0, 0, 0)},
     ),
     (
+        node("mentor", 14, "", "values = { speed_reference_1 = 12.3 }"),
+        "mentor",
+        {"speed_reference_1": 12.3, "1.17": 123},
+    ),
+    (
         node("ct-ansi", 12, "points.ref = { item = '1.17', decimals = 1 }", "values = { ref = -47.6, '7.05' = 9 }"),
         "ct-ansi",
         {"ref": -47.6, "7.05": 9},

@@ -304,6 +304,20 @@ async def test_read_only_names_are_refused_before_anything_is_sent(drive: MicroF
 
 
 @pytest.mark.asyncio
+async def test_by_number_too_since_every_drive_has_the_same_map(drive: MicroFlexDrive, line: Drive) -> None:
+    for element, name in ((109, "status_word"), (222, "outputs"), (119, "speed_demand")):
+        with pytest.raises(InvalidCommand, match=f"{name} is read-only"):
+            await drive.write(element, 1)
+        with pytest.raises(InvalidCommand, match=f"{element} is read-only"):
+            await drive.point(str(element)).write(1)
+        assert not drive.element(element).writable
+    assert line.asked == []
+    await drive.write(118, 5, idempotent=True)
+    await drive.write(50, 5, idempotent=True)  # not in the map: the drive's to refuse
+    assert line.asked == ["write element 118 = 5", "write element 50 = 5"]
+
+
+@pytest.mark.asyncio
 async def test_no_value_of_a_list_may_go_to_a_read_only_name(drive: MicroFlexDrive, line: Drive) -> None:
     with pytest.raises(InvalidCommand, match="speed_demand is read-only"):
         await drive.write("speed_reference", 10, 20)

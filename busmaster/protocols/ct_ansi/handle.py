@@ -74,17 +74,17 @@ class CtAnsiDrive(Handle):
         return await self.node.request(command, priority=priority, start_within=start_within, retries=retries)
 
     async def read_run(
-        self, parameter: str, count: int, *, chain: bool = False, priority: Priority | None = None
+        self, parameter: str, count: int, *, step: int = 1, chain: bool = False, priority: Priority | None = None
     ) -> tuple[float, ...]:
-        """`count` parameters of one menu, from `parameter` on; with `chain` in one exchange, where that is safe.
+        """`count` parameters of one menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
 
-        It is where no other drive can take or send a lone ACK for its own. Raises NoSuchParameter where the menu has a
-        gap.
+        `step` 0 reads the same one again and again. With `chain` in one exchange, where that is safe: where no other
+        drive can take or send a lone ACK, NAK or BS for its own. Raises NoSuchParameter where the menu has a gap.
         """
-        run = ReadRun(*parse_parameter(parameter), count)
+        run = ReadRun(*parse_parameter(parameter), count, step)
         if chain:
             return await self.node.request(run, priority=priority)
-        singles = [Read(run.menu, run.number + i) for i in range(count)]
+        singles = [Read(run.menu, run.number + step * i) for i in range(count)]
         return tuple([await self.node.request(single, priority=priority) for single in singles])
 
     async def write(

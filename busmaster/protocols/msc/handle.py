@@ -24,12 +24,12 @@ from busmaster.protocols.msc.codec import (
     DataRead,
     DataWrite,
     Merging,
-    ProgramStatus,
     ReadFlag,
     ReadFlags,
     ReadStatus,
     SetFlag,
 )
+from busmaster.protocols.msc.status import ProgramStatus
 
 if TYPE_CHECKING:
     from busmaster.bus.bus import Bus
