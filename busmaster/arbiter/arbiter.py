@@ -102,12 +102,20 @@ class Arbiter(LineMachine):
         return data or None
 
     def poll_event(self) -> Event | None:
-        if self.dispatcher.unnoted:
-            self.dispatcher.note_successes()
+        if self.dispatcher.unnoted is not None:
+            self.dispatcher.note_success()
         return self._events.popleft() if self._events else None
 
     def poll_timeout(self) -> float:
-        return self._deadlines.earliest()
+        deadlines = self._deadlines
+        earliest = deadlines.line
+        if deadlines.schedule < earliest:
+            earliest = deadlines.schedule
+        if deadlines.expiry < earliest:
+            earliest = deadlines.expiry
+        if deadlines.health < earliest:
+            earliest = deadlines.health
+        return earliest
 
     def reset_statistics(self, now: float) -> None:
         self._counters.reset(self.state, now)

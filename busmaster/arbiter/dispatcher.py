@@ -19,7 +19,7 @@ from busmaster.arbiter.backlog import Backlog
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.endings import make_error, name_error, not_started
-from busmaster.arbiter.events import Completed, Event, LatenessLowered, NodeChanged, Polled, Sampled
+from busmaster.arbiter.events import Event, LatenessLowered, NodeChanged, Polled, Sampled
 from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
 from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.schedule import Poll, Schedule
@@ -54,8 +54,8 @@ class Dispatcher:
         self, deadlines: Deadlines, counters: LineCounters, now: float, capacity: int, jitter: Callable[[], float]
     ) -> None:
         self.events: deque[Event] = deque()
-        self.unnoted: deque[Transaction] = deque()
-        """Those that have succeeded, until `note_successes`."""
+        self.unnoted: Transaction | None = None
+        """The one that has succeeded, until `note_success`."""
         self.backlog = Backlog()
         self.schedule = Schedule()
         self.nodes: list[NodeRecord] = []
@@ -81,13 +81,13 @@ class Dispatcher:
             return False
         if transaction.writes and transaction.priority is URGENT:
             self._supersede(node, now)
-        waiting = self.backlog.waiting(transaction.priority)
+        waiting = self.backlog.queues[transaction.priority].live
         if transaction.writes:
             waiting = max(waiting, len(node.writes))
         if waiting >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return False
-        if not self._may_ask(transaction, now):
+        if (node.health is DOWN or now < node.suspended_until) and not self._may_ask(transaction, now):
             return False
         if transaction.writes:
             node.writes.append(transaction)
@@ -140,7 +140,8 @@ class Dispatcher:
         counters = self.counters
         if transaction.attempts == 0 and not transaction.check:
             counters.waits[transaction.priority].record(now - transaction.queued)
-            self._count_ahead(transaction)
+            transaction.exchanges_ahead = counters.exchanges - transaction.exchanges_ahead
+            transaction.settling_ahead = counters.spent[SETTLING] - transaction.settling_ahead
             poll = transaction.poll
             if poll is not None and poll.started == -inf:
                 poll.started = now
@@ -156,30 +157,34 @@ class Dispatcher:
 
     def succeeded(self, transaction: Transaction, value: Any, now: float) -> None:
         """Noted at once where it bears on what goes next; else with the events, when the next request has left."""
+        if self.unnoted is not None:
+            self.note_success()
         transaction.value = value
         transaction.last_byte = now
-        self.unnoted.append(transaction)
+        self.unnoted = transaction
         if transaction.writes or transaction.node.health is not UP:
-            self.note_successes()
+            self.note_success()
 
-    def note_successes(self) -> None:
-        while self.unnoted:
-            transaction = self.unnoted.popleft()
-            node, now = transaction.node, transaction.last_byte
-            counters = node.counters
-            counters.ok += 1
-            counters.latency.record(now - transaction.started)
-            if transaction.late:
-                counters.late += 1
-            node.last_reply = now
-            if node.health is not UP:
-                self._heard(node, now)
-            if node.lateness_until < inf:
-                self._lower_lateness(transaction, now)
-            if transaction.paid:
-                self.probes.budget.refund(transaction.paid - (now - transaction.started))
-            transaction.refused_cycles = 0
-            self._end(transaction, now)
+    def note_success(self) -> None:
+        transaction = self.unnoted
+        if transaction is None:
+            return
+        self.unnoted = None
+        node, now = transaction.node, transaction.last_byte
+        counters = node.counters
+        counters.ok += 1
+        counters.latency.record(now - transaction.started)
+        if transaction.late:
+            counters.late += 1
+        node.last_reply = now
+        if node.health is not UP:
+            self._heard(node, now)
+        if node.lateness_until < inf:
+            self._lower_lateness(transaction, now)
+        if transaction.paid:
+            self.probes.budget.refund(transaction.paid - (now - transaction.started))
+        transaction.refused_cycles = 0
+        self._end(transaction, now)
 
     def attempt_failed(
         self, transaction: Transaction, no_reply: bool, what: str, now: float, doubted: bool = False
@@ -444,7 +449,8 @@ class Dispatcher:
                 error = make_error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
             self._next_write(transaction)
         if not transaction.attempts:
-            self._count_ahead(transaction)
+            transaction.exchanges_ahead = self.counters.exchanges - transaction.exchanges_ahead
+            transaction.settling_ahead = self.counters.spent[SETTLING] - transaction.settling_ahead
         transaction.phase = ENDED
         transaction.ended_at = now
         transaction.error = error
@@ -464,17 +470,12 @@ class Dispatcher:
                 self.events.append(Polled(poll))
         elif transaction.heard:
             self.counters.completed += 1
-            self.events.append(Completed(transaction))
+            self.events.append(transaction)
 
     def _waits(self, transaction: Transaction) -> None:
-        """What the line has counted so far is not what it waits for."""
+        """What the line has counted so far is not what it waits for: it is taken off when it has waited."""
         transaction.exchanges_ahead = self.counters.exchanges
         transaction.settling_ahead = self.counters.spent[SETTLING]
-
-    def _count_ahead(self, transaction: Transaction) -> None:
-        """It has waited: until now it held what `_waits` noted."""
-        transaction.exchanges_ahead = self.counters.exchanges - transaction.exchanges_ahead
-        transaction.settling_ahead = self.counters.spent[SETTLING] - transaction.settling_ahead
 
     def _next_write(self, transaction: Transaction) -> None:
         writes = transaction.node.writes

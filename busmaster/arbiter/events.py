@@ -9,17 +9,11 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
+from busmaster.arbiter.transaction import Transaction
+
 if TYPE_CHECKING:
     from busmaster.arbiter.health import Health, NodeRecord
     from busmaster.arbiter.schedule import Poll
-    from busmaster.arbiter.transaction import Transaction
-
-
-@dataclass(slots=True)
-class Completed:
-    """A caller's transaction has ended: its `value` or its `error` is set."""
-
-    transaction: Transaction
 
 
 @dataclass(slots=True)
@@ -108,6 +102,7 @@ class Strayed:
     collision: bool = False
 
 
+# A caller's transaction is told itself when it has ended: its `value` or its `error` is set then.
 Event: TypeAlias = (
-    Completed | Sampled | Polled | NodeChanged | LatenessRaised | LatenessLowered | LineChanged | PortFailed | Strayed
+    Transaction | Sampled | Polled | NodeChanged | LatenessRaised | LatenessLowered | LineChanged | PortFailed | Strayed
 )

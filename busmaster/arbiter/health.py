@@ -87,6 +87,7 @@ class NodeRecord:
         "timings",
         "unheard",
         "up_since",
+        "usual",
         "waiter",
         "writes",
     )
@@ -128,6 +129,8 @@ class NodeRecord:
         """Attempts in a row that brought nothing."""
         self.slowest = 0.0
         """Seconds to the first byte of about the slowest of its last replies."""
+        self.usual: float | None = None
+        """Seconds to the first byte of its usual reply, in runs of answers that are alike; None until there was one."""
         self.lateness_until = inf
         """When a lateness that was raised comes down again, if all replies are prompt until then."""
         self._before_raised: Timings | None = None
@@ -196,9 +199,10 @@ class ProbeBudget:
 
         One too short for a probe earns nothing: there a probe would delay what comes next.
         """
-        pause = self._pause + seconds
-        if pause > self.probe:
-            earned = BUDGET_IDLE_SHARE * (pause - max(self.probe, self._pause))
+        before, probe = self._pause, self.probe
+        pause = before + seconds
+        if pause > probe and self.tokens < BUDGET_CAPACITY:
+            earned = BUDGET_IDLE_SHARE * (pause - max(probe, before))
             self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)
         self._pause = 0.0 if over else pause
 

@@ -82,7 +82,7 @@ class LineMachine:
         self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency, byte_time)
         self._wire = OnWire(self._leg, self._echo, self._deadlines, self.dispatcher.urgent_waits)
         self._in_step = InStep(strict)
-        self._choice = Choice(self.dispatcher, self._in_step)
+        self._choice = Choice(self.dispatcher, self._in_step, self._wire)
         self._trust = Trust(self._in_step)
         # the line
         self._strays = Strays(self._events, self._counters)
@@ -99,7 +99,7 @@ class LineMachine:
         """
         if self.state is not OFFLINE or self._closed:
             return
-        self._wire.paced = paced
+        self._leg.paced = paced and not self._echo.declared
         self.dispatcher.fault = None
         self._events.append(LineChanged(LineChange.UP))
         lateness = max((node.lateness for node in self.dispatcher.nodes), default=UNKNOWN_LATENESS)
@@ -145,22 +145,20 @@ class LineMachine:
 
     def transmitted(self, now: float) -> None:
         """The port has taken only now what `poll_transmit` gave: whoever held the process up meanwhile."""
-        output = self._wire.output
-        said_at = output.said_at
+        wire = self._wire
+        said_at = wire.output.said_at
         late = now - said_at
         if late > 0:
-            output.said_at = now
+            wire.output.said_at = now
             leg = self._leg  # as leg.shift does: this is done for every request
-            leg.end, leg.out = leg.end + late, leg.out + late
-            leg.late_after += late
+            leg.end += late
+            leg.out += late
             leg.taint_until += late
-            leg.limit += late
             self._deadlines.line += late
             if self.state is SETTLING:
                 self._silent_at += late
-            transaction = self._wire.transaction
-            if late > LOOK_SLACK and transaction is not None and transaction.started == said_at:
-                transaction.started = now
+            if late > LOOK_SLACK and wire.transaction is not None and wire.transaction.started == said_at:
+                wire.transaction.started = now
 
     def line_due(self, now: float) -> bool:
         """A deadline of the line falls due: `unsent` is to be told first, where it is known."""
@@ -212,7 +210,7 @@ class LineMachine:
         if now < self._quarantine:
             self._settle(now)
             return True
-        chosen = self._choice.next(now, now - self._strays.last_byte - self._leg.latency)
+        chosen = self._choice.next(now, self._strays.last_byte)
         if chosen is None:
             return False
         if type(chosen) is not tuple:
@@ -254,7 +252,7 @@ class LineMachine:
         leg.begun_at = now
         if transaction.first_byte == -inf:
             transaction.first_byte = now
-        if now > leg.late_after:
+        if now > leg.end + leg.timing.nominal + leg.latency:
             transaction.late = True
         return data
 
@@ -281,33 +279,36 @@ class LineMachine:
 
     def _complete(self, step: Done[Any], now: float) -> None:
         """A value: the line is free when the closing ACK has left and the node has let go of the line."""
-        transaction, exchange = self._wire.transaction, self._wire.exchange
+        wire, leg = self._wire, self._leg
+        transaction, exchange = wire.transaction, wire.exchange
         assert transaction is not None
         assert exchange is not None
-        answered, leg = exchange.answered, self._leg
+        answered = exchange.answered
         if answered:
-            if leg.end > leg.begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
-                leg.end = leg.out = leg.begun_at
+            begun_at = leg.begun_at
+            if leg.end > begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
+                leg.end = leg.out = begun_at
             if self._in_step.alert or step.rest:
-                verdict = self._trust.weigh(self._wire, step, now)
+                verdict = self._trust.weigh(wire, step, now)
                 if isinstance(verdict, str):
                     self._disbelieve(verdict, step, now)
                     return
                 if verdict is not None:
                     self._deadlines.line = verdict
                     return
-            transaction.node.note_reply(exchange.answers, transaction.command, leg.begun_at - leg.end)
+            transaction.node.note_reply(exchange.answers, transaction.command, begun_at - leg.end)
         if step.send:
-            self._wire.say(step.send, now)
-        self._end_exchange()
+            wire.say(step.send, now)
+        wire.transaction = wire.exchange = self._trust.held = None
+        self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, step.value, now)
         if step.rest:
-            self._strays.note(step.rest, now, self._leg.quiet())
-        if step.rest or self._wire.strayed or (self._echo.owed and not answered):
+            self._strays.note(step.rest, now, leg.quiet())
+        if step.rest or wire.strayed or (self._echo.owed and not answered):
             self._settle(now)
             return
-        self._strays.answered()
-        self._release(self._leg.timing.turnaround if answered else 0.0, now)
+        self._strays.unanswered_one = None
+        self._release(leg.timing.turnaround if answered else 0.0, now)
 
     def _disbelieve(self, what: str, step: Done[Any], now: float) -> None:
         self._counters.doubted += 1
@@ -374,8 +375,7 @@ class LineMachine:
         wire = self._wire
         if failed and wire.exchange is not None:
             self._leg.give_up(wire.exchange.later)
-        wire.transaction = wire.exchange = None
-        self._trust.held = None
+        wire.transaction = wire.exchange = self._trust.held = None
         self._counters.exchanges += 1
 
     # the line between exchanges
@@ -493,7 +493,7 @@ class LineMachine:
     def _enter(self, state: LineState, now: float) -> None:
         spent = self._counters.spend(self.state, now)
         if self.state is READY:
-            self.dispatcher.probes.budget.idle(spent, over=state is not READY)
+            self.dispatcher.probes.budget.idle(spent, state is not READY)
         self.state = state
 
     def _offline(self) -> BusError:

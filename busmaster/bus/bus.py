@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Coroutine, Generator, Iterable, Sequence
+from collections.abc import Callable, Coroutine, Generator, Iterable, Sequence
 from dataclasses import replace
 from math import inf
 from threading import current_thread, get_ident
@@ -98,8 +98,9 @@ class Bus:
         self._streams: list[Stream[Event]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._connection: Connection | None = None
-        self._thread = 0
-        self.running = False
+        self.thread = 0
+        """In which its loop runs; 0 while it is not open."""
+        self.loop_runs: Callable[[], bool] = lambda: False
         self._closed = False
 
     # opening and closing
@@ -109,16 +110,16 @@ class Bus:
         if self.running:
             raise InvalidCommand(f"the bus on {self.endpoint.name} is open already: enter it once, and share it")
         self._loop = asyncio.get_running_loop()
-        self._thread = get_ident()
+        self.loop_runs = self._loop.is_running
         self.pump.bind(self._loop)
         self._arbiter.reset_statistics(self.now())
         connection = Connection(self.endpoint, self.pump, on_failed=self._on_failed, jitter=self._random)
         self._connection = connection
-        self.running = True
+        self.thread = get_ident()
         try:
             await connection.open()
         except BaseException:
-            self.running = False
+            self.thread = 0
             await connection.close()
             raise
         self._start(connection.run())
@@ -143,7 +144,7 @@ class Bus:
     async def _let_go(self) -> None:
         """Nothing is on the wire, or nobody waits for its end."""
         assert self._connection is not None
-        self.running = False
+        self.thread = 0
         try:
             await self._connection.close()
         finally:
@@ -295,6 +296,11 @@ class Bus:
 
     # looking
 
+    @property
+    def running(self) -> bool:
+        """Whether it is open, though its line may be down."""
+        return self.thread != 0
+
     def now(self) -> float:
         """The bus's clock, in seconds: all its times are of this clock."""
         return self.pump.clock()
@@ -379,12 +385,12 @@ class Bus:
 
     def check_loop(self) -> None:
         """Raise InvalidCommand where an open bus is used from another thread, or from another event loop."""
-        if self.running and (get_ident() != self._thread or not self._loop.is_running()):
+        if self.running and (get_ident() != self.thread or not self.loop_runs()):
             self._check_elsewhere()
 
     def _check_elsewhere(self) -> None:
         """Its loop does not run here: right only in its own thread, between two runs of the loop."""
-        if get_ident() != self._thread or is_any_loop_running():
+        if get_ident() != self.thread or is_any_loop_running():
             raise InvalidCommand(
                 f"the bus on {self.endpoint.name} was used from thread {current_thread().name!r} outside the "
                 "event loop that opened it: hand the call to that loop, with portal.call (anyio.from_thread) or "

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Hashable
 from dataclasses import replace
 from math import inf
+from threading import get_ident
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from busmaster.arbiter.counters import NodeStatistics
@@ -89,6 +90,8 @@ class Node:
         What is None was left open: a profile's `merge` too.
         """
         own = self.profile
+        if profile is own and timings is None and retries is None:
+            return
         wanted = {
             "other timings": timings not in (None, self.timings),
             "other retries": retries not in (None, self.record.retries),
@@ -124,7 +127,7 @@ class Node:
 
         Raises a BusError subclass. Cancelling it frees the caller at once and never disturbs the line (R6).
         """
-        transaction, future = self._start(command, priority, start_within, retries, idempotent, touches=touches)
+        transaction, future = self._start(command, priority, start_within, retries, idempotent, False, touches)
         try:
             value: T = await future
         except asyncio.CancelledError:
@@ -150,7 +153,6 @@ class Node:
         start_within: float | None,
         retries: int | None,
         idempotent: bool | None,
-        *,
         probe: bool = False,
         touches: Point[Any] | None = None,
     ) -> tuple[Transaction, asyncio.Future[Any]]:
@@ -167,9 +169,10 @@ class Node:
         if record.address == profile.broadcast and not command.writes:
             raise InvalidCommand(f"{profile.name}: address {self.address} is for writes to all; nobody answers a read")
         bus = self.bus
-        if not bus.running:
-            raise bus.not_open(node=self.label, command=str(command))
-        bus.check_loop()
+        if get_ident() != bus.thread or not bus.loop_runs():  # as bus.check_loop does: this is done for every request
+            if not bus.running:
+                raise bus.not_open(node=self.label, command=str(command))
+            bus.check_loop()
         if type(command) not in self.kinds:
             if not hasattr(command, "open"):
                 raise InvalidCommand(f"{self.label}: {command!r} is no command; read it through a handle, or its point")

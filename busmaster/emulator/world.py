@@ -12,7 +12,7 @@ from itertools import count
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, Event, LineChanged, NodeChanged
+from busmaster.arbiter.events import Event, LineChanged, NodeChanged
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.exchange import Command
@@ -77,7 +77,7 @@ class World:
     def request(
         self, node: NodeRecord, command: Command[Any], priority: Priority = Priority.COMMAND, **options: Any
     ) -> Transaction:
-        """Submits it now; `options` are those of Transaction. Its end comes as a Completed event, perhaps at once."""
+        """Submits it now; `options` are those of Transaction. Its end comes as an event, perhaps at once."""
         transaction = Transaction(node, command, priority=priority, **options)
         self.arbiter.submit(transaction, self.now)
         return transaction
@@ -186,9 +186,9 @@ class World:
 def told(event: Event) -> str:
     """An event in a line of text, the same on every run."""
     match event:
-        case Completed(transaction):
-            outcome = transaction.value if transaction.error is None else repr(transaction.error)
-            return f"{transaction.node.label}: {transaction.command} -> {outcome}"
+        case Transaction():
+            outcome = event.value if event.error is None else repr(event.error)
+            return f"{event.node.label}: {event.command} -> {outcome}"
         case LineChanged(change, cause):
             return f"line {change.value} {cause}".rstrip()
         case NodeChanged(node, before, after):

@@ -17,7 +17,7 @@ import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import DriverErrors
-from busmaster.arbiter.events import Completed, Event, Mark, Polled, Sampled
+from busmaster.arbiter.events import Event, Mark, Polled, Sampled
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Transaction
@@ -116,8 +116,8 @@ class Pump(asyncio.Protocol):
             if self._paused:
                 self._check_output(now)
         while (event := arbiter.poll_event()) is not None:
-            if type(event) is Completed:
-                self._resolve(event.transaction)
+            if type(event) is Transaction:
+                self._resolve(event)
             elif type(event) is Sampled:
                 self._on_sample(event.poll, event.transaction)
             elif type(event) is Polled:

@@ -6,7 +6,7 @@ from math import inf
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, Event, Polled
+from busmaster.arbiter.events import Event, Polled
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import Poll, set_members
 from busmaster.arbiter.state import LineState
@@ -184,7 +184,7 @@ class Bench:
 
     def ended(self, transaction: Transaction) -> int:
         """How often it was reported as completed."""
-        return sum(isinstance(e, Completed) and e.transaction is transaction for e in self.events)
+        return sum(e is transaction for e in self.events)
 
 
 def heard(bench: Bench) -> NodeRecord:

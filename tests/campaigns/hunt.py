@@ -12,7 +12,7 @@ from itertools import count
 from random import Random
 from typing import Any
 
-from busmaster.arbiter.events import Completed, Event, LatenessRaised, NodeChanged, Polled
+from busmaster.arbiter.events import Event, LatenessRaised, NodeChanged, Polled
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import Poll, line_time, set_members
 from busmaster.arbiter.state import LineState
@@ -292,7 +292,7 @@ class Hunt:
 
     def _on_event(self, event: Event) -> None:
         match event:
-            case Completed(transaction):
+            case Transaction() as transaction:
                 self._completed(transaction)
             case Polled(poll):
                 self.judge.polled(poll)
