@@ -11,7 +11,7 @@ from busmaster.emulator.device import NEVER, Delay, held
 from busmaster.emulator.motion import Axis, Motion
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
-from busmaster.protocols._comms.device import HCP2, Framing, HostCommsDevice
+from busmaster.protocols._comms.device import HCP2, Framing, HostCommsDevice, sendable
 
 LAST_COMMS = 99
 FIRST_AXIS = 100
@@ -101,6 +101,7 @@ class EmulatedMint(HostCommsDevice):
                 raise InvalidCommand(f"an emulated controller's element {element if first else item!r} cannot be given")
 
     def _hold(self, element: int, value: float) -> bool:
+        value = sendable(value, element)
         number, offset = divmod(element - FIRST_AXIS, AXIS_SIZE)
         if element <= LAST_COMMS:
             self.comms[element] = single(value) if self.single_precision else value
@@ -294,6 +295,10 @@ def jog_on_comms1(mint: EmulatedMint, element: int, now: float) -> None:
 
 PROGRAMS = {program.__name__: program for program in (winding, command_handshake, report_positions)}
 
+AXES_NEEDED: dict[str | None, int] = {command_handshake.__name__: 2}
+SHORTEST_STATEMENT = 0.0001
+"""Seconds: a program is caught up with statement by statement."""
+
 
 def make_mint(
     framing: Framing,
@@ -301,6 +306,7 @@ def make_mint(
     *,
     lively: bool,
     program: str | None = None,
+    axes: int = AXES,
     jogs_on_comms1: bool = False,
     statement: float | None = None,
     **options: Any,
@@ -309,10 +315,17 @@ def make_mint(
 
     If it is lively and no program is given, its axes swing, and a program reports their positions in its elements.
     """
+    if not AXES_NEEDED.get(program, 1) <= axes <= AXES:
+        raise InvalidCommand(
+            f"a controller has {AXES_NEEDED.get(program, 1)} to {AXES} axes for what it runs, not {axes}"
+        )
+    if statement is not None and statement < SHORTEST_STATEMENT:
+        raise InvalidCommand(f"a statement takes {SHORTEST_STATEMENT} s at least, not {statement:g} s")
     swings = lively and program is None
     controller = EmulatedMint(
         address,
         framing,
+        axes=axes,
         program=report_positions if swings else PROGRAMS[program] if program else None,
         events=(jog_on_comms1,) if jogs_on_comms1 else (),
         statement=statement or (0.05 if swings else 0.001),

@@ -33,6 +33,8 @@ class EmulatedCtAnsi(EmulatedMentor):
     ) -> None:
         if address % 10 == 0 or address < 11:
             raise InvalidCommand(f"a drive has an address from 11 to 99 without the tens, not {address}")
+        if width > LONGEST_VALUE:
+            raise InvalidCommand(f"a value has {LONGEST_VALUE} characters at most, not {width}")
         super().__init__(address, **options)
         self.plus = plus
         self.width = width

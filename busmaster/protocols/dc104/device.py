@@ -68,7 +68,9 @@ class EmulatedDc104(Device):
         """Hold values from a parameter on. One that is given does not move."""
         if not is_decimal(item) or not {int(item), int(item) + len(values) - 1} <= set(self.parameters):
             last = self.parameters.stop - 1
-            raise InvalidCommand(f"an emulated DC104 holds no {len(values)} from {item!r} on: its last one is {last}")
+            raise InvalidCommand(
+                f"an emulated DC104 cannot hold what is given at {item!r}: its last parameter is {last}"
+            )
         for parameter, value in enumerate(values, int(item)):
             self.registers[parameter] = held(value, 0, 0xFFFF, f"parameter {parameter}")
             self.lively &= parameter != LIVE

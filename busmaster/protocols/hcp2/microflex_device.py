@@ -11,7 +11,7 @@ from busmaster.emulator.device import NEVER, Delay, held
 from busmaster.emulator.motion import Ramp
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
-from busmaster.protocols._comms.device import HCP2, HostCommsDevice
+from busmaster.protocols._comms.device import HCP2, HostCommsDevice, sendable
 
 COMMAND_WORD, TORQUE_REFERENCE, SPEED_REFERENCE = 108, 116, 118
 
@@ -108,6 +108,7 @@ class EmulatedMicroFlex(HostCommsDevice):
                 raise InvalidCommand(f"an emulated drive's element {element if first else item!r} cannot be given")
 
     def _hold(self, element: int, value: float) -> bool:
+        value = sendable(value, element)
         match element:
             case 100 | 131:
                 self._motor.position = value / FULL_SPEED * 100

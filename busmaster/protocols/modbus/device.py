@@ -73,6 +73,10 @@ class EmulatedModbus(Device):
             raise InvalidCommand(f"a Modbus unit has an address from 1 to 247, not {address}")
         if oracle is not None and oracle.modulus > 2**16:
             raise InvalidCommand(f"a register carries 2**16 oracle values, not {oracle.modulus}")
+        if not functions <= FIXED | COUNTED:
+            raise InvalidCommand(
+                f"an emulated unit knows the functions {sorted(FIXED | COUNTED)}, not {sorted(functions)}"
+            )
         self.registers = list(registers)
         self.inputs = list(inputs)
         self.coils = list(coils)

@@ -51,6 +51,7 @@ REPLIES = {b"DREAD,": VALUE, b"BREAD,": VALUE * BLOCK, b"RFLAGS,": FLAGS // 8, b
 RUNNING, RAM_NOT_RELIABLE, SYSTEM_RESET, AUTO_START = 1, 4, 8, 64
 RUN_FLAG = 200
 """The user flag that lets the program count. Ours, like the address: the document has no program."""
+SHORTEST_PERIOD = 0.001
 FORM = "a data address that there is, flag:5, flags (the numbers of those that are on), or status"
 COUNT = 2000
 """The data address at which it counts."""
@@ -91,6 +92,8 @@ class EmulatedMsc(Device):
                 f"no MSC is unit {address}, an {model!r} or has addresses {address_step} apart: use units 1 to 15, "
                 f"{', '.join(MODELS)}, and steps of 1, 2 or 4"
             )
+        if period < SHORTEST_PERIOD:
+            raise InvalidCommand(f"its program counts every {SHORTEST_PERIOD} s at most, not every {period:g} s")
         if oracle is not None and oracle.modulus > 2**31:
             raise InvalidCommand(f"an MSC carries 2**31 oracle values, not {oracle.modulus}")
         self.model = model
@@ -137,7 +140,7 @@ class EmulatedMsc(Device):
         elif is_decimal(name) and int(name) * self._width + len(values) * VALUE <= len(self._memory):
             self.set_value(int(name), *(held(value, -(2**31), 2**31 - 1, "a data address") for value in values))
         else:
-            raise InvalidCommand(f"an emulated MSC holds no {len(values)} from {item!r} on: use {FORM}")
+            raise InvalidCommand(f"an emulated MSC cannot hold what is given at {item!r}: use {FORM}")
 
     @property
     def unacknowledged(self) -> bool:
