@@ -14,6 +14,7 @@ from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import GroupStatistics, PollGroup, Quality, Sample, Snapshot, Stream
+from busmaster.bus.requester import Requester, RequestOptions
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import (
@@ -103,6 +104,8 @@ __all__ = [
     "Quantiles",
     "Refused",
     "ReplyTiming",
+    "RequestOptions",
+    "Requester",
     "Sample",
     "SerialPort",
     "Snapshot",

@@ -73,28 +73,29 @@ class NodeRecord:
         "label",
         "last_reply",
         "lateness_until",
-        "measured",
+        "line",
         "probe_at",
         "probe_delay",
         "probed_at",
         "profile",
         "refused",
         "replies",
-        "reply_time",
         "retries",
         "slowest",
+        "stops",
         "suspended_until",
         "timings",
         "unheard",
         "up_since",
         "usual",
-        "waiter",
         "writes",
     )
 
-    def __init__(self, profile: Profile, address: int, timings: Timings, retries: int) -> None:
+    def __init__(self, profile: Profile, address: int, timings: Timings, retries: int, line: str = "") -> None:
         self.profile = profile
         self.address = address
+        self.line = line
+        """The name of its line, for errors."""
         self.label = profile.label(address)
         self.timings = timings
         self.retries = retries
@@ -105,10 +106,6 @@ class NodeRecord:
         """When the last of its transactions failed so."""
         self.replies = 0
         """Replies in a row since then."""
-        self.reply_time: float | None = None
-        """Seconds from a request to its reply, as poll groups measured them; None until they have."""
-        self.measured = 0
-        """How many replies that is the mean of."""
         self.last_reply = -inf
         self.up_since = -inf
         self.writes: deque[Transaction] = deque()
@@ -120,7 +117,8 @@ class NodeRecord:
         self.has_hook = False
         self.holds = 0
         """Returns whose on_return hook has not ended: its polls wait."""
-        self.waiter: object = None
+        self.stops = 0
+        """How often it was told to stop: what was decided before must not undo it."""
         self.answered: dict[Sequence[bytes], Command[Any]] = {}
         """A few reads that it has answered, by what their answers look like (R15)."""
         self.refused: set[Command[Any]] = set()

@@ -7,8 +7,10 @@ from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import Any
 
+from busmaster.arbiter.tap import Tap
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
+from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.config.names import expanded, listed
@@ -20,7 +22,6 @@ from busmaster.outputs.fan import Fan
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
 from busmaster.transport.endpoints import Endpoint
-from busmaster.transport.pump import Tap
 
 
 class ConfiguredLine:
@@ -92,7 +93,7 @@ class ConfiguredLine:
             PlannedGroup(
                 group.name,
                 group.period,
-                [(point.node.planned(), point.command) for point in self._wanted[group.name]],
+                [(Node.of(point).planned(), point.command) for point in self._wanted[group.name]],
                 phase=group.phase,
                 priority=group.priority,
             )
@@ -110,10 +111,11 @@ class ConfiguredLine:
         with node.table.at():
             make: Callable[..., Handle] = node.kind.handle
             handle = make(self.bus, node.address, timings=node.timings, retries=node.retries, **options)
+            own = Node.of(handle)
             if node.reply_time is not None:
-                handle.node.record.reply_time = node.reply_time  # until it is measured
+                own.reply_time = node.reply_time  # until it is measured
             if not is_decimal(node.name):
-                handle.node.record.label = node.name  # what messages and the screen call it
+                own.rename(node.name)  # what messages and the screen call it
         for point in node.points.values():
             with point.table.at(*(["item"] if "item" in point.table else [])):
                 handle.point(point.item)
@@ -124,7 +126,7 @@ class ConfiguredLine:
             with group.table.at("points", number):
                 for name in self._names(text):
                     point = self._point(*name)
-                    point.command.open(point.node.address, point.node.record.timings)
+                    point.command.open(point.node.address, Node.of(point).timings)
                     yield point
 
     def _names(self, text: str) -> Iterator[tuple[str, str]]:

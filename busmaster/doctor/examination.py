@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeAlias
 import anyio.to_thread
 
 from busmaster.arbiter.events import Mark
+from busmaster.arbiter.tap import Tap
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings
 from busmaster.doctor import adapters, diagnosis, uart
@@ -19,7 +20,6 @@ from busmaster.doctor.probing import Outcome, Prober, Wire, opened
 from busmaster.errors import LineDown
 from busmaster.registry import find
 from busmaster.transport.endpoints import Endpoint
-from busmaster.transport.pump import Tap
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 

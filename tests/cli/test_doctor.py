@@ -328,7 +328,12 @@ def test_a_tcp_port_is_examined_as_far_as_it_can_be(busmaster: Command, controll
     assert "MEND  node 77     does not answer\n" in done.out
     assert done.err == f"busmaster: {controllers.path.removeprefix('socket://')}: 1 thing to mend\n"
     with file.open("rb") as capture:
-        assert bytes.fromhex("07 30 38 02 30 31 05 0E") in [packet.frame for packet in read_packets(capture)]
+        packets = list(read_packets(capture))
+    assert bytes.fromhex("07 30 38 02 30 31 05 0E") in [packet.frame for packet in packets]
+    told = {(packet.node, packet.outcome.name, packet.comment) for packet in packets}
+    assert (8, "NONE", "probe") in told
+    assert (8, "OK", "read element 1: 0.0") in told
+    assert (77, "NO_REPLY", "read element 1: no reply") in told
 
 
 @pytest.mark.usefixtures("hasty")

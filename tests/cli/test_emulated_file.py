@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from busmaster.bus.node import Node
 from busmaster.bus.samples import Sample
 from busmaster.cli.lines import other_port
 from busmaster.config import ConfiguredLine, load
@@ -36,14 +37,14 @@ def emulated(path: Path, link: str, *options: str) -> Iterator[None]:
             process.terminate()
 
 
-def polled(path: Path, link: str | None = None) -> dict[str, Sample]:
+def polled(path: Path, link: str | None = None) -> dict[str, Sample[Any]]:
     """One cycle of every group, at the file's port or another. No node of the line has failed a request."""
     file = load(path)
 
-    async def poll() -> dict[str, Sample]:
+    async def poll() -> dict[str, Sample[Any]]:
         async with ConfiguredLine(file, port=other_port(file, link), outputs=False) as line:
             snapshots = [await anext(aiter(group)) for group in line.groups.values()]
-            assert [handle.node.statistics().failed for handle in line.nodes.values()] == [0] * len(line.nodes)
+            assert [Node.of(handle).statistics().failed for handle in line.nodes.values()] == [0] * len(line.nodes)
         return {getattr(point, "key", ""): sample for one in snapshots for point, sample in one.items()}
 
     return asyncio.run(asyncio.wait_for(poll(), PATIENCE))

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from busmaster import Priority, SerialPort, TcpPort
+from busmaster.bus.node import Node
 from busmaster.config import ConfiguredLine, FileError, LineFile, emulated_line, load
 from busmaster.config.sections import read
 from busmaster.config.source import Source
@@ -111,7 +112,7 @@ def test_a_node_overrides_its_protocol_and_the_protocol_its_document() -> None:
 
 def test_a_node_without_a_word_on_timing_has_its_protocols() -> None:
     assert parse(HEAD + NODE).nodes["winder"].timings is None
-    assert line(HEAD + NODE).nodes["winder"].node.record.timings == hcp2.PROFILE.timings
+    assert Node.of(line(HEAD + NODE).nodes["winder"]).timings == hcp2.PROFILE.timings
 
 
 def test_messages_and_the_screen_call_a_node_by_its_name() -> None:

@@ -38,7 +38,7 @@ def line() -> Parameters:
 
 @pytest.fixture
 def drive(line: Parameters) -> MentorDrive:
-    return MentorDrive(line.bus, 14, decimals={"1.17": 1, "01.18": 0})
+    return MentorDrive(line, 14, decimals={"1.17": 1, "01.18": 0})
 
 
 @pytest.mark.asyncio
@@ -133,7 +133,7 @@ async def test_what_the_guide_calls_wide_is_written_so_by_itself(drive: MentorDr
 
 @pytest.mark.asyncio
 async def test_a_parameter_that_the_guide_names_goes_by_its_name(line: Parameters) -> None:
-    drive = MentorDrive(line.bus, 14)
+    drive = MentorDrive(line, 14)
     await drive.write("speed_reference_1", -47.6, verify=True)
     assert line.asked == ["write 01.17 = -0476", "read 01.17"]
     assert await drive.read("speed_reference_1") == -47.6
@@ -150,22 +150,22 @@ async def test_a_parameter_that_the_guide_names_goes_by_its_name(line: Parameter
 
 
 def test_declared_decimals_go_before_the_guides_and_must_agree(line: Parameters) -> None:
-    drive = MentorDrive(line.bus, 14, decimals={"speed_reference_1": 2})
+    drive = MentorDrive(line, 14, decimals={"speed_reference_1": 2})
     assert drive.point("1.17").value_of(4765) == drive.point("speed_reference_1").value_of(4765) == 47.65
     with pytest.raises(InvalidCommand, match=r"01\.17 has 1 decimals by another name, not 2"):
-        MentorDrive(line.bus, 14, decimals={"1.17": 1, "01.17": 2})
+        MentorDrive(line, 14, decimals={"1.17": 1, "01.17": 2})
 
 
 @pytest.mark.asyncio
 async def test_all_drives_are_written_at_address_0(drive: MentorDrive, line: Parameters) -> None:
     await drive.write_all("1.17", 0)
-    await MentorDrive(line.bus, 0).write("1.17", 0)
+    await MentorDrive(line, 0).write("1.17", 0)
     assert [(address, command) for address, command, _ in line.log] == [(0, "write 01.17 = +0000")] * 2
 
 
 @pytest.mark.asyncio
 async def test_all_drives_are_never_read(line: Parameters) -> None:
-    everyone = MentorDrive(line.bus, 0)
+    everyone = MentorDrive(line, 0)
     with pytest.raises(InvalidCommand, match="all drives"):
         await everyone.read("1.17")
     with pytest.raises(InvalidCommand, match="all drives"):
@@ -212,17 +212,17 @@ def test_other_items_do_not_exist(drive: MentorDrive, item: str) -> None:
 @pytest.mark.parametrize("address", [1, 9, 10, 90])
 def test_an_address_that_later_products_take_for_a_group_warns(line: Parameters, address: int) -> None:
     with pytest.warns(UserWarning, match=f"address {address} means a group"):
-        MentorDrive(line.bus, address)
+        MentorDrive(line, address)
 
 
 @pytest.mark.parametrize("address", [0, 11, 99])
 def test_other_addresses_do_not(line: Parameters, address: int) -> None:
-    MentorDrive(line.bus, address)
+    MentorDrive(line, address)
 
 
 def test_runs_in_poll_groups_are_opted_into(line: Parameters) -> None:
-    assert MentorDrive(line.bus, 14).node.profile is PROFILE
-    assert MentorDrive(line.bus, 15, chained=True).node.profile is CHAINED
+    assert MentorDrive(line, 14).node.profile is PROFILE
+    assert MentorDrive(line, 15, chained=True).node.profile is CHAINED
 
 
 @pytest.mark.parametrize(

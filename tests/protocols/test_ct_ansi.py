@@ -128,7 +128,7 @@ def test_values_are_read_and_written_in_their_own_unit() -> None:
             await drive.write("1.21", 100.1)
         with pytest.raises(Refused):
             await drive.write("1.22", 1.25)  # finer than the parameter, and no decimals declared
-        everyone = CtAnsiDrive(drive.node.bus, 0)
+        everyone = CtAnsiDrive(drive.bus, 0)
         await everyone.write("1.23", 1.5)
         assert await drive.read("1.23") == 1.5
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from busmaster.contract.exchange import Command, Done, Expect, FrameError
+from busmaster.contract.driver import Driver, Ending
+from busmaster.contract.exchange import Command, FrameError
 from busmaster.contract.profile import Batch
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.msc.codec import (
@@ -57,12 +58,10 @@ REPLIES: dict[str, tuple[Command[Any], int, object]] = {
 
 def answer(command: Command[Any], unit: int, reply: bytes) -> Any:
     """The value of an exchange that is answered with an ACK and this packet in one chunk."""
-    exchange = command.open(unit, PROFILE.timings)
-    assert isinstance(exchange.feed(ACK + reply), Expect)
-    done = exchange.feed(b"")
-    assert isinstance(done, Done)
-    assert (done.send, done.rest) == (ACK, b"")
-    return done.value
+    driver = Driver(command.open(unit, PROFILE.timings)).feed(ACK + reply)
+    assert driver.said == []
+    assert driver.ending == Ending(driver.ending and driver.ending.value, send=ACK)
+    return driver.ending.value
 
 
 def test_every_frame_of_the_vectors_is_tested() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import shutil
 import sys
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import Any
 import pytest
 
 from busmaster import Bus, MemoryPort
-from busmaster.capture.pcapng import Outcome, read_packets
+from busmaster.capture.frames import Direction
+from busmaster.capture.pcapng import Outcome, Packet, read_packets
 from busmaster.capture.recorder import Recorder
 from busmaster.capture.replay import replay
 from busmaster.config import ConfiguredLine
@@ -23,6 +25,7 @@ from busmaster.emulator.serve import TcpServer, serve_tcp
 from busmaster.registry import discovery, find, kinds, make_device, protocols
 from busmaster.testing.fixtures import LineFactory, emulated_line, virtual_time
 from busmaster.testing.virtual_time import run_in_virtual_time
+from tests.capture.test_dissector import dissect
 from tests.cli.conftest import Command, busmaster
 
 __all__ = ["busmaster", "emulated_line", "virtual_time"]
@@ -190,6 +193,12 @@ def test_a_capture_names_it_by_text_and_is_replayed(tally: None, tmp_path: Path,
         ("write counter a = 5", False),
         ("read counter a", False),
     ]
+
+
+@pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
+def test_wireshark_calls_it_by_the_name_that_a_capture_has_for_it(tally: None, tmp_path: Path) -> None:
+    packets = [Packet(0, "tally", Direction.HOST, b"?"), Packet(0, "", Direction.NODE, b"!")]
+    assert dissect(tmp_path, packets, "_ws.col.Protocol") == [["tally"], ["unknown"]]
 
 
 def test_the_fixtures_make_lines_of_it(

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, overload
+from typing import Any, ClassVar, Generic, TypeVar, Unpack, overload
 
 from busmaster.bus.handle import Handle, Send, item_text, unknown_item
 from busmaster.bus.points import Point
+from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
 from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols._comms.codec import ReadElement, WriteElements, is_read_back, telegrams
 from busmaster.protocols._comms.elements import Element
-
-if TYPE_CHECKING:
-    from busmaster.bus.node import Priority
 
 T = TypeVar("T")
 
@@ -69,29 +67,12 @@ class CommsHandle(Handle):
             encode=encode if element.writable else None,
         )
 
-    async def read(
-        self,
-        element: int | str,
-        *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> float:
+    async def read(self, element: int | str, **options: Unpack[ReadOptions]) -> float:
         """The number that an element holds now. Raises Refused for one that the node does not have."""
         number = element if isinstance(element, int) else self._lookup(element).number
-        return await self.node.request(
-            self.read_command(number), priority=priority, start_within=start_within, retries=retries
-        )
+        return await self.node.request(self.read_command(number), **options)
 
-    async def write(
-        self,
-        element: int | str,
-        *values: float,
-        verify: bool = False,
-        idempotent: bool = False,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-    ) -> None:
+    async def write(self, element: int | str, *values: float, **options: Unpack[WriteOptions]) -> None:
         """Write values to an element and those after it, acknowledged.
 
         A list that does not fit one telegram of 60 characters is sent in several; if one of them fails, those before
@@ -101,14 +82,14 @@ class CommsHandle(Handle):
 
         Raises InvalidCommand before anything is sent for a value that cannot be sent, or a read-only name.
         """
-        commands = self.writes(element, values, idempotent)
+        commands = self.writes(element, values)
+        requests = SeveralRequests(self.node, options)
         for command in commands:
-            await self.node.request(command, priority=priority, start_within=start_within)
-        if verify:
-            for number, value in enumerate(values, commands[0].element):
-                await self._verify(number, value, priority)
+            await requests.request(command)
+        for number, value in enumerate(values if requests.verify else (), commands[0].element):
+            await self._verify(requests, number, value)
 
-    def writes(self, element: int | str, values: Sequence[float], idempotent: bool = False) -> list[WriteElements]:
+    def writes(self, element: int | str, values: Sequence[float]) -> list[WriteElements]:
         """What `write` sends. Raises InvalidCommand for a value that cannot be sent; and where the map has names, for a
         name that it calls read-only, or that another value of the list would go to; for its number where it is
         definite."""
@@ -119,7 +100,7 @@ class CommsHandle(Handle):
                     raise InvalidCommand(f"{self.node.label}: {known.name} is read-only")
         if not values:
             raise InvalidCommand(f"{self.node.label}: there is no value to write")
-        return [self.write_command(number + offset, part, idempotent) for offset, part in telegrams(values)]
+        return [self.write_command(number + offset, part) for offset, part in telegrams(values)]
 
     def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
         """Consecutive elements, in as many telegrams as it takes."""
@@ -127,13 +108,13 @@ class CommsHandle(Handle):
         self.writes(element, values)
         return [lambda: self.write(element, *values, verify=verify)]
 
-    async def _verify(self, number: int, written: float, priority: Priority | None) -> None:
+    async def _verify(self, requests: SeveralRequests, number: int, written: float) -> None:
         command = self.read_command(number)
-        found = await self.node.request(command, priority=priority)
+        found = await requests.read_back(command)
         if not is_read_back(written, found):
             raise VerifyFailed(
                 f"element {number} reads {found!r} after {written!r} was written",
-                node=self.node.label,
+                node=self.node,
                 command=str(command),
             )
 

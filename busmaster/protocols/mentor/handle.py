@@ -6,10 +6,11 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar, Unpack
 
 from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
+from busmaster.bus.requester import CommandOptions, NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal, whole_number
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
@@ -18,10 +19,6 @@ from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.mentor.codec import Read, ReadRun, Write, parse_parameter
 from busmaster.protocols.mentor.parameters import NAMED, WIDE
-
-if TYPE_CHECKING:
-    from busmaster.bus.bus import Bus
-    from busmaster.bus.node import Node, Priority
 
 T = TypeVar("T")
 
@@ -37,11 +34,11 @@ class Place(NamedTuple):
     number: int
     decimals: int | None
 
-    def write(self, value: float, *, wide: bool, high_resolution: bool, idempotent: bool = False) -> Write:
+    def write(self, value: float, *, wide: bool, high_resolution: bool) -> Write:
         """The command that writes a value; one that the guide calls wide is sent so. Raises InvalidCommand."""
         decimals = self.decimals if self.decimals is None else self.decimals + high_resolution
         wide = wide or (not high_resolution and self[:2] in WIDE)
-        return Write(self.menu, self.number, to_line(value, decimals), wide, high_resolution, idempotent)
+        return Write(self.menu, self.number, to_line(value, decimals), wide, high_resolution)
 
 
 class MentorDrive(Handle):
@@ -62,7 +59,7 @@ class MentorDrive(Handle):
 
     def __init__(
         self,
-        bus: Bus,
+        bus: NodeSource,
         address: int,
         *,
         decimals: Mapping[str, int] | None = None,
@@ -70,9 +67,8 @@ class MentorDrive(Handle):
         timings: Timings | None = None,
         retries: int | None = None,
     ) -> None:
-        self.node: Node = bus.node(
-            mentor.CHAINED if chained else mentor.PROFILE, address, timings=timings, retries=retries
-        )
+        profile = mentor.CHAINED if chained else mentor.PROFILE
+        super().__init__(bus, address, timings=timings, retries=retries, profile=profile)
         self._decimals: dict[tuple[int, int], int] = {}
         for text, digits in (decimals or {}).items():
             digits = whole_number(digits, 0, MOST_DECIMALS, f"the decimals of {text}")
@@ -127,23 +123,15 @@ class MentorDrive(Handle):
         decimals = tuple(self._decimals.get(parameter) for parameter in _parameters(run))
         return ScaledPoint(self.node, item, run, decode=lambda sent: self._values(run, sent), decimals=decimals)
 
-    async def read(
-        self,
-        parameter: str,
-        *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> float:
+    async def read(self, parameter: str, **options: Unpack[ReadOptions]) -> float:
         """A parameter's value; a bit is 0 or 1. Raises NoSuchParameter, or InvalidCommand at address 0."""
         self._check_readable()
         place = self._place(parameter)
-        command = Read(place.menu, place.number)
-        found = await self.node.request(command, priority=priority, start_within=start_within, retries=retries)
+        found = await self.node.request(Read(place.menu, place.number), **options)
         return from_line(found, place.decimals)
 
     async def read_run(
-        self, parameter: str, count: int, *, step: int = 1, chain: bool = False, priority: Priority | None = None
+        self, parameter: str, count: int, *, step: int = 1, chain: bool = False, **options: Unpack[ReadOptions]
     ) -> tuple[float, ...]:
         """`count` parameters of one menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
 
@@ -155,9 +143,9 @@ class MentorDrive(Handle):
         self._check_readable()
         run = ReadRun(*place_of(parameter), count, step)
         if chain:
-            return self._values(run, await self.node.request(run, priority=priority))
-        singles = [Read(*place) for place in _parameters(run)]
-        return self._values(run, [await self.node.request(single, priority=priority) for single in singles])
+            return self._values(run, await self.node.request(run, **options))
+        requests = SeveralRequests(self.node, options)
+        return self._values(run, [await requests.request(Read(*place)) for place in _parameters(run)])
 
     async def write(
         self,
@@ -166,10 +154,7 @@ class MentorDrive(Handle):
         *,
         wide: bool = False,
         high_resolution: bool = False,
-        verify: bool = False,
-        idempotent: bool = False,
-        priority: Priority | None = None,
-        start_within: float | None = None,
+        **options: Unpack[WriteOptions],
     ) -> None:
         """Write a parameter, acknowledged; at address 0 to all drives, which do not answer.
 
@@ -179,26 +164,31 @@ class MentorDrive(Handle):
         that does not fit.
         """
         place = self._place(parameter)
-        command = place.write(value, wide=wide, high_resolution=high_resolution, idempotent=idempotent)
-        if verify:
+        command = place.write(value, wide=wide, high_resolution=high_resolution)
+        requests = SeveralRequests(self.node, options)
+        if requests.verify:
             self._check_readable()
-        await self.node.request(command, priority=priority, start_within=start_within)
-        if verify:
+        await requests.request(command)
+        if requests.verify:
             check = Read(place.menu, place.number)
-            found = await self.node.request(check, priority=priority)
+            found = await requests.read_back(check)
             if abs(found * 10 - command.value) >= 10 if high_resolution else found != command.value:
                 raise VerifyFailed(
-                    f"{parameter} reads {found} after {command.text} was written",
-                    node=self.node.label,
-                    command=str(check),
+                    f"{parameter} reads {found} after {command.text} was written", node=self.node, command=str(check)
                 )
 
     async def write_all(
-        self, parameter: str, value: float, *, wide: bool = False, high_resolution: bool = False
+        self,
+        parameter: str,
+        value: float,
+        *,
+        wide: bool = False,
+        high_resolution: bool = False,
+        **options: Unpack[CommandOptions],
     ) -> None:
         """Write a parameter of every drive on the line at once (address 0). None answers."""
         command = self._place(parameter).write(value, wide=wide, high_resolution=high_resolution)
-        await self.node.bus.node(mentor.PROFILE, 0).request(command)
+        await self.bus.node(mentor.PROFILE, 0).request(command, **options)
 
     async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
         """As `point(item).read()`; a run without `chain` parameter by parameter, which is always safe."""

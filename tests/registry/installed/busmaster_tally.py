@@ -11,10 +11,11 @@ from __future__ import annotations
 import string
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
-from busmaster import InvalidCommand, Point, Refused
-from busmaster.bus.handle import Handle, unknown_item
+from busmaster import InvalidCommand, Point, Refused, VerifyFailed
+from busmaster.bus.handle import Handle, encoder, unknown_item
+from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
 from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import MORE, Command, Done, FrameError, Need, Sizes, no_reply
@@ -116,6 +117,19 @@ class Turnstile(Handle):
         if len(counter) != 1 or counter not in string.ascii_lowercase:
             raise unknown_item(item, ("gate",), "a counter, a to z, or gate")
         return Point(self.node, item, Count(counter), encode=lambda value: Preset(counter, value))
+
+    async def read(self, item: str, **options: Unpack[ReadOptions]) -> int:
+        return await self.point(item).read(**options)
+
+    async def write(self, item: str, value: int, **options: Unpack[WriteOptions]) -> None:
+        point, requests = self.point(item), SeveralRequests(self.node, options)
+        await requests.request(encoder(point)(value))
+        if requests.verify and await requests.read_back(point.command) != value:
+            raise VerifyFailed(f"{item} is not {value}", node=self.node)
+
+    @classmethod
+    def items(cls) -> tuple[str, ...]:
+        return ("gate",)
 
 
 class EmulatedTurnstile(Device):
