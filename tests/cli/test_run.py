@@ -104,9 +104,9 @@ def test_an_output_that_is_down_is_said_and_the_line_runs_on(busmaster: Command,
     assert ran.status == 0
     assert ran.lines
     said = ran.err.splitlines()
-    assert said[0] == "busmaster: sqlite is down: unable to open database file"
+    assert said[0] == f"busmaster: sqlite is down: {tmp_path}/x.db: Is a directory"
     assert said[-1].startswith("busmaster: sqlite: 0 written, ")
-    assert said[-1].endswith("dropped, down: unable to open database file")
+    assert said[-1].endswith(f"dropped, down: {tmp_path}/x.db: Is a directory")
 
 
 @pytest.mark.parametrize("command", ["run", "plan", "emulate"])
