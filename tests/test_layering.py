@@ -21,7 +21,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "contract": {"contract", "errors"},
     "wire": {"wire"} | BASE,
     "arbiter": {"arbiter"} | BASE,
-    "planning": {"planning", "arbiter.schedule"} | BASE,
+    "planning": {"planning", "arbiter"} | BASE,
     "transport": {"transport", "arbiter"} | BASE,
     "bus": {"bus", "transport", "arbiter", "planning"} | BASE,
     "emulator": {"emulator", "wire"} | BASE,

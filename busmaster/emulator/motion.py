@@ -81,6 +81,11 @@ class Axis:
         self._ramp.speed = self._ramp.target = 0.0
         self.motion = Motion.IDLE
 
+    def place(self, position: float, now: float) -> None:
+        """Be idle at a position."""
+        self.stop(now)
+        self._ramp.position = position
+
     def move(self, target: float, now: float, motion: Motion = Motion.MOVE) -> None:
         """Go to `target` at `speed`, then be idle: MOVEA and GO (HOME likewise, to 0)."""
         distance = target - self.position(now)

@@ -15,11 +15,12 @@ from itertools import count
 from math import ceil, floor, inf, log10
 from typing import Any
 
+from busmaster.arbiter.backlog import SHARE
 from busmaster.arbiter.schedule import SLICE, Poll, Priority, Schedule, line_time
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import LineSettings
 from busmaster.planning.merging import WEIGHING, Merge, Served, at_once, cheapest
-from busmaster.planning.worst_case import SHARE, Bounds, PlannedNode, Read, bound_steps, unanswered
+from busmaster.planning.worst_case import Bounds, PlannedNode, Read, bound_steps, unanswered
 
 COMFORT = 0.9
 """The share of the line that a schedule may take: the rest is for commands, retries and probes."""

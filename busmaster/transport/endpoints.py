@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import difflib
 import re
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Protocol
 from urllib.parse import parse_qsl, urlsplit
 
+from busmaster.contract.arguments import meant
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
 from busmaster.transport.identity import USB, Identity
@@ -123,9 +123,7 @@ def _options(query: str, known: Mapping[str, Callable[[str], object]]) -> dict[s
     options: dict[str, Any] = {}
     for key, text in parse_qsl(query, keep_blank_values=True):
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            guess = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(known)}"
-            raise InvalidCommand(f"no such port option {key!r}: {guess}")
+            raise InvalidCommand(f"no such port option {key!r}; {meant(key, known)}")
         try:
             options[key] = known[key](text)
         except (ValueError, KeyError):

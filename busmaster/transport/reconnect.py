@@ -55,10 +55,6 @@ class Connection:
         self._told: dict[str, str] = {}
         self._closing = asyncio.Event()
 
-    @property
-    def connected(self) -> bool:
-        return self._link is not None and not self._link.lost.is_set()
-
     async def open(self) -> None:
         """Open it once, now. Raises LineDown."""
         self._came_back()
