@@ -1,0 +1,204 @@
+"""The pages under docs/ say what is so: their telegrams are the codecs', their programs run, their links lead somewhere."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from busmaster.errors import Refused
+from busmaster.registry import find, make_device, protocols
+from busmaster.testing import answers_of
+from busmaster.testing.listening import Ending, Listening
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+LINKED = [*PAGES, ROOT / "README.md", ROOT / "benchmarks" / "README.md"]
+VECTORS = json.loads((ROOT / "tests" / "vectors" / "frames.json").read_text())
+BLOCK = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"(?<!!)\[[^\]]*\]\(([^)\s]+)\)")
+DONE = "done"
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return [text for _, said, text in BLOCK.findall(page.read_text()) if said == language]
+
+
+def value_of(node: ast.expr) -> Any:
+    """What a literal stands for; `range(32)` stands for the tuple of that."""
+    if isinstance(node, ast.Call):
+        return tuple(range(ast.literal_eval(node.args[0])))
+    return ast.literal_eval(node)
+
+
+class Telegrams:
+    """One example of a page: `KIND ADDRESS: command(arguments)`, then what each side says, then how it ends.
+
+    `>` is the host, `<` the node, `=` the outcome; two spaces go on with the line above. `KIND ADDRESS hears:` has no
+    command, for what no command of ours would send: there the emulated device alone is asked.
+    """
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        lines = re.sub(r"\n  +", " ", re.sub(r"\s+#.*", "", text)).strip().splitlines()
+        head, _, self.command = lines[0].partition(":")
+        kind, address, *hears = head.split()
+        self.kind, self.address, self.known = find(kind), int(address), not hears
+        self.said = [(line[0], bytes.fromhex(line[1:])) for line in lines[1:] if line[0] in "<>"]
+        self.outcome = next((line[1:].strip() for line in lines if line[0] == "="), "")
+
+    def __str__(self) -> str:
+        return self.text.splitlines()[0]
+
+    def built(self) -> Any:
+        call: Any = ast.parse(self.command.strip(), mode="eval").body
+        arguments = {argument.arg: value_of(argument.value) for argument in call.keywords}
+        return self.kind.protocol.read_back({"command": call.func.id, **arguments})
+
+    def check_codec(self) -> None:
+        listening = Listening(self.built().open(self.address, self.kind.profile.timings))
+        turn = 0
+        for side, data in self.said:
+            if side == "<":
+                listening.feed(data)
+                continue
+            closing = listening.ending.send if listening.ending is not None else b""
+            says = [listening.exchange.request, *listening.said, closing][turn]
+            assert data == says, f"{self}: the host says {says.hex(' ')!r}, not {data.hex(' ')}"
+            turn += 1
+        self.check_outcome(listening.expire())
+
+    def check_outcome(self, ending: Ending) -> None:
+        if isinstance(ending.error, Refused):
+            assert self.outcome == type(ending.error).__name__, f"{self}: {ending}"
+        else:
+            assert ending.delivered, f"{self}: {ending}"
+            wanted = None if self.outcome == DONE else value_of(ast.parse(self.outcome, mode="eval").body)
+            assert ending.value == wanted, f"{self}: {ending}"
+
+    def check_device(self) -> None:
+        """The emulated device takes the request for one of its own; where no command sends it, says just that."""
+        host = self.said[0][1]
+        told = b"".join(data for side, data in self.said if side == "<")
+        profile = self.kind.profile
+        address = profile.addresses[0] if self.address == profile.broadcast else self.address
+        heard = answers_of(make_device(self.kind.name, address))(host)
+        if self.known:
+            assert bool(heard) is bool(told), f"{self}: the emulated device answers {heard.hex(' ')!r}"
+        else:
+            assert heard == told, f"{self}: the emulated device answers {heard.hex(' ')!r}"
+
+
+def examples() -> Iterator[tuple[str, Telegrams]]:
+    for page in PAGES:
+        for text in blocks(page, "telegrams"):
+            for part in re.split(r"\n{2,}", text.strip()):
+                yield page.stem, Telegrams(part)
+
+
+EXAMPLES = list(examples())
+
+
+@pytest.mark.parametrize("example", [example for _, example in EXAMPLES if example.known], ids=str)
+def test_the_codec_sends_and_reads_the_very_bytes_of_an_example(example: Telegrams) -> None:
+    example.check_codec()
+
+
+@pytest.mark.parametrize("example", [example for _, example in EXAMPLES], ids=str)
+def test_the_emulated_device_answers_the_request_of_an_example(example: Telegrams) -> None:
+    example.check_device()
+
+
+@pytest.mark.parametrize("protocol", protocols(), ids=lambda protocol: protocol.name)
+def test_each_protocol_has_a_page_with_examples_of_every_command_but_those_that_merge_others(protocol: Any) -> None:
+    shown = {
+        example.command.partition("(")[0].strip()
+        for page, example in EXAMPLES
+        if example.known and page == protocol.name
+    }
+    assert shown == {name for name in protocol.commands if not name.startswith("pick_")}
+
+
+@pytest.mark.parametrize("family", VECTORS)
+def test_every_frame_of_the_vectors_is_on_its_page(family: str) -> None:
+    shown = {data for page, example in EXAMPLES if page == family.lower() for _, data in example.said}
+    assert [entry["name"] for entry in VECTORS[family] if bytes.fromhex(entry["hex"]) not in shown] == []
+
+
+@pytest.mark.parametrize(
+    ("page", "source"),
+    [(page, source) for page in PAGES for source in blocks(page, "python")],
+    ids=lambda value: value.stem if isinstance(value, Path) else "",
+)
+def test_a_program_on_a_page_runs(page: Path, source: str) -> None:
+    """Run as a module, so that what stands under `if __name__ == "__main__"` (a real port) does not."""
+    exec(compile(source, name_of(page), "exec"), {"__name__": "page"})
+
+
+def anchors(page: Path) -> set[str]:
+    """What the headings of a page can be linked to by, as most renderers make it."""
+    headings = re.findall(r"^#+ (.*)$", re.sub(BLOCK, "", page.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", LINKED, ids=name_of)
+def test_links_within_the_repository_lead_somewhere(page: Path) -> None:
+    for link in LINK.findall(re.sub(BLOCK, "", page.read_text())):
+        path, _, anchor = link.partition("#")
+        if "://" in path:
+            continue
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), f"{name_of(page)}: {link} leads nowhere"
+        assert not anchor or anchor in anchors(target), f"{name_of(page)}: {link} names no heading"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_files_that_a_page_names_are_there(page: Path) -> None:
+    """In `backquotes`, what has a slash and a known ending, or begins with a room of the repository."""
+    for name in re.findall(r"`((?:busmaster|tests|benchmarks|examples|docs)/[\w./-]*)`", page.read_text()):
+        assert (ROOT / name).exists(), f"{name_of(page)}: there is no {name}"
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name != "README.md"], ids=name_of)
+def test_every_page_can_be_found_from_the_index(page: Path) -> None:
+    index = ROOT / "docs" / "README.md"
+    linked = {(index.parent / link.partition("#")[0]).resolve() for link in LINK.findall(index.read_text())}
+    assert page.resolve() in linked
+
+
+# what is cited
+
+READ_BY_USERS = ("busmaster", "tests", "benchmarks", "examples", "docs")
+CITED_NOWHERE = re.compile(
+    r"\bDESIGN(\.md)?\b|\bPROTOCOLS(\.md)?\b|\bCLI\.md\b|\b[Ii]ssue #?\d|\b(in|from|of) (the )?seeds?\b(?! \d)"
+    r"|\((H|G|M|S|D)\d{1,2}\)|\bthe card('s)?\b|/work/"
+)
+"""Papers that were at hand when this was written, and are not here: the promises, R1 to R15, are in docs/promises.md."""
+
+
+def prose() -> Iterator[tuple[str, int, str]]:
+    paths = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", ROOT / "pyproject.toml"]
+    for room in READ_BY_USERS:
+        paths += [path for path in (ROOT / room).rglob("*") if path.suffix in (".py", ".md", ".toml", ".lua", ".json")]
+    for path in paths:
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            yield name_of(path), number, line
+
+
+def test_nothing_cites_what_is_not_in_the_repository() -> None:
+    """A protocol's own manual may be cited, by its title."""
+    found = [
+        f"{name}:{number}: {line.strip()}"
+        for name, number, line in prose()
+        if CITED_NOWHERE.search(line) and name != name_of(Path(__file__))
+    ]
+    assert found == []
