@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from benchmarks.masters import Ask
-from busmaster.profile import LineSettings
+from busmaster.contract.profile import LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.exchange import packet

@@ -12,8 +12,9 @@ from functools import partial
 from typing import Any
 
 from benchmarks.harness import Options, Outcome, Table
-from busmaster.exchange import Command, Expect, Timings
-from busmaster.profile import Profile
+from busmaster.contract.exchange import Command, Expect
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2

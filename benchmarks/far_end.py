@@ -18,10 +18,10 @@ from types import TracebackType
 from typing import Any
 
 from benchmarks.lines import CORES, ROOT, part_from
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer
-from busmaster.profile import LineSettings
 from busmaster.protocols.modbus.device import EmulatedModbus
 
 SETTINGS = LineSettings(57600)

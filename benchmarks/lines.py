@@ -17,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from busmaster.profile import LineSettings
+from busmaster.contract.profile import LineSettings
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.identity import Identity
 from busmaster.transport.serial_port import SerialPort

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from benchmarks.harness import Claim, Options, Outcome, Table
 from benchmarks.lines import Lines
 from busmaster import Bus, BusError, Hcp2Controller, Point, PollGroup
-from busmaster.profile import LineSettings
+from busmaster.contract.profile import LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.wire.checks import xor
 from busmaster.wire.readers import ETX, STX

@@ -17,8 +17,8 @@ from benchmarks.asks import hcp2_asks, wire_time
 from benchmarks.harness import Claim, Options, Outcome, Table, quantile
 from benchmarks.lines import Lines
 from benchmarks.masters import Ask
-from busmaster.bus import Bus
-from busmaster.profile import LineSettings
+from busmaster.bus.bus import Bus
+from busmaster.contract.profile import LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.transport.endpoints import Endpoint
 

@@ -18,9 +18,9 @@ import serial
 import serial_asyncio
 
 from benchmarks.lines import SocketPort
-from busmaster.bus import Bus
-from busmaster.exchange import Command
-from busmaster.profile import Profile
+from busmaster.bus.bus import Bus
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort

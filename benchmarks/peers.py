@@ -17,7 +17,7 @@ from benchmarks.lines import Lines
 from benchmarks.masters import Ask, Bare
 from benchmarks.modbus_masters import PROFILE, TIMINGS, Busmaster, Failed, Minimalmodbus, ModbusMaster, masters, notes
 from busmaster import SerialPort, Timings
-from busmaster.profile import LineSettings
+from busmaster.contract.profile import LineSettings
 from busmaster.protocols.modbus.codec import ReadRegisters, with_crc
 
 DELAY = 0.002

@@ -15,7 +15,7 @@ from benchmarks.asks import hcp2_asks, msc_asks, wire_time
 from benchmarks.harness import Claim, Options, Outcome, Table, alternate
 from benchmarks.lines import Lines
 from benchmarks.masters import Ask, Bare, Ours
-from busmaster.profile import LineSettings, Profile
+from busmaster.contract.profile import LineSettings, Profile
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
 

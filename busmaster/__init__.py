@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
@@ -9,7 +10,12 @@ from busmaster.arbiter.events import LatenessLowered, LatenessRaised, LineChange
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Timeline
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
+from busmaster.bus.node import Node
+from busmaster.bus.points import Point
+from busmaster.bus.polling import GroupStatistics, PollGroup, Quality, Sample, Snapshot, Stream
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import (
     BacklogFull,
     BusClosed,
@@ -27,12 +33,7 @@ from busmaster.errors import (
     VerifyFailed,
     WriteUnconfirmed,
 )
-from busmaster.exchange import ReplyTiming, Timings
-from busmaster.node import Node
 from busmaster.planning import GroupPlan, Plan, PlannedGroup, PlannedNode
-from busmaster.points import Point
-from busmaster.polling import GroupStatistics, PollGroup, Quality, Sample, Snapshot, Stream
-from busmaster.profile import LineSettings, Profile
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
 from busmaster.protocols.dc104.handle import Dc104Drive
 from busmaster.protocols.hcp.handle import HcpController
@@ -44,12 +45,12 @@ from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.protocols.msc.codec import ProgramStatus
 from busmaster.protocols.msc.handle import MscController
 from busmaster.transport.endpoints import Endpoint, endpoint
-from busmaster.transport.memory import MemoryPort
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
 if TYPE_CHECKING:
     from busmaster.config.line import open_line
+    from busmaster.emulator.memory import MemoryPort
 
 __all__ = [
     "BacklogFull",
@@ -118,10 +119,12 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> object:
-    """What needs more than a bus is imported when it is asked for."""
-    if name != "open_line":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from busmaster.config.line import open_line
+ON_DEMAND = {"MemoryPort": "busmaster.emulator.memory", "open_line": "busmaster.config.line"}
+"""Public names that need more than a bus does, and the modules which are imported when these are asked for."""
 
-    return open_line
+
+def __getattr__(name: str) -> object:
+    """Import what needs more than a bus when it is asked for."""
+    if name not in ON_DEMAND:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(ON_DEMAND[name]), name)

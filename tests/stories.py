@@ -5,14 +5,14 @@ from __future__ import annotations
 import random
 from collections.abc import Awaitable, Callable
 
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
+from busmaster.bus.polling import PollGroup, Snapshot
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
-from busmaster.polling import PollGroup, Snapshot
-from busmaster.profile import LineSettings
+from busmaster.emulator.memory import MemoryPort
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.testing.virtual_time import run_in_virtual_time
-from busmaster.transport.memory import MemoryPort
 
 Story = Callable[[Bus], Awaitable[None]]
 

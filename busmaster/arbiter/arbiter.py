@@ -18,9 +18,9 @@ from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import EXCHANGE, READY
 from busmaster.arbiter.transaction import Transaction
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed
-from busmaster.exchange import Timings
-from busmaster.profile import Profile
 
 
 class Arbiter(LineMachine):

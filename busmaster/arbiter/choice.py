@@ -15,7 +15,7 @@ from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import UP, NodeRecord
 from busmaster.arbiter.in_step import LONGEST_ALIKE, InStep
 from busmaster.arbiter.transaction import URGENT, Transaction
-from busmaster.exchange import Command, Exchange
+from busmaster.contract.exchange import Command, Exchange
 
 MOST_BEFORE = 3
 """Exchanges that may go before one that is held back; then it goes, and its answer is doubted. The bounds of R9, in

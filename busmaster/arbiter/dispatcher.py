@@ -25,6 +25,7 @@ from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.schedule import Poll, Schedule
 from busmaster.arbiter.state import SETTLING
 from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
+from busmaster.contract.exchange import Command
 from busmaster.errors import (
     BacklogFull,
     BusError,
@@ -35,7 +36,6 @@ from busmaster.errors import (
     Superseded,
     WriteUnconfirmed,
 )
-from busmaster.exchange import Command
 
 REFUSED_POLL_PAUSE = 10.0
 """Seconds between polls of a point that was refused again and again."""

@@ -10,8 +10,9 @@ from typing import Any
 
 from busmaster.arbiter.counters import NodeCounters
 from busmaster.arbiter.transaction import Transaction
-from busmaster.exchange import Command, Timings
-from busmaster.profile import Profile
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 
 DOWN_AFTER_FAILURES = 3
 DOWN_AFTER_SILENCE = 1.0

@@ -26,8 +26,8 @@ from collections.abc import Sequence
 from math import inf
 
 from busmaster.arbiter.strays import QUIET
-from busmaster.exchange import Leg as LaterLeg
-from busmaster.exchange import ReplyTiming
+from busmaster.contract.exchange import Leg as LaterLeg
+from busmaster.contract.timing import ReplyTiming
 
 TAINT_SHARE = 0.9
 """A reply cannot begin before this share of its request's own wire time (R4)."""

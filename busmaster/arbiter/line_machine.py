@@ -24,8 +24,7 @@ SETTLING   stray: silence starts  READY                    down: OFFLINE, all fa
 
 READY never lasts while something waits: whatever leads to READY starts the next transaction in the same call.
 An exchange ends in READY or HOLDOFF only when its outcome is certain: a reply that matches, with nothing behind it, or
-a NAK to a write. Everything else settles: until silence and past the lateness (leg.py has the times), or until silence
-alone where the reply is known to have begun.
+a NAK to a write. Everything else settles, to silence and past the lateness (leg.py has the times).
 """
 
 from __future__ import annotations
@@ -47,8 +46,9 @@ from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
 from busmaster.arbiter.strays import LOOK_SLACK, QUIET, Strays
 from busmaster.arbiter.trust import TWO_ANSWERS, Trust
+from busmaster.contract.exchange import NO_REPLY, Done, Expect, FrameError
+from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import BusError, LineDown, LineNoisy, Refused
-from busmaster.exchange import NO_REPLY, Done, Expect, FrameError, ReplyTiming
 
 UNKNOWN_LATENESS = 0.150
 """Assumed of an earlier master's nodes while none is known."""

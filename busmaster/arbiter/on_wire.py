@@ -10,7 +10,8 @@ from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.output import Output
 from busmaster.arbiter.transaction import Transaction
-from busmaster.exchange import Abandonable, Exchange, Expect, ReplyTiming, Step
+from busmaster.contract.exchange import Abandonable, Exchange, Expect, Step
+from busmaster.contract.timing import ReplyTiming
 
 
 class OnWire:

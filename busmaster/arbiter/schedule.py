@@ -17,8 +17,8 @@ from typing import Any
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.phases import STRIDE, quietest_offset
 from busmaster.arbiter.transaction import BACKGROUND, POLL, Priority, Transaction
+from busmaster.contract.exchange import Exchange
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import Exchange
 
 LONGEST_PATIENCE = 10.0
 """Seconds after which a poll's cycle goes before those that came later, however long its period is."""

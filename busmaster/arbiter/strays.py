@@ -8,7 +8,7 @@ from math import inf
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.events import Event, LatenessRaised, Strayed
 from busmaster.arbiter.health import NodeRecord
-from busmaster.exchange import Done, FrameError, Listener, Need
+from busmaster.contract.exchange import Done, FrameError, Listener, Need
 
 QUIET = 0.020
 """The least silence, in seconds, that ends a settle."""

@@ -6,8 +6,8 @@ import enum
 from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from busmaster.contract.exchange import Command
 from busmaster.errors import BusError
-from busmaster.exchange import Command
 
 if TYPE_CHECKING:
     from busmaster.arbiter.health import NodeRecord

@@ -6,7 +6,7 @@ from typing import Any
 
 from busmaster.arbiter.in_step import ANY_BYTE, InStep
 from busmaster.arbiter.on_wire import OnWire
-from busmaster.exchange import Done
+from busmaster.contract.exchange import Done
 
 TWO_ANSWERS = "two answers came where one was due"
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 from busmaster.capture.frames import Direction, Frame, Kind
-from busmaster.exchange import Command
+from busmaster.contract.exchange import Command
 
 LONGEST_FRAME = 250
 DEFAULT_GAP = 0.1

@@ -17,8 +17,9 @@ from busmaster.arbiter.transaction import Transaction
 from busmaster.capture.assemble import Assembler, Verdict
 from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, Packet, PcapngWriter
+from busmaster.contract.exchange import Command
+from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, GarbledReply, NoReply, Refused
-from busmaster.exchange import Command, Timings
 
 CAPACITY = 50_000
 """Events that may wait for the disk: minutes of a line at 57600 baud."""

@@ -14,8 +14,8 @@ from typing import Any
 from busmaster.capture.decode import Decoder
 from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.capture.pcapng import Outcome, Packet
+from busmaster.contract.exchange import Command, Done, Exchange, Expect, FrameError, Step
 from busmaster.errors import InvalidCommand, Refused
-from busmaster.exchange import Command, Done, Exchange, Expect, FrameError, Step
 from busmaster.registry import Protocol, find
 
 

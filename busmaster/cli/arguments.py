@@ -9,13 +9,13 @@ from typing import Any, TypeVar
 
 import click
 
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
+from busmaster.bus.handle import Handle
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.parsing import Whole, option_type, parse_nodes, parse_seconds, parse_window, parsed
 from busmaster.cli.protocols import handle_options, protocol_option, take_options
-from busmaster.exchange import Timings
-from busmaster.handle import Handle
-from busmaster.profile import LineSettings, Profile
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.timing import Timings
 from busmaster.registry import find
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import anyio
 import click
 
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
 from busmaster.cli.arguments import View, plain_option, seconds_option
 from busmaster.cli.demo_line import CONTROLLERS, DRIVES, SETTINGS
 from busmaster.cli.ending import until_ended

@@ -12,10 +12,10 @@ import random
 import select
 import sys
 
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, serve_pty
-from busmaster.profile import LineSettings
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 

@@ -10,12 +10,13 @@ import click
 from busmaster.cli.arguments import Connection, checked, nodes_option, only_address
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
-from busmaster.cli.examination import Patient, examine
 from busmaster.cli.output import emit_all, note
 from busmaster.cli.parsing import Whole, option_type, parse_window, parsed
+from busmaster.cli.progress import Bar
 from busmaster.cli.protocols import protocol_option
-from busmaster.profile import LineSettings, Profile
-from busmaster.transport.adapters import Finding
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.doctor.adapters import Finding
+from busmaster.doctor.examination import Patient, examine
 from busmaster.transport.endpoints import endpoint
 
 FAILED = 1
@@ -69,12 +70,12 @@ def patient_of(connection: Connection, nodes: Sequence[int] | None) -> Patient:
     if connection.protocol:
         where = parsed(lambda _: connection.endpoint(), connection.port)
         addresses = nodes_to_ask(connection.profile, nodes)
-        return Patient(where, connection.protocol, connection.timings, addresses, nodes is not None)
+        return Patient(where, connection.protocol, connection.timings, addresses, nodes is not None, Bar)
     if nodes is not None:
         raise click.UsageError("--nodes needs a --protocol, to ask them in")
     settings = USUAL if connection.baud is None else replace(USUAL, baudrate=connection.baud)
     where = parsed(lambda port: endpoint(port, defaults=settings), connection.port)
-    return Patient(replace(where, echo=True) if connection.echo else where)
+    return Patient(replace(where, echo=True) if connection.echo else where, progress=Bar)
 
 
 def nodes_to_ask(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:

@@ -7,8 +7,8 @@ from typing import TypeVar
 
 import click
 
+from busmaster.bus.handle import is_decimal
 from busmaster.errors import InvalidCommand
-from busmaster.handle import is_decimal
 from busmaster.registry import kinds
 
 S = TypeVar("S")

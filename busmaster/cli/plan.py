@@ -13,8 +13,8 @@ from busmaster.cli.arguments import json_option
 from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import emit, emit_all, json_line
 from busmaster.config import ConfiguredLine
+from busmaster.contract.profile import LineSettings
 from busmaster.planning import GroupPlan, Plan
-from busmaster.profile import LineSettings
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.serial_port import SerialPort
 

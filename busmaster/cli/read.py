@@ -7,11 +7,11 @@ from typing import Any
 
 import click
 
+from busmaster.bus.handle import Handle
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit, emit_all, json_line, json_value, value_text
 from busmaster.cli.protocols import ItemCommand, Offer, read_options, take_options
-from busmaster.handle import Handle
 
 
 class ItemsReadCommand(ItemCommand):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import click
 
+from busmaster.bus.node import Node
 from busmaster.cli.arguments import Connection, connected, json_option, nodes_option
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit, json_line, json_value, value_text
 from busmaster.cli.progress import Bar
 from busmaster.cli.protocols import NodeCommand
 from busmaster.errors import GarbledReply, NodeDown, NoReply, Refused
-from busmaster.node import Node
 
 
 @click.command(short_help="Find the nodes that answer.", cls=NodeCommand)

@@ -14,18 +14,18 @@ import anyio
 
 from busmaster.arbiter.events import Event, LineChange, LineChanged, PortFailed
 from busmaster.arbiter.state import LineState
-from busmaster.bus import Bus
-from busmaster.cli import uart
+from busmaster.bus.bus import Bus
+from busmaster.bus.points import Point
+from busmaster.bus.polling import PollGroup, Quality, Sample, Snapshot
 from busmaster.cli.app import OK
 from busmaster.cli.arguments import View
 from busmaster.cli.drawing import draw
 from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row
 from busmaster.cli.output import emit_all, json_line, note, value_text
 from busmaster.cli.parsing import parse_value
+from busmaster.doctor import uart
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.outputs.values import cycle_fields, event_text
-from busmaster.points import Point
-from busmaster.polling import PollGroup, Quality, Sample, Snapshot
 
 KEPT_PERIODS = 1_000
 KEPT_EVENTS = 8

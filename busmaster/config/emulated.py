@@ -6,9 +6,9 @@ import random
 from dataclasses import replace
 
 from busmaster.config.sections import LineFile
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Echo, Line
-from busmaster.profile import LineSettings
 from busmaster.registry import make_device
 from busmaster.transport.serial_port import SerialPort
 

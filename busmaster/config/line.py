@@ -8,18 +8,18 @@ from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import Any
 
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
+from busmaster.bus.handle import Handle
+from busmaster.bus.points import Point
+from busmaster.bus.polling import PollGroup
 from busmaster.config.names import expanded, listed
 from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
 from busmaster.config.table import nearest
 from busmaster.errors import InvalidCommand
-from busmaster.handle import Handle
 from busmaster.outputs.fan import Fan
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
-from busmaster.points import Point
-from busmaster.polling import PollGroup
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.pump import Tap
 

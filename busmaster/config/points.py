@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
+from busmaster.bus.points import Point
+from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import Command
-from busmaster.points import Point
 
 
 @dataclass(frozen=True, slots=True)

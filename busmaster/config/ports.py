@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from busmaster.config.table import Table
-from busmaster.profile import LineSettings, Profile
+from busmaster.contract.profile import LineSettings, Profile
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort

@@ -14,11 +14,11 @@ from busmaster.config.recording import Outputs, read_outputs
 from busmaster.config.source import Source
 from busmaster.config.table import Table, nearest
 from busmaster.config.timing import read_timings
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import NAMES, Faults
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import Timings
-from busmaster.profile import Profile
 from busmaster.registry import NodeKind, Option, find, kinds
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from busmaster.config.table import Table
-from busmaster.exchange import ReplyTiming, Timings
+from busmaster.contract.timing import ReplyTiming, Timings
 
 TIMES = ("nominal", "window", "lateness", "byte_gap", "turnaround")
 

@@ -23,11 +23,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.audience import Audience
 from busmaster.emulator.device import NEVER, Chance, Device, NoChance
 from busmaster.emulator.faults import Faults, Said, distort, flipped
 from busmaster.emulator.wave import Wave
-from busmaster.profile import LineSettings
 
 PIECE = 0.005
 """Seconds of a frame that a port hands over at once."""

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Chance, Device
-from busmaster.profile import LineSettings
 
 IDLE = 1
 START = 0

@@ -15,9 +15,10 @@ from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import Completed, Event, LineChanged, NodeChanged
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.emulator.line import Line
-from busmaster.exchange import Command, Timings
-from busmaster.profile import Profile
 
 FOREVER_STEPS = 100_000
 """Steps in one moment of time after which a world is thought to turn in circles."""

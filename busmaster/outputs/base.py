@@ -21,10 +21,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar
 
+from busmaster.bus.points import Point
+from busmaster.bus.polling import Sample, Snapshot
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.settings import Settings
-from busmaster.points import Point
-from busmaster.polling import Sample, Snapshot
 
 Formatted = TypeVar("Formatted")
 

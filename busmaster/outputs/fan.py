@@ -9,14 +9,14 @@ from typing import Any
 import anyio
 
 from busmaster.arbiter.events import LatenessRaised, NodeChanged
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
+from busmaster.bus.points import Point
+from busmaster.bus.polling import PollGroup, Snapshot, Stream
 from busmaster.outputs.base import Happening, Output, OutputStatistics
 from busmaster.outputs.files import CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings, MetricsSettings, MqttSettings, Settings, SqliteSettings
 from busmaster.outputs.sqlite import SqliteOutput
 from busmaster.outputs.values import event_text
-from busmaster.points import Point
-from busmaster.polling import PollGroup, Snapshot, Stream
 
 WAITING = 256
 """Cycles of a group that may wait for a loop that is busy with other things."""

@@ -9,10 +9,10 @@ import time
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 
+from busmaster.bus.polling import Snapshot
 from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
 from busmaster.outputs.settings import FileSettings
 from busmaster.outputs.values import cycle_fields, json_line, value_text
-from busmaster.polling import Snapshot
 
 COLUMNS = ("time", "group", "cycle", "node", "item", "value", "unit", "quality", "error")
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, ClassVar, TypeVar
 from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.transaction import Priority
-from busmaster.bus import Bus
-from busmaster.node import Node
+from busmaster.bus.bus import Bus
+from busmaster.bus.node import Node
 from busmaster.outputs.base import Output, OutputStatistics, check_extra
 from busmaster.outputs.settings import MetricsSettings
 

@@ -29,13 +29,13 @@ import anyio
 from anyio.abc import TaskGroup
 
 from busmaster.arbiter.state import LineState
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
+from busmaster.bus.points import Point
+from busmaster.bus.polling import Snapshot
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.outputs.base import TICK, Item, Output, check_extra, reason, size_of
 from busmaster.outputs.settings import MqttSettings
 from busmaster.outputs.values import cycle_fields, json_line, sample_fields
-from busmaster.points import Point
-from busmaster.polling import Snapshot
 
 if TYPE_CHECKING:
     from aiomqtt import Client, Message

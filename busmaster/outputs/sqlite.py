@@ -11,11 +11,11 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeAlias
 
+from busmaster.bus.points import Point
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
 from busmaster.outputs.settings import SqliteSettings
 from busmaster.outputs.values import json_value
-from busmaster.points import Point
 
 VERSION = 1
 SCHEMA = """

@@ -12,7 +12,7 @@ from typing import Any
 
 from busmaster.arbiter.events import Event, LatenessRaised, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health
-from busmaster.polling import Quality, Sample, Snapshot
+from busmaster.bus.polling import Quality, Sample, Snapshot
 
 
 def number_text(value: float) -> str:

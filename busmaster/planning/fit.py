@@ -16,10 +16,10 @@ from math import ceil, floor, inf, log10
 from typing import Any
 
 from busmaster.arbiter.schedule import SLICE, Poll, Priority, Schedule, line_time
-from busmaster.exchange import Command
-from busmaster.merging import WEIGHING, Merge, Served, at_once, cheapest
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import LineSettings
+from busmaster.planning.merging import WEIGHING, Merge, Served, at_once, cheapest
 from busmaster.planning.worst_case import SHARE, Bounds, PlannedNode, Read, bound_steps, unanswered
-from busmaster.profile import LineSettings
 
 COMFORT = 0.9
 """The share of the line that a schedule may take: the rest is for commands, retries and probes."""

@@ -13,9 +13,10 @@ from math import ceil
 from typing import Any, TypeAlias
 
 from busmaster.arbiter.schedule import Priority, line_time
-from busmaster.exchange import Command, Exchange, Timings
-from busmaster.merging import WEIGHING, at_once
-from busmaster.profile import Profile
+from busmaster.contract.exchange import Command, Exchange
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
+from busmaster.planning.merging import WEIGHING, at_once
 
 SHARE = 7
 """Exchanges of higher classes after which a lower class that waits gets a slot (R9)."""

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Literal
 from busmaster.errors import InvalidCommand
 
 if TYPE_CHECKING:  # so that a master alone does not load the emulator
+    from busmaster.bus.handle import Handle
     from busmaster.capture.decode import Dialect
+    from busmaster.contract.exchange import Command
+    from busmaster.contract.profile import Profile
     from busmaster.emulator.device import Delay, Device
     from busmaster.emulator.oracle import Oracle
-    from busmaster.exchange import Command
-    from busmaster.handle import Handle
-    from busmaster.profile import Profile
 
 NAME = re.compile(r"[a-z][a-z0-9_-]*")
 HIGHEST_CAPTURE_ID = 255

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from busmaster.contract.exchange import Command
 from busmaster.emulator.device import Device
 from busmaster.errors import Refused
-from busmaster.exchange import Command
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from busmaster.contract.exchange import Command, Exchange
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import Command, Exchange, ReplyTiming, Timings
-from busmaster.profile import Profile
 
 OTHER_TIMINGS = Timings(
     read=ReplyTiming(0.011, 0.022, 0.033, 0.004),

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from busmaster.exchange import Done, Exchange, Expect, FrameError, Refused, Step
+from busmaster.contract.exchange import Done, Exchange, Expect, FrameError, Refused, Step
 
 PATIENCE = 64
 """Legs after which an exchange that still wants another one is taken to have no end."""

@@ -13,7 +13,8 @@
         )
 
 A few cases say what the document says: a command, the node, what that node answers, and the value. From them the kit
-derives what the arbiter relies on (`busmaster.exchange`), and raises `NotConformant` with all that does not hold:
+derives what the arbiter relies on (`busmaster.contract.exchange`), and raises `NotConformant` with all that does not
+hold:
 
 - every split of every reply gives what one chunk gives (of longer replies: into two, into three, and one byte at a
   time); what is cut short is MORE, and an error when time runs out;
@@ -37,9 +38,9 @@ from itertools import islice
 from random import Random
 from typing import Any
 
+from busmaster.contract.exchange import Command, Done, Exchange, FrameError, Listener
+from busmaster.contract.profile import Profile
 from busmaster.errors import Refused
-from busmaster.exchange import Command, Done, Exchange, FrameError, Listener
-from busmaster.profile import Profile
 from busmaster.testing.answers import check_exchangeable, check_good_reply
 from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen
 from busmaster.testing.commands import check_addresses, check_checks, check_command, check_invalid

@@ -9,8 +9,8 @@ from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Protocol
 from urllib.parse import parse_qsl, urlsplit
 
+from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
-from busmaster.profile import LineSettings
 from busmaster.transport.identity import USB, Identity
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort

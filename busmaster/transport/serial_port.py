@@ -26,9 +26,9 @@ from typing import TYPE_CHECKING, Any
 import serial
 from serial.rs485 import RS485Settings
 
+from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand, LineDown
-from busmaster.profile import LineSettings
-from busmaster.transport import adapters, identity
+from busmaster.transport import holders, identity
 from busmaster.transport.aside import aside
 from busmaster.transport.identity import Identity, identify, is_pty, resolve
 from busmaster.transport.marks import ESCAPE, MarkingSerial, Unescape, stop_marking, taker_of_marked_bytes
@@ -347,7 +347,7 @@ def _refusal(port: SerialPort, error: Exception) -> LineDown:
     """Why it did not open, in words, and what to try."""
     path, code = port.path, _code(error)
     if code in (errno.EBUSY, errno.EAGAIN):
-        owner = adapters.lock_owner(path) or next(iter(adapters.holders(path)), "another program")
+        owner = holders.lock_owner(path) or next(iter(holders.holders(path)), "another program")
         return LineDown(
             f"{path} is in use by {owner}", hint="end that first: two masters on one line garble each other"
         )
@@ -355,7 +355,7 @@ def _refusal(port: SerialPort, error: Exception) -> LineDown:
         target = f": it points to {os.readlink(path)}, which is gone" if os.path.islink(path) else ""
         return LineDown(f"{path} does not exist{target}", hint="plug it in, or see `python -m serial.tools.list_ports`")
     if code in (errno.EACCES, errno.EPERM):
-        group = adapters.owning_group(path)
+        group = holders.owning_group(path)
         return LineDown(f"no permission to open {path}", hint=f"join its group: `sudo usermod -aG {group} $USER`")
     if isinstance(error, ValueError):
         return LineDown(f"{path} does not take {port.baudrate} baud, {port.settings.framing}", hint="use another rate")

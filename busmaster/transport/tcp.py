@@ -10,8 +10,8 @@ import socket
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 
+from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand, LineDown
-from busmaster.profile import LineSettings
 from busmaster.transport.identity import Identity
 
 CONNECT_DEADLINE = 5.0

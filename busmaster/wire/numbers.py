@@ -8,8 +8,8 @@ from decimal import ROUND_HALF_UP, Decimal
 from functools import lru_cache
 from typing import SupportsFloat
 
+from busmaster.contract.exchange import FrameError
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import FrameError
 from busmaster.wire.characters import made_of
 
 LONGEST_NUMBER = 20

@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Generic, NoReturn, TypeVar
 
+from busmaster.contract.exchange import MORE, Done, Expect, FrameError, Leg, Need, Sizes, no_reply
+from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import Refused
-from busmaster.exchange import MORE, Done, Expect, FrameError, Leg, Need, ReplyTiming, Sizes, no_reply
 from busmaster.wire.characters import made_of
 from busmaster.wire.checks import xor
 

@@ -11,8 +11,9 @@ from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import Poll, set_members
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Transaction
-from busmaster.exchange import Command, Timings
-from busmaster.profile import Profile
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.wire.checks import xor
 from busmaster.wire.readers import ENQ

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from busmaster.arbiter.state import LineState
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import NoReply
-from busmaster.exchange import ReplyTiming, Timings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from busmaster.arbiter.state import LineState
+from busmaster.contract.exchange import Exchange
+from busmaster.contract.timing import Timings
 from busmaster.errors import GarbledReply, NoReply, WriteUnconfirmed
-from busmaster.exchange import Exchange, Timings
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import (
     ANOTHER_ELEMENT,

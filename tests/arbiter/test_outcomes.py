@@ -9,8 +9,8 @@ import pytest
 from busmaster.arbiter.events import LatenessLowered, LatenessRaised
 from busmaster.arbiter.health import CALM_LATENESS, Health, NodeRecord
 from busmaster.arbiter.transaction import Priority
+from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, GarbledReply, NoReply, Refused, Superseded, WriteUnconfirmed
-from busmaster.exchange import Timings
 from busmaster.protocols._comms.codec import Reading, Writing
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import ACK, FIVE, LATENESS, NAK, QUIET, READ_1_OF_NODE_1, TAU, WRITE_5, Bench, request_of, up

@@ -17,8 +17,8 @@ from busmaster.arbiter.health import (
     note_failure,
     note_success,
 )
+from busmaster.contract.profile import Profile
 from busmaster.errors import NodeDown, NoReply
-from busmaster.profile import Profile
 from busmaster.protocols._comms.codec import CHECKED
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp

@@ -27,9 +27,9 @@ from busmaster.arbiter.schedule import (
     set_members,
 )
 from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
-from busmaster.merging import at_once
-from busmaster.profile import LineSettings
+from busmaster.planning.merging import at_once
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
 

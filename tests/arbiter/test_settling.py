@@ -8,8 +8,8 @@ import pytest
 
 from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, Strayed
 from busmaster.arbiter.state import LineState
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import GarbledReply, LineNoisy, Refused
-from busmaster.exchange import ReplyTiming, Timings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from tests.arbiter.bench import (

@@ -18,9 +18,9 @@ from benchmarks.loop_stalls import Hold, Watch
 from benchmarks.masters import Ask, Bare, Master, Ours, Streams
 from benchmarks.simulation import Simulation
 from benchmarks.trials import ours_in_virtual_time
+from busmaster.contract.exchange import Done
+from busmaster.contract.profile import LineSettings, Profile
 from busmaster.emulator.faults import Faults
-from busmaster.exchange import Done
-from busmaster.profile import LineSettings, Profile
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
 from busmaster.testing.virtual_time import run_in_virtual_time

@@ -17,11 +17,11 @@ from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import Poll, line_time, set_members
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.contract.exchange import Command
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo
 from busmaster.emulator.world import World
-from busmaster.exchange import Command
 from tests.campaigns.edges import EdgeLine, crowd
 from tests.campaigns.judge import Asked, BrokenRuleError, Judge, Totals
 from tests.campaigns.kinds import KINDS, elements_of

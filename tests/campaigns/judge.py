@@ -16,8 +16,8 @@ from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.contract.exchange import Command
 from busmaster.errors import BacklogFull, NotStarted, Refused, WriteUnconfirmed
-from busmaster.exchange import Command
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import AUTO_START, RAM_NOT_RELIABLE, RUNNING, SYSTEM_RESET
 from tests.campaigns.kinds import Kind, echoed, elements_of

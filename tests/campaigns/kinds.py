@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from random import Random
 from typing import Any
 
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
 from busmaster.emulator.device import Delay, Device
-from busmaster.exchange import Command
-from busmaster.profile import Profile
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.dc104.device import EmulatedDc104
 from busmaster.protocols.hcp import codec as hcp

@@ -11,13 +11,14 @@ from busmaster.arbiter.events import Completed, Event, NodeChanged, Polled
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.schedule import Poll, line_time, set_members
 from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.timing import Timings
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.world import World
-from busmaster.exchange import Command, Timings
 from busmaster.planning import Bounds, PlannedNode, bounds
-from busmaster.profile import LineSettings, Profile
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 

@@ -14,14 +14,14 @@ import pytest
 
 from busmaster import Bus, BusError, MicroFlexDrive, Priority, WriteUnconfirmed
 from busmaster.arbiter.transaction import Transaction
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
-from busmaster.profile import LineSettings
+from busmaster.emulator.memory import MemoryPort
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2 import microflex
 from busmaster.protocols.hcp2.microflex_device import EmulatedMicroFlex
 from busmaster.testing.virtual_time import run_in_virtual_time
-from busmaster.transport.memory import MemoryPort
 
 SETTINGS = LineSettings(57600)
 WARM = 0.5

@@ -9,9 +9,9 @@ import pytest
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay, Device
 from busmaster.errors import BacklogFull
-from busmaster.profile import LineSettings
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc

@@ -12,7 +12,7 @@ from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.strays import QUIET
 from busmaster.arbiter.transaction import Transaction
-from busmaster.exchange import FrameError
+from busmaster.contract.exchange import FrameError
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.msc import exchange as msc_exchange
 from busmaster.wire import readers

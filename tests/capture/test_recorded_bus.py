@@ -7,18 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
 from busmaster.capture.pcapng import Outcome, Packet, read_packets
 from busmaster.capture.recorder import Recorder
 from busmaster.capture.replay import replay
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.line import Echo, Line
+from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import NoReply, Refused
-from busmaster.profile import LineSettings
 from busmaster.protocols.hcp.handle import HcpController
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from busmaster.registry import find, make_device
-from busmaster.transport.memory import MemoryPort
 
 
 async def record(path: Path, echo: bool) -> list[Packet]:

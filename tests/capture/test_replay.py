@@ -8,7 +8,8 @@ from busmaster.capture.assemble import Assembler, Verdict
 from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, Packet
 from busmaster.capture.replay import Replayed, replay
-from busmaster.exchange import Command, Timings
+from busmaster.contract.exchange import Command
+from busmaster.contract.timing import Timings
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2

@@ -21,20 +21,20 @@ from pathlib import Path
 import pytest
 
 from busmaster.capture.pcapng import read_packets
-from busmaster.cli import diagnosis, examination
-from busmaster.cli.examination import HARMLESS, Patient, examine, other_settings
-from busmaster.cli.probing import Outcome, Prober, opened
+from busmaster.contract.profile import LineSettings
+from busmaster.doctor import diagnosis, examination
+from busmaster.doctor.adapters import Finding
+from busmaster.doctor.examination import HARMLESS, Patient, examine, other_settings
+from busmaster.doctor.probing import Outcome, Prober, opened
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo, Line
+from busmaster.emulator.memory import MemoryPort
 from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
-from busmaster.profile import LineSettings
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import find, kinds, make_device
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport import identity
-from busmaster.transport.adapters import Finding
-from busmaster.transport.memory import MemoryPort
 from tests.cli.conftest import Command
 from tests.cli.conftest import Outcome as Ended
 from tests.transport.fakes import plugged

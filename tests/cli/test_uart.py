@@ -9,16 +9,16 @@ import pytest
 
 from busmaster.arbiter.counters import DriverErrors
 from busmaster.arbiter.events import Mark
-from busmaster.cli import uart
-from busmaster.cli.examination import Patient, examine
-from busmaster.cli.probing import opened
+from busmaster.doctor import uart
+from busmaster.doctor.adapters import Finding
+from busmaster.doctor.examination import Patient, examine
+from busmaster.doctor.probing import opened
 from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from busmaster.testing import run_in_virtual_time
-from busmaster.transport.adapters import Finding
 from busmaster.transport.kernel import OpenPort
-from busmaster.transport.memory import MemoryPort
 from busmaster.transport.serial_port import SerialPort
 from tests.transport.fakes import plugged
 

@@ -9,15 +9,15 @@ import anyio
 import pytest
 
 from busmaster.arbiter.counters import DriverErrors
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
 from busmaster.cli.arguments import View
 from busmaster.cli.messages import Action, Frame
 from busmaster.cli.watching import Watch, count_cycles
 from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
 from busmaster.emulator.serve import TcpServer
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
-from busmaster.transport.memory import MemoryPort
 from busmaster.transport.tcp import TcpPort
 
 

@@ -10,9 +10,9 @@ from busmaster import Priority, SerialPort, TcpPort
 from busmaster.config import ConfiguredLine, FileError, LineFile, emulated_line, load
 from busmaster.config.sections import read
 from busmaster.config.source import Source
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.outputs.settings import FileSettings, MqttSettings, SqliteSettings
-from busmaster.profile import LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc.handle import MscController
 from busmaster.registry import kinds

@@ -5,9 +5,9 @@ from __future__ import annotations
 from random import Random
 from typing import Any
 
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
-from busmaster.profile import LineSettings
 
 SETTINGS = LineSettings(57600)
 TAU = SETTINGS.byte_time

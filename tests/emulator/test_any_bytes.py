@@ -17,11 +17,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
 from busmaster.emulator.oracle import Oracle
-from busmaster.exchange import Command
-from busmaster.profile import Profile
 from busmaster.protocols._comms.device import HCP
 from busmaster.protocols._comms.mint import EmulatedMint, command_handshake, jog_on_comms1, winding
 from busmaster.protocols.dc104 import codec as dc104

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.faults import HEARING, SPEAKING, Faults
 from busmaster.emulator.line import PIECE, Echo, Line
 from busmaster.emulator.wave import Wave
 from busmaster.errors import InvalidCommand
-from busmaster.profile import LineSettings
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.registry import make_device
 from tests.emulator.lines import SETTINGS, TAU, arrivals, ask, hexed, line_of

@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from busmaster.arbiter.transaction import Phase, Transaction
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Line
 from busmaster.emulator.world import World
 from busmaster.errors import BusError, NoReply, NoSuchParameter, Refused
-from busmaster.exchange import Command
-from busmaster.profile import Profile
 from busmaster.protocols._comms.device import HCP
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.dc104 import codec as dc104

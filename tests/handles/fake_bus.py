@@ -9,11 +9,12 @@ from typing import Any, cast
 
 import anyio.lowlevel
 
-from busmaster.bus import Bus
-from busmaster.exchange import Command, Timings
-from busmaster.merging import Merge
-from busmaster.node import Priority
-from busmaster.profile import Profile
+from busmaster.bus.bus import Bus
+from busmaster.bus.node import Priority
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
+from busmaster.planning.merging import Merge
 
 Answer = Callable[[Command[Any]], Any]
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from busmaster.bus.node import Priority
+from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand, VerifyFailed
-from busmaster.exchange import Command
-from busmaster.node import Priority
 from busmaster.protocols._comms.codec import ReadElement, WriteElements
 from busmaster.protocols._comms.handle import CommsHandle
 from busmaster.protocols.hcp.handle import HcpController

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from busmaster.bus.node import Priority
+from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand, VerifyFailed
-from busmaster.exchange import Command
-from busmaster.node import Priority
 from busmaster.protocols.dc104.codec import Read, Write
 from busmaster.protocols.dc104.handle import Dc104Drive
 from tests.handles.fake_bus import FakeBus

@@ -25,9 +25,9 @@ from busmaster import (
     Snapshot,
     VerifyFailed,
 )
+from busmaster.bus.handle import Handle
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
-from busmaster.handle import Handle
 from busmaster.protocols._comms.device import HCP
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.dc104 import device as dc104

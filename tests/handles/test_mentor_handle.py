@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand, VerifyFailed
-from busmaster.exchange import Command
 from busmaster.protocols.mentor.codec import CHAINED, PROFILE, Read, ReadRun, Write
 from busmaster.protocols.mentor.handle import MentorDrive, from_line, to_line
 from tests.handles.fake_bus import FakeBus

@@ -10,9 +10,9 @@ from typing import Any
 import anyio
 import pytest
 
+from busmaster.bus.node import Priority
+from busmaster.contract.exchange import Command
 from busmaster.errors import BusClosed, BusError, InvalidCommand, NoReply, Superseded, VerifyFailed, WriteUnconfirmed
-from busmaster.exchange import Command
-from busmaster.node import Priority
 from busmaster.protocols.hcp2 import microflex_handle as module
 from busmaster.protocols.hcp2.codec import Read, Write
 from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord

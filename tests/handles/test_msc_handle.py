@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from busmaster.bus.node import Priority
+from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand, Refused, VerifyFailed
-from busmaster.exchange import Command
-from busmaster.node import Priority
 from busmaster.protocols.msc.codec import (
     BlockRead,
     BlockWrite,

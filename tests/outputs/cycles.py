@@ -6,16 +6,16 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
+from busmaster.bus.node import Timeline
+from busmaster.bus.points import Point
+from busmaster.bus.polling import Quality, Sample, Snapshot
 from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import NoReply
-from busmaster.node import Timeline
 from busmaster.outputs.base import Output
-from busmaster.points import Point
-from busmaster.polling import Quality, Sample, Snapshot
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
-from busmaster.transport.memory import MemoryPort
 
 BUS = Bus(MemoryPort(Line(hcp2.PROFILE.line)))
 NODE = Hcp2Controller(BUS, 5)

@@ -6,9 +6,9 @@ import threading
 import time
 from collections.abc import Callable
 
+from busmaster.bus.polling import Snapshot
 from busmaster.outputs.base import BatchOutput, Happening, Item, Output
 from busmaster.outputs.settings import Settings
-from busmaster.polling import Snapshot
 from tests.outputs.cycles import cycle, settled, until
 
 

@@ -11,8 +11,9 @@ from importlib.util import find_spec
 import pytest
 
 from busmaster.arbiter.counters import DriverErrors
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import NoReply
 from busmaster.outputs.base import OutputStatistics
 from busmaster.outputs.metrics import MetricsOutput
@@ -20,7 +21,6 @@ from busmaster.outputs.settings import MetricsSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
-from busmaster.transport.memory import MemoryPort
 from tests.outputs.brokers import free_port
 from tests.outputs.cycles import BUS, until
 

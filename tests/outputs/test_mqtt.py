@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand, NoReply
 from busmaster.outputs.base import Happening
 from busmaster.outputs.mqtt import MqttOutput, command_value
 from busmaster.outputs.settings import MqttSettings
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
-from busmaster.transport.memory import MemoryPort
 from tests.outputs.brokers import Broker, free_port, needs_mosquitto, running
 from tests.outputs.cycles import BUS, cycle, until
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from hypothesis import strategies as st
 
+from busmaster.contract.exchange import MORE, Done, Exchange, Expect, FrameError
 from busmaster.errors import Refused
-from busmaster.exchange import MORE, Done, Exchange, Expect, FrameError
 
 VECTORS = Path(__file__).parent.parent / "vectors" / "frames.json"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Hashable
 from typing import Any
 
+from busmaster.contract.exchange import Command
 from busmaster.errors import NoSuchParameter, Refused
-from busmaster.exchange import Command
 from busmaster.protocols._comms.device import HCP, HCP2
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.dc104 import codec as dc104

@@ -10,8 +10,8 @@ import pytest
 
 from busmaster import Bus, CtAnsiDrive, InvalidCommand, MemoryPort, NoSuchParameter, Refused, VerifyFailed
 from busmaster.capture.frames import Kind
+from busmaster.contract.exchange import Done
 from busmaster.emulator.line import Line
-from busmaster.exchange import Done
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.ct_ansi.device import EmulatedCtAnsi
 from busmaster.registry import find

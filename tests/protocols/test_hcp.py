@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from busmaster.contract.exchange import Done, FrameError
 from busmaster.errors import InvalidCommand, Refused
-from busmaster.exchange import Done, FrameError
 from busmaster.protocols._comms.codec import is_read_back, telegrams
 from busmaster.protocols.hcp.codec import PROFILE, Read, Write
 from busmaster.protocols.hcp2 import codec as hcp2

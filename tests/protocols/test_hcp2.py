@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from busmaster.contract.exchange import MORE, Done, FrameError
 from busmaster.errors import InvalidCommand, Refused
-from busmaster.exchange import MORE, Done, FrameError
 from busmaster.protocols.hcp2.codec import PROFILE, Read, Write
 from busmaster.wire.checks import xor
 from tests.protocols.asking import answer, debris, outcome, single_bytes, vectors

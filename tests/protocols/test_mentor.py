@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from busmaster.contract.exchange import MORE, Command, Done, Expect, FrameError
+from busmaster.contract.profile import Batch
 from busmaster.errors import InvalidCommand, NoSuchParameter, Refused
-from busmaster.exchange import MORE, Command, Done, Expect, FrameError
-from busmaster.profile import Batch
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor.codec import CHAINED, PROFILE, Read, ReadRun, Write, merge_runs, parse_parameter
 from busmaster.wire.checks import bcc

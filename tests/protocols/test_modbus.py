@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from busmaster import Bus, InvalidCommand, MemoryPort, ModbusUnit, Refused, VerifyFailed
+from busmaster.contract.exchange import Done
 from busmaster.emulator.line import Line
-from busmaster.exchange import Done
 from busmaster.protocols.modbus.codec import (
     EXCEPTIONS,
     PROFILE,

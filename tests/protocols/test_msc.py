@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from busmaster.contract.exchange import Command, Done, Expect, FrameError
+from busmaster.contract.profile import Batch
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import Command, Done, Expect, FrameError
-from busmaster.profile import Batch
 from busmaster.protocols.msc.codec import (
     PROFILE,
     BlockRead,

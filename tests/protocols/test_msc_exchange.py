@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from busmaster.exchange import MORE, Done, Expect, FrameError, Refused
+from busmaster.contract.exchange import MORE, Done, Expect, FrameError, Refused
 from busmaster.protocols.msc.codec import PROFILE, BlockRead, DataRead, DataWrite, ReadFlag, ReadStatus
 from busmaster.protocols.msc.exchange import PacketExchange, StalePacketListener, packet
 

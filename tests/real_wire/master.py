@@ -18,8 +18,8 @@ from itertools import count
 from typing import Any
 
 from busmaster import Bus, BusError, SerialPort, TcpPort
+from busmaster.emulator.memory import MemoryPort
 from busmaster.transport.endpoints import Endpoint
-from busmaster.transport.memory import MemoryPort
 from tests.campaigns.kinds import elements_of
 from tests.real_wire.kinds import KINDS, Kind, make_line
 from tests.real_wire.slaves import tell

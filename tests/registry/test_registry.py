@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from busmaster.contract.exchange import Command, FrameError
 from busmaster.emulator.device import Delay
 from busmaster.errors import InvalidCommand, Refused
-from busmaster.exchange import Command, FrameError
 from busmaster.protocols.ct_ansi import codec as ct_ansi
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp

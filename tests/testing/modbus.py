@@ -8,22 +8,11 @@ from typing import Any, ClassVar
 
 import pytest
 
+from busmaster.contract.exchange import MORE, Command, Done, Expect, FrameError, Leg, Need, Sizes, no_reply
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.device import Device
 from busmaster.errors import InvalidCommand, Refused
-from busmaster.exchange import (
-    MORE,
-    Command,
-    Done,
-    Expect,
-    FrameError,
-    Leg,
-    Need,
-    ReplyTiming,
-    Sizes,
-    Timings,
-    no_reply,
-)
-from busmaster.profile import LineSettings, Profile
 from busmaster.testing import Case, NotConformant, check_protocol
 
 READ, WRITE, EXCEPTION = 3, 6, 0x80

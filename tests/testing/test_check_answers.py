@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from busmaster.exchange import Done, ReplyTiming
+from busmaster.contract.exchange import Done
+from busmaster.contract.timing import ReplyTiming
 from busmaster.testing import Case
 from tests.testing.modbus import (
     CASES,

@@ -10,19 +10,9 @@ from typing import Any
 
 import pytest
 
+from busmaster.contract.exchange import Command, Done, Expect, FrameError, Leg, Need, Sizes, no_reply
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import Refused
-from busmaster.exchange import (
-    Command,
-    Done,
-    Expect,
-    FrameError,
-    Leg,
-    Need,
-    ReplyTiming,
-    Sizes,
-    Timings,
-    no_reply,
-)
 from busmaster.testing import Foreign, NotConformant, RoundTrip, Unseen, answers_of, check_protocol
 from tests.testing.modbus import (
     CASES,

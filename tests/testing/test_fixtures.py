@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from busmaster import Bus, Hcp2Controller, NoReply
+from busmaster.emulator.memory import MemoryPort
 from busmaster.testing.fixtures import LineFactory, emulated_line, virtual_time
-from busmaster.transport.memory import MemoryPort
 
 __all__ = ["emulated_line", "virtual_time"]
 

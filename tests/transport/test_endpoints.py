@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
-from busmaster.profile import LineSettings
 from busmaster.transport.endpoints import Endpoint, endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort

@@ -14,11 +14,11 @@ from busmaster import Bus, Hcp2Controller, LineDown, MemoryPort, NoReply, Serial
 from busmaster.arbiter.events import LineChange, LineChanged
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryTransport
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport import pump as pump_module
-from busmaster.transport.memory import MemoryTransport
 from busmaster.transport.pump import STUCK_AFTER, Pump
 from tests.transport.fakes import FarEnd, plugged, standing_still
 from tests.transport.test_marks import reply

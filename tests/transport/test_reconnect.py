@@ -11,8 +11,8 @@ from typing import Any, cast
 
 import pytest
 
+from busmaster.contract.profile import LineSettings
 from busmaster.errors import LineDown
-from busmaster.profile import LineSettings
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport import reconnect
 from busmaster.transport.endpoints import Endpoint

@@ -18,7 +18,7 @@ import pytest
 import serial
 
 from busmaster.arbiter.events import LineChange, LineChanged, PortFailed
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
 from busmaster.errors import LineDown
 from busmaster.transport import identity, serial_port
 from busmaster.transport.identity import identify

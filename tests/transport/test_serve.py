@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, TcpServer, serve_pty, serve_tcp
-from busmaster.profile import LineSettings
 from busmaster.protocols._comms.mint import EmulatedMint
 
 WRITE = bytes.fromhex("07 30 32 02 30 31 31 32 33 2E 34 35 36 03 2B")  # AN00129: node 2, Comms(1) = 123.456

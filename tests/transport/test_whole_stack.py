@@ -22,9 +22,9 @@ from busmaster import (
     SerialPort,
     TcpPort,
 )
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, serve_pty, serve_tcp
-from busmaster.profile import LineSettings
 from busmaster.registry import make_device
 from busmaster.transport.endpoints import Endpoint
 

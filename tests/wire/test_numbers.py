@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from busmaster.contract.exchange import FrameError
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import FrameError
 from busmaster.wire.numbers import LONGEST_NUMBER, format_list, format_number, parse_number
 
 

@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from busmaster.contract.exchange import MORE, Done, FrameError
+from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import Refused
-from busmaster.exchange import MORE, Done, FrameError, ReplyTiming
 from busmaster.wire.checks import xor
 from busmaster.wire.readers import AcknowledgeReader, TelegramReader, find_etx, telegram_sizes
 

@@ -18,7 +18,7 @@ from busmaster.capture.telegrams import (
     closed_size,
     field_end,
 )
-from busmaster.exchange import Command
+from busmaster.contract.exchange import Command
 from busmaster.protocols._comms.codec import ReadElement, WriteElements
 from busmaster.wire.checks import xor
 

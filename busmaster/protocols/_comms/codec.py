@@ -10,10 +10,11 @@ from ctypes import c_float
 from dataclasses import dataclass, field
 from typing import ClassVar, NoReturn
 
-from busmaster.arguments import whole_number
+from busmaster.contract.arguments import whole_number
+from busmaster.contract.exchange import Sizes
+from busmaster.contract.profile import LineSettings
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand, Refused
-from busmaster.exchange import ReplyTiming, Sizes, Timings
-from busmaster.profile import LineSettings
 from busmaster.wire.numbers import LONGEST_LIST, LONGEST_NUMBER, format_list, format_number, parse_number
 from busmaster.wire.readers import NAK, AcknowledgeReader, TelegramReader, telegram_sizes
 

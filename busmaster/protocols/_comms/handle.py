@@ -6,15 +6,15 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, overload
 
+from busmaster.bus.handle import Handle, Send, is_decimal, item_text, unknown_item
+from busmaster.bus.points import Point
+from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand, VerifyFailed
-from busmaster.exchange import Command
-from busmaster.handle import Handle, Send, is_decimal, item_text, unknown_item
-from busmaster.points import Point
 from busmaster.protocols._comms.codec import ReadElement, WriteElements, is_read_back, telegrams
 from busmaster.protocols._comms.elements import Element
 
 if TYPE_CHECKING:
-    from busmaster.node import Priority
+    from busmaster.bus.node import Priority
 
 T = TypeVar("T")
 

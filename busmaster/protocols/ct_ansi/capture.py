@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from busmaster.capture.frames import Frame, Kind
-from busmaster.exchange import Command
+from busmaster.contract.exchange import Command
 from busmaster.protocols.ct_ansi.codec import Read, ReadRun, Write
 from busmaster.protocols.mentor.capture import STEPS, MentorDialect
 from busmaster.protocols.mentor.codec import parse_parameter

@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import ClassVar
 
-from busmaster.arguments import whole_number
+from busmaster.contract.arguments import whole_number
+from busmaster.contract.exchange import FrameError, Sizes
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import FrameError, ReplyTiming, Sizes, Timings
-from busmaster.profile import LineSettings, Profile
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.mentor.codec import Broadcast, ParameterReading, Writing, read_request, reset
 from busmaster.wire.checks import bcc

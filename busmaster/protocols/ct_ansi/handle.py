@@ -7,17 +7,17 @@ from collections.abc import Mapping
 from decimal import ROUND_HALF_UP, Decimal
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.bus.points import Point
+from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand, VerifyFailed
-from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
-from busmaster.points import Point
-from busmaster.profile import Profile
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.mentor.codec import parse_parameter
 
 if TYPE_CHECKING:
-    from busmaster.bus import Bus
-    from busmaster.exchange import Timings
-    from busmaster.node import Priority
+    from busmaster.bus.bus import Bus
+    from busmaster.bus.node import Priority
+    from busmaster.contract.timing import Timings
 
 FORM = "a parameter such as 1.21, or 1.21:8 for a run of 8"
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from busmaster.capture.frames import UNASKED, Direction, Frame, Kind
-from busmaster.exchange import Command
+from busmaster.contract.exchange import Command
 from busmaster.protocols.dc104.codec import Read, Write
 from busmaster.wire.checks import sum8
 

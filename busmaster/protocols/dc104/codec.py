@@ -12,9 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from busmaster.arguments import whole_number
-from busmaster.exchange import MORE, Done, FrameError, Need, ReplyTiming, Sizes, Timings, no_reply
-from busmaster.profile import LineSettings, Profile
+from busmaster.contract.arguments import whole_number
+from busmaster.contract.exchange import MORE, Done, FrameError, Need, Sizes, no_reply
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.wire.checks import sum8
 from busmaster.wire.readers import NAK, STX, AcknowledgeReader, SingleLeg
 

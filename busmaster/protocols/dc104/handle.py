@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.bus.points import Point
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.errors import VerifyFailed
-from busmaster.exchange import Command, Timings
-from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
-from busmaster.points import Point
-from busmaster.profile import Profile
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.dc104.codec import Read, Write
 
 if TYPE_CHECKING:
-    from busmaster.bus import Bus
-    from busmaster.node import Priority
+    from busmaster.bus.bus import Bus
+    from busmaster.bus.node import Priority
 
 
 class Dc104Drive(Handle):

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
-from busmaster.exchange import Timings
-from busmaster.profile import Profile
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.protocols._comms.codec import (
     CHECKED,
     LINE,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from busmaster.profile import Profile
+from busmaster.contract.profile import Profile
 from busmaster.protocols._comms.handle import CommsHandle
 from busmaster.protocols.hcp import codec as hcp
 

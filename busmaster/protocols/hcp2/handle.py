@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from busmaster.arguments import whole_number
-from busmaster.points import Point
-from busmaster.profile import Profile
+from busmaster.bus.points import Point
+from busmaster.contract.arguments import whole_number
+from busmaster.contract.profile import Profile
 from busmaster.protocols._comms.handle import CommsHandle, Named
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2 import comms_array

@@ -9,10 +9,10 @@ from weakref import WeakKeyDictionary
 
 import anyio
 
-from busmaster.arguments import seconds
+from busmaster.bus.node import Node, Priority
+from busmaster.contract.arguments import seconds
+from busmaster.contract.profile import Profile
 from busmaster.errors import BusClosed, BusError, VerifyFailed, WriteUnconfirmed
-from busmaster.node import Node, Priority
-from busmaster.profile import Profile
 from busmaster.protocols._comms.handle import CommsHandle, Named
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2 import microflex

@@ -23,7 +23,7 @@ from busmaster.capture.telegrams import (
     field_end,
     number,
 )
-from busmaster.exchange import Command
+from busmaster.contract.exchange import Command
 from busmaster.protocols.mentor.codec import Read, ReadRun, Write, parse_parameter
 from busmaster.wire.checks import bcc
 

@@ -16,10 +16,11 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, ClassVar, NoReturn, TypeVar
 
-from busmaster.arguments import whole_number
+from busmaster.contract.arguments import whole_number
+from busmaster.contract.exchange import Command, Done, Expect, FrameError, Leg, Need, Sizes
+from busmaster.contract.profile import Batch, LineSettings, Profile
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand, NoSuchParameter, Refused
-from busmaster.exchange import Command, Done, Expect, FrameError, Leg, Need, ReplyTiming, Sizes, Timings
-from busmaster.profile import Batch, LineSettings, Profile
 from busmaster.wire.checks import bcc
 from busmaster.wire.readers import (
     ACK,

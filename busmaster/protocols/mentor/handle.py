@@ -8,18 +8,19 @@ from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from busmaster.arguments import whole_number
+from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.bus.points import Point
+from busmaster.contract.arguments import whole_number
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
-from busmaster.exchange import Command, Timings
-from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
-from busmaster.points import Point
-from busmaster.profile import Profile
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.mentor.codec import Read, ReadRun, Write, parse_parameter
 
 if TYPE_CHECKING:
-    from busmaster.bus import Bus
-    from busmaster.node import Node, Priority
+    from busmaster.bus.bus import Bus
+    from busmaster.bus.node import Node, Priority
 
 T = TypeVar("T")
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from busmaster.capture.frames import UNASKED, Direction, Frame, Kind
-from busmaster.exchange import Command
+from busmaster.contract.exchange import Command
 from busmaster.protocols.modbus.codec import (
     BROADCAST,
     EXCEPTIONS,

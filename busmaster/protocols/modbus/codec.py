@@ -17,10 +17,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, TypeVar
 
-from busmaster.arguments import whole_number
+from busmaster.contract.arguments import whole_number
+from busmaster.contract.exchange import MORE, Done, FrameError, Leg, Sizes, Step, no_reply
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand, Refused
-from busmaster.exchange import MORE, Done, FrameError, Leg, ReplyTiming, Sizes, Step, Timings, no_reply
-from busmaster.profile import LineSettings, Profile
 
 T = TypeVar("T")
 

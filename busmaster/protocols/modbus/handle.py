@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from busmaster.bus.handle import Handle, Send, is_decimal, item_text, unknown_item
+from busmaster.bus.points import Point
+from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand, VerifyFailed
-from busmaster.handle import Handle, Send, is_decimal, item_text, unknown_item
-from busmaster.points import Point
-from busmaster.profile import Profile
 from busmaster.protocols.modbus.codec import (
     MOST_BITS_WRITTEN,
     MOST_WRITTEN,
@@ -23,7 +23,7 @@ from busmaster.protocols.modbus.codec import (
 from busmaster.protocols.modbus.numbers import FORMS, Number
 
 if TYPE_CHECKING:
-    from busmaster.node import Priority
+    from busmaster.bus.node import Priority
 
 BITS = ("coil", "discrete")
 WRITABLE = ("coil", "holding")

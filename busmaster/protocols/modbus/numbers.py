@@ -7,7 +7,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from busmaster.arguments import whole_number
+from busmaster.contract.arguments import whole_number
 from busmaster.errors import InvalidCommand
 
 FORMS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}

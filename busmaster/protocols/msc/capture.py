@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from busmaster.capture.frames import UNACKED, UNASKED, Direction, Frame, Kind
-from busmaster.exchange import Command
+from busmaster.contract.exchange import Command
 from busmaster.protocols.msc import codec
 from busmaster.wire.checks import sum16
 

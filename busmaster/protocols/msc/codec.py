@@ -14,10 +14,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from busmaster.arguments import whole_number
+from busmaster.contract.arguments import whole_number
+from busmaster.contract.exchange import Command, FrameError
+from busmaster.contract.profile import Batch, LineSettings, Profile
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import Command, FrameError, ReplyTiming, Timings
-from busmaster.profile import Batch, LineSettings, Profile
 from busmaster.protocols.msc.exchange import UNITS, PacketExchange, Reply, StalePacketListener, packet
 from busmaster.wire.readers import ACK
 

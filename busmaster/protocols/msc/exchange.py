@@ -27,19 +27,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from busmaster.exchange import (
-    MORE,
-    Done,
-    Expect,
-    FrameError,
-    Leg,
-    Need,
-    Refused,
-    Sizes,
-    Step,
-    Timings,
-    no_reply,
-)
+from busmaster.contract.exchange import MORE, Done, Expect, FrameError, Leg, Need, Refused, Sizes, Step, no_reply
+from busmaster.contract.timing import Timings
 from busmaster.wire.checks import sum16
 from busmaster.wire.readers import ACK, NAK, STX
 

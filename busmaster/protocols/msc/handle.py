@@ -6,12 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
+from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.bus.node import Node, Priority
+from busmaster.bus.points import Point
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, Refused, VerifyFailed
-from busmaster.exchange import Command, Timings
-from busmaster.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
-from busmaster.node import Node, Priority
-from busmaster.points import Point
-from busmaster.profile import Profile
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.blocks import Count, Part, Progress, place, reads, reads_back, writes
 from busmaster.protocols.msc.codec import (
@@ -30,7 +31,7 @@ from busmaster.protocols.msc.codec import (
 )
 
 if TYPE_CHECKING:
-    from busmaster.bus import Bus
+    from busmaster.bus.bus import Bus
 
 MODELS_WITH_RFLAGS = frozenset({"MSC-250", "MSC-850/32"})
 ADDRESS_STEPS = (1, 4)

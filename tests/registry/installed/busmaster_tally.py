@@ -14,13 +14,14 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from busmaster import InvalidCommand, Point, Refused
-from busmaster.arguments import whole_number
+from busmaster.bus.handle import Handle, unknown_item
 from busmaster.capture.frames import Direction, Frame, Kind
+from busmaster.contract.arguments import whole_number
+from busmaster.contract.exchange import MORE, Command, Done, FrameError, Need, Sizes, no_reply
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.oracle import Oracle
-from busmaster.exchange import MORE, Command, Done, FrameError, Need, ReplyTiming, Sizes, Timings, no_reply
-from busmaster.handle import Handle, unknown_item
-from busmaster.profile import LineSettings, Profile
 from busmaster.registry import NodeKind, Option, Protocol, everywhere
 from busmaster.wire.readers import SingleLeg
 

@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from busmaster.contract.exchange import Command, Listener
+from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import Command, Listener, Timings
 
 START_BIT = 1
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.line import Line
-from busmaster.profile import LineSettings
 from busmaster.transport.clock import clock_of
 from busmaster.transport.identity import Identity
 

@@ -19,8 +19,8 @@ from busmaster import (
     ReplyTiming,
     Timings,
 )
+from busmaster.bus.handle import Handle
 from busmaster.emulator.line import Line
-from busmaster.handle import Handle
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc

@@ -9,11 +9,11 @@ from statistics import median
 
 from busmaster.capture.decode import Decoder
 from busmaster.capture.frames import Kind
-from busmaster.cli.probing import Outcome, Probe
-from busmaster.exchange import ReplyTiming
-from busmaster.profile import LineSettings, Profile
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.timing import ReplyTiming
+from busmaster.doctor.adapters import Finding
+from busmaster.doctor.probing import Outcome, Probe
 from busmaster.registry import find
-from busmaster.transport.adapters import Finding
 
 SHOWN = 12
 """Bytes of garbage that are printed."""

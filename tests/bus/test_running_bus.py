@@ -12,11 +12,11 @@ import pytest
 from busmaster.arbiter.events import Event, NodeChanged
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import line_time
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
+from busmaster.bus.node import Node, Priority
+from busmaster.bus.polling import PollGroup
 from busmaster.emulator.device import Delay
 from busmaster.errors import BusError, InvalidCommand, NodeDown, NoReply
-from busmaster.node import Node, Priority
-from busmaster.polling import PollGroup
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller

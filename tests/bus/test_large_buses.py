@@ -13,13 +13,13 @@ import pytest
 
 from busmaster.arbiter.schedule import AT_ONCE, SLICE, Schedule
 from busmaster.arbiter.transaction import Transaction
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
+from busmaster.bus.points import Point
+from busmaster.bus.polling import PollGroup
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Batch
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import Command
-from busmaster.merging import WEIGHING
-from busmaster.points import Point
-from busmaster.polling import PollGroup
-from busmaster.profile import Batch
+from busmaster.planning.merging import WEIGHING
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller

@@ -8,10 +8,10 @@ from typing import Any
 import hypothesis.strategies as st
 from hypothesis import given, settings
 
-from busmaster.exchange import Command
-from busmaster.merging import Merge, at_once, cheapest
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Batch
 from busmaster.planning import PlannedNode
-from busmaster.profile import Batch
+from busmaster.planning.merging import Merge, at_once, cheapest
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
 

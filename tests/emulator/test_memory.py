@@ -6,12 +6,12 @@ import asyncio
 
 import pytest
 
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Echo, Line
-from busmaster.profile import LineSettings
+from busmaster.emulator.memory import MemoryPort, MemoryTransport
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport.endpoints import is_paced
-from busmaster.transport.memory import MemoryPort, MemoryTransport
 from tests.transport.fakes import Recorder
 
 SETTINGS = LineSettings(9600)

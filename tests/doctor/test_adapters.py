@@ -12,17 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.transport import adapters, identity
-from busmaster.transport.adapters import (
-    Finding,
-    Holder,
-    holders,
-    inspect,
-    latency_timer,
-    lock_owner,
-    low_latency,
-    rs485_mode,
-)
+from busmaster.doctor.adapters import Finding, inspect, latency_timer, low_latency, rs485_mode
+from busmaster.transport import identity
+from busmaster.transport.holders import Holder, holders, lock_owner, owning_group
 from tests.transport.fakes import FarEnd, plugged
 from tests.transport.usb import UsbTree
 
@@ -102,7 +94,7 @@ def test_a_port_that_may_not_be_opened_names_its_group(far_end: FarEnd, monkeypa
     monkeypatch.setattr(os, "access", lambda *_: False)
     permission = inspect(far_end.path)[1]
     assert not permission.ok
-    assert f"usermod -aG {adapters.owning_group(far_end.path)} $USER" in permission.advice
+    assert f"usermod -aG {owning_group(far_end.path)} $USER" in permission.advice
 
 
 def test_a_group_without_a_name_goes_by_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,7 +102,7 @@ def test_a_group_without_a_name_goes_by_its_number(tmp_path: Path, monkeypatch: 
         raise KeyError(gid)
 
     monkeypatch.setattr(grp, "getgrgid", nameless)
-    assert adapters.owning_group(str(tmp_path)) == str(tmp_path.stat().st_gid)
+    assert owning_group(str(tmp_path)) == str(tmp_path.stat().st_gid)
 
 
 def test_who_holds_and_who_locks_a_port_is_found_through_its_link(tmp_path: Path, far_end: FarEnd) -> None:

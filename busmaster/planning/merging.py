@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-from busmaster.exchange import Command
-from busmaster.profile import Batch
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Batch
 
 T = TypeVar("T")
 

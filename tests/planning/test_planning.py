@@ -13,10 +13,11 @@ from hypothesis import given, settings
 from busmaster import planning
 from busmaster.arbiter import backlog, choice, strays
 from busmaster.arbiter.transaction import Priority
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import LineSettings
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
-from busmaster.exchange import Command, ReplyTiming, Timings
 from busmaster.planning import Bounds, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan, worst_case
-from busmaster.profile import LineSettings
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2

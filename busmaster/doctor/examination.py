@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol, TypeAlias
 
 import anyio.to_thread
 
 from busmaster.arbiter.events import Mark
-from busmaster.cli import diagnosis, uart
-from busmaster.cli.diagnosis import Record
-from busmaster.cli.probing import Outcome, Prober, Wire, opened
-from busmaster.cli.progress import Bar
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.timing import Timings
+from busmaster.doctor import adapters, diagnosis, uart
+from busmaster.doctor.adapters import Finding
+from busmaster.doctor.diagnosis import Record
+from busmaster.doctor.probing import Outcome, Prober, Wire, opened
 from busmaster.errors import LineDown
-from busmaster.exchange import Timings
-from busmaster.profile import LineSettings, Profile
 from busmaster.registry import find
-from busmaster.transport import adapters
-from busmaster.transport.adapters import Finding
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.pump import Tap
 from busmaster.transport.serial_port import SerialPort
@@ -42,15 +41,41 @@ FRAMINGS = ((8, "N"), (7, "E"), (8, "E"))
 Tell = Callable[[Finding], None]
 
 
+class Progress(Protocol):
+    """Is told of each step of a course whose number of steps is known."""
+
+    def advance(self) -> None: ...
+
+
+class Unseen:
+    """Shows nobody how far it is."""
+
+    def advance(self) -> None:
+        pass
+
+
+Course: TypeAlias = Callable[[str, int], AbstractContextManager[Progress]]
+"""Shows how far a course of so many steps is, for as long as it is entered."""
+
+
+def unseen(_label: str, _steps: int) -> AbstractContextManager[Progress]:
+    """Show nothing."""
+    return nullcontext(Unseen())
+
+
 @dataclass(frozen=True, slots=True)
 class Patient:
-    """What is examined. Without a protocol no node is asked. `named`: the user said which nodes there are."""
+    """What is examined. Without a protocol no node is asked.
+
+    `named`: the user said which nodes there are. `progress` shows how far each course is; nothing does by default.
+    """
 
     endpoint: Endpoint
     protocol: str | None = None
     timings: Timings | None = None
     addresses: tuple[int, ...] = ()
     named: bool = False
+    progress: Course = unseen
 
     @property
     def profile(self) -> Profile:
@@ -167,7 +192,7 @@ async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
     """Every address once, and those that live again and again. The silent are left out, unless they were named."""
     records = []
     label = patient.profile.label
-    with Bar("asking", len(patient.addresses)) as bar:
+    with patient.progress("asking", len(patient.addresses)) as bar:
         for address in patient.addresses:
             probes = [await prober.ask(address, alone=True)]
             while patient.named and probes[-1].outcome is Outcome.SILENT and len(probes) < SILENT_PROBES:
@@ -177,7 +202,7 @@ async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
                 records.append(record)
             bar.advance()
     living = [record for record in records if record.lives]
-    with Bar("measuring", len(living) * PROBES) as bar:
+    with patient.progress("measuring", len(living) * PROBES) as bar:
         for record in living:
             for left in reversed(range(PROBES)):
                 record.probes.append(await prober.ask(record.address, alone=not left))
@@ -198,7 +223,7 @@ async def try_settings(patient: Patient, wire: Wire, prober: Prober, tell: Tell)
     candidates = other_settings(settings)
     patience = patient.profile.timings.read.window
     try:
-        with Bar("trying rates", len(candidates)) as bar:
+        with patient.progress("trying rates", len(candidates)) as bar:
             for candidate in candidates:
                 found = await answers_at(candidate, device, prober, asked, patience)
                 bar.advance()

@@ -14,17 +14,17 @@ import anyio
 import pytest
 from anyio.from_thread import start_blocking_portal
 
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
+from busmaster.bus.polling import PollGroup
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BusClosed, InvalidCommand
-from busmaster.polling import PollGroup
-from busmaster.profile import LineSettings
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.testing.virtual_time import run_in_virtual_time
-from busmaster.transport.memory import MemoryPort
 
 
 def slow_bus() -> Bus:

@@ -6,13 +6,14 @@ import difflib
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
+from busmaster.bus.points import Point
+from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand, VerifyFailed
-from busmaster.points import Point
-from busmaster.profile import Profile
 
 if TYPE_CHECKING:
-    from busmaster.bus import Bus
-    from busmaster.exchange import Command, Timings
+    from busmaster.bus.bus import Bus
+    from busmaster.contract.exchange import Command
+    from busmaster.contract.timing import Timings
 
 Send: TypeAlias = Callable[[], Awaitable[None]]
 """Sends what was prepared."""

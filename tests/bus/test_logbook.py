@@ -16,7 +16,7 @@ from busmaster.arbiter.events import (
     Strayed,
 )
 from busmaster.arbiter.health import Health
-from busmaster.logbook import PAUSE, Logbook
+from busmaster.bus.logbook import PAUSE, Logbook
 from tests.arbiter.bench import Bench
 
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from busmaster.bus import Bus
+from busmaster.bus.bus import Bus
+from busmaster.bus.points import Point
+from busmaster.bus.polling import Quality
+from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.errors import GarbledReply, NoReply, Refused
-from busmaster.points import Point
-from busmaster.polling import Quality
-from busmaster.profile import LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.mentor import codec as mentor

@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import COMMAND, Priority, Timeline, Transaction
-from busmaster.arguments import seconds, whole_number
+from busmaster.contract.arguments import seconds, whole_number
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, InvalidCommand, Refused
-from busmaster.exchange import Command, Timings
-from busmaster.merging import Merge
 from busmaster.planning import PlannedNode
-from busmaster.profile import Profile
+from busmaster.planning.merging import Merge
 
 if TYPE_CHECKING:
-    from busmaster.bus import Bus
-    from busmaster.points import Point
+    from busmaster.bus.bus import Bus
+    from busmaster.bus.points import Point
 
 T = TypeVar("T")
 MOST_RETRIES = 100

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.schedule import Poll, line_time, set_members
 from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.bus.points import Point
+from busmaster.bus.samples import NO_SAMPLES, GroupStatistics, Quality, Sample, Snapshot, Stream, Tally
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Batch
 from busmaster.errors import BusClosed, GarbledReply, InvalidCommand, Refused
-from busmaster.exchange import Command
-from busmaster.merging import WEIGHING, Merge, Served, cheapest
 from busmaster.planning import PlannedGroup, shape
-from busmaster.points import Point
-from busmaster.profile import Batch
-from busmaster.samples import NO_SAMPLES, GroupStatistics, Quality, Sample, Snapshot, Stream, Tally
+from busmaster.planning.merging import WEIGHING, Merge, Served, cheapest
 
 if TYPE_CHECKING:
-    from busmaster.bus import Bus
-    from busmaster.node import Node
+    from busmaster.bus.bus import Bus
+    from busmaster.bus.node import Node
 
 __all__ = ["GroupStatistics", "PollGroup", "Quality", "Sample", "Snapshot", "Stream"]
 

@@ -22,16 +22,16 @@ from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import SLICE, Poll
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
-from busmaster.arguments import seconds, whole_number
+from busmaster.bus.logbook import Logbook
+from busmaster.bus.node import Node, checked_priority, checked_retries
+from busmaster.bus.points import Point
+from busmaster.bus.polling import PollGroup, Sample, Stream
+from busmaster.contract.arguments import seconds, whole_number
+from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed, InvalidCommand, LineDown
-from busmaster.exchange import Timings
-from busmaster.logbook import Logbook
-from busmaster.merging import Merge, at_once
-from busmaster.node import Node, checked_priority, checked_retries
 from busmaster.planning import Plan, PlannedGroup, Read, bounds, plan_steps
-from busmaster.points import Point
-from busmaster.polling import PollGroup, Sample, Stream
-from busmaster.profile import LineSettings, Profile
+from busmaster.planning.merging import Merge, at_once
 from busmaster.transport.endpoints import Endpoint, is_paced
 from busmaster.transport.pump import Pump, Tap
 from busmaster.transport.reconnect import Connection

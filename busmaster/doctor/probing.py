@@ -17,10 +17,11 @@ import anyio
 
 from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import Mark
-from busmaster.cli.output import value_text
+from busmaster.contract.exchange import Command, Done, Exchange, Expect, FrameError
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import LineDown, Refused
-from busmaster.exchange import Command, Done, Exchange, Expect, FrameError, ReplyTiming, Timings
-from busmaster.profile import Profile
+from busmaster.outputs.values import value_text
 from busmaster.transport.clock import clock_of
 from busmaster.transport.endpoints import Endpoint, is_paced
 from busmaster.transport.kernel import OpenPort, open_port

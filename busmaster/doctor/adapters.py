@@ -8,9 +8,7 @@ from __future__ import annotations
 import array
 import contextlib
 import fcntl
-import grp
 import os
-import re
 import stat
 import termios
 from collections.abc import Iterator
@@ -19,8 +17,7 @@ from pathlib import Path
 
 from busmaster.errors import LineDown
 from busmaster.transport import identity
-
-PROC = Path("/proc")
+from busmaster.transport.holders import PROC, holders, owning_group, serves
 
 SLOW_LATENCY_TIMER = 2
 """Milliseconds; above that, an FTDI adapter's batching shows in every reply."""
@@ -43,17 +40,6 @@ class Finding:
     advice: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Holder:
-    """A process that has the port open."""
-
-    pid: int
-    command: str
-
-    def __str__(self) -> str:
-        return "this program" if self.pid == os.getpid() else f"{self.command} (process {self.pid})"
-
-
 def inspect(name: str, *, proc: Path = PROC) -> tuple[Finding, ...]:
     """Everything that can be said without opening it of the port at a path, or of usb:SERIAL. May block."""
     try:
@@ -64,37 +50,6 @@ def inspect(name: str, *, proc: Path = PROC) -> tuple[Finding, ...]:
     if found[0].ok:
         found += [*_name(name, path), _permission(path), _holders(path, proc), *_driver(path), *_latency_timer(path)]
     return tuple(found)
-
-
-def holders(path: str, *, proc: Path = PROC) -> tuple[Holder, ...]:
-    """Who has it open, of the processes that we may look into (root sees all)."""
-    device = os.path.realpath(path)
-    return tuple(_holder(pid, proc) for pid in _pids(proc) if _has_open(proc / str(pid), device))
-
-
-def lock_owner(path: str, *, proc: Path = PROC) -> Holder | None:
-    """Who has locked it (flock), by the kernel's own table."""
-    try:
-        inode = os.stat(path)
-        table = (proc / "locks").read_text()
-    except OSError:
-        return None
-    place = f"{os.major(inode.st_dev):02x}:{os.minor(inode.st_dev):02x}:{inode.st_ino}"
-    for line in table.splitlines():
-        fields = line.split()
-        if fields[1:2] == ["FLOCK"] and place in fields:
-            pid = int(fields[4])
-            return _holder(pid, proc) if pid > 0 else None  # 0 or -1: in another container
-    return None
-
-
-def owning_group(path: str) -> str:
-    """The group that may open it, by name where it has one."""
-    gid = os.stat(path).st_gid
-    try:
-        return grp.getgrgid(gid).gr_name
-    except KeyError:
-        return str(gid)
 
 
 def latency_timer(path: str) -> int | None:
@@ -170,7 +125,7 @@ def _permission(path: str) -> Finding:
 
 def _holders(path: str, proc: Path) -> Finding:
     device = os.path.realpath(path)
-    found = [str(holder) for holder in holders(path, proc=proc) if not _serves(proc / str(holder.pid), device)]
+    found = [str(holder) for holder in holders(path, proc=proc) if not serves(proc / str(holder.pid), device)]
     if not found:
         return Finding("holders", True, "no other program has it open")
     return Finding(
@@ -207,46 +162,3 @@ def _entry(path: str) -> Path:
 
 def _device(path: str) -> Path:
     return identity.SYS / "class/tty" / os.path.basename(os.path.realpath(path)) / "device"
-
-
-def _pids(proc: Path) -> list[int]:
-    try:
-        return sorted(int(entry) for entry in os.listdir(proc) if entry.isdigit())
-    except OSError:
-        return []
-
-
-def _has_open(process: Path, device: str) -> bool:
-    """False too where we may not look, or it has just ended. To know a node (O_PATH) is not to have it open."""
-    with contextlib.suppress(OSError):
-        for number in os.listdir(process / "fd"):
-            with contextlib.suppress(OSError):
-                if (
-                    os.readlink(process / "fd" / number) == device
-                    and not _flags(process / "fdinfo" / number) & os.O_PATH
-                ):
-                    return True
-    return False
-
-
-def _flags(descriptor: Path) -> int:
-    found = re.search(r"^flags:\s*(\d+)$", descriptor.read_text(), re.MULTILINE)
-    return int(found[1], 8) if found else 0
-
-
-def _serves(process: Path, device: str) -> bool:
-    """Whether it has the other end of this pseudo-terminal open: then it is the line, not a second master."""
-    for descriptor in process.glob("fdinfo/*"):
-        with contextlib.suppress(OSError):
-            index = re.search(r"^tty-index:\s*(\d+)$", descriptor.read_text(), re.MULTILINE)
-            if index is not None and device == f"/dev/pts/{index[1]}":
-                return True
-    return False
-
-
-def _holder(pid: int, proc: Path) -> Holder:
-    try:
-        command = (proc / str(pid) / "comm").read_text().strip()
-    except OSError:
-        command = "another program"
-    return Holder(pid, command)

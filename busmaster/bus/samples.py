@@ -16,9 +16,9 @@ from busmaster.arbiter.counters import Quantiles
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Timeline
-from busmaster.arguments import whole_number
+from busmaster.bus.points import Point
+from busmaster.contract.arguments import whole_number
 from busmaster.errors import BusError
-from busmaster.points import Point
 
 T = TypeVar("T")
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from busmaster.arguments import seconds
+from busmaster.contract.arguments import seconds
+from busmaster.contract.exchange import Command
 from busmaster.errors import GarbledReply, InvalidCommand
-from busmaster.exchange import Command
 
 if TYPE_CHECKING:
-    from busmaster.node import Node, Priority
+    from busmaster.bus.node import Node, Priority
 
 T = TypeVar("T")
 

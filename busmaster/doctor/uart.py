@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from busmaster.arbiter.counters import DriverErrors
-from busmaster.transport.adapters import Finding
+from busmaster.doctor.adapters import Finding
 
 UART_ERRORS = {
     "framing": ("framing error", "wrong baud rate, or no termination; then missing biasing, swapped wires A and B"),

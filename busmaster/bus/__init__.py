@@ -1,0 +1,1 @@
+"""What a user holds: the bus, its nodes, points, poll groups, and handles' common base."""
