@@ -107,7 +107,13 @@ class Bus:
         self._check_not_closed()
         if self.running:
             raise InvalidCommand(f"the bus on {self.endpoint.name} is open already: enter it once, and share it")
-        self._loop = asyncio.get_running_loop()
+        loop = running_loop()
+        if loop is None:  # awaited, and not by asyncio
+            raise InvalidCommand(
+                f"the bus on {self.endpoint.name} needs asyncio's event loop, which does not run here: "
+                "run the program by asyncio.run, or by anyio.run with its asyncio backend, not by trio"
+            )
+        self._loop = loop
         self._thread = get_ident()
         self.pump.bind(self._loop)
         self._arbiter.reset_statistics(self.now())
@@ -376,7 +382,7 @@ class Bus:
 
     def _check_elsewhere(self) -> None:
         """Its loop does not run here: right only in its own thread, between two runs of the loop."""
-        if get_ident() != self._thread or is_any_loop_running():
+        if get_ident() != self._thread or running_loop() is not None:
             raise InvalidCommand(
                 f"the bus on {self.endpoint.name} was used from thread {current_thread().name!r} outside the "
                 "event loop that opened it: hand the call to that loop, with portal.call (anyio.from_thread) or "
@@ -473,10 +479,9 @@ class Bus:
             self._arbiter.dispatcher.release_node(node.record)
 
 
-def is_any_loop_running() -> bool:
-    """Return whether an event loop runs in this thread."""
+def running_loop() -> asyncio.AbstractEventLoop | None:
+    """Return the event loop of asyncio that runs in this thread, or None."""
     try:
-        asyncio.get_running_loop()
+        return asyncio.get_running_loop()
     except RuntimeError:
-        return False
-    return True
+        return None
