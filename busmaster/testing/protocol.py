@@ -12,7 +12,7 @@
             invalid=[lambda: ReadRegister(70000)],
         )
 
-A few cases say what the document says: a command, the node, what that node answers, and the value. From them the kit
+A few cases say what the manual says: a command, the node, what that node answers, and the value. From them the kit
 derives what the arbiter relies on (`busmaster.contract.exchange`), and raises `NotConformant` with all that does not
 hold:
 

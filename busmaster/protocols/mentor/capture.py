@@ -35,7 +35,7 @@ class MentorDialect:
     """CT-ANSI: EOT a a a a m m p p ENQ, EOT a a a a STX m m p p ..., and NAK, ACK, BS for again, next, previous.
 
     Bit 7 is parity, or nothing: it is not looked at. ACK and NAK are the drive's while something is asked, and the
-    host's short commands after a read that was answered (PROTOCOLS 4.1).
+    host's short commands after a read that was answered.
     """
 
     starts = bytes((EOT, STX))

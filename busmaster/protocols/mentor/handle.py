@@ -119,7 +119,7 @@ class MentorDrive(Handle):
         """`count` parameters of one menu, from `parameter` on.
 
         With `chain` all in one exchange, one request byte for each after the first: only where no other drive can take
-        or send that byte for its own (M14), that is where every node of the line is a drive that forgets what it last
+        or send that byte for its own, that is where every node of the line is a drive that forgets what it last
         sent when another is addressed. Raises NoSuchParameter where the menu has a gap.
         """
         self._check_readable()
