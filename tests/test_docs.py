@@ -1,12 +1,14 @@
-"""The pages under docs/ say what is so: their telegrams are the codecs', their programs run, their links lead somewhere."""
+"""The pages of docs/ say what is so: telegrams are the codecs', programs run, links lead somewhere."""
 
 from __future__ import annotations
 
 import ast
 import json
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -134,14 +136,12 @@ def test_every_frame_of_the_vectors_is_on_its_page(family: str) -> None:
     assert [entry["name"] for entry in VECTORS[family] if bytes.fromhex(entry["hex"]) not in shown] == []
 
 
-@pytest.mark.parametrize(
-    ("page", "source"),
-    [(page, source) for page in PAGES for source in blocks(page, "python")],
-    ids=lambda value: value.stem if isinstance(value, Path) else "",
-)
-def test_a_program_on_a_page_runs(page: Path, source: str) -> None:
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_the_programs_on_a_page_run_in_their_order_as_one(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run as a module, so that what stands under `if __name__ == "__main__"` (a real port) does not."""
-    exec(compile(source, name_of(page), "exec"), {"__name__": "page"})
+    module = ModuleType("page")
+    monkeypatch.setitem(sys.modules, "page", module)  # dataclasses look there
+    exec(compile("\n".join(blocks(page, "python")), name_of(page), "exec"), vars(module))
 
 
 def anchors(page: Path) -> set[str]:
@@ -163,9 +163,10 @@ def test_links_within_the_repository_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_files_that_a_page_names_are_there(page: Path) -> None:
-    """In `backquotes`, what has a slash and a known ending, or begins with a room of the repository."""
-    for name in re.findall(r"`((?:busmaster|tests|benchmarks|examples|docs)/[\w./-]*)`", page.read_text()):
-        assert (ROOT / name).exists(), f"{name_of(page)}: there is no {name}"
+    """In `backquotes`, perhaps with others."""
+    for words in re.findall(r"`([^`\n]+)`", re.sub(BLOCK, "", page.read_text())):
+        for name in re.findall(r"\b(?:busmaster|tests|benchmarks|examples|docs)/[\w./-]*", words):
+            assert (ROOT / name).exists(), f"{name_of(page)}: there is no {name}"
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.name != "README.md"], ids=name_of)
@@ -175,6 +176,22 @@ def test_every_page_can_be_found_from_the_index(page: Path) -> None:
     assert page.resolve() in linked
 
 
+def test_the_picture_and_the_table_of_rooms_have_every_room() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    [picture] = [text for _, said, text in BLOCK.findall(page) if said == "text"]
+    rooms = {path.stem for path in (ROOT / "busmaster").iterdir() if path.suffix in ("", ".py") and path.name[0] != "_"}
+    rooms -= {"py"}  # py.typed
+    assert {Path(name).stem for name in re.findall(r"^\| `busmaster/(\w+)(?:/|\.py)`", page, re.MULTILINE)} == rooms
+    assert rooms - {"dissectors"} <= set(re.findall(r"\w+", picture))
+
+
+def test_pre_commit_runs_what_the_extras_install_and_fetches_nothing() -> None:
+    text = (ROOT / ".pre-commit-config.yaml").read_text()
+    hooks = re.findall(r"entry: \.venv/bin/(.*?)(?: --force-exclude)?$", text, re.MULTILINE)
+    assert set(hooks) == {"ruff check", "ruff format --check", "mypy"}
+    assert re.findall(r"repo: (.*)", text) == ["local"]
+
+
 # what is cited
 
 READ_BY_USERS = ("busmaster", "tests", "benchmarks", "examples", "docs")
@@ -182,7 +199,7 @@ CITED_NOWHERE = re.compile(
     r"\bDESIGN(\.md)?\b|\bPROTOCOLS(\.md)?\b|\bCLI\.md\b|\b[Ii]ssue #?\d|\b(in|from|of) (the )?seeds?\b(?! \d)"
     r"|\((H|G|M|S|D)\d{1,2}\)|\bthe card('s)?\b|/work/"
 )
-"""Papers that were at hand when this was written, and are not here: the promises, R1 to R15, are in docs/promises.md."""
+"""Papers that are not here. The promises, R1 to R15, are in docs/promises.md."""
 
 
 def prose() -> Iterator[tuple[str, int, str]]:
