@@ -42,8 +42,18 @@ def _common(table: Table, groups: Collection[str]) -> dict[str, Any]:
 
 
 def _file(table: Table, common: dict[str, Any]) -> Settings:
-    table.only("enabled", "groups", "buffer", "path")
-    return FileSettings(path=table.text("path"), **common)
+    table.only("enabled", "groups", "buffer", "path", "mode", "sync_every")
+    return FileSettings(
+        path=table.text("path"), mode=_mode(table), sync_every=table.seconds("sync_every", 10.0), **common
+    )
+
+
+def _mode(table: Table) -> int:
+    """Who may read and write a new file, as chmod takes it in octal."""
+    text = table.text("mode", "0640")
+    if len(text) not in (3, 4) or not set(text) <= set("01234567") or int(text, 8) > 0o777:
+        raise table.error('a mode is octal, as chmod takes it: mode = "0640"', "mode")
+    return int(text, 8)
 
 
 def _sqlite(table: Table, common: dict[str, Any]) -> Settings:

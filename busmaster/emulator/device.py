@@ -24,38 +24,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol, final
+from typing import final
 
+from busmaster.emulator.chance import Chance, NoChance
 from busmaster.emulator.faults import Faults
 from busmaster.errors import InvalidCommand
 
 NEVER = math.inf
 NAK = b"\x15"
-
-
-class Chance(Protocol):
-    """What the emulator uses of a seeded `random.Random`, which is handed in: the same seed, the same line."""
-
-    def random(self) -> float: ...
-    def uniform(self, a: float, b: float) -> float: ...
-    def randrange(self, start: int, stop: int) -> int: ...
-    def getrandbits(self, k: int) -> int: ...
-
-
-class NoChance:
-    """Stands in where no random.Random was handed in: says so as soon as chance is needed."""
-
-    def random(self) -> float:
-        raise ValueError("hand a random.Random(seed) to the Line: a delay or a fault on it is random")
-
-    def uniform(self, a: float, b: float) -> float:
-        return self.random()
-
-    def randrange(self, start: int, stop: int) -> int:
-        return int(self.random())
-
-    def getrandbits(self, k: int) -> int:
-        return int(self.random())
 
 
 @dataclass(frozen=True, slots=True)

@@ -84,8 +84,13 @@ def reason(error: BaseException) -> str:
 
 
 def check_folder(path: str) -> None:
-    """Raises InvalidCommand where no file can ever be made: that is better said before anything starts."""
+    """Raise InvalidCommand where no file can ever be made: that is better said before anything starts.
+
+    Folders whose names hold fields of a date are made when their time comes.
+    """
     folder = os.path.dirname(path)
+    while "%" in folder:
+        folder = os.path.dirname(folder)
     if folder and not os.path.isdir(folder):
         raise InvalidCommand(f"{path}: there is no folder {folder}")
 

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 import time
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 
-from busmaster.bus.polling import Snapshot
+from busmaster.bus.polling import Sample, Snapshot
 from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
+from busmaster.outputs.growing_file import GrowingFile
 from busmaster.outputs.settings import FileSettings
 from busmaster.outputs.values import cycle_fields, json_line, value_text
 
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""What a spreadsheet takes for the beginning of a formula."""
 COLUMNS = ("time", "group", "cycle", "node", "item", "value", "unit", "quality", "error")
 
 
 class FileOutput(BatchOutput[bytes]):
-    """Appends to the file; begins another when the date in its name changes."""
+    """Appends to the file; begins another when the date in its name changes, or when it was moved away."""
+
+    head = b""
+    """What a file begins with."""
 
     def __init__(
         self,
@@ -28,47 +33,26 @@ class FileOutput(BatchOutput[bytes]):
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
         super().__init__(kind, settings, clock, say)
-        check_folder(time.strftime(settings.path))
-        self._pattern = settings.path
-        self._path = ""
-        self._descriptor: int | None = None
-
-    def head(self) -> bytes:
-        """What a file begins with."""
-        return b""
+        check_folder(settings.path)
+        self._file = GrowingFile(
+            settings.path,
+            mode=settings.mode,
+            sync_every=settings.sync_every,
+            head=self.head,
+            tell=lambda text: say(f"{kind}: {text}"),
+        )
 
     def commit(self, batch: list[bytes]) -> None:
-        """A batch that the disk has no room for is cut off again."""
-        descriptor = self._open()
-        end = os.lseek(descriptor, 0, os.SEEK_END)
-        rest = memoryview((b"" if end else self.head()) + b"".join(batch))
-        try:
-            while rest:
-                rest = rest[os.write(descriptor, rest) :]
-        except OSError:
-            os.ftruncate(descriptor, end)
-            raise
+        self._file.append(b"".join(batch))
 
     def shut(self) -> None:
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
-
-    def _open(self) -> int:
-        path = time.strftime(self._pattern)
-        if path != self._path:
-            self.shut()
-            self._path = path
-        if self._descriptor is None:
-            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
-        return self._descriptor
+        self._file.close()
 
 
 class CsvOutput(FileOutput):
-    """A line a value. Times are UTC, to the millisecond."""
+    """A line a value. Times are UTC, to the millisecond. No name is taken for a formula by a spreadsheet."""
 
-    def head(self) -> bytes:
-        return csv_lines([COLUMNS])
+    head = ",".join(COLUMNS).encode() + b"\n"
 
     def format(self, item: Item, time_of: Callable[[float], float]) -> bytes | None:
         if isinstance(item, Happening):
@@ -76,14 +60,14 @@ class CsvOutput(FileOutput):
         return csv_lines(
             (
                 utc(time_of(sample.finished)),
-                item.group,
+                no_formula(item.group),
                 item.cycle,
-                point.key.partition("/")[0],
-                point.item,
-                "" if sample.error else value_text(sample.value),
-                point.unit,
+                no_formula(point.key.partition("/")[0]),
+                no_formula(point.item),
+                value_cell(sample),
+                no_formula(point.unit),
                 sample.quality.value,
-                sample.error.what if sample.error else "",
+                no_formula(sample.error.what) if sample.error else "",
             )
             for point, sample in self.unhurried(item)
         )
@@ -104,6 +88,19 @@ def csv_lines(rows: Iterable[Iterable[object]]) -> bytes:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue().encode()
+
+
+def value_cell(sample: Sample) -> str:
+    """A value as text; only one that is a text itself could be taken for a formula."""
+    if sample.error:
+        return ""
+    text = value_text(sample.value)
+    return no_formula(text) if isinstance(sample.value, str) else text
+
+
+def no_formula(text: str) -> str:
+    """The text, behind an apostrophe where a spreadsheet would otherwise compute it."""
+    return f"'{text}" if text[:1] in FORMULA else text
 
 
 def utc(moment: float) -> str:

@@ -25,9 +25,15 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileSettings(Settings):
-    """`path` may hold fields of a date (line-%Y-%m-%d.csv): a new file begins when the name changes."""
+    """`path` may hold fields of a date (%Y/line-%m-%d.csv): a new file begins when the name changes.
+
+    `mode` is what a new file may be used for and by whom, narrowed by the process's umask. `sync_every`: after so many
+    seconds at most what was written survives a loss of power too; 0 for after each batch.
+    """
 
     path: str
+    mode: int = 0o640
+    sync_every: float = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,7 +7,6 @@ import pkgutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -15,6 +14,8 @@ from busmaster.errors import InvalidCommand
 from busmaster.registry.protocol import NodeKind, Option, Protocol
 
 if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
     from busmaster.emulator.device import Delay, Device
     from busmaster.emulator.oracle import Oracle
 
@@ -29,6 +30,8 @@ def protocols() -> tuple[Protocol, ...]:
 
     A protocol of another package that cannot be loaded, or whose names are taken, is left out with a warning.
     """
+    from importlib.metadata import entry_points  # it takes longer to import than all protocols together
+
     found = list(_own())
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         try:

@@ -22,6 +22,7 @@ from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import LineDown
+from busmaster.transport.alarm import Alarm
 from busmaster.transport.clock import clock_of
 from busmaster.transport.kernel import OpenPort, open_port
 
@@ -78,7 +79,7 @@ class Pump(asyncio.Protocol):
         self._paused = False
         self._held_since = inf
         self._gave_up = ""
-        self._timer: asyncio.TimerHandle | None = None
+        self._alarm: Alarm | None = None
         self._armed = inf
         self._run_out: anyio.Event | None = None
 
@@ -86,6 +87,7 @@ class Pump(asyncio.Protocol):
         """Keep this loop's time."""
         self._loop = loop
         self.clock = clock_of(loop)
+        self._alarm = Alarm(loop, self._on_time)
 
     # what the bus calls
 
@@ -144,9 +146,9 @@ class Pump(asyncio.Protocol):
 
     def stop(self) -> None:
         """No timer any more: the bus is closed."""
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+        if self._alarm is not None:
+            self._alarm.close()
+            self._alarm = None
         self._loop = None
 
     # what asyncio calls
@@ -212,15 +214,11 @@ class Pump(asyncio.Protocol):
             future.set_exception(transaction.error)
 
     def _arm(self, due: float) -> None:
-        if self._loop is None:
-            return
-        if self._timer is not None:
-            self._timer.cancel()
-        self._armed = due
-        self._timer = self._loop.call_at(self._loop.time() + max(0.0, due - self.clock()), self._on_time)
+        if self._alarm is not None:
+            self._armed = due
+            self._alarm.set(due - self.clock())
 
     def _on_time(self) -> None:
-        self._timer = None
         self._armed = inf
         now = self.clock()
         unread = False

@@ -7,7 +7,8 @@ from random import Random
 import pytest
 
 from busmaster.emulator.device import Delay
-from busmaster.emulator.faults import BEYOND, FORGED, HEARING, NAMES, SPEAKING, WITHIN, Faults, noise
+from busmaster.emulator.disturbance import noise
+from busmaster.emulator.faults import BEYOND, FORGED, HEARING, NAMES, SPEAKING, WITHIN, Faults
 from busmaster.emulator.line import Line
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand

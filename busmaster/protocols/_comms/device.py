@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Context, Decimal
 from functools import lru_cache
 
-from busmaster.emulator.device import NAK, Chance, Delay, Device
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import NAK, Delay, Device
 from busmaster.emulator.oracle import Oracle
 from busmaster.wire.checks import xor
 

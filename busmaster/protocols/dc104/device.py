@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 
-from busmaster.emulator.device import NAK, Chance, Delay, Device
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import NAK, Delay, Device
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import sum8

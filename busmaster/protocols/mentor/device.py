@@ -14,7 +14,8 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 
-from busmaster.emulator.device import NAK, Chance, Delay, Device
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import NAK, Delay, Device
 from busmaster.emulator.motion import Ramp
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand

@@ -9,7 +9,8 @@ import math
 import struct
 from collections.abc import Iterable, Sequence
 
-from busmaster.emulator.device import NEVER, Chance, Delay, Device
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import NEVER, Delay, Device
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
 

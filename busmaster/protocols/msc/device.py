@@ -8,7 +8,8 @@ its ACK, and is sent again until the host ACKs it, five times at most ("Data tra
 
 from __future__ import annotations
 
-from busmaster.emulator.device import NAK, NEVER, Chance, Delay, Device
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import NAK, NEVER, Delay, Device
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import sum16
