@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from busmaster.errors import Refused
+from busmaster.errors import NoSuchParameter, Refused
 from busmaster.registry import find, make_device, protocols
-from busmaster.testing import answers_of
+from busmaster.testing import Case, answers_of, check_dialect
 from busmaster.testing.listening import Ending, Listening
 
 ROOT = Path(__file__).parent.parent
@@ -25,6 +25,7 @@ VECTORS = json.loads((ROOT / "tests" / "vectors" / "frames.json").read_text())
 BLOCK = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?<!!)\[[^\]]*\]\(([^)\s]+)\)")
 DONE = "done"
+REFUSALS = {kind.__name__: kind for kind in (Refused, NoSuchParameter)}
 
 
 def name_of(page: Path) -> str:
@@ -113,6 +114,13 @@ EXAMPLES = list(examples())
 @pytest.mark.parametrize("example", [example for _, example in EXAMPLES if example.known], ids=str)
 def test_the_codec_sends_and_reads_the_very_bytes_of_an_example(example: Telegrams) -> None:
     example.check_codec()
+
+
+@pytest.mark.parametrize("example", [example for _, example in EXAMPLES if example.known], ids=str)
+def test_a_listener_reads_an_example_off_the_line(example: Telegrams) -> None:
+    legs = [data for side, data in example.said if side == "<"]
+    raises = REFUSALS.get(example.outcome)
+    check_dialect(example.kind.protocol, [Case(example.built(), example.address, legs, raises=raises)])
 
 
 @pytest.mark.parametrize("example", [example for _, example in EXAMPLES], ids=str)

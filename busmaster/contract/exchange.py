@@ -127,7 +127,8 @@ class Exchange(Protocol[T_co]):
     def answers(self) -> tuple[bytes, ...]:
         """What its good replies begin with, or are where they are one byte: one for each reply that decides.
 
-        Two exchanges that share one could be taken for each other (R15). Empty for a broadcast.
+        Two exchanges that share one could be taken for each other (R15); they are compared whole, so one that only
+        begins like another is another. Empty for a broadcast.
         """
         ...
 
