@@ -230,7 +230,7 @@ class _Kit:
             if byte not in starts:
                 ending = self.hear(case, bytes((byte,)), *case.legs).expire()
                 if ending.delivered or isinstance(ending.error, Refused) or ending.is_bug:
-                    yield f"{case}: {byte:02x} and then the reply gives {ending}"
+                    yield f"{case}: {byte:02x}, which is not in starts, and then the reply gives {ending}"
 
     def check_garbage(self, case: Case, count: int) -> Iterator[str]:
         for _ in range(count):
