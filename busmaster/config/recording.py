@@ -57,8 +57,22 @@ def _mode(table: Table) -> int:
 
 
 def _sqlite(table: Table, common: dict[str, Any]) -> Settings:
-    table.only("enabled", "groups", "buffer", "path", "keep_days")
-    return SqliteSettings(path=table.text("path"), keep_days=table.number("keep_days", None), **common)
+    table.only("enabled", "groups", "buffer", "path", "mode", "keep_days", "keep_mb")
+    return SqliteSettings(
+        path=table.text("path"),
+        mode=_mode(table),
+        keep_days=_limit(table, "keep_days"),
+        keep_mb=_limit(table, "keep_mb"),
+        **common,
+    )
+
+
+def _limit(table: Table, key: str) -> float | None:
+    """How much is kept; None where everything is."""
+    limit = table.number(key, None)
+    if limit is not None and limit <= 0:
+        raise table.error(f"must be more than 0, not {limit}; leave it out to keep all", key)
+    return limit
 
 
 def _mqtt(table: Table, common: dict[str, Any]) -> Settings:

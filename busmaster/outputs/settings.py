@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Literal
 
 from busmaster.errors import InvalidCommand
@@ -38,10 +39,21 @@ class FileSettings(Settings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SqliteSettings(Settings):
-    """Values older than `keep_days` are deleted; None keeps all."""
+    """What is older than `keep_days` is deleted, and the oldest of more than `keep_mb` megabytes; None keeps all.
+
+    `mode` is that of a new file, narrowed by the process's umask.
+    """
 
     path: str
     keep_days: float | None = None
+    keep_mb: float | None = None
+    mode: int = 0o640
+
+    def __post_init__(self) -> None:
+        for name in ("keep_days", "keep_mb"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < inf:
+                raise InvalidCommand(f"{name} is more than 0, not {value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
