@@ -182,6 +182,8 @@ class Node:
     def _give_up(self, transaction: Transaction) -> None:
         """Nobody waits for it any more. A write that is on the wire now is over before anything else can be read."""
         self.bus.pump.cancel(transaction)
+        # Its end is not told to anyone, but what it may have changed is: samples that were read before it are stale
+        # now.
         if transaction.writes and transaction.attempts:
             self.bus.touched(transaction, self.bus.now())
 

@@ -72,6 +72,7 @@ class Point(Generic[T]):
         if max_age is not None:
             if max_age != inf:
                 max_age = seconds(max_age, f"{self.node.label}: max_age")
+            # whichever group has it: two groups may read one quantity, and a write makes both of their samples stale
             sample = self.node.bus.latest(self)
             if sample is not None and sample.error is None and sample.age(self.node.bus.now()) <= max_age:
                 value: T = sample.value

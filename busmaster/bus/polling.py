@@ -217,6 +217,7 @@ class PollGroup:
         self.latest = snapshot
         for consumer in self._consumers:
             consumer.put(snapshot)
+        # Once: choosing anew whenever a mean moves would make the cycles differ for ever.
         if poll.cycles == WEIGHED_AGAIN:
             self._choose()
 
@@ -257,7 +258,7 @@ class PollGroup:
 
     def _choosing(self) -> Iterator[int]:
         """Give the poll its transactions and its cost, if they are other ones than it has."""
-        for merged in (True, False):
+        for merged in (True, False):  # a merge that fails costs its savings, not the group
             try:
                 reads = yield from self._reads(merged)
                 break
@@ -332,7 +333,7 @@ class PollGroup:
 def _measure(transaction: Transaction, read: _Read) -> None:
     """The mean of what the node takes to reply, over the last of its replies."""
     node = transaction.node
-    if transaction.attempts == 1:
+    if transaction.attempts == 1:  # of a repeated one, the time includes what the failed attempts cost
         wait = (transaction.last_byte - transaction.started - read.bytes_time) / read.legs
         node.measured = min(node.measured + 1, REPLIES_REMEMBERED)
         known = wait if node.reply_time is None else node.reply_time

@@ -167,6 +167,8 @@ class Stream(Generic[T]):
         while not self._items:
             if self._closed:
                 raise StopAsyncIteration
+            # A new event only when the old one was used, and shared until then: of two tasks that wait on one stream,
+            # one would else wait on an event that nobody knows any more.
             if self._arrived.is_set():
                 self._arrived = anyio.Event()
             await self._arrived.wait()
