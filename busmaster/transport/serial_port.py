@@ -1,7 +1,8 @@
 """A serial port, on pyserial and pyserial-asyncio with the latter's traps mended.
 
-Inherited from pyserial is how a port is opened and configured, and from pyserial-asyncio the reader and writer on the
-loop, pausing and resuming, and the write buffer. Mended is all that costs time or hides something: a write leaves at
+Inherited from pyserial is how a port is opened and configured. Inherited from pyserial-asyncio is little, and private to
+it: how reader and writer are registered with the loop and removed, pausing and resuming of reading, the limits of the
+write buffer and the pausing of the protocol by them. Mended is all that costs time or hides something: a write leaves at
 once instead of a turn of the loop later; reading asks no select(), which fails above descriptor 1023; every loss is
 reported, once, and never from within a write; bytes with parity or framing errors come marked (pyserial switches the
 check off); and nothing that can block (opening, configuring, draining, closing) runs on the loop's thread: a driver may
