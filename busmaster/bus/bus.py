@@ -174,7 +174,7 @@ class Bus:
     def node(
         self, profile: Profile, address: int, *, timings: Timings | None = None, retries: int | None = None
     ) -> Node:
-        """The node at this address: a protocol and an address are one node, however often it is asked for.
+        """Return the node at this address: a protocol and an address are one node, however often it is asked for.
 
         Raises InvalidCommand for an address that the protocol does not have, and for another profile, timings or
         retries than it was first asked with; what is None was left open.
@@ -237,7 +237,7 @@ class Bus:
         return group
 
     def remove_group(self, group: PollGroup) -> None:
-        """What `PollGroup.close` does: its polls end, and what they have on the wire goes unheard."""
+        """Do what `PollGroup.close` does: its polls end, and what they have on the wire goes unheard."""
         self.check_loop()
         if self._groups.get(group.name) is group:
             del self._groups[group.name]
@@ -254,19 +254,19 @@ class Bus:
         self._logbook.failed_choice(group, error)
 
     def demand(self, poll: Poll) -> None:
-        """What `PollGroup.demand` does."""
+        """Do what `PollGroup.demand` does."""
         self.check_loop()
         self._arbiter.demand(poll, self.now())
         self.pump.turn()
 
     def suspend(self, node: Node, seconds: float) -> None:
-        """What `Node.suspend` does."""
+        """Do what `Node.suspend` does."""
         self.check_loop()
         self._arbiter.dispatcher.suspend(node.record, self.now() + seconds)
         self.pump.turn()
 
     def latest(self, point: Point[Any]) -> Sample | None:
-        """The youngest good sample of this point in any group, unless a write has made it stale."""
+        """Return the youngest good sample of this point in any group, unless a write has made it stale."""
         youngest = None
         for group in self._groups.values():
             sample = None if group.latest is None else group.latest.samples.get(point)
@@ -277,7 +277,7 @@ class Bus:
         return youngest
 
     def touched(self, write: Transaction, when: float) -> None:
-        """A write is over: what was asked before is not newer than what it changed."""
+        """Note that a write is over: what was asked before is not newer than what it changed."""
         node = write.node
         if isinstance(node.waiter, Node):
             node.waiter.touched = when
@@ -287,19 +287,19 @@ class Bus:
         self._touched[write.touches] = self.last_touched = when
 
     def is_stale(self, point: Point[Any], started: float) -> bool:
-        """Whether a write to the point's quantity, or to all of its node, has ended since its read was started."""
+        """Return whether a write to the point's quantity, or to all of its node, has ended since its read began."""
         touched = self._touched
         return max(touched.get(point.quantity, -inf), touched.get(point.node, -inf)) > started
 
     # looking
 
     def now(self) -> float:
-        """The bus's clock, in seconds: all its times are of this clock."""
+        """Return the time of the bus's clock, in seconds: all its times are of this clock."""
         return self.pump.clock()
 
     @property
     def byte_time(self) -> float:
-        """tau: seconds per byte of this line."""
+        """Return tau, the seconds per byte of this line."""
         return self._arbiter.byte_time
 
     @property
@@ -307,7 +307,7 @@ class Bus:
         return self._arbiter.state
 
     def statistics(self) -> LineStatistics:
-        """An immutable snapshot of the line's counts since it was opened or reset."""
+        """Return an immutable snapshot of the line's counts since it was opened or reset."""
         self.check_loop()
         return replace(self._arbiter.statistics(self.now()), driver=self.pump.driver_errors())
 
@@ -320,7 +320,7 @@ class Bus:
             group.reset_statistics()
 
     def plan(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-        """What becomes of the groups that run, and of `more`, by the reply times measured so far.
+        """Reckon what becomes of the groups that run, and of `more`, by the reply times measured so far.
 
         It is reckoned at once: with hundreds of points that takes some ten milliseconds, in which no line of this
         loop goes on. While a line runs, await `plan_in_steps`.
@@ -329,7 +329,7 @@ class Bus:
         return at_once(self._planning(more, could_merge))
 
     async def plan_in_steps(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-        """Like `plan`, in steps of less than a millisecond between which exchanges go on."""
+        """Do what `plan` does, in steps of less than a millisecond between which exchanges go on."""
         self.check_loop()
         steps = self._planning(more, could_merge)
         done = 0
@@ -344,7 +344,7 @@ class Bus:
                 await asyncio.sleep(0)
 
     def worst_case_wait(self, priority: Priority = Priority.COMMAND) -> float:
-        """How long, in seconds, a request of this class, made now, waits at the most until it is sent (R9).
+        """Return how long, in seconds, a request of this class, made now, waits at most until it is sent (R9).
 
         It reckons with what is polled, what waits already, every node's probe, and each kind of command that was
         asked or polled so far; with nodes that are dead, late or trickling; not with a line that is never silent.
@@ -368,7 +368,7 @@ class Bus:
         return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 
     def events(self) -> Stream[Event]:
-        """What happens to the line and its nodes, from now on (NodeChanged, LineChanged, PortFailed, ...)."""
+        """Return a stream of what happens to line and nodes from now on (NodeChanged, LineChanged, PortFailed, ...)."""
         self.check_loop()
         self._check_not_closed()
         return Stream(self._streams, EVENT_BUFFER)

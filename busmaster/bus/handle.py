@@ -34,12 +34,12 @@ class Handle:
         self.node = bus.node(self.profile, address, timings=timings, retries=retries)
 
     def point(self, item: str) -> Point[Any]:
-        """The point that ITEM names on the command line. Raises InvalidCommand for one that does not exist."""
+        """Return the point that ITEM names on the command line. Raises InvalidCommand for one that does not exist."""
         raise NotImplementedError
 
     @classmethod
     def items(cls) -> tuple[str, ...]:
-        """The names (not the numbers) that `point` knows."""
+        """Return the names (not the numbers) that `point` knows."""
         return ()
 
     @classmethod
@@ -99,14 +99,14 @@ def is_decimal(text: str) -> bool:
 
 
 def item_text(item: str) -> str:
-    """The item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
+    """Return the item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
     if not isinstance(item, str):
         raise InvalidCommand(f"an item is text, such as {str(item)!r}, not {item!r}")
     return item
 
 
 def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
-    """The error for an item that does not exist: what would do, and the nearest name."""
+    """Return the error for an item that does not exist: it says what would do, and the nearest name."""
     near = difflib.get_close_matches(str(item), list(known), n=1)
     guess = f"; did you mean {near[0]!r}?" if near else ""
     return InvalidCommand(f"no such item {item!r}: use {form}{guess}")

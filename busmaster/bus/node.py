@@ -55,11 +55,11 @@ class Node:
 
     @property
     def label(self) -> str:
-        """ "node 5", as messages call it."""
+        """Return how messages call it: "node 5"."""
         return self.record.label
 
     def planned(self) -> PlannedNode:
-        """The node as the planner sees it, with its reply time as measured so far."""
+        """Return the node as the planner sees it, with its reply time as measured so far."""
         record = self.record
         return PlannedNode(record.profile, record.address, record.timings, record.reply_time)
 
@@ -72,9 +72,10 @@ class Node:
 
     @property
     def on_return(self) -> Callable[[Node], Awaitable[None]] | None:
-        """Awaited when the node comes back from DOWN, before its polls resume: re-send its parameters here.
+        """Return the hook that is awaited when the node is back from DOWN, before its polls resume.
 
-        By default nothing is done: a master that enables a drive or repeats a reference by itself is a danger.
+        Parameters are re-sent in it. By default nothing is done: a master that enables a drive or repeats a reference
+        by itself is a danger.
         """
         return self._on_return
 
@@ -135,7 +136,7 @@ class Node:
     async def timed_request(
         self, command: Command[T], *, priority: Priority | None = None, start_within: float | None = None
     ) -> tuple[T, Timeline]:
-        """Like `request`, with the timeline that says why it took as long as it did."""
+        """Do what `request` does, and return beside the value the timeline that says why it took so long."""
         transaction, future = self._start(command, priority, start_within, None, None)
         try:
             return await future, transaction.timeline()
@@ -188,8 +189,8 @@ class Node:
             self.bus.touched(transaction, self.bus.now())
 
     async def probe(self) -> bool:
-        """Ask the node's cheapest read now, once; True if it answered (a refusal is an answer), False if not, or if
-        it could not be asked."""
+        """Ask the node's cheapest read now, once. Return True if it answered (a refusal is an answer), False if not, or
+        if it could not be asked."""
         transaction, future = self._start(self.profile.probe, None, None, 0, None, probe=True)
         try:
             await future
@@ -203,7 +204,7 @@ class Node:
         return True
 
     def suspend(self, for_: float) -> None:
-        """For maintenance: its polls rest and its requests fail with NodeDown for so many seconds, 0 to end it now."""
+        """Let it rest for maintenance: no polls, and NodeDown for requests, for so many seconds; 0 ends that now."""
         self.bus.suspend(self, seconds(for_, f"{self.label}: a suspension"))
 
     @property
@@ -211,7 +212,7 @@ class Node:
         return self.bus.now() < self.record.suspended_until
 
     def statistics(self) -> NodeStatistics:
-        """Counts and latencies since the bus was opened or its statistics were reset."""
+        """Return counts and latencies since the bus was opened or its statistics were reset."""
         self.bus.check_loop()
         return self.record.counters.snapshot(self.record.lateness)
 

@@ -48,7 +48,7 @@ class Sample(NamedTuple):
     timeline: Timeline
 
     def age(self, now: float) -> float:
-        """Seconds since the value was asked for."""
+        """Return the seconds since the value was asked for."""
         return now - (self.finished if self.started is None else self.started)
 
 
@@ -114,7 +114,7 @@ class Tally:
         self.samples = NO_SAMPLES.copy()
 
     def note(self, poll: Poll, qualities: Mapping[Quality, int]) -> None:
-        """A cycle is over, with so many samples of each quality.
+        """Count a cycle that is over, with so many samples of each quality.
 
         What its first exchange waited for is what the cycle waited for.
         """
@@ -175,7 +175,7 @@ class Stream(Generic[T]):
         return self._items.popleft()
 
     def close(self) -> None:
-        """It gets nothing more; what it holds can still be read."""
+        """Give it nothing more; what it holds can still be read."""
         self._closed = True
         if self in self._listeners:
             self._listeners.remove(self)

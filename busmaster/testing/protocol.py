@@ -65,7 +65,7 @@ def check_protocol(
     garbage: int = 100,
     seed: int = 0,
 ) -> Tally:
-    """Raises NotConformant unless the protocol keeps the contract for all of `cases`, see the module's text.
+    """Raise NotConformant unless the protocol keeps the contract for all of `cases`, see the module's text.
 
     `names(command, address)` is what a reply to it names: where it is equal for two cases, the reply to one may be
     taken for the other's. `device` is told what the host says, and returns what the device says at once (see
