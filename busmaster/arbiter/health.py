@@ -73,27 +73,29 @@ class NodeRecord:
         "label",
         "last_reply",
         "lateness_until",
-        "measured",
+        "line",
         "probe_at",
         "probe_delay",
         "probed_at",
         "profile",
         "refused",
         "replies",
-        "reply_time",
         "retries",
         "slowest",
+        "stops",
         "suspended_until",
         "timings",
         "unheard",
         "up_since",
-        "waiter",
+        "usual",
         "writes",
     )
 
-    def __init__(self, profile: Profile, address: int, timings: Timings, retries: int) -> None:
+    def __init__(self, profile: Profile, address: int, timings: Timings, retries: int, line: str = "") -> None:
         self.profile = profile
         self.address = address
+        self.line = line
+        """The name of its line, for errors."""
         self.label = profile.label(address)
         self.timings = timings
         self.retries = retries
@@ -104,10 +106,6 @@ class NodeRecord:
         """When the last of its transactions failed so."""
         self.replies = 0
         """Replies in a row since then."""
-        self.reply_time: float | None = None
-        """Seconds from a request to its reply, as poll groups measured them; None until they have."""
-        self.measured = 0
-        """How many replies that is the mean of."""
         self.last_reply = -inf
         self.up_since = -inf
         self.writes: deque[Transaction] = deque()
@@ -119,7 +117,8 @@ class NodeRecord:
         self.has_hook = False
         self.holds = 0
         """Returns whose on_return hook has not ended: its polls wait."""
-        self.waiter: object = None
+        self.stops = 0
+        """How often it was told to stop: what was decided before must not undo it."""
         self.answered: dict[Sequence[bytes], Command[Any]] = {}
         """A few reads that it has answered, by what their answers look like (R15)."""
         self.refused: set[Command[Any]] = set()
@@ -128,6 +127,8 @@ class NodeRecord:
         """Attempts in a row that brought nothing."""
         self.slowest = 0.0
         """Seconds to the first byte of about the slowest of its last replies."""
+        self.usual: float | None = None
+        """Seconds to the first byte of its usual reply, in runs of answers that are alike; None until there was one."""
         self.lateness_until = inf
         """When a lateness that was raised comes down again, if all replies are prompt until then."""
         self._before_raised: Timings | None = None
@@ -198,10 +199,11 @@ class ProbeBudget:
 
         One too short for a probe earns nothing: there a probe would delay what comes next.
         """
-        pause = self._pause + seconds
-        if pause > self.probe:
+        before, probe = self._pause, self.probe
+        pause = before + seconds
+        if pause > probe and self.tokens < BUDGET_CAPACITY:
             # only what is longer than a probe, and only what was not counted when the same pause was looked at before
-            earned = BUDGET_IDLE_SHARE * (pause - max(self.probe, self._pause))
+            earned = BUDGET_IDLE_SHARE * (pause - max(probe, before))
             self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)
         self._pause = 0.0 if over else pause
 

@@ -36,7 +36,6 @@ from typing import Any, cast
 from busmaster.arbiter.choice import Choice
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import LineChange, LineChanged, Mark, Strayed
 from busmaster.arbiter.health import DOWN
@@ -45,7 +44,8 @@ from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
 from busmaster.arbiter.strays import LOOK_SLACK, QUIET, Strays
-from busmaster.arbiter.trust import TWO_ANSWERS, Trust
+from busmaster.arbiter.tapped import make_dispatcher
+from busmaster.arbiter.trust import COLLIDED, TOO_EARLY, TWO_ANSWERS, Trust, damaged
 from busmaster.contract.exchange import NO_REPLY, Done, Expect, FrameError
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import BusError, LineDown, LineNoisy, Refused
@@ -67,13 +67,14 @@ class LineMachine:
         capacity: int = 1000,
         jitter: Callable[[], float] = lambda: 0.5,
         strict: bool = False,
+        tapped: bool = False,
     ) -> None:
         self.state = OFFLINE
         self.noisy = False
         self._echo = Echo(echo)
         self._deadlines = Deadlines()
         self._counters = LineCounters(now)
-        self.dispatcher = Dispatcher(self._deadlines, self._counters, now, capacity, jitter)
+        self.dispatcher = make_dispatcher(tapped, self._deadlines, self._counters, now, capacity, jitter)
         self.dispatcher.fault = self._offline
         self._events = self.dispatcher.events
         self._cause = "not open yet"
@@ -82,7 +83,7 @@ class LineMachine:
         self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency, byte_time)
         self._wire = OnWire(self._leg, self._echo, self._deadlines, self.dispatcher.urgent_waits)
         self._in_step = InStep(strict)
-        self._choice = Choice(self.dispatcher, self._in_step)
+        self._choice = Choice(self.dispatcher, self._in_step, self._wire)
         self._trust = Trust(self._in_step)
         # the line
         self._strays = Strays(self._events, self._counters)
@@ -99,7 +100,7 @@ class LineMachine:
         """
         if self.state is not OFFLINE or self._closed:
             return
-        self._wire.paced = paced
+        self._leg.paced = paced and not self._echo.declared
         self.dispatcher.fault = None
         self._events.append(LineChanged(LineChange.UP))
         lateness = max((node.lateness for node in self.dispatcher.nodes), default=UNKNOWN_LATENESS)
@@ -139,28 +140,26 @@ class LineMachine:
         self._echo.forget()
         if self.state is EXCHANGE:
             self._leg.begun = True
-            self._attempt_failed(FrameError(f"{mark.value} in the reply, says the port"), now)
+            self._attempt_failed(FrameError(damaged(mark)), now)
         else:
             self._stray(b"\0", now)
 
     def transmitted(self, now: float) -> None:
         """The port has taken only now what `poll_transmit` gave: whoever held the process up meanwhile."""
-        output = self._wire.output
-        said_at = output.said_at
+        wire = self._wire
+        said_at = wire.output.said_at
         late = now - said_at
         if late > 0:
-            output.said_at = now
+            wire.output.said_at = now
             leg = self._leg  # as leg.shift does: this is done for every request
-            leg.end, leg.out = leg.end + late, leg.out + late
-            leg.late_after += late
+            leg.end += late
+            leg.out += late
             leg.taint_until += late
-            leg.limit += late
             self._deadlines.line += late
             if self.state is SETTLING:
                 self._silent_at += late
-            transaction = self._wire.transaction
-            if late > LOOK_SLACK and transaction is not None and transaction.started == said_at:
-                transaction.started = now
+            if late > LOOK_SLACK and wire.transaction is not None and wire.transaction.started == said_at:
+                wire.transaction.started = now
 
     def line_due(self, now: float) -> bool:
         """A deadline of the line falls due: `unsent` is to be told first, where it is known."""
@@ -187,7 +186,7 @@ class LineMachine:
         deadlines = self._deadlines
         if now >= deadlines.schedule:
             self.dispatcher.release_polls(now)
-        if now >= deadlines.expiry:
+        if now >= deadlines.expiry and not unread:
             self.dispatcher.expire(now)
         if now >= deadlines.health:
             self._enter(self.state, now)
@@ -212,7 +211,7 @@ class LineMachine:
         if now < self._quarantine:
             self._settle(now)
             return True
-        chosen = self._choice.next(now, now - self._strays.last_byte - self._leg.latency)
+        chosen = self._choice.next(now, self._strays.last_byte)
         if chosen is None:
             return False
         if type(chosen) is not tuple:
@@ -237,7 +236,7 @@ class LineMachine:
         if now < leg.taint_until or wire.output.held:
             self._counters.tainted += 1
             self._strays.last_byte = now
-            self._attempt_failed(FrameError("bytes came before the request was out", heard=data), now)
+            self._attempt_failed(FrameError(TOO_EARLY, heard=data), now)
             return b""
         if not exchange.answered:
             self._strays.note(data, now, leg.quiet())
@@ -254,7 +253,7 @@ class LineMachine:
         leg.begun_at = now
         if transaction.first_byte == -inf:
             transaction.first_byte = now
-        if now > leg.late_after:
+        if now > leg.end + leg.timing.nominal + leg.latency:
             transaction.late = True
         return data
 
@@ -281,33 +280,36 @@ class LineMachine:
 
     def _complete(self, step: Done[Any], now: float) -> None:
         """A value: the line is free when the closing ACK has left and the node has let go of the line."""
-        transaction, exchange = self._wire.transaction, self._wire.exchange
+        wire, leg = self._wire, self._leg
+        transaction, exchange = wire.transaction, wire.exchange
         assert transaction is not None
         assert exchange is not None
-        answered, leg = exchange.answered, self._leg
+        answered = exchange.answered
         if answered:
-            if leg.end > leg.begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
-                leg.end = leg.out = leg.begun_at
+            begun_at = leg.begun_at
+            if leg.end > begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
+                leg.end = leg.out = begun_at
             if self._in_step.alert or step.rest:
-                verdict = self._trust.weigh(self._wire, step, now)
+                verdict = self._trust.weigh(wire, step, now)
                 if isinstance(verdict, str):
                     self._disbelieve(verdict, step, now)
                     return
                 if verdict is not None:
                     self._deadlines.line = verdict
                     return
-            transaction.node.note_reply(exchange.answers, transaction.command, leg.begun_at - leg.end)
+            transaction.node.note_reply(exchange.answers, transaction.command, begun_at - leg.end)
         if step.send:
-            self._wire.say(step.send, now)
-        self._end_exchange()
+            wire.say(step.send, now)
+        wire.transaction = wire.exchange = self._trust.held = None
+        self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, step.value, now)
         if step.rest:
-            self._strays.note(step.rest, now, self._leg.quiet())
-        if step.rest or self._wire.strayed or (self._echo.owed and not answered):
+            self._strays.note(step.rest, now, leg.quiet())
+        if step.rest or wire.strayed or (self._echo.owed and not answered):
             self._settle(now)
             return
-        self._strays.answered()
-        self._release(self._leg.timing.turnaround if answered else 0.0, now)
+        self._strays.unanswered_one = None
+        self._release(leg.timing.turnaround if answered else 0.0, now)
 
     def _disbelieve(self, what: str, step: Done[Any], now: float) -> None:
         self._counters.doubted += 1
@@ -374,8 +376,7 @@ class LineMachine:
         wire = self._wire
         if failed and wire.exchange is not None:
             self._leg.give_up(wire.exchange.later)
-        wire.transaction = wire.exchange = None
-        self._trust.held = None
+        wire.transaction = wire.exchange = self._trust.held = None
         self._counters.exchanges += 1
 
     # the line between exchanges
@@ -463,8 +464,7 @@ class LineMachine:
             self._events.append(Strayed(data, collision=True))
             self._strays.last_byte = now
             if self.state is EXCHANGE:
-                what = "the echo differs from what was sent: a collision, or an adapter without echo"
-                self._attempt_failed(FrameError(what), now)
+                self._attempt_failed(FrameError(COLLIDED), now)
             else:
                 self._settle(now)
             return b""
@@ -493,7 +493,7 @@ class LineMachine:
     def _enter(self, state: LineState, now: float) -> None:
         spent = self._counters.spend(self.state, now)
         if self.state is READY:
-            self.dispatcher.probes.budget.idle(spent, over=state is not READY)
+            self.dispatcher.probes.budget.idle(spent, state is not READY)
         self.state = state
 
     def _offline(self) -> BusError:

@@ -31,6 +31,7 @@ COMMANDS = (
     "monitor",
     "doctor",
     "replay",
+    "items",
 )
 """One module of this package each, which defines `command`; imported only when it is asked for."""
 
@@ -179,7 +180,7 @@ def bus_error_text(error: BusError) -> str:
     """As the error says it; without the command where only the node matters."""
     if not isinstance(error, NoReply):
         return str(error)
-    text = f"{error.node}: {error.what}" if error.node else error.what
+    text = f"{error.label}: {error.what}" if error.label else error.what
     if error.attempts:
         text += f", {error.attempts} attempt{'' if error.attempts == 1 else 's'}"
     return f"{text}; {error.hint}" if error.hint else text

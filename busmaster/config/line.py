@@ -8,20 +8,21 @@ from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import Any
 
+from busmaster.arbiter.tap import Tap
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
+from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.config.names import expanded, listed
 from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
-from busmaster.config.table import nearest
+from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.fan import Fan
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
 from busmaster.transport.endpoints import Endpoint
-from busmaster.transport.pump import Tap
 
 
 class ConfiguredLine:
@@ -93,7 +94,7 @@ class ConfiguredLine:
             PlannedGroup(
                 group.name,
                 group.period,
-                [(point.node.planned(), point.command) for point in self._wanted[group.name]],
+                [(Node.of(point).planned(), point.command) for point in self._wanted[group.name]],
                 phase=group.phase,
                 priority=group.priority,
             )
@@ -111,10 +112,11 @@ class ConfiguredLine:
         with node.table.at():
             make: Callable[..., Handle] = node.kind.handle
             handle = make(self.bus, node.address, timings=node.timings, retries=node.retries, **options)
+            own = Node.of(handle)
             if node.reply_time is not None:
-                handle.node.record.reply_time = node.reply_time  # until it is measured
+                own.reply_time = node.reply_time  # until it is measured
             if not node.name.isdigit():
-                handle.node.record.label = node.name  # what messages and the screen call it
+                own.rename(node.name)  # what messages and the screen call it
         for point in node.points.values():
             with point.table.at(*(["item"] if "item" in point.table else [])):
                 handle.point(point.item)
@@ -125,7 +127,7 @@ class ConfiguredLine:
             with group.table.at("points", number):
                 for name in self._names(text):
                     point = self._point(*name)
-                    point.command.open(point.node.address, point.node.record.timings)
+                    point.command.open(point.node.address, Node.of(point).timings)
                     yield point
 
     def _names(self, text: str) -> Iterator[tuple[str, str]]:
@@ -135,7 +137,7 @@ class ConfiguredLine:
             raise InvalidCommand(f"a point is written NODE/ITEM, not {text!r}")
         for node in (name for part in listed(nodes) for name in expanded(part, self.nodes)):
             if node not in self.nodes:
-                raise InvalidCommand(f"no such node {node!r}; {nearest(node, self.nodes)}")
+                raise InvalidCommand(f"no such node {node!r}; {meant(node, self.nodes)}")
             section = self.file.nodes[node]
             known = {*section.points, *section.options.get("symbols", ())}
             for item in (name for part in listed(items) for name in expanded(part, known)):
@@ -155,7 +157,9 @@ class ConfiguredLine:
             source = _known(handle, name, node.points)
             return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
         decimals = 0 if node.kind.takes_decimals else section.decimals
-        scale = Scale.of(section.factor, section.offset, decimals, whole=node.kind.whole_numbers(section.item))
+        rounds = node.kind.takes_decimals and (section.decimals or node.kind.decimals(section.item))
+        whole = not rounds and node.kind.whole_numbers(section.item)  # else the handle rounds, to its decimals
+        scale = Scale.of(section.factor, section.offset, decimals, whole=whole)
         return NamedPoint.of(handle.point(section.item), where=where, name=name, unit=section.unit, scale=scale)
 
     def _add_outputs(self) -> None:

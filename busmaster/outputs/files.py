@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-import time
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
+from typing import Any
 
 from busmaster.bus.polling import Sample, Snapshot
 from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
 from busmaster.outputs.growing_file import GrowingFile
 from busmaster.outputs.settings import FileSettings
-from busmaster.outputs.values import cycle_fields, json_line, value_text
+from busmaster.outputs.values import cycle_fields, json_line, micros, value_text
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What a spreadsheet takes for the beginning of a formula."""
@@ -29,10 +29,9 @@ class FileOutput(BatchOutput[bytes]):
         self,
         kind: str,
         settings: FileSettings,
-        clock: Callable[[], float] = time.monotonic,
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(kind, settings, clock, say)
+        super().__init__(kind, settings, say)
         check_folder(settings.path)
         self._file = GrowingFile(
             settings.path,
@@ -54,12 +53,12 @@ class CsvOutput(FileOutput):
 
     head = ",".join(COLUMNS).encode() + b"\n"
 
-    def format(self, item: Item, time_of: Callable[[float], float]) -> bytes | None:
+    def format(self, item: Item) -> bytes | None:
         if isinstance(item, Happening):
             return None
         return csv_lines(
             (
-                utc(time_of(sample.finished)),
+                utc(micros(sample.wall)),
                 no_formula(item.group),
                 item.cycle,
                 no_formula(point.key.partition("/")[0]),
@@ -76,11 +75,11 @@ class CsvOutput(FileOutput):
 class JsonlOutput(FileOutput):
     """A line a cycle, as `busmaster run --json` prints it, and a line an event. Times are seconds since 1970."""
 
-    def format(self, item: Item, time_of: Callable[[float], float]) -> bytes:
+    def format(self, item: Item) -> bytes:
         if isinstance(item, Snapshot):
-            fields = cycle_fields(item, time_of)
+            fields = cycle_fields(item, item.wall_at)
         else:
-            fields = {"event": item.text, "node": item.node or None, "time": time_of(item.time)}
+            fields = {"event": item.text, "node": item.node or None, "time": item.time}
         return json_line(**fields).encode() + b"\n"
 
 
@@ -90,7 +89,7 @@ def csv_lines(rows: Iterable[Iterable[object]]) -> bytes:
     return text.getvalue().encode()
 
 
-def value_cell(sample: Sample) -> str:
+def value_cell(sample: Sample[Any]) -> str:
     """A value as text; only one that is a text itself could be taken for a formula."""
     if sample.error:
         return ""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
-import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeAlias
 
@@ -17,7 +16,7 @@ from busmaster.errors import InvalidCommand
 from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
 from busmaster.outputs.retention import Retention
 from busmaster.outputs.settings import SqliteSettings
-from busmaster.outputs.values import json_value
+from busmaster.outputs.values import json_value, micros
 
 VERSION = 1
 SCHEMA = """
@@ -60,10 +59,9 @@ class SqliteOutput(BatchOutput[Rows]):
         self,
         kind: str,
         settings: SqliteSettings,
-        clock: Callable[[], float] = time.monotonic,
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(kind, settings, clock, say)
+        super().__init__(kind, settings, say)
         check_folder(settings.path)
         self._path = settings.path
         self._mode = settings.mode
@@ -71,12 +69,12 @@ class SqliteOutput(BatchOutput[Rows]):
         self._database: sqlite3.Connection | None = None
         self._numbers: dict[str, int] = {}
 
-    def format(self, item: Item, time_of: Callable[[float], float]) -> Rows:
+    def format(self, item: Item) -> Rows:
         if isinstance(item, Happening):
-            return Rows([], (time_of(item.time), item.node or None, item.text))
+            return Rows([], (item.time, item.node or None, item.text))
         samples = [
             (
-                time_of(sample.finished),
+                micros(sample.wall),
                 point,
                 column(sample.value),
                 sample.quality.value,

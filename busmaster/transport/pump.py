@@ -11,15 +11,16 @@ import asyncio
 import time
 from collections.abc import Callable
 from math import inf
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import DriverErrors
-from busmaster.arbiter.events import Completed, Event, Mark, Polled, Sampled
+from busmaster.arbiter.events import Event, Mark, Overdue, Polled, Sampled
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import LineState
+from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import LineDown
 from busmaster.transport.alarm import Alarm
@@ -30,19 +31,6 @@ STUCK_AFTER = 5.0
 """Seconds after which output that has not left is discarded with its connection. Flow control, a busy adapter and a
 network that lost a segment let go within one or two; whatever holds it longer does not mend by itself, and a request
 that old may move a machine when nobody expects it any more."""
-
-
-class Tap(Protocol):
-    """Sees what passes (a capture). Must not block, nor raise.
-
-    `transmitted` hears of bytes when they have been handed to the port, with the time of that.
-    """
-
-    def transmitted(self, now: float, data: bytes) -> None: ...
-
-    def received(self, now: float, data: bytes) -> None: ...
-
-    def completed(self, transaction: Transaction) -> None: ...
 
 
 class Pump(asyncio.Protocol):
@@ -58,7 +46,7 @@ class Pump(asyncio.Protocol):
         on_sample: Callable[[Poll, Transaction], None],
         on_cycle: Callable[[Poll], None],
         on_event: Callable[[Event], None],
-        on_written: Callable[[Transaction], None] = lambda _: None,
+        on_written: Callable[[Transaction, float], None] = lambda *_: None,
         paced: Callable[[asyncio.BaseTransport], bool] = lambda _: False,
         tap: Tap | None = None,
         name: str = "the port",
@@ -112,16 +100,21 @@ class Pump(asyncio.Protocol):
             self._written = now = self.clock()  # again: the process may have stood still before it got here
             arbiter.transmitted(now)
             if self.tap is not None:
-                self.tap.transmitted(now, data)
+                self.tap.transmitted(now, data, arbiter.attempt)
             if self._paused:
                 self._check_output(now)
         while (event := arbiter.poll_event()) is not None:
-            if type(event) is Completed:
-                self._resolve(event.transaction)
+            if type(event) is Transaction:
+                self._resolve(event)
             elif type(event) is Sampled:
                 self._on_sample(event.poll, event.transaction)
             elif type(event) is Polled:
                 self._on_cycle(event.poll)
+            elif type(event) is Overdue:
+                self._give_up_on(event)
+            elif type(event) is Attempt:
+                if self.tap is not None:
+                    self.tap.attempted(event)
             else:
                 self._on_event(event)
         due = arbiter.poll_timeout()
@@ -164,7 +157,7 @@ class Pump(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         now = self.clock()
         if self.tap is not None:
-            self.tap.received(now, data)
+            self.tap.received(now, data, self.arbiter.attempt)
         if self._held_since < inf:  # what was held may have left since: only then can this be its answer
             self._check_output(now)
         self.arbiter.data_received(data, now)
@@ -174,7 +167,7 @@ class Pump(asyncio.Protocol):
         """The UART found this byte damaged."""
         now = self.clock()
         if self.tap is not None:
-            self.tap.received(now, byte)
+            self.tap.received(now, byte, self.arbiter.attempt)
         self.arbiter.byte_marked(mark, now)
         self.turn()
 
@@ -201,10 +194,8 @@ class Pump(asyncio.Protocol):
     # inside
 
     def _resolve(self, transaction: Transaction) -> None:
-        if self.tap is not None:
-            self.tap.completed(transaction)
         if transaction.writes and transaction.attempts:
-            self._on_written(transaction)
+            self._on_written(transaction, transaction.ended_at)
         future = transaction.waiter
         if future is None or future.done():
             return
@@ -212,6 +203,15 @@ class Pump(asyncio.Protocol):
             future.set_result(transaction.value)
         else:
             future.set_exception(transaction.error)
+
+    def _give_up_on(self, late: Overdue) -> None:
+        """Its caller goes, the exchange stays: a write that is on the wire is over before anything else can be read."""
+        transaction = late.transaction
+        if transaction.writes:
+            self._on_written(transaction, self.clock())
+        future = transaction.waiter
+        if future is not None and not future.done():
+            future.set_exception(late.error)
 
     def _arm(self, due: float) -> None:
         if self._alarm is not None:
@@ -222,9 +222,12 @@ class Pump(asyncio.Protocol):
         self._armed = inf
         now = self.clock()
         unread = False
-        if self._port is not None and self.arbiter.line_due(now):
-            unread = self._port.unread()
-            self._check_output(now)
+        if self._port is not None:
+            line_due = self.arbiter.line_due(now)
+            if line_due or self.arbiter.answer_counts(now):
+                unread = self._port.unread()
+            if line_due:
+                self._check_output(now)
         self.arbiter.handle_timeout(now, unread=unread)
         self.turn()
 

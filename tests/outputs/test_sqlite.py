@@ -17,7 +17,7 @@ from busmaster.outputs.base import Happening
 from busmaster.outputs.retention import DAY, Retention
 from busmaster.outputs.settings import SqliteSettings
 from busmaster.outputs.sqlite import DATED, SqliteOutput, column
-from busmaster.protocols.msc.codec import ProgramStatus
+from busmaster.protocols.msc.status import ProgramStatus
 from tests.outputs.cycles import cycle, settled, until
 
 
@@ -47,7 +47,7 @@ def test_values_events_and_errors_are_there_under_their_names(tmp_path: Path) ->
     with recording(path) as output:
         output.offer(cycle(1, 12.5, 3, (1, 2), NoReply("no reply")))
         output.offer(cycle(2, 13.5, 4, (3, 4), 5.0))
-        output.offer(Happening(time.monotonic(), "winder", "winder is down, was suspect"))
+        output.offer(Happening(time.time(), "winder", "winder is down, was suspect"))
     assert output.statistics().written == 9
     history = query(path, "select node, item, value, quality, error from history order by time, item")
     assert history[:4] == [

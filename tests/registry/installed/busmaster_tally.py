@@ -11,13 +11,15 @@ from __future__ import annotations
 import string
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
-from busmaster import InvalidCommand, Point, Refused
-from busmaster.bus.handle import Handle, unknown_item
+from busmaster import InvalidCommand, Point, Refused, VerifyFailed
+from busmaster.bus.handle import Handle, encoder, unknown_item
+from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
 from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import MORE, Command, Done, FrameError, Need, Sizes, no_reply
+from busmaster.contract.items import Item
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.device import Delay, Device
@@ -103,6 +105,7 @@ class Turnstile(Handle):
         line=LineSettings(9600),
         timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.1, lateness=0.15, byte_gap=0.02)),
         probe=Count("a"),
+        shares_line_with=frozenset({"mentor"}),
     )
 
     def __init__(self, bus: Any, address: int, *, gate: int = 1, **options: Any) -> None:
@@ -114,6 +117,19 @@ class Turnstile(Handle):
         if len(counter) != 1 or counter not in string.ascii_lowercase:
             raise unknown_item(item, ("gate",), "a counter, a to z, or gate")
         return Point(self.node, item, Count(counter), encode=lambda value: Preset(counter, value))
+
+    async def read(self, item: str, **options: Unpack[ReadOptions]) -> int:
+        return await self.point(item).read(**options)
+
+    async def write(self, item: str, value: int, **options: Unpack[WriteOptions]) -> None:
+        point, requests = self.point(item), SeveralRequests(self.node, options)
+        await requests.request(encoder(point)(value))
+        if requests.verify and await requests.read_back(point.command) != value:
+            raise VerifyFailed(f"{item} is not {value}", node=self.node)
+
+    @classmethod
+    def items(cls) -> tuple[str, ...]:
+        return ("gate",)
 
 
 class EmulatedTurnstile(Device):
@@ -186,6 +202,13 @@ PROTOCOL = Protocol(
             Turnstile,
             make_device,
             items="a counter, a to z, or gate",
+            documented=(
+                *(
+                    Item(letter, letter, "how many have passed", access="read/write")
+                    for letter in string.ascii_lowercase
+                ),
+                Item("gate", "", "the counter that the gate has", access="read/write"),
+            ),
             options=(Option("gate", "whole", "which counter the gate has, 1 for a"),),
             whole_numbers=everywhere,
         ),
