@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
+from busmaster.contract.driver import Driver, Ending
 from busmaster.errors import NoSuchParameter, Refused
-from busmaster.registry import find, make_device, protocols
+from busmaster.registry import NodeKind, find, kinds, make_device, protocols
 from busmaster.testing import Case, answers_of, check_dialect
-from busmaster.testing.listening import Ending, Listening
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -68,17 +68,17 @@ class Telegrams:
         return self.kind.protocol.read_back({"command": call.func.id, **arguments})
 
     def check_codec(self) -> None:
-        listening = Listening(self.built().open(self.address, self.kind.profile.timings))
+        driver = Driver(self.built().open(self.address, self.kind.profile.timings))
         turn = 0
         for side, data in self.said:
             if side == "<":
-                listening.feed(data)
+                driver.feed(data)
                 continue
-            closing = listening.ending.send if listening.ending is not None else b""
-            says = [listening.exchange.request, *listening.said, closing][turn]
+            closing = driver.ending.send if driver.ending is not None else b""
+            says = [driver.exchange.request, *driver.said, closing][turn]
             assert data == says, f"{self}: the host says {says.hex(' ')!r}, not {data.hex(' ')}"
             turn += 1
-        self.check_outcome(listening.expire())
+        self.check_outcome(driver.run_out())
 
     def check_outcome(self, ending: Ending) -> None:
         if isinstance(ending.error, Refused):
@@ -144,6 +144,22 @@ def test_every_frame_of_the_vectors_is_on_its_page(family: str) -> None:
     assert [entry["name"] for entry in VECTORS[family] if bytes.fromhex(entry["hex"]) not in shown] == []
 
 
+SAID_ONCE = re.compile(r"(axis|adc)[1-7]")
+"""Of items that are alike for each axis and channel the pages have the first."""
+
+
+@pytest.mark.parametrize("kind", kinds().values(), ids=lambda kind: str(kind.name))
+def test_every_item_that_has_a_name_is_on_its_page_with_its_unit_and_access(kind: NodeKind) -> None:
+    """Two kinds on one page may have an item of one name and number: one row of the tables suits each."""
+    page = (ROOT / "docs" / "protocols" / f"{kind.protocol.name}.md").read_text()
+    named = [item for item in kind.documented if re.fullmatch(r"(axis0\.)?[a-z]\w*", item.item)]
+    for item in (item for item in named if not SAID_ONCE.match(item.item)):
+        assert item.item in page, f"{item.item} is not on the page"
+        rows = [line for line in page.splitlines() if line.startswith(f"| {item.number} | `{item.item}` |")]
+        suits = [row for row in rows if ("| R/W |" in row) is (item.access == "read/write") and item.unit in row]
+        assert suits or not rows, f"{item.item} is {item.access} in {item.unit or 'no unit'}, not {rows}"
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_the_programs_on_a_page_run_in_their_order_as_one(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run as a module, so that what stands under `if __name__ == "__main__"` (a real port) does not."""
@@ -204,8 +220,8 @@ def test_pre_commit_runs_what_the_extras_install_and_fetches_nothing() -> None:
 
 READ_BY_USERS = ("busmaster", "tests", "benchmarks", "examples", "docs")
 CITED_NOWHERE = re.compile(
-    r"\bDESIGN(\.md)?\b|\bPROTOCOLS(\.md)?\b|\bCLI\.md\b|\b[Ii]ssue #?\d|\b(in|from|of) (the )?seeds?\b(?! \d)"
-    r"|\((H|G|M|S|D)\d{1,2}\)|\bthe card('s)?\b|/work/"
+    r"\bDESIGN(\.md)?\b|\bPROTOCOLS(\.md)?\b|\bCLI\.md\b|\b[Ii]ssue #?\d|\((H|G|M|S|D)\d{1,2}\)"
+    r"|\b(PUBLISHED in|data from|example from) seeds?\b|\bthe card('s)?\b|/work/"
 )
 """Papers that are not here. The promises, R1 to R15, are in docs/promises.md."""
 

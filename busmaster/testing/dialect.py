@@ -20,12 +20,12 @@ from typing import Any
 
 from busmaster.capture.decode import Decoder
 from busmaster.capture.frames import Direction, Frame, Kind
+from busmaster.contract.driver import Driver
 from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand
 from busmaster.registry import Protocol
 from busmaster.testing.cases import Case, NotConformant
 from busmaster.testing.damage import bytewise
-from busmaster.testing.listening import Listening
 
 Said = tuple[Direction, bytes]
 APART = 0.5
@@ -56,15 +56,15 @@ def _check(protocol: Protocol, case: Case) -> Iterator[str]:
 
 def _conversation(protocol: Protocol, case: Case) -> Iterator[Said]:
     """What both sides say, the host's closing word too."""
-    listening = Listening(case.command.open(case.address, protocol.profile.timings))
-    yield Direction.HOST, listening.exchange.request
+    driver = Driver(case.command.open(case.address, protocol.profile.timings))
+    yield Direction.HOST, driver.exchange.request
     heard = 0
     for leg in case.legs:
         yield Direction.NODE, leg
-        listening.feed(leg)
-        yield from ((Direction.HOST, word) for word in listening.said[heard:])
-        heard = len(listening.said)
-    ending = listening.ending
+        driver.feed(leg)
+        yield from ((Direction.HOST, word) for word in driver.said[heard:])
+        heard = len(driver.said)
+    ending = driver.ending
     if ending is not None and ending.send:
         yield Direction.HOST, ending.send
 
