@@ -1,4 +1,4 @@
-"""Who may import whom, read off the syntax trees. The table is the design's; a new module must find its row here.
+"""Who may import whom, read off the syntax trees. docs/architecture.md draws it; a new module must find its row here.
 
 A package that is drawn apart so that it can be read apart is so for its types too: imports for types count.
 """

@@ -43,7 +43,7 @@ class Handle(ABC):
 
     @abstractmethod
     def point(self, item: str) -> Point[Any]:
-        """The point that ITEM names on the command line. Raises InvalidCommand for one that does not exist."""
+        """Return the point that ITEM names on the command line. Raises InvalidCommand for one that does not exist."""
 
     @abstractmethod
     async def read(self, item: Any, /, **options: Unpack[ReadOptions]) -> Any:
@@ -56,7 +56,7 @@ class Handle(ABC):
     @classmethod
     @abstractmethod
     def items(cls) -> tuple[str, ...]:
-        """The names (not the numbers) that `point` knows."""
+        """Return the names (not the numbers) that `point` knows."""
 
     @classmethod
     def names_of_items(cls) -> Mapping[str, str]:
@@ -110,12 +110,12 @@ def encoder(point: Point[Any]) -> Callable[[Any], Command[None]]:
 
 
 def item_text(item: str) -> str:
-    """The item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
+    """Return the item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
     if not isinstance(item, str):
         raise InvalidCommand(f"an item is text, such as {str(item)!r}, not {item!r}")
     return item
 
 
 def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
-    """The error for an item that does not exist: what would do, and the nearest name."""
+    """Return the error for an item that does not exist: it says what would do, and the nearest name."""
     return InvalidCommand(f"no such item {item!r}: use {form}{guess(str(item), known)}")

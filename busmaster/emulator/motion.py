@@ -44,7 +44,7 @@ class Ramp:
 
 
 class Motion(enum.IntEnum):
-    """An axis's mode of motion. The numbers of AXISMODE are not in the documents: these are ours."""
+    """An axis's mode of motion. The numbers of AXISMODE are in Mint's help, not in AN00129: these are ours."""
 
     IDLE = 0
     JOG = 1

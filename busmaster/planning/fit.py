@@ -85,7 +85,7 @@ class GroupPlan:
 
     @property
     def utilisation(self) -> float:
-        """The share of the line that it asks for."""
+        """Return the share of the line that it asks for."""
         return self.line_time / self.period
 
 
@@ -109,12 +109,12 @@ class Plan:
 
     @property
     def fits(self) -> bool:
-        """As long as nothing goes wrong, no cycle is missed."""
+        """Return whether no cycle is missed as long as nothing goes wrong."""
         return self.utilisation <= 1 and not any(group.missed for group in self.groups)
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """What does not fit and what would, a sentence each; empty where the schedule fits comfortably."""
+        """Say what does not fit and what would, a sentence each; empty where the schedule fits comfortably."""
         return tuple(_advice(self))
 
 
@@ -126,7 +126,7 @@ def plan(
     others: Iterable[Read] = (),
     could_merge: Sequence[Merge] = (),
 ) -> Plan:
-    """What becomes of these poll groups on this line.
+    """Reckon what becomes of these poll groups on this line.
 
     `others` may be asked beside them: the worst case reckons with those, and with every node's probe. `could_merge`
     are merges to be weighed that no group opts in to. Raises InvalidCommand for a period or phase that cannot be.

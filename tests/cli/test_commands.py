@@ -1,4 +1,4 @@
-"""read, write, poll and scan, as CLI.md has them, against an emulated line on a TCP port."""
+"""read, write, poll and scan, as a person types them, against an emulated line on a TCP port."""
 
 from __future__ import annotations
 

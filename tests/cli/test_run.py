@@ -1,4 +1,4 @@
-"""run, plan and emulate with a LINE.toml, as CLI.md has them."""
+"""run, plan and emulate with a LINE.toml."""
 
 from __future__ import annotations
 

@@ -214,7 +214,7 @@ def test_a_broadcast_reaches_all_and_the_line_goes_on() -> None:
     assert [master.asks(mentor.Read(1, 17), drive.address) for drive in drives] == [250, 250]
 
 
-# HCP and HCP2 on one line (PROTOCOLS 1.4)
+# HCP and HCP2 on one line
 
 
 def test_hcp_and_hcp2_controllers_share_a_line() -> None:
@@ -276,7 +276,7 @@ def test_msc_never_takes_a_packet_whose_ack_was_lost_for_the_answer() -> None:
 
 
 def test_a_packet_that_was_never_acknowledged_does_not_come_again_into_other_exchanges() -> None:
-    """The host's closing ACK is lost; one second later the controller sends its packet again (S16)."""
+    """The host's closing ACK is lost; one second later the controller sends its packet again."""
     first, second = EmulatedMsc(3), EmulatedMsc(4)
     second.set_value(2008, 44)
     master = Master(msc.PROFILE, first, second)
