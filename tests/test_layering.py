@@ -29,7 +29,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "emulator.memory": {"emulator", "transport"} | BASE,
     "registry": {"registry", "bus.handle", "emulator.device", "emulator.oracle", "capture.decode"} | BASE,
     "outputs": {"outputs", "bus", "arbiter"} | BASE,
-    "capture": {"capture", "wire", "registry", "arbiter.transaction"} | BASE,
+    "capture": {"capture", "wire", "registry", "arbiter.tap"} | BASE,
     "doctor": {"doctor", "registry", "capture", "transport", "arbiter", "outputs.values"} | BASE,
     "config": ALL - {"capture", "testing", "cli", "protocols"},
     "testing": ALL - {"cli", "config", "protocols"},

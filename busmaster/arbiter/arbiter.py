@@ -17,6 +17,7 @@ from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import EXCHANGE, READY
+from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import Transaction
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
@@ -29,6 +30,7 @@ class Arbiter(LineMachine):
     `byte_time` is tau, in seconds. `echo`: what is sent is received too. `receive_latency`: seconds that received bytes
     may lie in an adapter. `capacity`: requests of one class that may wait. `jitter` returns numbers from 0 to 1, by
     which probes are spread. `strict`: answers that could be another's are held until that one would have come (R15).
+    `tapped`: `attempt` says what is on the wire, and the end of each attempt is an event.
     """
 
     name = ""
@@ -42,6 +44,11 @@ class Arbiter(LineMachine):
     @byte_time.setter
     def byte_time(self, seconds: float) -> None:
         self._leg.byte_time = seconds
+
+    @property
+    def attempt(self) -> Attempt | None:
+        """What is on the wire, on a line that is tapped."""
+        return self.dispatcher.attempt
 
     def add_node(
         self, profile: Profile, address: int, now: float, timings: Timings | None = None, retries: int | None = None

@@ -23,6 +23,7 @@ from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
 from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.schedule import Poll, Schedule
 from busmaster.arbiter.state import SETTLING
+from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.errors import (
@@ -48,6 +49,9 @@ NOT_DONE = (Refused, Superseded)
 class Dispatcher:
     """The transactions of one line. Times are the caller's clock, in seconds."""
 
+    attempt: Attempt | None = None
+    """What is on the wire, where somebody taps the line (tapped.py)."""
+
     def __init__(
         self, deadlines: Deadlines, counters: LineCounters, now: float, capacity: int, jitter: Callable[[], float]
     ) -> None:
@@ -70,9 +74,10 @@ class Dispatcher:
 
     def submit(self, transaction: Transaction, now: float) -> bool:
         """Queue it, or end it at once with the reason why not: then False."""
-        node = transaction.node
+        node, counters = transaction.node, self.counters
         transaction.queued = now
-        self._waits(transaction)
+        transaction.exchanges_ahead = counters.exchanges  # as _waits does: this is done for every request
+        transaction.settling_ahead = counters.spent[SETTLING]
         if self.fault is not None:
             self._end(transaction, now, name_error(self.fault(), transaction))
             return False

@@ -9,6 +9,7 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
+from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import BusError
 
@@ -126,4 +127,5 @@ Event: TypeAlias = (
     | LineChanged
     | PortFailed
     | Strayed
+    | Attempt
 )

@@ -36,7 +36,6 @@ from typing import Any, cast
 from busmaster.arbiter.choice import Choice
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import LineChange, LineChanged, Mark, Strayed
 from busmaster.arbiter.health import DOWN
@@ -45,7 +44,8 @@ from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
 from busmaster.arbiter.strays import LOOK_SLACK, QUIET, Strays
-from busmaster.arbiter.trust import TWO_ANSWERS, Trust
+from busmaster.arbiter.tapped import make_dispatcher
+from busmaster.arbiter.trust import COLLIDED, TOO_EARLY, TWO_ANSWERS, Trust, damaged
 from busmaster.contract.exchange import NO_REPLY, Done, Expect, FrameError
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import BusError, LineDown, LineNoisy, Refused
@@ -67,13 +67,14 @@ class LineMachine:
         capacity: int = 1000,
         jitter: Callable[[], float] = lambda: 0.5,
         strict: bool = False,
+        tapped: bool = False,
     ) -> None:
         self.state = OFFLINE
         self.noisy = False
         self._echo = Echo(echo)
         self._deadlines = Deadlines()
         self._counters = LineCounters(now)
-        self.dispatcher = Dispatcher(self._deadlines, self._counters, now, capacity, jitter)
+        self.dispatcher = make_dispatcher(tapped, self._deadlines, self._counters, now, capacity, jitter)
         self.dispatcher.fault = self._offline
         self._events = self.dispatcher.events
         self._cause = "not open yet"
@@ -139,7 +140,7 @@ class LineMachine:
         self._echo.forget()
         if self.state is EXCHANGE:
             self._leg.begun = True
-            self._attempt_failed(FrameError(f"{mark.value} in the reply, says the port"), now)
+            self._attempt_failed(FrameError(damaged(mark)), now)
         else:
             self._stray(b"\0", now)
 
@@ -235,7 +236,7 @@ class LineMachine:
         if now < leg.taint_until or wire.output.held:
             self._counters.tainted += 1
             self._strays.last_byte = now
-            self._attempt_failed(FrameError("bytes came before the request was out", heard=data), now)
+            self._attempt_failed(FrameError(TOO_EARLY, heard=data), now)
             return b""
         if not exchange.answered:
             self._strays.note(data, now, leg.quiet())
@@ -463,8 +464,7 @@ class LineMachine:
             self._events.append(Strayed(data, collision=True))
             self._strays.last_byte = now
             if self.state is EXCHANGE:
-                what = "the echo differs from what was sent: a collision, or an adapter without echo"
-                self._attempt_failed(FrameError(what), now)
+                self._attempt_failed(FrameError(COLLIDED), now)
             else:
                 self._settle(now)
             return b""

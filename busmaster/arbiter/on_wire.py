@@ -10,6 +10,7 @@ from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.output import Output
 from busmaster.arbiter.transaction import Transaction
+from busmaster.contract.driver import follow, without_noise
 from busmaster.contract.exchange import Abandonable, Exchange, Expect, Step
 
 
@@ -45,19 +46,13 @@ class OnWire:
 
     def without_noise(self, data: bytes) -> bytes:
         """Return what is left of the first bytes of a reply where the profile tolerates noise before it."""
-        exchange = self.exchange
-        assert exchange is not None
-        return data.lstrip(bytes(set(data) - set(exchange.starts)))
+        assert self.exchange is not None
+        return without_noise(self.exchange, data)
 
     def follow(self, step: Expect, now: float) -> Step[Any]:
         """Go from leg to leg for as long as the reader says so. Raises what the reader raises."""
-        exchange = self.exchange
-        assert exchange is not None
-        following: Step[Any] = step
-        while type(following) is Expect:
-            self._next_leg(following, now)
-            following = exchange.feed(b"")
-        return following
+        assert self.exchange is not None
+        return follow(self.exchange, step, self._next_leg, now)
 
     def say(self, send: bytes, now: float) -> None:
         """Say what closes an exchange, or answers a stray packet."""

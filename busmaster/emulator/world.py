@@ -14,6 +14,7 @@ from typing import Any
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import Event, LineChanged, NodeChanged, Overdue
 from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
@@ -33,7 +34,8 @@ class World:
 
     `on_event` is called with each event of the arbiter; it may submit, cancel and so on. `record`, if given, is called
     with every step as a line of text: the same seeds give the same transcript.
-    The port opens at once; `unplug` and `plug` take it away and give it back. `strict` is the arbiter's (R15).
+    The port opens at once; `unplug` and `plug` take it away and give it back. `strict` is the arbiter's (R15); `tap`
+    sees what passes, as on a bus.
     """
 
     def __init__(
@@ -46,6 +48,7 @@ class World:
         now: float = 0.0,
         jitter: Callable[[], float] = lambda: 0.5,
         strict: bool = False,
+        tap: Tap | None = None,
     ) -> None:
         self.line = line
         line.prompt = False
@@ -59,7 +62,9 @@ class World:
             capacity=capacity,
             jitter=jitter,
             strict=strict,
+            tapped=tap is not None,
         )
+        self.tap = tap
         self._on_event = on_event
         self._record = record
         self._actions: list[tuple[float, int, Callable[[], object]]] = []
@@ -143,6 +148,8 @@ class World:
         if data and self.plugged:
             if self._record is not None:
                 self._record(f"{now:.6f} < {data.hex(' ')}")
+            if self.tap is not None:
+                self.tap.received(now, data, self.arbiter.attempt)
             self.arbiter.data_received(data, now)
             self._pump()
         if due_at <= now:
@@ -163,10 +170,16 @@ class World:
                     self._record(f"{self.now:.6f} > {data.hex(' ')}")
                 if self.plugged:
                     self.line.send(data, self.now)
+                    if self.tap is not None:
+                        self.tap.transmitted(self.now, data, arbiter.attempt)
             event = arbiter.poll_event()
             if event is None:
                 if data is None:
                     return
+                continue
+            if type(event) is Attempt:
+                if self.tap is not None:
+                    self.tap.attempted(event)
                 continue
             if self._record is not None:
                 self._record(f"{self.now:.6f} {told(event)}")

@@ -11,7 +11,7 @@ import asyncio
 import time
 from collections.abc import Callable
 from math import inf
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import anyio
 
@@ -20,6 +20,7 @@ from busmaster.arbiter.counters import DriverErrors
 from busmaster.arbiter.events import Event, Mark, Overdue, Polled, Sampled
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import LineState
+from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import LineDown
 from busmaster.transport.alarm import Alarm
@@ -30,19 +31,6 @@ STUCK_AFTER = 5.0
 """Seconds after which output that has not left is discarded with its connection. Flow control, a busy adapter and a
 network that lost a segment let go within one or two; whatever holds it longer does not mend by itself, and a request
 that old may move a machine when nobody expects it any more."""
-
-
-class Tap(Protocol):
-    """Sees what passes (a capture). Must not block, nor raise.
-
-    `transmitted` hears of bytes when they have been handed to the port, with the time of that.
-    """
-
-    def transmitted(self, now: float, data: bytes) -> None: ...
-
-    def received(self, now: float, data: bytes) -> None: ...
-
-    def completed(self, transaction: Transaction) -> None: ...
 
 
 class Pump(asyncio.Protocol):
@@ -112,7 +100,7 @@ class Pump(asyncio.Protocol):
             self._written = now = self.clock()  # again: the process may have stood still before it got here
             arbiter.transmitted(now)
             if self.tap is not None:
-                self.tap.transmitted(now, data)
+                self.tap.transmitted(now, data, arbiter.attempt)
             if self._paused:
                 self._check_output(now)
         while (event := arbiter.poll_event()) is not None:
@@ -124,6 +112,9 @@ class Pump(asyncio.Protocol):
                 self._on_cycle(event.poll)
             elif type(event) is Overdue:
                 self._give_up_on(event)
+            elif type(event) is Attempt:
+                if self.tap is not None:
+                    self.tap.attempted(event)
             else:
                 self._on_event(event)
         due = arbiter.poll_timeout()
@@ -166,7 +157,7 @@ class Pump(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         now = self.clock()
         if self.tap is not None:
-            self.tap.received(now, data)
+            self.tap.received(now, data, self.arbiter.attempt)
         if self._held_since < inf:  # what was held may have left since: only then can this be its answer
             self._check_output(now)
         self.arbiter.data_received(data, now)
@@ -176,7 +167,7 @@ class Pump(asyncio.Protocol):
         """The UART found this byte damaged."""
         now = self.clock()
         if self.tap is not None:
-            self.tap.received(now, byte)
+            self.tap.received(now, byte, self.arbiter.attempt)
         self.arbiter.byte_marked(mark, now)
         self.turn()
 
@@ -203,8 +194,6 @@ class Pump(asyncio.Protocol):
     # inside
 
     def _resolve(self, transaction: Transaction) -> None:
-        if self.tap is not None:
-            self.tap.completed(transaction)
         if transaction.writes and transaction.attempts:
             self._on_written(transaction, transaction.ended_at)
         future = transaction.waiter

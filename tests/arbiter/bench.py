@@ -65,8 +65,9 @@ class Bench:
         latency: float = 0.0,
         capacity: int = 1000,
         strict: bool = False,
+        tapped: bool = False,
     ) -> None:
-        self.arbiter = Arbiter(TAU, echo=echo, receive_latency=latency, capacity=capacity, strict=strict)
+        self.arbiter = Arbiter(TAU, echo=echo, receive_latency=latency, capacity=capacity, strict=strict, tapped=tapped)
         self.unsent: int | None = None
         """How many bytes the port has not sent yet, for ports that can tell."""
         self.held = False

@@ -11,6 +11,7 @@ from math import inf
 from random import Random
 from typing import Any
 
+from busmaster.arbiter.tap import Attempt
 from busmaster.emulator.world import World, told
 from tests.campaigns.edges import EdgeLine
 from tests.campaigns.mixes import Standstill
@@ -142,6 +143,8 @@ class StandingWorld(World):
         if self.plugged:
             if self._record is not None:
                 self._record(f"{self.now:.6f} < {data.hex(' ')}")
+            if self.tap is not None:
+                self.tap.received(self.now, data, self.arbiter.attempt)
             self.arbiter.data_received(data, self.now)
             self._pump()
 
@@ -174,10 +177,16 @@ class StandingWorld(World):
                 if self.plugged:
                     self.line.send(data, self.now)
                     arbiter.transmitted(self.now)
+                    if self.tap is not None:
+                        self.tap.transmitted(self.now, data, arbiter.attempt)
             event = arbiter.poll_event()
             if event is None:
                 if data is None:
                     return
+                continue
+            if type(event) is Attempt:
+                if self.tap is not None:
+                    self.tap.attempted(event)
                 continue
             if self._record is not None:
                 self._record(f"{self.now:.6f} {told(event)}")

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from busmaster import Bus, BusError, MicroFlexDrive, Priority, WriteUnconfirmed
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.tap import Attempt
 from busmaster.bus.node import Node
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
@@ -36,12 +36,12 @@ class Sent:
 
     frames: list[tuple[float, bytes]] = field(default_factory=list)
 
-    def transmitted(self, now: float, data: bytes) -> None:
+    def transmitted(self, now: float, data: bytes, _attempt: Attempt | None, /) -> None:
         self.frames.append((now, data))
 
-    def received(self, now: float, data: bytes) -> None: ...
+    def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None: ...
 
-    def completed(self, transaction: Transaction) -> None: ...
+    def attempted(self, attempt: Attempt, /) -> None: ...
 
     def first(self, request: bytes, since: float) -> float:
         return next(now for now, data in self.frames if now >= since and request in data)

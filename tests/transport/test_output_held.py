@@ -101,7 +101,9 @@ class Ledger:
 
     # both
 
-    def transmitted(self, now: float, data: bytes | None = None) -> None:
+    attempt = None
+
+    def transmitted(self, now: float, data: bytes | None = None, _attempt: object = None, /) -> None:
         self.notes.append(("transmitted", now) if data is None else ("tapped", now, data))
 
 
