@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
     from busmaster.protocols.mentor.handle import MentorDrive
     from busmaster.protocols.modbus.handle import ModbusUnit
-    from busmaster.protocols.msc.codec import ProgramStatus
     from busmaster.protocols.msc.handle import MscController
+    from busmaster.protocols.msc.status import ProgramStatus
 
 __all__ = [
     "BacklogFull",
@@ -133,7 +133,7 @@ ON_DEMAND = {
     "MicroFlexDrive": "busmaster.protocols.hcp2.microflex_handle",
     "ModbusUnit": "busmaster.protocols.modbus.handle",
     "MscController": "busmaster.protocols.msc.handle",
-    "ProgramStatus": "busmaster.protocols.msc.codec",
+    "ProgramStatus": "busmaster.protocols.msc.status",
     "StatusWord": "busmaster.protocols.hcp2.microflex",
     "open_line": "busmaster.config.line",
 }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import random
-import warnings
 from collections.abc import Coroutine, Generator, Iterable, Sequence
 from dataclasses import replace
 from types import TracebackType
@@ -26,6 +25,7 @@ from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup, Sample, Stream
 from busmaster.bus.requester import checked_priority, checked_retries
 from busmaster.bus.shared_line import SharedLine
+from busmaster.bus.suitability import check_company, check_settings
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings
@@ -35,7 +35,6 @@ from busmaster.planning.merging import Merge, at_once
 from busmaster.transport.endpoints import Endpoint, is_paced
 from busmaster.transport.pump import Pump
 from busmaster.transport.reconnect import Connection
-from busmaster.transport.serial_port import SerialPort
 
 T = TypeVar("T")
 
@@ -94,6 +93,8 @@ class Bus:
             name=endpoint.name,
         )
         self._nodes: dict[tuple[str, int], Node] = {}
+        self._profiles: dict[str, Profile] = {}
+        """Of the protocols on this line, by name."""
         self._groups: dict[str, PollGroup] = {}
         self._streams: list[Stream[Event]] = []
         self._tasks: set[asyncio.Task[None]] = set()
@@ -167,8 +168,9 @@ class Bus:
     ) -> Node:
         """The node at this address: a protocol and an address are one node, however often it is asked for.
 
-        Raises InvalidCommand for an address that the protocol does not have, and for another profile, timings or
-        retries than it was first asked with; what is None was left open.
+        Raises InvalidCommand for an address that the protocol does not have; for a protocol that cannot share the line
+        with those that are on it; and for another profile, timings or retries than the node was first asked with. What
+        is None was left open.
         """
         self.check_loop()
         profile.check_address(address)
@@ -183,9 +185,15 @@ class Bus:
         if known is not None:
             known.check_shared(profile, timings, retries)
             return known
-        self._check_framing(profile)
+        if profile.name not in self._profiles:
+            check_company(profile, self._profiles.values())
+            check_settings(profile, self.endpoint)
+        if not self._byte_time_known:
+            self._arbiter.byte_time = profile.line.byte_time
+            self._byte_time_known = True
         node = Node(self._line, self._arbiter.add_node(profile, address, self.now(), timings, retries))
         self._nodes[profile.name, address] = node
+        self._profiles.setdefault(profile.name, profile)
         return node
 
     @property
@@ -339,20 +347,6 @@ class Bus:
     def _forget(self, group: PollGroup) -> None:
         if self._groups.get(group.name) is group:
             del self._groups[group.name]
-
-    def _check_framing(self, profile: Profile) -> None:
-        settings = self.endpoint.settings
-        if settings is None:
-            if not self._byte_time_known:
-                self._arbiter.byte_time = profile.line.byte_time
-                self._byte_time_known = True
-        elif not isinstance(self.endpoint, SerialPort) or any(name == profile.name for name, _ in self._nodes):
-            return
-        elif settings.framing != profile.line.framing:
-            warnings.warn(
-                f"{profile.name} is meant for {profile.line.framing}, but {self.endpoint.name} is {settings.framing}",
-                stacklevel=4,
-            )
 
     def _on_event(self, event: Event) -> None:
         if isinstance(event, NodeChanged) and event.returning:

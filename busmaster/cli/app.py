@@ -31,6 +31,7 @@ COMMANDS = (
     "monitor",
     "doctor",
     "replay",
+    "items",
 )
 """One module of this package each, which defines `command`; imported only when it is asked for."""
 

@@ -17,7 +17,7 @@ from busmaster.bus.polling import PollGroup
 from busmaster.config.names import expanded, listed
 from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
-from busmaster.config.table import nearest
+from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.fan import Fan
 from busmaster.outputs.settings import MqttSettings
@@ -137,7 +137,7 @@ class ConfiguredLine:
             raise InvalidCommand(f"a point is written NODE/ITEM, not {text!r}")
         for node in (name for part in listed(nodes) for name in expanded(part, self.nodes)):
             if node not in self.nodes:
-                raise InvalidCommand(f"no such node {node!r}; {nearest(node, self.nodes)}")
+                raise InvalidCommand(f"no such node {node!r}; {meant(node, self.nodes)}")
             section = self.file.nodes[node]
             known = {*section.points, *section.options.get("symbols", ())}
             for item in (name for part in listed(items) for name in expanded(part, known)):
@@ -157,7 +157,9 @@ class ConfiguredLine:
             source = _known(handle, name, node.points)
             return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
         decimals = 0 if node.kind.takes_decimals else section.decimals
-        scale = Scale.of(section.factor, section.offset, decimals, whole=node.kind.whole_numbers(section.item))
+        rounds = node.kind.takes_decimals and (section.decimals or node.kind.decimals(section.item))
+        whole = not rounds and node.kind.whole_numbers(section.item)  # else the handle rounds, to its decimals
+        scale = Scale.of(section.factor, section.offset, decimals, whole=whole)
         return NamedPoint.of(handle.point(section.item), where=where, name=name, unit=section.unit, scale=scale)
 
     def _add_outputs(self) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator
 from typing import Any, Literal, TypeAlias, get_args
 
-from busmaster.config.table import Table, nearest
+from busmaster.config.table import Table
+from busmaster.contract.arguments import meant
 from busmaster.outputs.settings import (
     BUFFER,
     FileSettings,
@@ -37,7 +38,7 @@ def _common(table: Table, groups: Collection[str]) -> dict[str, Any]:
     chosen = table.texts("groups", ())
     for number, name in enumerate(chosen):
         if name not in groups:
-            raise table.error(f"no such group {name!r}; {nearest(name, groups)}", "groups", number)
+            raise table.error(f"no such group {name!r}; {meant(name, groups)}", "groups", number)
     return {"groups": chosen, "buffer": table.whole("buffer", BUFFER, least=1)}
 
 

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from busmaster.arbiter.transaction import Priority
+from busmaster.bus.suitability import check_company
 from busmaster.config.names import NODE_NAME, POINT_NAME, expanded
 from busmaster.config.ports import read_port
 from busmaster.config.recording import Outputs, read_outputs
 from busmaster.config.source import Source
-from busmaster.config.table import Table, nearest
+from busmaster.config.table import Table
 from busmaster.config.timing import read_timings
+from busmaster.contract.arguments import meant
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.emulator.device import Delay
@@ -144,8 +146,12 @@ def _defaults(top: Table) -> dict[str, Table]:
 def _nodes(top: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSection]:
     taken: dict[tuple[str, int], str] = {}
     names: set[str] = set()
+    profiles: dict[str, Profile] = {}
     for table in top.tables("nodes"):
         for node in _several(table, defaults):
+            with table.at("protocol"):
+                check_company(node.profile, profiles.values())
+            profiles.setdefault(node.profile.name, node.profile)
             if node.name in names:
                 raise table.error(f"there are two nodes {node.name!r}")
             names.add(node.name)
@@ -286,7 +292,7 @@ def _emulator(table: Table, nodes: Mapping[str, NodeSection]) -> EmulatorSection
             names = list(expanded(one.name, nodes))
         for name in names:
             if name not in nodes:
-                raise one.error(f"no such node {name!r}; {nearest(name, nodes)}")
+                raise one.error(f"no such node {name!r}; {meant(name, nodes)}")
             delays[name] = _delay(one, delays[name])
             faults[name] = _faults(one.table("faults"), shared.data)
     return EmulatorSection(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
 from busmaster.config.source import FileError, Key, Source
+from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
 
 T = TypeVar("T")
@@ -41,7 +41,7 @@ class Table:
         """Raises FileError for a key that is none of these."""
         for key in self.data:
             if key not in known:
-                raise self.error(f"no such key; {nearest(key, known)}", key)
+                raise self.error(f"no such key; {meant(key, known)}", key)
 
     def error(self, text: str, *way: str | int) -> FileError:
         return self.source.error((*self.key, *way), text)
@@ -89,7 +89,7 @@ class Table:
         known = tuple(known)
         value = self.text(key, default)
         if key in self.data and value not in known:
-            raise self.error(f"no such {key} {value!r}; {nearest(str(value), known)}", key)
+            raise self.error(f"no such {key} {value!r}; {meant(str(value), known)}", key)
         return value
 
     def texts(self, key: str, default: T | _Required = REQUIRED) -> tuple[str, ...] | T:
@@ -129,15 +129,6 @@ class Table:
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise self.error(f"must be {meant}, not {shown(value)}", key)
         return value
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """What may have been meant."""
-    known = tuple(known)
-    near = difflib.get_close_matches(name, known, n=1)
-    if near:
-        return f"did you mean {near[0]!r}?"
-    return f"there are {', '.join(known)}" if known else "there are none"
 
 
 def shown(value: object) -> str:

@@ -94,7 +94,8 @@ class Plan:
 
     A command waits at most for `typical_wait` on a healthy line (one exchange), and for `dead_wait` behind a node that
     does not answer. `worst_waits` are the bounds of R9 for one more request of each class. `fitting_baudrate` is the
-    lowest usual one at which the schedule would fit comfortably; None where it does as it is, or where none is enough.
+    lowest usual one at which the schedule would fit comfortably; None where it does as it is, where none is enough, and
+    where the devices of a protocol have one rate alone.
     """
 
     line: LineSettings
@@ -309,6 +310,8 @@ def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
 
 
 def _fitting_baudrate(drafts: Sequence[_Draft], line: LineSettings) -> Generator[int, None, int | None]:
+    if any(node.profile.fixed_rate for draft in drafts for node, _ in draft.exchanges):
+        return None
     for baudrate in BAUDRATES:
         if baudrate > line.baudrate:
             byte_time = replace(line, baudrate=baudrate).byte_time

@@ -10,6 +10,7 @@ from functools import cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
 from busmaster.registry.protocol import NodeKind, Option, Protocol
 
@@ -56,7 +57,7 @@ def find(name: str) -> NodeKind:
     """Return the kind of node that goes by a name. Raises InvalidCommand if there is none."""
     kind = kinds().get(name)
     if kind is None:
-        raise InvalidCommand(f"no such protocol {name!r}: use {', '.join(kinds())}")
+        raise InvalidCommand(f"no such protocol {name!r}; {meant(name, kinds())}")
     return kind
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal
 
+from busmaster.contract.items import Item
 from busmaster.errors import InvalidCommand
 
 if TYPE_CHECKING:  # so that a master alone does not load the emulator
@@ -81,6 +82,8 @@ class NodeKind:
     make_device: DeviceMaker
     items: str
     """What an ITEM of such a node looks like, for the command line's help; its words are wrapped there."""
+    documented: tuple[Item, ...] = ()
+    """What the protocol's document says of items, one by one."""
     options: tuple[Option, ...] = ()
     """Arguments of its handle."""
     read_options: tuple[Option, ...] = ()
@@ -104,6 +107,11 @@ class NodeKind:
     def profile(self) -> Profile:
         return self.protocol.profile
 
+    def decimals(self, item: str) -> int:
+        """Return how many of an item's last digits on the line are decimals, as the document has it; else 0."""
+        name = item.partition(":")[0]
+        return next((one.decimals for one in self.documented if one.item == name), 0)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Protocol:
@@ -118,8 +126,6 @@ class Protocol:
     kinds: tuple[NodeKind, ...]
     commands: Mapping[str, type[Command[Any]]]
     dialect: Callable[[], Dialect]
-    shares_line_with: frozenset[str] = frozenset()
-    """The other protocols whose nodes may be on the same line."""
 
     def __post_init__(self) -> None:
         if not self.kinds:

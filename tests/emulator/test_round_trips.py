@@ -29,6 +29,7 @@ from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.mentor.device import EmulatedMentor
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import EmulatedMsc
+from busmaster.protocols.msc.status import ProgramStatus
 from busmaster.registry import make_device
 
 PROFILES = {"hcp": hcp.PROFILE, "hcp2": hcp2.PROFILE, "msc": msc.PROFILE, "mentor": mentor.PROFILE}
@@ -91,7 +92,7 @@ MSC_STEPS: list[Step] = [
     (msc.ReadFlag(5), False),
     (msc.ReadFlags(), {0, 255}),
     (msc.PickedFlags((0, 1, 255)), (True, False, True)),
-    (msc.ReadStatus(), msc.ProgramStatus.PROGRAM_RUNNING | msc.ProgramStatus.AUTO_START_ENABLED),
+    (msc.ReadStatus(), ProgramStatus.PROGRAM_RUNNING | ProgramStatus.AUTO_START_ENABLED),
 ]
 MENTOR_STEPS: list[Step] = [
     (mentor.Write(1, 17, -476), None),

@@ -15,13 +15,13 @@ from busmaster.protocols.msc.codec import (
     ClearFlag,
     DataRead,
     DataWrite,
-    ProgramStatus,
     ReadFlag,
     ReadFlags,
     ReadStatus,
     SetFlag,
 )
 from busmaster.protocols.msc.handle import MscController
+from busmaster.protocols.msc.status import ProgramStatus
 from tests.handles.fake_bus import FakeBus
 
 FIRST = 2000

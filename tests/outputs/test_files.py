@@ -15,7 +15,7 @@ from busmaster.errors import InvalidCommand, NoReply
 from busmaster.outputs.base import Happening
 from busmaster.outputs.files import COLUMNS, CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings
-from busmaster.protocols.msc.codec import ProgramStatus
+from busmaster.protocols.msc.status import ProgramStatus
 from tests.outputs.cycles import cycle
 
 

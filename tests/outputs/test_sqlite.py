@@ -17,7 +17,7 @@ from busmaster.outputs.base import Happening
 from busmaster.outputs.retention import DAY, Retention
 from busmaster.outputs.settings import SqliteSettings
 from busmaster.outputs.sqlite import DATED, SqliteOutput, column
-from busmaster.protocols.msc.codec import ProgramStatus
+from busmaster.protocols.msc.status import ProgramStatus
 from tests.outputs.cycles import cycle, settled, until
 
 

@@ -162,6 +162,17 @@ def test_no_baud_rate_is_offered_where_the_replies_alone_take_too_long() -> None
     assert planned(group("a", 0.02, 8, node=PlannedNode(hcp2.PROFILE, 1, reply_time=0.01))).fitting_baudrate is None
 
 
+def test_no_baud_rate_is_offered_to_devices_that_have_but_one() -> None:
+    node = PlannedNode(msc.PROFILE, 1, reply_time=0.002)
+    groups = [PlannedGroup("a", 0.1, [(node, msc.DataRead(address)) for address in range(4)])]
+    prediction = plan(groups, line=msc.PROFILE.line)
+    assert prediction.utilisation > 1
+    assert prediction.fitting_baudrate is None
+    selectable = PlannedNode(replace(msc.PROFILE, fixed_rate=False), 1, reply_time=0.002)
+    groups = [replace(groups[0], reads=[(selectable, command) for _, command in groups[0].reads])]
+    assert plan(groups, line=msc.PROFILE.line).fitting_baudrate is not None
+
+
 def test_merged_reads_are_told_with_what_they_save() -> None:
     node = PlannedNode(mentor.PROFILE, 4, reply_time=0.01)
     reads = [(node, mentor.Read(1, number)) for number in range(1, 9)]

@@ -102,6 +102,28 @@ def test_the_help_names_it_with_its_items_and_options(tally: None, busmaster: Co
     assert "--gate N tally: which counter the gate has, 1 for a." in said
 
 
+def test_its_items_are_listed(tally: None, busmaster: Command) -> None:
+    assert [line.split()[0] for line in busmaster("items", "tally", "passed").lines] == [
+        "ITEM",
+        *"abcdefghijklmnopqrstuvwxyz",
+    ]
+    assert busmaster("items", "taly").err.endswith("no such protocol 'taly'; did you mean 'tally'?\n")
+
+
+SCREW = '[nodes.screw]\nprotocol = "mentor"\naddress = 14\n'
+
+
+def test_it_shares_a_line_with_whom_it_knows_and_then_wants_the_line_said(tally: None) -> None:
+    both = FILE + SCREW
+    with pytest.raises(FileError, match="no baud rate given"):  # for the two are meant for different lines
+        read(Source("line.toml", both))
+    file = read(Source("line.toml", both.replace("ttyS0", "ttyS0?baudrate=9600&bytesize=7&parity=E")))
+    with pytest.warns(UserWarning, match="tally is meant for 8N1, but /dev/ttyS0 is 7E1"):
+        assert list(ConfiguredLine(file, outputs=False).nodes) == ["west", "screw"]
+    with pytest.raises(FileError, match="hcp2 and tally nodes cannot share a line"):
+        read(Source("line.toml", both.replace('"mentor"', '"hcp2"')))
+
+
 def test_an_option_of_its_own_is_no_option_of_others(tally: None, busmaster: Command) -> None:
     wrong = busmaster("read", "/dev/null", "--protocol", "hcp2", "--node", "1", "1", "--gate", "2")
     assert wrong.status == 2

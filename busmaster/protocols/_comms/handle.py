@@ -23,6 +23,8 @@ class CommsHandle(Handle):
     read_command: ClassVar[type[ReadElement]]
     write_command: ClassVar[type[WriteElements]]
     elements: ClassVar[Mapping[str, Element[object]]] = {}
+    definite: ClassVar[bool] = False
+    """Whether every node has the map as it is: what it calls read-only is then refused by number, too."""
     form: ClassVar[str]
     """What an item looks like, for the message to someone who mistyped it."""
 
@@ -41,10 +43,13 @@ class CommsHandle(Handle):
         return self.named(self._lookup(item))
 
     def element(self, number: int) -> Point[float]:
-        """An element by its number: read and written as it is, for the node to refuse."""
-        return Point(
-            self.node, str(number), self.read_command(number), encode=lambda value: self.write_command(number, (value,))
-        )
+        """An element by its number: read and written as it is, for the node to refuse unless the map is definite."""
+
+        def encode(value: float) -> Command[None]:
+            return self.write_command(number, (value,))
+
+        read_only = self.definite and any(e.number == number and not e.writable for e in self.elements.values())
+        return Point(self.node, str(number), self.read_command(number), encode=None if read_only else encode)
 
     def named(self, element: Element[T]) -> Point[T]:
         """An element by what it stands for: decoded, with its unit, and read-only if the map says so."""
@@ -85,9 +90,10 @@ class CommsHandle(Handle):
 
     def writes(self, element: int | str, values: Sequence[float]) -> list[WriteElements]:
         """What `write` sends. Raises InvalidCommand for a value that cannot be sent; and where the map has names, for a
-        name that it calls read-only, or that another value of the list would go to."""
+        name that it calls read-only, or that another value of the list would go to; for its number where it is
+        definite."""
         number = element if isinstance(element, int) else self._lookup(element).number
-        if not isinstance(element, int):
+        if self.definite or not isinstance(element, int):
             for known in self.elements.values():
                 if known.number in range(number, number + max(1, len(values))) and not known.writable:
                     raise InvalidCommand(f"{self.node.label}: {known.name} is read-only")

@@ -6,6 +6,7 @@ from busmaster.protocols.ct_ansi.capture import CtAnsiDialect
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
 from busmaster.protocols.mentor import CHAIN
+from busmaster.protocols.mentor.parameters import ANY
 from busmaster.registry import NodeKind, Protocol, device_of
 
 PROTOCOL = Protocol(
@@ -16,6 +17,7 @@ PROTOCOL = Protocol(
             CtAnsiDrive,
             device_of("busmaster.protocols.ct_ansi.device"),
             items="1.21 (menu and parameter), 1.21:8 (8 parameters from there on)",
+            documented=(ANY,),
             read_options=(CHAIN,),
             takes_decimals=True,
             capture_id=8,
@@ -23,5 +25,4 @@ PROTOCOL = Protocol(
     ),
     commands={"read": Read, "read_run": ReadRun, "write": Write},
     dialect=CtAnsiDialect,
-    shares_line_with=frozenset({"mentor"}),
 )

@@ -66,18 +66,18 @@ class CtAnsiDrive(Handle):
         return await self.node.request(Read(*parse_parameter(parameter)), **options)
 
     async def read_run(
-        self, parameter: str, count: int, *, chain: bool = False, **options: Unpack[ReadOptions]
+        self, parameter: str, count: int, *, step: int = 1, chain: bool = False, **options: Unpack[ReadOptions]
     ) -> tuple[float, ...]:
-        """`count` parameters of one menu, from `parameter` on; with `chain` in one exchange, where that is safe.
+        """`count` parameters of one menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
 
-        It is where no other drive can take or send a lone ACK for its own. Raises NoSuchParameter where the menu has a
-        gap.
+        `step` 0 reads the same one again and again. With `chain` in one exchange, where that is safe: where no other
+        drive can take or send a lone ACK, NAK or BS for its own. Raises NoSuchParameter where the menu has a gap.
         """
-        run = ReadRun(*parse_parameter(parameter), count)
+        run = ReadRun(*parse_parameter(parameter), count, step)
         if chain:
             return await self.node.request(run, **options)
         requests = SeveralRequests(self.node, options)
-        return tuple([await requests.request(Read(run.menu, run.number + i)) for i in range(count)])
+        return tuple([await requests.request(Read(run.menu, run.number + step * i)) for i in range(count)])
 
     async def write(self, parameter: str, value: float, **options: Unpack[WriteOptions]) -> None:
         """Write a parameter, acknowledged; at address 0 to all drives, which do not answer.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from busmaster.contract.items import Item
 from busmaster.protocols.dc104.capture import Dc104Dialect
 from busmaster.protocols.dc104.codec import PROFILE, Read, Write
 from busmaster.protocols.dc104.handle import Dc104Drive
@@ -15,6 +16,7 @@ PROTOCOL = Protocol(
             Dc104Drive,
             device_of("busmaster.protocols.dc104.device"),
             items="a parameter, 1 to 255",
+            documented=(Item("1-255", "1-255", "a parameter, 0 to 65535", access="read/write"),),
             options=(Option("maximum", "whole"), Option("allow_zero", "flag")),
             whole_numbers=everywhere,
             capture_id=6,

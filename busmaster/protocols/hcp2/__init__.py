@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from busmaster.protocols.hcp2 import comms_array, microflex
 from busmaster.protocols.hcp2.capture import Hcp2Dialect
 from busmaster.protocols.hcp2.codec import PROFILE, Read, Write
 from busmaster.protocols.hcp2.handle import Hcp2Controller
@@ -15,9 +16,8 @@ PROTOCOL = Protocol(
             "hcp2",
             Hcp2Controller,
             device_of("busmaster.protocols.hcp2.device"),
-            items="an element, 1 to 255, or its name: axis0.position (to axis7; position velocity mode axis_error "
-            "demand encoder idle following_error), inputs outputs adc0 (to adc7) error error_line error_axis running "
-            "line_number firmware",
+            items=comms_array.FORM,
+            documented=comms_array.ITEMS,
             capture_id=2,
         ),
         NodeKind(
@@ -25,10 +25,10 @@ PROTOCOL = Protocol(
             MicroFlexDrive,
             device_of("busmaster.protocols.hcp2.microflex_device"),
             items=f"an element, or its name: {' '.join(MicroFlexDrive.elements)}",
+            documented=microflex.ITEMS,
             capture_id=3,
         ),
     ),
     commands={"read": Read, "write": Write},
     dialect=Hcp2Dialect,
-    shares_line_with=frozenset({"hcp"}),
 )

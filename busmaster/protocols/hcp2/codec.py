@@ -68,4 +68,5 @@ PROFILE = Profile(
     timings=TIMINGS,
     probe=Read(1),
     checks=tuple(Read(element) for element in CHECKED),
+    shares_line_with=frozenset({"hcp"}),
 )

@@ -40,6 +40,7 @@ class MicroFlexDrive(CommsHandle):
     read_command = hcp2.Read
     write_command = hcp2.Write
     elements = microflex.ELEMENTS
+    definite = True
     form = "an element number, 1 to 255, or a name such as speed_measured"
 
     position = Named(microflex.POSITION)

@@ -6,6 +6,7 @@ from busmaster.protocols.msc import codec
 from busmaster.protocols.msc.capture import MscDialect
 from busmaster.protocols.msc.codec import PROFILE
 from busmaster.protocols.msc.handle import MscController
+from busmaster.protocols.msc.items import ITEMS
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
 PROTOCOL = Protocol(
@@ -16,6 +17,7 @@ PROTOCOL = Protocol(
             MscController,
             device_of("busmaster.protocols.msc.device"),
             items="2008 (a data address), 2008:32 (32 values from there on), flag:5, flags, status",
+            documented=ITEMS,
             options=(
                 Option("symbols", "addresses", common=False),
                 Option("address_step", "whole", "addresses from one value to the next"),

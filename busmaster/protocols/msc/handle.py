@@ -23,12 +23,12 @@ from busmaster.protocols.msc.codec import (
     DataRead,
     DataWrite,
     Merging,
-    ProgramStatus,
     ReadFlag,
     ReadFlags,
     ReadStatus,
     SetFlag,
 )
+from busmaster.protocols.msc.status import ProgramStatus
 
 MODELS_WITH_RFLAGS = frozenset({"MSC-250", "MSC-850/32"})
 ADDRESS_STEPS = (1, 4)

@@ -19,6 +19,7 @@ from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
 from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import MORE, Command, Done, FrameError, Need, Sizes, no_reply
+from busmaster.contract.items import Item
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.device import Delay, Device
@@ -104,6 +105,7 @@ class Turnstile(Handle):
         line=LineSettings(9600),
         timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.1, lateness=0.15, byte_gap=0.02)),
         probe=Count("a"),
+        shares_line_with=frozenset({"mentor"}),
     )
 
     def __init__(self, bus: Any, address: int, *, gate: int = 1, **options: Any) -> None:
@@ -200,6 +202,13 @@ PROTOCOL = Protocol(
             Turnstile,
             make_device,
             items="a counter, a to z, or gate",
+            documented=(
+                *(
+                    Item(letter, letter, "how many have passed", access="read/write")
+                    for letter in string.ascii_lowercase
+                ),
+                Item("gate", "", "the counter that the gate has", access="read/write"),
+            ),
             options=(Option("gate", "whole", "which counter the gate has, 1 for a"),),
             whole_numbers=everywhere,
         ),
