@@ -76,7 +76,7 @@ class LineMachine:
         self._counters = LineCounters(now)
         self.dispatcher = make_dispatcher(tapped, self._deadlines, self._counters, now, capacity, jitter)
         self.dispatcher.fault = self._offline
-        self._events = self.dispatcher.events
+        self.events = self.dispatcher.events
         self._cause = "not open yet"
         self._closed = False
         # the exchange on the wire
@@ -86,7 +86,7 @@ class LineMachine:
         self._choice = Choice(self.dispatcher, self._in_step, self._wire)
         self._trust = Trust(self._in_step)
         # the line
-        self._strays = Strays(self._events, self._counters)
+        self._strays = Strays(self.events, self._counters)
         self._up_at = -inf
         self._quarantine = -inf
         self._silent_at = -inf
@@ -102,7 +102,7 @@ class LineMachine:
             return
         self._leg.paced = paced and not self._echo.declared
         self.dispatcher.fault = None
-        self._events.append(LineChanged(LineChange.UP))
+        self.events.append(LineChanged(LineChange.UP))
         lateness = max((node.lateness for node in self.dispatcher.nodes), default=UNKNOWN_LATENESS)
         self._up_at = now
         self._quarantine = now + lateness + self._leg.latency + self._leg.byte_time
@@ -114,7 +114,7 @@ class LineMachine:
             return
         self._counters.losses += 1
         self._cause = cause
-        self._events.append(LineChanged(LineChange.DOWN, cause))
+        self.events.append(LineChanged(LineChange.DOWN, cause))
         if not self._closed:
             self.dispatcher.fault = self._offline
         self._go_offline(now)
@@ -419,7 +419,7 @@ class LineMachine:
             if self.noisy:
                 self.noisy = False
                 self.dispatcher.fault = None
-                self._events.append(LineChanged(LineChange.QUIET))
+                self.events.append(LineChanged(LineChange.QUIET))
         self._enter(READY, now)
         self._deadlines.line = self._strays.look_before(inf, now)
         self._advance(now)
@@ -437,7 +437,7 @@ class LineMachine:
         if strays.babbling(now) and not self.noisy:
             self.noisy = True
             self._counters.noisy += 1
-            self._events.append(LineChanged(LineChange.NOISY))
+            self.events.append(LineChanged(LineChange.NOISY))
             self.dispatcher.fault = lambda: LineNoisy("the line has not been silent for a second")
             self.dispatcher.fail_all(now)
 
@@ -461,7 +461,7 @@ class LineMachine:
         rest = self._echo.strip(data)
         if rest is None:
             self._counters.collisions += 1
-            self._events.append(Strayed(data, collision=True))
+            self.events.append(Strayed(data, collision=True))
             self._strays.last_byte = now
             if self.state is EXCHANGE:
                 self._attempt_failed(FrameError(COLLIDED), now)

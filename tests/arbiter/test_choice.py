@@ -17,7 +17,6 @@ REQUEST = 8 * TAU
 URGENT, COMMAND, POLL, BACKGROUND = Priority
 MOST_ALIKE = 32
 WRITE_0 = "07 30 31 02 30 31 30 03 31"
-WRITE_5_OF_2 = "07 30 32 02 30 31 35 03 37"
 
 
 def write(value: int = 5, *, idempotent: bool = False) -> hcp2.Write:
