@@ -93,7 +93,7 @@ class Choice:
             chosen = self._another(first, now, alike) or first
         if chosen is first:
             self._gone_before = 0
-        if isinstance(chosen, float):
+        if not isinstance(chosen, tuple):
             self._dispatcher.backlog.restore(transaction)
         else:
             if chosen[0] is not transaction:
@@ -195,7 +195,8 @@ class Choice:
             if node.address != node.profile.broadcast and node.suspended_until <= now
         ]
         alive = [node for node in nodes if not node.silent]
-        alive.sort(key=lambda node: (node.health is not UP, -node.last_reply))
+        alive.sort(key=lambda node: node.last_reply, reverse=True)
+        alive.sort(key=lambda node: node.health is not UP)
         return alive, [node for node in nodes if node.silent]
 
 

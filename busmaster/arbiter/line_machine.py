@@ -286,9 +286,6 @@ class LineMachine:
         assert exchange is not None
         answered = exchange.answered
         if answered:
-            begun_at = leg.begun_at
-            if leg.end > begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
-                leg.end = leg.out = begun_at
             if self._in_step.alert or step.rest:
                 verdict = self._trust.weigh(wire, step, now)
                 if isinstance(verdict, str):
@@ -297,7 +294,9 @@ class LineMachine:
                 if verdict is not None:
                     self._deadlines.line = verdict
                     return
-            transaction.node.note_reply(exchange.answers, transaction.command, begun_at - leg.end)
+            if leg.end > leg.begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
+                leg.end = leg.out = leg.begun_at
+            transaction.node.note_reply(exchange.answers, transaction.command, leg.begun_at - leg.end)
         if step.send:
             wire.say(step.send, now)
         wire.transaction = wire.exchange = self._trust.held = None
@@ -368,6 +367,7 @@ class LineMachine:
         self._end_exchange()
         self.dispatcher.refused(transaction, refusal, certain, now)
         if transaction.writes and certain:
+            self._leg.answered()
             self._release(self._leg.timing.turnaround, now)
         else:
             self._settle(now, begun=confirmed and certain)
@@ -376,6 +376,7 @@ class LineMachine:
         wire = self._wire
         if failed and wire.exchange is not None:
             self._leg.give_up(wire.exchange.later)
+            self._leg.strayed(self._strays.last_byte)  # what came in place of the reply may have been it, damaged
         wire.transaction = wire.exchange = self._trust.held = None
         self._counters.exchanges += 1
 
@@ -386,8 +387,7 @@ class LineMachine:
         if self._closed:
             self._go_offline(now)
         elif hold or not self._advance(now):
-            out = self._leg.out
-            free = (out if out > now else now) + hold
+            free = max(self._leg.out, now) + hold
             held = free > now
             self._enter(HOLDOFF if held else READY, now)
             self._deadlines.line = free if held else inf
@@ -459,10 +459,10 @@ class LineMachine:
     def _strip_echo(self, data: bytes, now: float) -> bytes:
         """Take the echo of what was sent off the front, byte for byte; a mismatch is a collision."""
         rest = self._echo.strip(data)
+        self._strays.last_byte = now  # where the echo is lost, this may be another's byte that looks like it
         if rest is None:
             self._counters.collisions += 1
             self.events.append(Strayed(data, collision=True))
-            self._strays.last_byte = now
             if self.state is EXCHANGE:
                 self._attempt_failed(FrameError(COLLIDED), now)
             else:
