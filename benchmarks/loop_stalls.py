@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 from benchmarks.harness import Claim, Options, Outcome, Table
 from benchmarks.lines import Lines
 from busmaster import Bus, BusError, Hcp2Controller, Point, PollGroup
+from busmaster.bus.node import Node
 from busmaster.contract.profile import LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.wire.checks import xor
@@ -233,7 +234,7 @@ async def _many_groups(turn: Round, values: dict[Point[Any], float]) -> int:
 
 
 async def _requests(turn: Round, points: list[Point[Any]]) -> None:
-    node = points[0].node
+    node = Node.of(points[0])
     await turn.hold("Node.request()", lambda: node.request(hcp2.Read(1)))
     await turn.hold("Node.timed_request()", lambda: node.timed_request(hcp2.Read(1)))
     await turn.hold("Node.probe()", node.probe)

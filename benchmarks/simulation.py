@@ -12,7 +12,7 @@ from collections.abc import Callable
 from random import Random
 
 from benchmarks.harness import Claim, Options, Outcome, Table
-from busmaster.arbiter.events import Completed, Event, Polled
+from busmaster.arbiter.events import Event, Polled
 from busmaster.arbiter.schedule import Poll, set_members
 from busmaster.arbiter.transaction import Transaction
 from busmaster.emulator.device import Delay
@@ -101,9 +101,9 @@ class Simulation:
         self.world.request(self._nodes[number % len(self._nodes)], self._commands[number % len(self._commands)])
 
     def _on_event(self, event: Event) -> None:
-        if isinstance(event, Completed):
-            self._count(event.transaction)
-            if not event.transaction.probe:
+        if isinstance(event, Transaction):
+            self._count(event)
+            if not event.probe:
                 self._ask()
         elif isinstance(event, Polled):
             for transaction in event.poll.results:

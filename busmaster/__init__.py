@@ -14,6 +14,7 @@ from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import GroupStatistics, PollGroup, Quality, Sample, Snapshot, Stream
+from busmaster.bus.requester import Requester, RequestOptions
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import (
@@ -34,16 +35,6 @@ from busmaster.errors import (
     WriteUnconfirmed,
 )
 from busmaster.planning import GroupPlan, Plan, PlannedGroup, PlannedNode
-from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
-from busmaster.protocols.dc104.handle import Dc104Drive
-from busmaster.protocols.hcp.handle import HcpController
-from busmaster.protocols.hcp2.handle import Hcp2Controller
-from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
-from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
-from busmaster.protocols.mentor.handle import MentorDrive
-from busmaster.protocols.modbus.handle import ModbusUnit
-from busmaster.protocols.msc.codec import ProgramStatus
-from busmaster.protocols.msc.handle import MscController
 from busmaster.transport.endpoints import Endpoint, endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -51,6 +42,16 @@ from busmaster.transport.tcp import TcpPort
 if TYPE_CHECKING:
     from busmaster.config.line import open_line
     from busmaster.emulator.memory import MemoryPort
+    from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
+    from busmaster.protocols.dc104.handle import Dc104Drive
+    from busmaster.protocols.hcp.handle import HcpController
+    from busmaster.protocols.hcp2.handle import Hcp2Controller
+    from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
+    from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
+    from busmaster.protocols.mentor.handle import MentorDrive
+    from busmaster.protocols.modbus.handle import ModbusUnit
+    from busmaster.protocols.msc.handle import MscController
+    from busmaster.protocols.msc.status import ProgramStatus
 
 __all__ = [
     "BacklogFull",
@@ -103,6 +104,8 @@ __all__ = [
     "Quantiles",
     "Refused",
     "ReplyTiming",
+    "RequestOptions",
+    "Requester",
     "Sample",
     "SerialPort",
     "Snapshot",
@@ -119,12 +122,26 @@ __all__ = [
 ]
 
 
-ON_DEMAND = {"MemoryPort": "busmaster.emulator.memory", "open_line": "busmaster.config.line"}
-"""Public names that need more than a bus does, and the modules which are imported when these are asked for."""
+ON_DEMAND = {
+    "CommandWord": "busmaster.protocols.hcp2.microflex",
+    "CtAnsiDrive": "busmaster.protocols.ct_ansi.handle",
+    "Dc104Drive": "busmaster.protocols.dc104.handle",
+    "Hcp2Controller": "busmaster.protocols.hcp2.handle",
+    "HcpController": "busmaster.protocols.hcp.handle",
+    "MemoryPort": "busmaster.emulator.memory",
+    "MentorDrive": "busmaster.protocols.mentor.handle",
+    "MicroFlexDrive": "busmaster.protocols.hcp2.microflex_handle",
+    "ModbusUnit": "busmaster.protocols.modbus.handle",
+    "MscController": "busmaster.protocols.msc.handle",
+    "ProgramStatus": "busmaster.protocols.msc.status",
+    "StatusWord": "busmaster.protocols.hcp2.microflex",
+    "open_line": "busmaster.config.line",
+}
+"""Public names that a bus alone does not need, and the modules which are imported when these are asked for."""
 
 
 def __getattr__(name: str) -> object:
-    """Import what needs more than a bus when it is asked for."""
+    """Import what a bus alone does not need when it is asked for: who uses one protocol pays for one."""
     if name not in ON_DEMAND:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(ON_DEMAND[name]), name)

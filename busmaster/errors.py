@@ -1,11 +1,27 @@
 """What can go wrong, and nothing else.
 
-Every transaction that fails raises one fresh instance of a `BusError` subclass. It carries the node, the
-command and the number of attempts, and its text says in one sentence what happened, where, and what to try.
+Every transaction that fails raises one fresh instance of a `BusError` subclass. It carries the line, the node, the
+command and the number of attempts, and its text says in one sentence what happened, where, and what to try. It may be
+sent to another process: it pickles.
 A wrong argument is not a bus error: it raises `InvalidCommand` when the command is built, or when it is asked for.
 """
 
 from __future__ import annotations
+
+from typing import Any, Protocol
+
+
+class Addressed(Protocol):
+    """What an error is told of the node that it is about."""
+
+    @property
+    def line(self) -> str: ...
+
+    @property
+    def label(self) -> str: ...
+
+    @property
+    def address(self) -> int: ...
 
 
 class InvalidCommand(ValueError):
@@ -16,8 +32,9 @@ class InvalidCommand(ValueError):
 class BusError(Exception):
     """A transaction did not end with a value.
 
-    `what` is the happening ("no reply within 100 ms"), `hint` what to try, `node` the node's label ("node 5")
-    or None for the whole line, `command` the command as text, `attempts` how often it was on the wire.
+    `what` is the happening ("no reply within 100 ms"), `hint` what to try, `command` the command as text, `attempts`
+    how often it was on the wire. `line` is the name of the line's port, `label` and `address` are the node's ("node
+    5", 5); each is None where it is not known, or where the error is not about one node.
     """
 
     hint = ""
@@ -26,21 +43,39 @@ class BusError(Exception):
         self,
         what: str,
         *,
-        node: str | None = None,
+        node: Addressed | None = None,
         command: str | None = None,
         attempts: int = 0,
         hint: str | None = None,
     ) -> None:
         super().__init__(what)
         self.what = what
-        self.node = node
+        self.line: str | None = None
+        self.label: str | None = None
+        self.address: int | None = None
         self.command = command
         self.attempts = attempts
+        if node is not None:
+            self.name(node)
         if hint is not None:
             self.hint = hint
 
+    def name(self, node: Addressed) -> None:
+        """Say which node, of which line, it is about."""
+        self.line = node.line or None
+        self.label = node.label
+        self.address = node.address
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Keep all attributes; of a cause that is no error of the line's, which may not pickle, its text."""
+        state, cause = dict(self.__dict__), self.__cause__
+        if cause is not None:
+            told = isinstance(cause, BusError)
+            state["__cause__"] = cause if told else Exception(f"{type(cause).__name__}: {cause}")
+        return type(self), (self.what,), state
+
     def __str__(self) -> str:
-        text = self.what if self.node is None else f"{self.node}: {self.what}"
+        text = self.what if self.label is None else f"{self.label}: {self.what}"
         if self.attempts:
             text += f", {self.attempts} attempt{'' if self.attempts == 1 else 's'}"
         if self.command:
@@ -49,7 +84,7 @@ class BusError(Exception):
 
 
 class NoReply(BusError, TimeoutError):
-    """Nothing came within the reply window, at any attempt."""
+    """Nothing came within the reply window, at any attempt; or not before the caller's `finish_within` ran out."""
 
     hint = "check the node's address, power, baud rate and wiring"
 
@@ -75,7 +110,7 @@ class Refused(BusError):
         what: str = "refused",
         *,
         confirm: bool = True,
-        node: str | None = None,
+        node: Addressed | None = None,
         command: str | None = None,
         attempts: int = 0,
         hint: str | None = None,
@@ -91,7 +126,8 @@ class NoSuchParameter(Refused):
 
 
 class WriteUnconfirmed(BusError):
-    """A write was sent and its answer never came or was garbled: the node may or may not have taken it."""
+    """A write was sent, and its answer never came, or was garbled, or had not come when `finish_within` ran out: all or
+    a part of it may have been carried out."""
 
     hint = "read the value back before you write again"
 
@@ -115,7 +151,7 @@ class NodeDown(BusError):
 
 
 class NotStarted(BusError, TimeoutError):
-    """The request had not been sent when its `start_within` ran out. Nothing was sent."""
+    """The request had not been sent when its `start_within` or `finish_within` ran out. Nothing was sent."""
 
     hint = "the line is busy: see bus.statistics() or busmaster plan"
 

@@ -17,9 +17,9 @@ from busmaster.testing import run_in_virtual_time
 # The application
 
 
-async def guard(drive: MicroFlexDrive, limit: float) -> None:
+async def guard(bus: Bus, drive: MicroFlexDrive, limit: float) -> None:
     """Looks at the drive's temperature once a second, and disables it when that is above `limit`."""
-    group = drive.node.bus.poll_group("guard", period=1.0, points=[drive.temperature])
+    group = bus.poll_group("guard", period=1.0, points=[drive.temperature])
     try:
         async for snapshot in group:
             sample = snapshot[drive.temperature]
@@ -39,7 +39,7 @@ def test_a_drive_that_gets_too_hot_is_disabled() -> None:
             drive = MicroFlexDrive(bus, 7)
             await drive.enable()
             await drive.set_torque_reference(100.0)
-            await asyncio.wait_for(guard(drive, limit=60.0), timeout=600)
+            await asyncio.wait_for(guard(bus, drive, limit=60.0), timeout=600)
         assert not emulated.enabled
 
     emulated = EmulatedMicroFlex(7, current_control=True)
@@ -53,7 +53,7 @@ def test_a_drive_that_stays_cool_is_left_alone_for_an_hour() -> None:
             drive = MicroFlexDrive(bus, 7)
             await drive.enable()
             await drive.set_speed_reference(50.0)
-            guarding = asyncio.ensure_future(guard(drive, limit=60.0))
+            guarding = asyncio.ensure_future(guard(bus, drive, limit=60.0))
             await asyncio.sleep(3600)
             assert not guarding.done()
             assert emulated.enabled

@@ -26,6 +26,7 @@ from busmaster import (
     TcpPort,
     Timings,
 )
+from busmaster.bus.node import Node
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -69,7 +70,7 @@ REQUESTS: list[Callable[[Hcp2Controller], Awaitable[object]]] = [
     lambda axis: axis.write(1, 1.0, priority=cast("Any", "urgent")),
     lambda axis: axis.element(1).read(priority=cast("Any", -1)),
     lambda axis: axis.element(1).write(1.0, priority=cast("Any", -1)),
-    lambda axis: axis.node.timed_request(hcp2.Read(1), priority=cast("Any", -1)),
+    lambda axis: Node.of(axis).timed_request(hcp2.Read(1), priority=cast("Any", -1)),
     lambda axis: axis.read(1, retries=-1),
     lambda axis: axis.read(1, retries=101),
     lambda axis: axis.read(1, retries=True),
@@ -83,8 +84,8 @@ REQUESTS: list[Callable[[Hcp2Controller], Awaitable[object]]] = [
     lambda axis: axis.read(cast("Any", 1.0)),
     lambda axis: axis.element(1).read(max_age=nan),
     lambda axis: axis.element(1).read(max_age=-1.0),
-    lambda axis: MicroFlexDrive(axis.node.bus, 1).enable(within=nan),
-    lambda axis: MicroFlexDrive(axis.node.bus, 1).disable(within=-1.0),
+    lambda axis: MicroFlexDrive(axis.bus, 1).enable(within=nan),
+    lambda axis: MicroFlexDrive(axis.bus, 1).disable(within=-1.0),
 ]
 
 
@@ -115,8 +116,8 @@ def group(bus: Bus, **options: Any) -> PollGroup:
         lambda bus: Hcp2Controller(bus, 1).axis(True),
         lambda bus: Hcp2Controller(bus, 1).axis(8),
         lambda bus: Hcp2Controller(bus, 1).io.adc(True),
-        lambda bus: Hcp2Controller(bus, 1).node.suspend(nan),
-        lambda bus: Hcp2Controller(bus, 1).node.suspend(True),
+        lambda bus: Node.of(Hcp2Controller(bus, 1)).suspend(nan),
+        lambda bus: Node.of(Hcp2Controller(bus, 1)).suspend(True),
         lambda bus: MentorDrive(bus, 11, decimals={"1.17": cast("Any", 1.5)}),
         *(lambda bus, wrong=wrong: group(bus, period=wrong) for wrong in (0.0, -1.0, nan, inf, True, "1")),
         *(lambda bus, wrong=wrong: group(bus, phase=wrong) for wrong in (-0.1, 1.0, nan, True)),
@@ -154,6 +155,6 @@ def test_the_number_of_a_priority_is_that_priority_and_an_urgent_write_overtakes
 def test_timings_are_taken_as_timings() -> None:
     async def main() -> None:
         async with bus_of() as bus:
-            assert Hcp2Controller(bus, 1, timings=Timings.uniform(TIMING)).node.timings.read == TIMING
+            assert Node.of(Hcp2Controller(bus, 1, timings=Timings.uniform(TIMING))).timings.read == TIMING
 
     run_in_virtual_time(main())

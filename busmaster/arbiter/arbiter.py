@@ -17,6 +17,7 @@ from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import EXCHANGE, READY
+from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import Transaction
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
@@ -29,7 +30,11 @@ class Arbiter(LineMachine):
     `byte_time` is tau, in seconds. `echo`: what is sent is received too. `receive_latency`: seconds that received bytes
     may lie in an adapter. `capacity`: requests of one class that may wait. `jitter` returns numbers from 0 to 1, by
     which probes are spread. `strict`: answers that could be another's are held until that one would have come (R15).
+    `tapped`: `attempt` says what is on the wire, and the end of each attempt is an event.
     """
+
+    name = ""
+    """What errors call the line."""
 
     @property
     def byte_time(self) -> float:
@@ -39,6 +44,11 @@ class Arbiter(LineMachine):
     @byte_time.setter
     def byte_time(self, seconds: float) -> None:
         self._leg.byte_time = seconds
+
+    @property
+    def attempt(self) -> Attempt | None:
+        """What is on the wire, on a line that is tapped."""
+        return self.dispatcher.attempt
 
     def add_node(
         self, profile: Profile, address: int, now: float, timings: Timings | None = None, retries: int | None = None
@@ -50,12 +60,33 @@ class Arbiter(LineMachine):
             address,
             profile.timings if timings is None else timings,
             profile.retries if retries is None else retries,
+            self.name,
         )
         self.dispatcher.nodes.append(node)
         if profile.listen is not None and self._strays.listener is None:
             self._strays.listener = profile.listen()
         self._quarantine = max(self._quarantine, self._up_at + node.lateness + self._leg.latency + self.byte_time)
         return node
+
+    def name_node(self, node: NodeRecord, label: str) -> None:
+        """Have messages call it so."""
+        node.label = label
+
+    def change_profile(self, node: NodeRecord, profile: Profile) -> None:
+        """Go by another profile of its protocol from now on: one that merges otherwise."""
+        node.profile = profile
+
+    def expect_hook(self, node: NodeRecord, expected: bool) -> None:
+        """Hold its polls when it comes back until `Dispatcher.release_node`, or do not."""
+        node.has_hook = expected
+
+    def note_stop(self, node: NodeRecord) -> None:
+        """It is told to stop."""
+        node.stops += 1
+
+    def answer_counts(self, now: float) -> bool:
+        """A caller's time is over while something is on the wire: what has come is to be handed over first."""
+        return self.state is EXCHANGE and now >= self._deadlines.expiry
 
     def submit(self, transaction: Transaction, now: float) -> bool:
         """False if it waits and nothing else has changed: then there is nothing to pump."""
@@ -102,12 +133,20 @@ class Arbiter(LineMachine):
         return data or None
 
     def poll_event(self) -> Event | None:
-        if self.dispatcher.unnoted:
-            self.dispatcher.note_successes()
-        return self._events.popleft() if self._events else None
+        if self.dispatcher.unnoted is not None:
+            self.dispatcher.note_success()
+        return self.events.popleft() if self.events else None
 
     def poll_timeout(self) -> float:
-        return self._deadlines.earliest()
+        deadlines = self._deadlines
+        earliest = deadlines.line
+        if deadlines.schedule < earliest:
+            earliest = deadlines.schedule
+        if deadlines.expiry < earliest:
+            earliest = deadlines.expiry
+        if deadlines.health < earliest:
+            earliest = deadlines.health
+        return earliest
 
     def reset_statistics(self, now: float) -> None:
         self._counters.reset(self.state, now)

@@ -58,6 +58,9 @@ class _Fifo:
         return found
 
     def discard(self) -> None:
+        # A caller that gives up must be free at once, however long the queue is, so its place is only given up, and
+        # swept later. Without the sweep, callers that always give up would fill the memory of a line that never gets
+        # to them.
         self.live -= 1
         if len(self._entries) > 2 * self.live + SLACK:
             self._entries = deque(self)
@@ -85,6 +88,8 @@ class _EarliestDeadlineFirst:
         self.live += 1
 
     def push_front(self, transaction: Transaction) -> None:
+        # The first of all whatever its deadline, or a write would go behind what it had its turn before. The negative
+        # number puts it before the one that has the same deadline, and the last one put back before the others.
         transaction.deadline = self._entries[0][0] if self._entries else transaction.deadline
         heapq.heappush(self._entries, (transaction.deadline, -next(self._order), transaction))
         self.live += 1
@@ -131,60 +136,63 @@ class _EarliestDeadlineFirst:
 class Backlog:
     """The waiting transactions of all classes. A transaction in it has the phase QUEUED."""
 
-    __slots__ = ("_before", "_queues", "_rotated", "_streak")
+    __slots__ = ("_rotated", "_rotated_before", "_streak", "_streak_before", "queues")
 
     def __init__(self) -> None:
-        self._queues = (_Fifo(), _Fifo(), _EarliestDeadlineFirst(), _EarliestDeadlineFirst())
+        self.queues = (_Fifo(), _Fifo(), _EarliestDeadlineFirst(), _EarliestDeadlineFirst())
         self._streak = 0
         self._rotated = BACKGROUND
-        self._before = (0, BACKGROUND)
+        self._streak_before, self._rotated_before = 0, BACKGROUND
 
     def __len__(self) -> int:
-        urgent, command, poll, background = self._queues
+        urgent, command, poll, background = self.queues
         return urgent.live + command.live + poll.live + background.live
 
     def waiting(self, priority: Priority) -> int:
-        return self._queues[priority].live
+        return self.queues[priority].live
 
     def push(self, transaction: Transaction) -> None:
         """At the back of its class (of its deadline, in POLL and BACKGROUND)."""
         transaction.phase = QUEUED
-        self._queues[transaction.priority].push(transaction)
+        self.queues[transaction.priority].push(transaction)
 
     def push_front(self, transaction: Transaction) -> None:
         """At the front of its class: for a write whose turn had come while an earlier one was not over."""
         transaction.phase = QUEUED
-        self._queues[transaction.priority].push_front(transaction)
+        self.queues[transaction.priority].push_front(transaction)
 
     def discard(self, transaction: Transaction, phase: Phase) -> None:
         """Take a queued transaction out and give it another phase."""
         transaction.phase = phase
-        self._queues[transaction.priority].discard()
+        self.queues[transaction.priority].discard()
 
     def restore(self, transaction: Transaction) -> None:
         """Put back what was popped last: it is the next to be popped, and its class keeps its turn."""
-        self._streak, self._rotated = self._before
+        self._streak, self._rotated = self._streak_before, self._rotated_before
         self.push_front(transaction)
 
     def pick(self, priority: Priority, suits: Callable[[Transaction], bool]) -> Transaction | None:
         """Take out the first of the first few of a class that suits; the others keep their places."""
-        return self._queues[priority].pick(suits)
+        return self.queues[priority].pick(suits)
 
     def promote(self, transaction: Transaction, priority: Priority) -> None:
         """To the front of a higher class: a write that a write of that class must not overtake."""
-        self._queues[transaction.priority].remove(transaction)
+        self.queues[transaction.priority].remove(transaction)
         transaction.priority = priority
         self.push_front(transaction)
 
     def pop(self) -> Transaction | None:
         """The next to go, or None. URGENT first, always; below it a waiting lower class gets every eighth slot."""
-        urgent, command, poll, background = self._queues
-        self._before = (self._streak, self._rotated)
+        urgent, command, poll, background = self.queues
+        self._streak_before = self._streak
+        self._rotated_before = self._rotated
         if urgent.live:
+            # Not counted as a higher class that had its turn: a stop waits for nobody's fairness. R9's bounds of the
+            # lower classes therefore hold below sustained urgent traffic only.
             return urgent.pop()
         if command.live:
             if not poll.live and not background.live:
-                self._streak = 0
+                self._streak = 0  # nobody was kept waiting, so nobody is owed a slot
             elif self._streak >= SHARE:
                 return self._lower_slot()
             else:
@@ -205,7 +213,7 @@ class Backlog:
     def _lower_slot(self) -> Transaction:
         """POLL and BACKGROUND in turn, if both wait."""
         self._streak = 0
-        _, _, poll, background = self._queues
+        _, _, poll, background = self.queues
         if poll.live and (self._rotated is BACKGROUND or not background.live):
             self._rotated = POLL
             return poll.pop()
@@ -214,6 +222,6 @@ class Backlog:
 
     def drain(self) -> list[Transaction]:
         """Everything that waits, in order of class; the backlog is empty afterwards."""
-        drained = [transaction for queue in self._queues for transaction in queue]
-        self._queues = (_Fifo(), _Fifo(), _EarliestDeadlineFirst(), _EarliestDeadlineFirst())
+        drained = [transaction for queue in self.queues for transaction in queue]
+        self.queues = (_Fifo(), _Fifo(), _EarliestDeadlineFirst(), _EarliestDeadlineFirst())
         return drained

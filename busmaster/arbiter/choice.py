@@ -11,9 +11,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from math import inf
 from typing import Any, TypeAlias
 
+from busmaster.arbiter.alike import Alike
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import UP, NodeRecord
-from busmaster.arbiter.in_step import LONGEST_ALIKE, InStep
+from busmaster.arbiter.in_step import InStep
+from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.transaction import URGENT, Transaction
 from busmaster.contract.exchange import Command, Exchange
 
@@ -22,22 +24,25 @@ MOST_BEFORE = 3
 planning, count them."""
 
 Chosen: TypeAlias = tuple[Transaction, Exchange[Any]]
+Unfit: TypeAlias = Callable[[Sequence[bytes], NodeRecord], bool]
+"""Whether what would answer an exchange of that node proves nothing."""
 
 
 class Choice:
-    """Chooses for one line, from what its dispatcher has waiting, by what `in_step` says is owed."""
+    """Chooses for one line, from what its dispatcher has waiting, by what `in_step` says is owed; `wire` has times."""
 
-    def __init__(self, dispatcher: Dispatcher, in_step: InStep) -> None:
+    def __init__(self, dispatcher: Dispatcher, in_step: InStep, wire: OnWire) -> None:
         self._dispatcher = dispatcher
         self._in_step = in_step
+        self._alike = Alike(wire)
         self._gone_before = 0
 
-    def next(self, now: float, silent: float) -> Chosen | float | None:
+    def next(self, now: float, last_byte: float) -> Chosen | float | None:
         """The transaction to be sent now, with its exchange. None if none waits; a time if none may go before it.
 
-        `silent`: for so many seconds nothing has come, so that an answer too many would have shown.
+        `last_byte`: when the last one came.
         """
-        dispatcher, in_step = self._dispatcher, self._in_step
+        dispatcher, in_step, alike = self._dispatcher, self._in_step, self._alike
         while (transaction := dispatcher.next(now)) is not None:
             node = transaction.node
             try:
@@ -50,35 +55,42 @@ class Choice:
         else:
             return None
         if answers == in_step.last and not exchange.later:
-            in_step.alike = 0 if silent > exchange.timing.window else in_step.alike + 1
-            if in_step.alike >= LONGEST_ALIKE or in_step.alert:
-                return self._carefully((transaction, exchange), now)
+            too_many = alike.another(exchange, last_byte, now)
+            if too_many or in_step.alert:
+                return self._carefully((transaction, exchange), now, too_many)
         elif in_step.alert:
             return self._carefully((transaction, exchange), now)
         else:
-            in_step.alike = 0
+            alike.count = 0
+        alike.node = node
         in_step.before, in_step.last = in_step.last, answers
         return transaction, exchange
 
-    def _carefully(self, first: Chosen, now: float) -> Chosen | float:
-        """As `next`, where something is owed or doubted, or too many answers were alike."""
+    def _carefully(self, first: Chosen, now: float, too_many: bool = False) -> Chosen | float:
+        """As `next`, where something is owed or doubted, or `too_many` answers were alike."""
         in_step = self._in_step
         in_step.lapse(now)
         chosen: Chosen | float = first
         transaction, exchange = first
         answers = exchange.answers
+
+        def alike(other: Sequence[bytes], node: NodeRecord) -> bool:
+            return other == answers
+
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
         elif transaction.probe and in_step.clashes(answers, now, transaction.node):
             chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
         elif in_step.clashes(answers, now):
             chosen = self._instead_of(first, now)
-        elif in_step.alike >= LONGEST_ALIKE:
-            unlike = self._another(first, now, answers.__eq__)
-            chosen = unlike or self._ask_check(self._whom_to_ask(now)[0], now, answers.__eq__) or first
-            in_step.alike = 0
+        elif in_step.clashes(answers, now, transaction.node):
+            chosen = self._ask_itself(first, now) or first
+        elif too_many:
+            unlike = self._another(first, now, alike)
+            chosen = unlike or self._ask_check(self._whom_to_ask(now)[0], now, alike) or first
+            self._alike.count = 0
         elif in_step.doubts(now) and answers == in_step.last:
-            chosen = self._another(first, now, answers.__eq__) or first
+            chosen = self._another(first, now, alike) or first
         if chosen is first:
             self._gone_before = 0
         if not isinstance(chosen, tuple):
@@ -87,7 +99,8 @@ class Choice:
             if chosen[0] is not transaction:
                 self._dispatcher.backlog.restore(transaction)
             if chosen[1].answers != in_step.last:
-                in_step.alike = 0
+                self._alike.count = 0
+            self._alike.node = chosen[0].node
             in_step.before, in_step.last = in_step.last, chosen[1].answers
         return chosen
 
@@ -97,7 +110,10 @@ class Choice:
         if self._gone_before >= MOST_BEFORE:
             return first
 
-        def clashes(answers: Sequence[bytes]) -> bool:
+        def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
+            return in_step.clashes(answers, now, node)
+
+        def proves_nothing(answers: Sequence[bytes], node: NodeRecord) -> bool:
             return in_step.clashes(answers, now)
 
         owing = dict.fromkeys(in_step.owing(answers, now))
@@ -114,7 +130,7 @@ class Choice:
             if worth_it and not (owing or asked):  # all are silent: a check of its own node costs no more than it would
                 asked = [first[0].node]
             other = self._ask_check([*owing, *asked], now, clashes)
-            if other is None and not any(_fit_checks(silent, clashes)):  # there is nothing unlike to ask
+            if other is None and not any(_fit_checks(silent, proves_nothing)):  # there is nothing unlike to ask
                 over = in_step.over(answers)
                 if now < over:
                     return over
@@ -123,6 +139,15 @@ class Choice:
             return first
         self._gone_before += 1
         return other
+
+    def _ask_itself(self, first: Chosen, now: float) -> Chosen | None:
+        """A check of a node that owes what it is to be asked for: its answer would not be believed. None for one that
+        is likely to be dead."""
+        node = first[0].node
+        if node.silent or self._gone_before >= MOST_BEFORE:
+            return None
+        self._gone_before += 1
+        return self._ask_check([node], now, lambda answers, node: self._in_step.clashes(answers, now, node))
 
     def _other_probe(self, probe: Transaction, now: float) -> Chosen | None:
         """The same dead node asked for something that is not owed."""
@@ -134,9 +159,7 @@ class Choice:
                 return probe, exchange
         return None
 
-    def _another(
-        self, first: Chosen, now: float, unfit: Callable[[Sequence[bytes]], bool], of: NodeRecord | None = None
-    ) -> Chosen | None:
+    def _another(self, first: Chosen, now: float, unfit: Unfit, of: NodeRecord | None = None) -> Chosen | None:
         """One of the same class, `of` this node if one is given. No read overtakes a write to its node, and no write
         anything that is for its node."""
         opened: list[Exchange[Any]] = []
@@ -147,7 +170,7 @@ class Choice:
             in_order = other.node not in (passed if other.writes else written)
             if in_order and of in (None, other.node) and self._dispatcher.may_go(other, now):
                 exchange = _opened(other)
-                if exchange is not None and exchange.answered and not unfit(exchange.answers):
+                if exchange is not None and exchange.answered and not unfit(exchange.answers, other.node):
                     opened.append(exchange)
                     return True
             passed.add(other.node)
@@ -158,9 +181,7 @@ class Choice:
         transaction = self._dispatcher.backlog.pick(first[0].priority, suits)
         return None if transaction is None else (transaction, opened[0])
 
-    def _ask_check(
-        self, nodes: Iterable[NodeRecord], now: float, unfit: Callable[[Sequence[bytes]], bool]
-    ) -> Chosen | None:
+    def _ask_check(self, nodes: Iterable[NodeRecord], now: float, unfit: Unfit) -> Chosen | None:
         """A read of the first of these nodes that has one whose answer is fit to prove something."""
         for node, command, exchange in _fit_checks(nodes, unfit):
             return self._dispatcher.check(node, command, now), exchange
@@ -179,14 +200,12 @@ class Choice:
         return alive, [node for node in nodes if node.silent]
 
 
-def _fit_checks(
-    nodes: Iterable[NodeRecord], unfit: Callable[[Sequence[bytes]], bool]
-) -> Iterator[tuple[NodeRecord, Command[Any], Exchange[Any]]]:
+def _fit_checks(nodes: Iterable[NodeRecord], unfit: Unfit) -> Iterator[tuple[NodeRecord, Command[Any], Exchange[Any]]]:
     """The reads of these nodes whose answers are fit to prove something."""
     for node in nodes:
         for command in checks_of(node):
             exchange = command.open(node.address, node.timings)
-            if not unfit(exchange.answers):
+            if not unfit(exchange.answers, node):
                 yield node, command, exchange
 
 

@@ -19,13 +19,3 @@ class Deadlines:
         """The first queued request's `start_within` runs out."""
         self.health = inf
         """A dead node's next probe, or the end of a suspension."""
-
-    def earliest(self) -> float:
-        earliest = self.line
-        if self.schedule < earliest:
-            earliest = self.schedule
-        if self.expiry < earliest:
-            earliest = self.expiry
-        if self.health < earliest:
-            earliest = self.health
-        return earliest

@@ -7,23 +7,23 @@ and ends every transaction exactly once.
 
 from __future__ import annotations
 
-import heapq
 from collections import deque
 from collections.abc import Callable
-from itertools import count
-from math import inf, nextafter
+from math import inf
 from typing import Any
 
 from busmaster.arbiter import health
 from busmaster.arbiter.backlog import Backlog
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.endings import make_error, name_error, not_started
-from busmaster.arbiter.events import Completed, Event, LatenessLowered, NodeChanged, Polled, Sampled
+from busmaster.arbiter.endings import make_error, name_error, too_late
+from busmaster.arbiter.events import Event, LatenessLowered, NodeChanged, Overdue, Polled, Sampled
+from busmaster.arbiter.expiries import Expiries
 from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
 from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.schedule import Poll, Schedule
 from busmaster.arbiter.state import SETTLING
+from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.errors import (
@@ -41,7 +41,6 @@ REFUSED_POLL_PAUSE = 10.0
 """Seconds between polls of a point that was refused again and again."""
 RETRY_PATIENCE = 1.0
 """Seconds after which a request in POLL or BACKGROUND wants to be answered; the period, for a poll."""
-EXPIRY_SLACK = 64
 SUSPENDED = "suspended for maintenance"
 NOT_DONE = (Refused, Superseded)
 """Errors that say of a write that it was not carried out, unless an attempt before them may have been."""
@@ -50,12 +49,15 @@ NOT_DONE = (Refused, Superseded)
 class Dispatcher:
     """The transactions of one line. Times are the caller's clock, in seconds."""
 
+    attempt: Attempt | None = None
+    """What is on the wire, where somebody taps the line (tapped.py)."""
+
     def __init__(
         self, deadlines: Deadlines, counters: LineCounters, now: float, capacity: int, jitter: Callable[[], float]
     ) -> None:
         self.events: deque[Event] = deque()
-        self.unnoted: deque[Transaction] = deque()
-        """Those that have succeeded, until `note_successes`."""
+        self.unnoted: Transaction | None = None
+        """The one that has succeeded, until `note_success`."""
         self.backlog = Backlog()
         self.schedule = Schedule()
         self.nodes: list[NodeRecord] = []
@@ -66,35 +68,35 @@ class Dispatcher:
         self.probes = Probes(deadlines, self.nodes, now)
         self._capacity = capacity
         self._jitter = jitter
-        self._expiries: list[tuple[float, int, Transaction]] = []
-        self._order = count()
+        self._expiries = Expiries(deadlines)
 
     # requests
 
     def submit(self, transaction: Transaction, now: float) -> bool:
         """Queue it, or end it at once with the reason why not: then False."""
-        node = transaction.node
+        node, counters = transaction.node, self.counters
         transaction.queued = now
-        self._waits(transaction)
+        transaction.exchanges_ahead = counters.exchanges  # as _waits does: this is done for every request
+        transaction.settling_ahead = counters.spent[SETTLING]
         if self.fault is not None:
             self._end(transaction, now, name_error(self.fault(), transaction))
             return False
         if transaction.writes and transaction.priority is URGENT:
             self._supersede(node, now)
-        waiting = self.backlog.waiting(transaction.priority)
+        waiting = self.backlog.queues[transaction.priority].live
         if transaction.writes:
             waiting = max(waiting, len(node.writes))
         if waiting >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return False
-        if not self._may_ask(transaction, now):
+        if (node.health is DOWN or now < node.suspended_until) and not self._may_ask(transaction, now):
             return False
         if transaction.writes:
             node.writes.append(transaction)
         if transaction.deadline == inf:
             transaction.deadline = now + RETRY_PATIENCE
         if transaction.start_by < inf:
-            self._expect_start(transaction)
+            self._expiries.expect(transaction, len(self.backlog))
         self.backlog.push(transaction)
         return True
 
@@ -114,8 +116,10 @@ class Dispatcher:
         """The transaction that may be sent now, or None."""
         while (transaction := self.backlog.pop()) is not None:
             node = transaction.node
-            if transaction.start_by < now and transaction.queued < now and not transaction.attempts:
-                self._end(transaction, now, not_started(transaction, now))
+            if transaction.start_by < now and (
+                transaction.finish_by <= now or (transaction.queued < now and not transaction.attempts)
+            ):
+                self._end(transaction, now, too_late(transaction, now))
             elif transaction.writes and node.writes[0] is not transaction:
                 self._park(transaction)
             elif (node.health is not DOWN and not node.holds and node.suspended_until <= now) or self._may_ask(
@@ -132,7 +136,7 @@ class Dispatcher:
         node = transaction.node
         if node.health is DOWN or node.holds or node.suspended_until > now:
             return False
-        in_time = transaction.start_by >= now or transaction.attempts > 0
+        in_time = transaction.start_by >= now or (transaction.attempts > 0 and transaction.finish_by > now)
         return in_time and not (transaction.writes and node.writes[0] is not transaction)
 
     def started(self, transaction: Transaction, now: float) -> None:
@@ -140,7 +144,8 @@ class Dispatcher:
         counters = self.counters
         if transaction.attempts == 0 and not transaction.check:
             counters.waits[transaction.priority].record(now - transaction.queued)
-            self._count_ahead(transaction)
+            transaction.exchanges_ahead = counters.exchanges - transaction.exchanges_ahead
+            transaction.settling_ahead = counters.spent[SETTLING] - transaction.settling_ahead
             poll = transaction.poll
             if poll is not None and poll.started == -inf:
                 poll.started = now
@@ -156,30 +161,34 @@ class Dispatcher:
 
     def succeeded(self, transaction: Transaction, value: Any, now: float) -> None:
         """Noted at once where it bears on what goes next; else with the events, when the next request has left."""
+        if self.unnoted is not None:
+            self.note_success()
         transaction.value = value
         transaction.last_byte = now
-        self.unnoted.append(transaction)
+        self.unnoted = transaction
         if transaction.writes or transaction.node.health is not UP:
-            self.note_successes()
+            self.note_success()
 
-    def note_successes(self) -> None:
-        while self.unnoted:
-            transaction = self.unnoted.popleft()
-            node, now = transaction.node, transaction.last_byte
-            counters = node.counters
-            counters.ok += 1
-            counters.latency.record(now - transaction.started)
-            if transaction.late:
-                counters.late += 1
-            node.last_reply = now
-            if node.health is not UP:
-                self._heard(node, now)
-            if node.lateness_until < inf:
-                self._lower_lateness(transaction, now)
-            if transaction.paid:
-                self.probes.budget.refund(transaction.paid - (now - transaction.started))
-            transaction.refused_cycles = 0
-            self._end(transaction, now)
+    def note_success(self) -> None:
+        transaction = self.unnoted
+        if transaction is None:
+            return
+        self.unnoted = None
+        node, now = transaction.node, transaction.last_byte
+        counters = node.counters
+        counters.ok += 1
+        counters.latency.record(now - transaction.started)
+        if transaction.late:
+            counters.late += 1
+        node.last_reply = now
+        if node.health is not UP:
+            self._heard(node, now)
+        if node.lateness_until < inf:
+            self._lower_lateness(transaction, now)
+        if transaction.paid:
+            self.probes.budget.refund(transaction.paid - (now - transaction.started))
+        transaction.refused_cycles = 0
+        self._end(transaction, now)
 
     def attempt_failed(
         self, transaction: Transaction, no_reply: bool, what: str, now: float, doubted: bool = False
@@ -261,17 +270,22 @@ class Dispatcher:
             self._end(transaction, now, name_error(fault(), transaction))
 
     def expire(self, now: float) -> None:
-        """Fail what should have started by now (R12)."""
-        heap = self._expiries
-        while heap and (heap[0][0] < now or heap[0][2].phase is ENDED):
-            transaction = heapq.heappop(heap)[2]
-            if transaction.attempts:
+        """Tell callers whose time is over: nothing was sent, or it was, and how it ends is not known (R12).
+
+        What is on the wire runs out unheard, as when its caller is cancelled; what has come by now has come in time.
+        """
+        self.note_success()
+        for transaction in self._expiries.due(now):
+            if not transaction.heard or (transaction.attempts and transaction.finish_by >= now):
+                continue
+            if transaction.phase is ON_WIRE:
+                transaction.heard = False
+                self.counters.cancelled += 1
+                self.events.append(Overdue(transaction, too_late(transaction, now)))
                 continue
             if transaction.phase is QUEUED:
                 self.backlog.discard(transaction, PARKED)
-            if transaction.phase is PARKED:
-                self._end(transaction, now, not_started(transaction, now))
-        self._deadlines.expiry = nextafter(heap[0][0], inf) if heap else inf
+            self._end(transaction, now, too_late(transaction, now))
 
     # polls
 
@@ -428,14 +442,6 @@ class Dispatcher:
                     self.backlog.discard(write, PARKED)
                 self._end(write, now, make_error(Superseded, "overtaken by an urgent write to the same node", write))
 
-    def _expect_start(self, transaction: Transaction) -> None:
-        heap = self._expiries
-        if len(heap) > 2 * len(self.backlog) + EXPIRY_SLACK:
-            self._expiries = heap = [entry for entry in heap if entry[2].phase is not ENDED]
-            heapq.heapify(heap)
-        heapq.heappush(heap, (transaction.start_by, next(self._order), transaction))
-        self._deadlines.expiry = nextafter(heap[0][0], inf)
-
     def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:
         """Exactly once (R8). A write that was on the wire before something else ended it may have been carried out."""
         if transaction.writes:
@@ -444,7 +450,8 @@ class Dispatcher:
                 error = make_error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
             self._next_write(transaction)
         if not transaction.attempts:
-            self._count_ahead(transaction)
+            transaction.exchanges_ahead = self.counters.exchanges - transaction.exchanges_ahead
+            transaction.settling_ahead = self.counters.spent[SETTLING] - transaction.settling_ahead
         transaction.phase = ENDED
         transaction.ended_at = now
         transaction.error = error
@@ -464,17 +471,12 @@ class Dispatcher:
                 self.events.append(Polled(poll))
         elif transaction.heard:
             self.counters.completed += 1
-            self.events.append(Completed(transaction))
+            self.events.append(transaction)
 
     def _waits(self, transaction: Transaction) -> None:
-        """What the line has counted so far is not what it waits for."""
+        """What the line has counted so far is not what it waits for: it is taken off when it has waited."""
         transaction.exchanges_ahead = self.counters.exchanges
         transaction.settling_ahead = self.counters.spent[SETTLING]
-
-    def _count_ahead(self, transaction: Transaction) -> None:
-        """It has waited: until now it held what `_waits` noted."""
-        transaction.exchanges_ahead = self.counters.exchanges - transaction.exchanges_ahead
-        transaction.settling_ahead = self.counters.spent[SETTLING] - transaction.settling_ahead
 
     def _next_write(self, transaction: Transaction) -> None:
         writes = transaction.node.writes

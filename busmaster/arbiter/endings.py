@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from busmaster.arbiter.transaction import Transaction
-from busmaster.errors import BusError, NotStarted
+from busmaster.errors import BusError, NoReply, NotStarted, WriteUnconfirmed
+
+TOO_LATE = "allow more time, or see bus.statistics(), or busmaster plan, for what holds it up"
 
 
 def make_error(kind: type[BusError], what: str, transaction: Transaction) -> BusError:
@@ -13,13 +15,19 @@ def make_error(kind: type[BusError], what: str, transaction: Transaction) -> Bus
 
 def name_error(error: BusError, transaction: Transaction) -> BusError:
     """Say which node, which command and how often."""
-    error.node = transaction.node.label
+    error.name(transaction.node)
     error.command = str(transaction.command)
     error.attempts = transaction.attempts
     return error
 
 
-def not_started(transaction: Transaction, now: float) -> BusError:
-    """Return the error of a transaction whose time to start is over (R12)."""
+def too_late(transaction: Transaction, now: float) -> BusError:
+    """Return the error of a transaction whose caller's time is over: whether it was sent is what the error says."""
     waited = (now - transaction.queued) * 1000
-    return make_error(NotStarted, f"not sent within its time: it waited {waited:.0f} ms for the line", transaction)
+    if not transaction.attempts:
+        return make_error(NotStarted, f"not sent within its time: it waited {waited:.0f} ms for the line", transaction)
+    kind = WriteUnconfirmed if transaction.writes else NoReply
+    error = make_error(kind, f"sent, but not answered within its time: {waited:.0f} ms", transaction)
+    if kind is NoReply:
+        error.hint = TOO_LATE
+    return error

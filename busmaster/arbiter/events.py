@@ -9,17 +9,24 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
+from busmaster.arbiter.tap import Attempt
+from busmaster.arbiter.transaction import Transaction
+from busmaster.errors import BusError
+
 if TYPE_CHECKING:
     from busmaster.arbiter.health import Health, NodeRecord
     from busmaster.arbiter.schedule import Poll
-    from busmaster.arbiter.transaction import Transaction
 
 
 @dataclass(slots=True)
-class Completed:
-    """A caller's transaction has ended: its `value` or its `error` is set."""
+class Overdue:
+    """A transaction's `finish_by` has passed while it was on the wire: its caller gets this error now.
+
+    The exchange runs out as if its caller had been cancelled (R6), and it is not told again.
+    """
 
     transaction: Transaction
+    error: BusError
 
 
 @dataclass(slots=True)
@@ -108,6 +115,17 @@ class Strayed:
     collision: bool = False
 
 
+# A caller's transaction is told itself when it has ended: its `value` or its `error` is set then.
 Event: TypeAlias = (
-    Completed | Sampled | Polled | NodeChanged | LatenessRaised | LatenessLowered | LineChanged | PortFailed | Strayed
+    Transaction
+    | Overdue
+    | Sampled
+    | Polled
+    | NodeChanged
+    | LatenessRaised
+    | LatenessLowered
+    | LineChanged
+    | PortFailed
+    | Strayed
+    | Attempt
 )

@@ -73,27 +73,29 @@ class NodeRecord:
         "label",
         "last_reply",
         "lateness_until",
-        "measured",
+        "line",
         "probe_at",
         "probe_delay",
         "probed_at",
         "profile",
         "refused",
         "replies",
-        "reply_time",
         "retries",
         "slowest",
+        "stops",
         "suspended_until",
         "timings",
         "unheard",
         "up_since",
-        "waiter",
+        "usual",
         "writes",
     )
 
-    def __init__(self, profile: Profile, address: int, timings: Timings, retries: int) -> None:
+    def __init__(self, profile: Profile, address: int, timings: Timings, retries: int, line: str = "") -> None:
         self.profile = profile
         self.address = address
+        self.line = line
+        """The name of its line, for errors."""
         self.label = profile.label(address)
         self.timings = timings
         self.retries = retries
@@ -104,10 +106,6 @@ class NodeRecord:
         """When the last of its transactions failed so."""
         self.replies = 0
         """Replies in a row since then."""
-        self.reply_time: float | None = None
-        """Seconds from a request to its reply, as poll groups measured them; None until they have."""
-        self.measured = 0
-        """How many replies that is the mean of."""
         self.last_reply = -inf
         self.up_since = -inf
         self.writes: deque[Transaction] = deque()
@@ -119,7 +117,8 @@ class NodeRecord:
         self.has_hook = False
         self.holds = 0
         """Returns whose on_return hook has not ended: its polls wait."""
-        self.waiter: object = None
+        self.stops = 0
+        """How often it was told to stop: what was decided before must not undo it."""
         self.answered: dict[Sequence[bytes], Command[Any]] = {}
         """A few reads that it has answered, by what their answers look like (R15)."""
         self.refused: set[Command[Any]] = set()
@@ -128,6 +127,8 @@ class NodeRecord:
         """Attempts in a row that brought nothing."""
         self.slowest = 0.0
         """Seconds to the first byte of about the slowest of its last replies."""
+        self.usual: float | None = None
+        """Seconds to the first byte of its usual reply, in runs of answers that are alike; None until there was one."""
         self.lateness_until = inf
         """When a lateness that was raised comes down again, if all replies are prompt until then."""
         self._before_raised: Timings | None = None
@@ -135,6 +136,8 @@ class NodeRecord:
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
         """It has answered rightly, after so many seconds."""
         self.unheard = 0
+        # Up at once, down slowly: it decides which answers are believed (R15), and one slow reply among many fast ones
+        # is what it must not forget.
         slowest = self.slowest
         self.slowest = took if took > slowest else slowest - SLOWEST_DECAY * (slowest - took)
         if len(self.answered) < MOST_ANSWERED and answers not in self.answered and not command.writes:
@@ -196,9 +199,11 @@ class ProbeBudget:
 
         One too short for a probe earns nothing: there a probe would delay what comes next.
         """
-        pause = self._pause + seconds
-        if pause > self.probe:
-            earned = BUDGET_IDLE_SHARE * (pause - max(self.probe, self._pause))
+        before, probe = self._pause, self.probe
+        pause = before + seconds
+        if pause > probe and self.tokens < BUDGET_CAPACITY:
+            # only what is longer than a probe, and only what was not counted when the same pause was looked at before
+            earned = BUDGET_IDLE_SHARE * (pause - max(probe, before))
             self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)
         self._pause = 0.0 if over else pause
 
@@ -263,9 +268,13 @@ def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> N
         if now >= node.probe_at:
             _probe_later(node, min(2 * node.probe_delay, LONGEST_PROBE_DELAY), now, jitter)
         return
+    # One failure is enough of a node that was never heard: nothing says that it is there, and a
+    # line that starts with thirty absent nodes would else wait for each of them three times.
     never_heard = node.health is UNKNOWN
     silent = now - node.last_reply >= DOWN_AFTER_SILENCE
     if never_heard or (node.failures >= DOWN_AFTER_FAILURES and silent):
+        # One that has just come back and is gone again goes on with its longer delays, or flapping would cost as much
+        # line time as dying for the first time, each time.
         again = min(2 * node.probe_delay, LONGEST_PROBE_DELAY)
         node.health = DOWN
         _probe_later(node, again if flaps(node, now) else FIRST_PROBE_DELAY, now, jitter)
@@ -276,4 +285,5 @@ def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> N
 def _probe_later(node: NodeRecord, delay: float, now: float, jitter: Callable[[], float]) -> None:
     node.probe_delay = delay
     node.probed_at = now
+    # Nodes that died together (one fuse, one cable) would else be probed together ever after.
     node.probe_at = now + delay * (1 + PROBE_JITTER * (2 * jitter() - 1))

@@ -30,7 +30,7 @@ class Histogram:
 
     def record(self, seconds: float) -> None:
         new = self._new
-        new.append(seconds if seconds > 0.0 else 0.0)
+        new.append(seconds)
         if len(new) >= BATCH:
             self._sort_in()
 
@@ -75,6 +75,8 @@ class Histogram:
     def _sort_in(self) -> None:
         new = self._new
         counts = self._counts
+        if min(new) < 0.0:
+            new[:] = [max(seconds, 0.0) for seconds in new]
         for bucket, count in Counter(array("H", array("d", new).tobytes())[_UPPER]).items():
             counts[bucket] = counts.get(bucket, 0) + count
         self._total += sum(new)

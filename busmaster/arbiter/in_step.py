@@ -38,9 +38,6 @@ DOUBT_PERIOD = 30.0
 """Seconds after something was said twice in which answers like those heard lately are doubted."""
 SAID_MEMORY = 0.5
 """Seconds for which what was said may be said again."""
-LONGEST_ALIKE = 31
-"""Answers alike behind a first one, without a pause in which one too many would show, after which an unlike one is
-asked: 32 in all."""
 MOST_DEBTS = 400
 """More unheard replies than fit into LAPSE at any window that is in use; the oldest goes."""
 
@@ -65,7 +62,7 @@ class Debt:
 class InStep:
     """What is owed on one line, and how far its answers can be trusted. Times are in seconds, on the caller's clock."""
 
-    __slots__ = ("_doubt_until", "_doubted", "_said", "alert", "alike", "before", "debts", "last")
+    __slots__ = ("_doubt_until", "_doubted", "_said", "alert", "before", "debts", "last")
 
     def __init__(self, strict: bool = False) -> None:
         """`strict`: as if something had been said twice a moment ago, always."""
@@ -76,8 +73,6 @@ class InStep:
         """What would answer the exchange that was begun last."""
         self.before: Sequence[bytes] = ()
         """What would answer the one before that."""
-        self.alike = 0
-        """Exchanges in a row, before the last, whose answers are like its."""
         self._doubted: list[tuple[bytes, float]] = []
         self._said: deque[tuple[Sequence[bytes], float]] = deque(maxlen=256)
         self._doubt_until = inf if strict else -inf

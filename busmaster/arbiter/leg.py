@@ -46,10 +46,10 @@ class Leg:
         "begun_at",
         "byte_time",
         "end",
-        "late_after",
         "latency",
-        "limit",
+        "longest",
         "out",
+        "paced",
         "taint_until",
         "timing",
     )
@@ -67,11 +67,12 @@ class Leg:
         self.byte_time = byte_time
         self._follows: ReplyTiming | None = None
         self._follows_until = -inf
-        self.limit = inf
+        self.longest = 0
+        """Bytes that its reply can have."""
+        self.paced = False
+        """Bytes leave at the baud rate, and no echo of them comes: what comes too early cannot be a reply (R4)."""
         self.taint_until = -inf
         """What comes before cannot be its reply."""
-        self.late_after = -inf
-        """A reply that begins then is late, and counts all the same."""
 
     def say(self, count: int, now: float) -> None:
         """Note that the host says so many bytes, behind what it has said already."""
@@ -80,25 +81,21 @@ class Leg:
     def begin(self, timing: ReplyTiming, said: int, longest: int, now: float) -> float:
         """The host says `said` bytes, and the reply has at most `longest`. Returns when it must have begun."""
         self.timing = timing
+        self.longest = longest
         self.begun = False
         self._follows = None
-        byte_time = self.byte_time
         out = self.out
-        self.out = self.end = end = (out if out > now else now) + said * byte_time
-        latency = self.latency
-        self.late_after = end + timing.nominal + latency
-        due = end + timing.window + latency
-        self.limit = due + longest * byte_time + timing.byte_gap
-        return due
-
-    def taint(self, said: int, now: float) -> None:
-        """On a paced line: bytes that come before most of the request is out cannot be its reply."""
-        self.taint_until = now + TAINT_SHARE * said * self.byte_time
+        self.out = self.end = end = (out if out > now else now) + said * self.byte_time
+        if self.paced and said:
+            self.taint_until = now + TAINT_SHARE * said * self.byte_time
+        return end + timing.window + self.latency
 
     def gap_over(self, now: float) -> float:
         """When the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
-        due = now + self.timing.byte_gap + self.latency + self.byte_time
-        return due if due < self.limit else self.limit
+        timing, latency, byte_time = self.timing, self.latency, self.byte_time
+        due = now + timing.byte_gap + latency + byte_time
+        limit = self.end + timing.window + latency + self.longest * byte_time + timing.byte_gap
+        return due if due < limit else limit
 
     def echoed(self, now: float) -> float:
         """The last byte of its echo came: its times start here. When its reply must begin."""
@@ -109,9 +106,7 @@ class Leg:
         """What was said is out so much later than was thought."""
         self.end += seconds
         self.out += seconds
-        self.late_after += seconds
         self.taint_until += seconds
-        self.limit += seconds
 
     def quiet(self) -> float:
         """The silence, in seconds, after which nothing more of a frame can come."""
@@ -123,6 +118,11 @@ class Leg:
         self._follows = later[0].timing if later and not later[0].sent else None
         if self._follows is not None:
             self._follows_until = self._past(self.end, self._follows)
+
+    def answered(self) -> None:
+        """What was answered has left, whatever the baud rate says: not every port keeps to it."""
+        if self.end > self.begun_at:
+            self.end = self.out = self.begun_at
 
     def strayed(self, now: float) -> None:
         """Something came: perhaps the reply that was given up, and its next leg begins here. Or it was noise, and the

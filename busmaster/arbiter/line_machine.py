@@ -36,7 +36,6 @@ from typing import Any, cast
 from busmaster.arbiter.choice import Choice
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import LineChange, LineChanged, Mark, Strayed
 from busmaster.arbiter.health import DOWN
@@ -45,7 +44,8 @@ from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
 from busmaster.arbiter.strays import LOOK_SLACK, QUIET, Strays
-from busmaster.arbiter.trust import TWO_ANSWERS, Trust
+from busmaster.arbiter.tapped import make_dispatcher
+from busmaster.arbiter.trust import COLLIDED, TOO_EARLY, TWO_ANSWERS, Trust, damaged
 from busmaster.contract.exchange import NO_REPLY, Done, Expect, FrameError
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import BusError, LineDown, LineNoisy, Refused
@@ -67,25 +67,26 @@ class LineMachine:
         capacity: int = 1000,
         jitter: Callable[[], float] = lambda: 0.5,
         strict: bool = False,
+        tapped: bool = False,
     ) -> None:
         self.state = OFFLINE
         self.noisy = False
         self._echo = Echo(echo)
         self._deadlines = Deadlines()
         self._counters = LineCounters(now)
-        self.dispatcher = Dispatcher(self._deadlines, self._counters, now, capacity, jitter)
+        self.dispatcher = make_dispatcher(tapped, self._deadlines, self._counters, now, capacity, jitter)
         self.dispatcher.fault = self._offline
-        self._events = self.dispatcher.events
+        self.events = self.dispatcher.events
         self._cause = "not open yet"
         self._closed = False
         # the exchange on the wire
         self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency, byte_time)
         self._wire = OnWire(self._leg, self._echo, self._deadlines, self.dispatcher.urgent_waits)
         self._in_step = InStep(strict)
-        self._choice = Choice(self.dispatcher, self._in_step)
+        self._choice = Choice(self.dispatcher, self._in_step, self._wire)
         self._trust = Trust(self._in_step)
         # the line
-        self._strays = Strays(self._events, self._counters)
+        self._strays = Strays(self.events, self._counters)
         self._up_at = -inf
         self._quarantine = -inf
         self._silent_at = -inf
@@ -99,9 +100,9 @@ class LineMachine:
         """
         if self.state is not OFFLINE or self._closed:
             return
-        self._wire.paced = paced
+        self._leg.paced = paced and not self._echo.declared
         self.dispatcher.fault = None
-        self._events.append(LineChanged(LineChange.UP))
+        self.events.append(LineChanged(LineChange.UP))
         lateness = max((node.lateness for node in self.dispatcher.nodes), default=UNKNOWN_LATENESS)
         self._up_at = now
         self._quarantine = now + lateness + self._leg.latency + self._leg.byte_time
@@ -113,7 +114,7 @@ class LineMachine:
             return
         self._counters.losses += 1
         self._cause = cause
-        self._events.append(LineChanged(LineChange.DOWN, cause))
+        self.events.append(LineChanged(LineChange.DOWN, cause))
         if not self._closed:
             self.dispatcher.fault = self._offline
         self._go_offline(now)
@@ -139,28 +140,26 @@ class LineMachine:
         self._echo.forget()
         if self.state is EXCHANGE:
             self._leg.begun = True
-            self._attempt_failed(FrameError(f"{mark.value} in the reply, says the port"), now)
+            self._attempt_failed(FrameError(damaged(mark)), now)
         else:
             self._stray(b"\0", now)
 
     def transmitted(self, now: float) -> None:
         """The port has taken only now what `poll_transmit` gave: whoever held the process up meanwhile."""
-        output = self._wire.output
-        said_at = output.said_at
+        wire = self._wire
+        said_at = wire.output.said_at
         late = now - said_at
         if late > 0:
-            output.said_at = now
+            wire.output.said_at = now
             leg = self._leg  # as leg.shift does: this is done for every request
-            leg.end, leg.out = leg.end + late, leg.out + late
-            leg.late_after += late
+            leg.end += late
+            leg.out += late
             leg.taint_until += late
-            leg.limit += late
             self._deadlines.line += late
             if self.state is SETTLING:
                 self._silent_at += late
-            transaction = self._wire.transaction
-            if late > LOOK_SLACK and transaction is not None and transaction.started == said_at:
-                transaction.started = now
+            if late > LOOK_SLACK and wire.transaction is not None and wire.transaction.started == said_at:
+                wire.transaction.started = now
 
     def line_due(self, now: float) -> bool:
         """A deadline of the line falls due: `unsent` is to be told first, where it is known."""
@@ -187,7 +186,7 @@ class LineMachine:
         deadlines = self._deadlines
         if now >= deadlines.schedule:
             self.dispatcher.release_polls(now)
-        if now >= deadlines.expiry:
+        if now >= deadlines.expiry and not unread:
             self.dispatcher.expire(now)
         if now >= deadlines.health:
             self._enter(self.state, now)
@@ -212,7 +211,7 @@ class LineMachine:
         if now < self._quarantine:
             self._settle(now)
             return True
-        chosen = self._choice.next(now, now - self._strays.last_byte - self._leg.latency)
+        chosen = self._choice.next(now, self._strays.last_byte)
         if chosen is None:
             return False
         if type(chosen) is not tuple:
@@ -237,7 +236,7 @@ class LineMachine:
         if now < leg.taint_until or wire.output.held:
             self._counters.tainted += 1
             self._strays.last_byte = now
-            self._attempt_failed(FrameError("bytes came before the request was out", heard=data), now)
+            self._attempt_failed(FrameError(TOO_EARLY, heard=data), now)
             return b""
         if not exchange.answered:
             self._strays.note(data, now, leg.quiet())
@@ -254,7 +253,7 @@ class LineMachine:
         leg.begun_at = now
         if transaction.first_byte == -inf:
             transaction.first_byte = now
-        if now > leg.late_after:
+        if now > leg.end + leg.timing.nominal + leg.latency:
             transaction.late = True
         return data
 
@@ -281,13 +280,14 @@ class LineMachine:
 
     def _complete(self, step: Done[Any], now: float) -> None:
         """A value: the line is free when the closing ACK has left and the node has let go of the line."""
-        transaction, exchange = self._wire.transaction, self._wire.exchange
+        wire, leg = self._wire, self._leg
+        transaction, exchange = wire.transaction, wire.exchange
         assert transaction is not None
         assert exchange is not None
-        answered, leg = exchange.answered, self._leg
+        answered = exchange.answered
         if answered:
             if self._in_step.alert or step.rest:
-                verdict = self._trust.weigh(self._wire, step, now)
+                verdict = self._trust.weigh(wire, step, now)
                 if isinstance(verdict, str):
                     self._disbelieve(verdict, step, now)
                     return
@@ -298,16 +298,17 @@ class LineMachine:
                 leg.end = leg.out = leg.begun_at
             transaction.node.note_reply(exchange.answers, transaction.command, leg.begun_at - leg.end)
         if step.send:
-            self._wire.say(step.send, now)
-        self._end_exchange()
+            wire.say(step.send, now)
+        wire.transaction = wire.exchange = self._trust.held = None
+        self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, step.value, now)
         if step.rest:
-            self._strays.note(step.rest, now, self._leg.quiet())
-        if step.rest or self._wire.strayed or (self._echo.owed and not answered):
+            self._strays.note(step.rest, now, leg.quiet())
+        if step.rest or wire.strayed or (self._echo.owed and not answered):
             self._settle(now)
             return
-        self._strays.answered()
-        self._release(self._leg.timing.turnaround if answered else 0.0, now)
+        self._strays.unanswered_one = None
+        self._release(leg.timing.turnaround if answered else 0.0, now)
 
     def _disbelieve(self, what: str, step: Done[Any], now: float) -> None:
         self._counters.doubted += 1
@@ -366,9 +367,7 @@ class LineMachine:
         self._end_exchange()
         self.dispatcher.refused(transaction, refusal, certain, now)
         if transaction.writes and certain:
-            leg = self._leg
-            if leg.end > leg.begun_at:  # as where a value comes
-                leg.end = leg.out = leg.begun_at
+            self._leg.answered()
             self._release(self._leg.timing.turnaround, now)
         else:
             self._settle(now, begun=confirmed and certain)
@@ -378,8 +377,7 @@ class LineMachine:
         if failed and wire.exchange is not None:
             self._leg.give_up(wire.exchange.later)
             self._leg.strayed(self._strays.last_byte)  # what came in place of the reply may have been it, damaged
-        wire.transaction = wire.exchange = None
-        self._trust.held = None
+        wire.transaction = wire.exchange = self._trust.held = None
         self._counters.exchanges += 1
 
     # the line between exchanges
@@ -389,8 +387,7 @@ class LineMachine:
         if self._closed:
             self._go_offline(now)
         elif hold or not self._advance(now):
-            out = self._leg.out
-            free = (out if out > now else now) + hold
+            free = max(self._leg.out, now) + hold
             held = free > now
             self._enter(HOLDOFF if held else READY, now)
             self._deadlines.line = free if held else inf
@@ -422,7 +419,7 @@ class LineMachine:
             if self.noisy:
                 self.noisy = False
                 self.dispatcher.fault = None
-                self._events.append(LineChanged(LineChange.QUIET))
+                self.events.append(LineChanged(LineChange.QUIET))
         self._enter(READY, now)
         self._deadlines.line = self._strays.look_before(inf, now)
         self._advance(now)
@@ -440,7 +437,7 @@ class LineMachine:
         if strays.babbling(now) and not self.noisy:
             self.noisy = True
             self._counters.noisy += 1
-            self._events.append(LineChanged(LineChange.NOISY))
+            self.events.append(LineChanged(LineChange.NOISY))
             self.dispatcher.fault = lambda: LineNoisy("the line has not been silent for a second")
             self.dispatcher.fail_all(now)
 
@@ -465,10 +462,9 @@ class LineMachine:
         self._strays.last_byte = now  # where the echo is lost, this may be another's byte that looks like it
         if rest is None:
             self._counters.collisions += 1
-            self._events.append(Strayed(data, collision=True))
+            self.events.append(Strayed(data, collision=True))
             if self.state is EXCHANGE:
-                what = "the echo differs from what was sent: a collision, or an adapter without echo"
-                self._attempt_failed(FrameError(what), now)
+                self._attempt_failed(FrameError(COLLIDED), now)
             else:
                 self._settle(now)
             return b""
@@ -497,7 +493,7 @@ class LineMachine:
     def _enter(self, state: LineState, now: float) -> None:
         spent = self._counters.spend(self.state, now)
         if self.state is READY:
-            self.dispatcher.probes.budget.idle(spent, over=state is not READY)
+            self.dispatcher.probes.budget.idle(spent, state is not READY)
         self.state = state
 
     def _offline(self) -> BusError:

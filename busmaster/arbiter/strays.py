@@ -98,6 +98,8 @@ class Strays:
         stalled = first_byte > self._look_at + LOOK_SLACK  # it may have lain unread for as long
         age = (self._looked if stalled else first_byte) - asked
         raised = min(STRAGGLER_MARGIN * age, LONGEST_LATENESS)
+        # Before its lateness is exceeded, not after: by then it can be taken for somebody's answer. What comes later
+        # than the memory is nobody's straggler any more, but noise, or owed (R15).
         if STRAGGLER_SHARE * lateness < age <= STRAGGLER_MEMORY and raised > lateness:
             node.raise_lateness(raised, first_byte)
             self._events.append(LatenessRaised(node, age, raised))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from math import inf
+from math import inf, nextafter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from busmaster.contract.exchange import Command
@@ -65,6 +65,7 @@ class Transaction:
         "ended_at",
         "error",
         "exchanges_ahead",
+        "finish_by",
         "first_byte",
         "heard",
         "idempotent",
@@ -102,6 +103,7 @@ class Transaction:
         retries: int | None = None,
         idempotent: bool | None = None,
         probe: bool = False,
+        finish_by: float = inf,
         *,
         waiter: Any = None,
         poll: Poll | None = None,
@@ -112,10 +114,14 @@ class Transaction:
         self.writes = command.writes
         self.idempotent = command.idempotent if idempotent is None else idempotent
         if probe or (self.writes and not self.idempotent):
-            self.retries = 0
+            self.retries = 0  # whatever number was given: that alone does not make a write repeatable
         else:
             self.retries = node.retries if retries is None else retries
         self.start_by = start_by
+        self.finish_by = finish_by
+        """Its caller waits no longer, and nothing is sent from then on."""
+        if finish_by < inf:
+            self.start_by = min(start_by, nextafter(finish_by, -inf))
         self.waiter = waiter
         self.poll = poll
         self.probe = probe

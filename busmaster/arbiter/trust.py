@@ -4,11 +4,23 @@ from __future__ import annotations
 
 from typing import Any
 
+from busmaster.arbiter.events import Mark
 from busmaster.arbiter.in_step import ANY_BYTE, InStep
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.contract.exchange import Done
 
 TWO_ANSWERS = "two answers came where one was due"
+TOO_EARLY = "bytes came before the request was out"
+COLLIDED = "the echo differs from what was sent: a collision, or an adapter without echo"
+
+
+def damaged(mark: Mark) -> str:
+    """Say that the port found a byte damaged."""
+    return f"{mark.value} in the reply, says the port"
+
+
+SPOILING = frozenset((TOO_EARLY, COLLIDED, *map(damaged, Mark)))
+"""Reasons for which what comes is not read at all."""
 
 
 class Trust:

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import random
-import warnings
 from collections.abc import Coroutine, Generator, Iterable, Sequence
 from dataclasses import replace
-from math import inf
-from threading import current_thread, get_ident
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import anyio
 import anyio._backends._asyncio  # now, not when a line runs: it takes 30 ms
@@ -19,23 +16,27 @@ from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import Event, NodeChanged, PortFailed, Strayed
 from busmaster.arbiter.health import Health
-from busmaster.arbiter.schedule import SLICE, Poll
+from busmaster.arbiter.schedule import SLICE
 from busmaster.arbiter.state import LineState
-from busmaster.arbiter.transaction import Phase, Priority, Transaction
-from busmaster.bus.logbook import Logbook
-from busmaster.bus.node import Node, checked_priority, checked_retries
+from busmaster.arbiter.tap import Tap
+from busmaster.arbiter.transaction import Phase, Priority
+from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup, Sample, Stream
+from busmaster.bus.requester import checked_priority, checked_retries
+from busmaster.bus.shared_line import SharedLine, running_loop
+from busmaster.bus.suitability import check_company, check_settings
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings
-from busmaster.errors import BusClosed, InvalidCommand, LineDown
+from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.planning import Plan, PlannedGroup, Read, bounds, plan_steps
 from busmaster.planning.merging import Merge, at_once
 from busmaster.transport.endpoints import Endpoint, is_paced
-from busmaster.transport.pump import Pump, Tap
+from busmaster.transport.pump import Pump
 from busmaster.transport.reconnect import Connection
-from busmaster.transport.serial_port import SerialPort
+
+T = TypeVar("T")
 
 BYTE_TIME_UNTIL_KNOWN = 10 / 9600
 EVENT_BUFFER = 256
@@ -68,7 +69,6 @@ class Bus:
             )
         self.endpoint = endpoint
         self._random = random.Random(seed)
-        self._logbook = Logbook(endpoint.name)
         settings = endpoint.settings
         self._byte_time_known = settings is not None
         self._arbiter = Arbiter(
@@ -78,28 +78,27 @@ class Bus:
             capacity=capacity,
             jitter=self._random.random,
             strict=strict,
+            tapped=tap is not None,
         )
-        self.pump = Pump(
+        self._arbiter.name = endpoint.name
+        self._line = line = SharedLine(endpoint.name, self._arbiter)
+        self.pump = line.pump = Pump(
             self._arbiter,
             on_sample=lambda poll, transaction: poll.waiter.sampled(transaction),
             on_cycle=lambda poll: poll.waiter.cycle_finished(),
             on_event=self._on_event,
-            on_written=lambda transaction: self.touched(transaction, transaction.ended_at),
+            on_written=line.touched,
             paced=lambda transport: is_paced(endpoint, transport),
             tap=tap,
             name=endpoint.name,
         )
         self._nodes: dict[tuple[str, int], Node] = {}
+        self._profiles: dict[str, Profile] = {}
+        """Of the protocols on this line, by name."""
         self._groups: dict[str, PollGroup] = {}
-        self._touched: dict[object, float] = {}
-        self.last_touched = -inf
-        """When the last write to anything ended."""
         self._streams: list[Stream[Event]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._connection: Connection | None = None
-        self._thread = 0
-        self.running = False
-        self._closed = False
 
     # opening and closing
 
@@ -107,18 +106,23 @@ class Bus:
         self._check_not_closed()
         if self.running:
             raise InvalidCommand(f"the bus on {self.endpoint.name} is open already: enter it once, and share it")
-        self._loop = asyncio.get_running_loop()
-        self._thread = get_ident()
-        self.pump.bind(self._loop)
+        loop = running_loop()
+        if loop is None:  # awaited, and not by asyncio
+            raise InvalidCommand(
+                f"the bus on {self.endpoint.name} needs asyncio's event loop, which does not run here: "
+                "run the program by asyncio.run, or by anyio.run with its asyncio backend, not by trio"
+            )
+        self._line.bind(loop)
         self._arbiter.reset_statistics(self.now())
         connection = Connection(self.endpoint, self.pump, on_failed=self._on_failed, jitter=self._random)
         self._connection = connection
-        self.running = True
         try:
             await connection.open()
-        except BaseException:
-            self.running = False
+        except BaseException as error:
+            self._line.unbind()
             await connection.close()
+            if isinstance(error, BusError):
+                error.line = self.endpoint.name
             raise
         self._start(connection.run())
         return self
@@ -128,7 +132,7 @@ class Bus:
     ) -> None:
         """Waiting callers get BusClosed at once; the exchange on the wire may end, within its own window."""
         self.check_loop()
-        self._closed = True
+        self._line.closed = True
         for group in self.groups:
             group.close()
         self._arbiter.close(self.now())
@@ -142,7 +146,7 @@ class Bus:
     async def _let_go(self) -> None:
         """Nothing is on the wire, or nobody waits for its end."""
         assert self._connection is not None
-        self.running = False
+        self._line.unbind()
         try:
             await self._connection.close()
         finally:
@@ -168,25 +172,34 @@ class Bus:
     def node(
         self, profile: Profile, address: int, *, timings: Timings | None = None, retries: int | None = None
     ) -> Node:
-        """The node at this address: a protocol and an address are one node, however often it is asked for.
+        """Return the node at this address: a protocol and an address are one node, however often it is asked for.
 
-        Raises InvalidCommand for an address that the protocol does not have, and for another profile, timings or
-        retries than it was first asked with; what is None was left open.
+        Raises InvalidCommand for an address that the protocol does not have; for a protocol that cannot share the line
+        with those that are on it; and for another profile, timings or retries than the node was first asked with. What
+        is None was left open.
         """
         self.check_loop()
         profile.check_address(address)
         if timings is not None and not isinstance(timings, Timings):
             raise InvalidCommand(f"{profile.label(address)}: timings are a Timings, not {timings!r}")
         if retries is not None:
-            retries = checked_retries(retries, profile.label(address))
+            try:
+                retries = checked_retries(retries)
+            except InvalidCommand as bad:
+                raise InvalidCommand(f"{profile.label(address)}: {bad}") from None
         known = self._nodes.get((profile.name, address))
         if known is not None:
             known.check_shared(profile, timings, retries)
             return known
-        self._check_framing(profile)
-        node = Node(self, self._arbiter.add_node(profile, address, self.now(), timings, retries))
-        node.record.waiter = node
+        if profile.name not in self._profiles:
+            check_company(profile, self._profiles.values())
+            check_settings(profile, self.endpoint)
+        if not self._byte_time_known:
+            self._arbiter.byte_time = profile.line.byte_time
+            self._byte_time_known = True
+        node = Node(self._line, self._arbiter.add_node(profile, address, self.now(), timings, retries))
         self._nodes[profile.name, address] = node
+        self._profiles.setdefault(profile.name, profile)
         return node
 
     @property
@@ -216,84 +229,44 @@ class Bus:
         Raises InvalidCommand for a name that is in use, and for times and priorities that are none.
         """
         self.check_loop()
-        if self._closed or not self.running:
-            raise self.not_open()
+        if self._line.closed or not self.running:
+            raise self._line.not_open()
         period = seconds(period, f"poll group {name!r}: a period")
         if phase is not None:
             phase = seconds(phase, f"poll group {name!r}: a phase")
         priority = checked_priority(priority)
         if name in self._groups:
             raise InvalidCommand(f"there is a poll group {name!r} already")
-        group = PollGroup(self, name, period, points, phase=phase, priority=priority, merge=merge)
+        group = PollGroup(
+            self._line, name, period, points, phase=phase, priority=priority, merge=merge, on_close=self._forget
+        )
         self._arbiter.add_poll(group.poll, self.now())
         self._groups[name] = group
         self.pump.turn()
         return group
 
-    def remove_group(self, group: PollGroup) -> None:
-        """What `PollGroup.close` does: its polls end, and what they have on the wire goes unheard."""
-        self.check_loop()
-        if self._groups.get(group.name) is group:
-            del self._groups[group.name]
-            self._arbiter.remove_poll(group.poll, self.now())
-            self.pump.turn()
-
-    def prepare(self, poll: Poll) -> None:
-        """Do what a poll group's new preparation says, while the line goes on."""
-        self._arbiter.dispatcher.prepare_poll(poll, self.now())
-        self.pump.turn()
-
-    def failed_choice(self, group: str, error: Exception) -> None:
-        """Log that a group's exchanges could not be chosen."""
-        self._logbook.failed_choice(group, error)
-
-    def demand(self, poll: Poll) -> None:
-        """What `PollGroup.demand` does."""
-        self.check_loop()
-        self._arbiter.demand(poll, self.now())
-        self.pump.turn()
-
-    def suspend(self, node: Node, seconds: float) -> None:
-        """What `Node.suspend` does."""
-        self.check_loop()
-        self._arbiter.dispatcher.suspend(node.record, self.now() + seconds)
-        self.pump.turn()
-
-    def latest(self, point: Point[Any]) -> Sample | None:
-        """The youngest good sample of this point in any group, unless a write has made it stale."""
-        youngest = None
-        for group in self._groups.values():
-            sample = None if group.latest is None else group.latest.samples.get(point)
-            if sample is None or sample.error is not None or sample.started is None:
-                continue
-            if (youngest is None or sample.finished > youngest.finished) and not self.is_stale(point, sample.started):
-                youngest = sample
-        return youngest
-
-    def touched(self, write: Transaction, when: float) -> None:
-        """A write is over: what was asked before is not newer than what it changed."""
-        node = write.node
-        if isinstance(node.waiter, Node):
-            node.waiter.touched = when
-        if node.address == node.profile.broadcast:
-            for other in self._nodes.values():
-                other.touched = self._touched[other] = when
-        self._touched[write.touches] = self.last_touched = when
-
-    def is_stale(self, point: Point[Any], started: float) -> bool:
-        """Whether a write to the point's quantity, or to all of its node, has ended since its read was started."""
-        touched = self._touched
-        return max(touched.get(point.quantity, -inf), touched.get(point.node, -inf)) > started
+    def latest(self, point: Point[T]) -> Sample[T] | None:
+        """Return the youngest good sample of this point in any group, unless a write has made it stale."""
+        return self._line.latest(point)
 
     # looking
 
     def now(self) -> float:
-        """The bus's clock, in seconds: all its times are of this clock."""
+        """Return the time of the bus's clock, in seconds: all its times are of this clock."""
         return self.pump.clock()
+
+    def wall_time(self) -> float:
+        """The same moment in seconds since 1970, by the machine's clock."""
+        return self.now() + self._line.wall_offset()
+
+    @property
+    def running(self) -> bool:
+        """Whether it is open, though its line may be down."""
+        return self._line.running
 
     @property
     def byte_time(self) -> float:
-        """tau: seconds per byte of this line."""
+        """Return tau, the seconds per byte of this line."""
         return self._arbiter.byte_time
 
     @property
@@ -301,7 +274,7 @@ class Bus:
         return self._arbiter.state
 
     def statistics(self) -> LineStatistics:
-        """An immutable snapshot of the line's counts since it was opened or reset."""
+        """Return an immutable snapshot of the line's counts since it was opened or reset."""
         self.check_loop()
         return replace(self._arbiter.statistics(self.now()), driver=self.pump.driver_errors())
 
@@ -314,7 +287,7 @@ class Bus:
             group.reset_statistics()
 
     def plan(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-        """What becomes of the groups that run, and of `more`, by the reply times measured so far.
+        """Reckon what becomes of the groups that run, and of `more`, by the reply times measured so far.
 
         It is reckoned at once: with hundreds of points that takes some ten milliseconds, in which no line of this
         loop goes on. While a line runs, await `plan_in_steps`.
@@ -323,7 +296,7 @@ class Bus:
         return at_once(self._planning(more, could_merge))
 
     async def plan_in_steps(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-        """Like `plan`, in steps of less than a millisecond between which exchanges go on."""
+        """Do what `plan` does, in steps of less than a millisecond between which exchanges go on."""
         self.check_loop()
         steps = self._planning(more, could_merge)
         done = 0
@@ -338,7 +311,7 @@ class Bus:
                 await asyncio.sleep(0)
 
     def worst_case_wait(self, priority: Priority = Priority.COMMAND) -> float:
-        """How long, in seconds, a request of this class, made now, waits at the most until it is sent (R9).
+        """Return how long, in seconds, a request of this class, made now, waits at most until it is sent (R9).
 
         It reckons with what is polled, what waits already, every node's probe, and each kind of command that was
         asked or polled so far; with nodes that are dead, late or trickling; not with a line that is never silent.
@@ -362,58 +335,29 @@ class Bus:
         return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 
     def events(self) -> Stream[Event]:
-        """What happens to the line and its nodes, from now on (NodeChanged, LineChanged, PortFailed, ...)."""
+        """Return a stream of what happens to line and nodes from now on (NodeChanged, LineChanged, PortFailed, ...)."""
         self.check_loop()
         self._check_not_closed()
         return Stream(self._streams, EVENT_BUFFER)
 
-    # misuse
-
     def check_loop(self) -> None:
         """Raise InvalidCommand where an open bus is used from another thread, or from another event loop."""
-        if self.running and (get_ident() != self._thread or not self._loop.is_running()):
-            self._check_elsewhere()
-
-    def _check_elsewhere(self) -> None:
-        """Its loop does not run here: right only in its own thread, between two runs of the loop."""
-        if get_ident() != self._thread or is_any_loop_running():
-            raise InvalidCommand(
-                f"the bus on {self.endpoint.name} was used from thread {current_thread().name!r} outside the "
-                "event loop that opened it: hand the call to that loop, with portal.call (anyio.from_thread) or "
-                "asyncio.run_coroutine_threadsafe"
-            )
-
-    def not_open(self, *, node: str | None = None, command: str | None = None) -> BusClosed:
-        """Return the error for what needs an open bus, before it is entered or after it was left."""
-        if not self._closed:
-            return BusClosed("the bus is not open", node=node, command=command)
-        hint = "make a new Bus: one is opened and closed once"
-        return BusClosed("the bus was closed", node=node, command=command, hint=hint)
+        self._line.check_loop()
 
     # inside
 
     def _check_not_closed(self) -> None:
-        if self._closed:
-            raise self.not_open()
+        if self._line.closed:
+            raise self._line.not_open()
 
-    def _check_framing(self, profile: Profile) -> None:
-        settings = self.endpoint.settings
-        if settings is None:
-            if not self._byte_time_known:
-                self._arbiter.byte_time = profile.line.byte_time
-                self._byte_time_known = True
-        elif not isinstance(self.endpoint, SerialPort) or any(name == profile.name for name, _ in self._nodes):
-            return
-        elif settings.framing != profile.line.framing:
-            warnings.warn(
-                f"{profile.name} is meant for {profile.line.framing}, but {self.endpoint.name} is {settings.framing}",
-                stacklevel=4,
-            )
+    def _forget(self, group: PollGroup) -> None:
+        if self._groups.get(group.name) is group:
+            del self._groups[group.name]
 
     def _on_event(self, event: Event) -> None:
-        if isinstance(event, NodeChanged) and event.returning and isinstance(event.node.waiter, Node):
-            self._start(self._run_hook(event.node.waiter))
-        self._logbook.note(event, self.now())
+        if isinstance(event, NodeChanged) and event.returning:
+            self._start(self._run_hook(self._nodes[event.node.profile.name, event.node.address]))
+        self._line.logbook.note(event, self.now())
         if not isinstance(event, Strayed):
             for stream in self._streams:
                 stream.put(event)
@@ -468,15 +412,6 @@ class Bus:
                 if node.on_return is not None:
                     await node.on_return(node)
         except Exception as error:
-            self._logbook.failed_hook(node.label, error)
+            self._line.logbook.failed_hook(node.label, error)
         finally:
             self._arbiter.dispatcher.release_node(node.record)
-
-
-def is_any_loop_running() -> bool:
-    """Return whether an event loop runs in this thread."""
-    try:
-        asyncio.get_running_loop()
-    except RuntimeError:
-        return False
-    return True

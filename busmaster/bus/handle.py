@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import difflib
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias, Unpack
 
 from busmaster.bus.points import Point
+from busmaster.bus.requester import NodeSource, ReadOptions, WriteOptions
+from busmaster.contract.arguments import guess, is_decimal
+from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
-
-if TYPE_CHECKING:
-    from busmaster.bus.bus import Bus
-    from busmaster.contract.exchange import Command
-    from busmaster.contract.timing import Timings
 
 Send: TypeAlias = Callable[[], Awaitable[None]]
 """Sends what was prepared."""
 
 
-class Handle:
-    """An awaitable handle of one node: thin and typed, over `Node.request`.
+class Handle(ABC):
+    """An awaitable handle of one node: thin and typed, over `Requester.request`.
 
     Raises InvalidCommand for an address that the protocol does not have. Handles of one protocol and address share the
     node, whatever their kind (a controller and a drive that speak alike): what one leaves out, of timings, retries and
@@ -30,17 +29,34 @@ class Handle:
 
     profile: ClassVar[Profile]
 
-    def __init__(self, bus: Bus, address: int, *, timings: Timings | None = None, retries: int | None = None) -> None:
-        self.node = bus.node(self.profile, address, timings=timings, retries=retries)
+    def __init__(
+        self,
+        bus: NodeSource,
+        address: int,
+        *,
+        timings: Timings | None = None,
+        retries: int | None = None,
+        profile: Profile | None = None,
+    ) -> None:
+        self.bus = bus
+        self.node = bus.node(profile or self.profile, address, timings=timings, retries=retries)
 
+    @abstractmethod
     def point(self, item: str) -> Point[Any]:
-        """The point that ITEM names on the command line. Raises InvalidCommand for one that does not exist."""
-        raise NotImplementedError
+        """Return the point that ITEM names on the command line. Raises InvalidCommand for one that does not exist."""
+
+    @abstractmethod
+    async def read(self, item: Any, /, **options: Unpack[ReadOptions]) -> Any:
+        """What an item holds now. `RequestOptions` says what the options are."""
+
+    @abstractmethod
+    async def write(self, item: Any, value: Any, /, **options: Unpack[WriteOptions]) -> None:
+        """Write a value to an item. `RequestOptions` says what the options are."""
 
     @classmethod
+    @abstractmethod
     def items(cls) -> tuple[str, ...]:
-        """The names (not the numbers) that `point` knows."""
-        return ()
+        """Return the names (not the numbers) that `point` knows."""
 
     @classmethod
     def names_of_items(cls) -> Mapping[str, str]:
@@ -69,7 +85,7 @@ class Handle:
         async def send() -> None:
             await point.write(value)
             if verify and (found := await point.read()) != value:
-                raise VerifyFailed(f"{item} reads {found!r} after {value!r} was written", node=self.node.label)
+                raise VerifyFailed(f"{item} reads {found!r} after {value!r} was written", node=self.node)
 
         return send
 
@@ -93,20 +109,13 @@ def encoder(point: Point[Any]) -> Callable[[Any], Command[None]]:
     return point.encode
 
 
-def is_decimal(text: str) -> bool:
-    """Return whether a text is a whole number without a sign, in digits as the command line takes them."""
-    return text.isascii() and text.isdigit()
-
-
 def item_text(item: str) -> str:
-    """The item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
+    """Return the item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
     if not isinstance(item, str):
         raise InvalidCommand(f"an item is text, such as {str(item)!r}, not {item!r}")
     return item
 
 
 def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
-    """The error for an item that does not exist: what would do, and the nearest name."""
-    near = difflib.get_close_matches(str(item), list(known), n=1)
-    guess = f"; did you mean {near[0]!r}?" if near else ""
-    return InvalidCommand(f"no such item {item!r}: use {form}{guess}")
+    """Return the error for an item that does not exist: it says what would do, and the nearest name."""
+    return InvalidCommand(f"no such item {item!r}: use {form}{guess(str(item), known)}")

@@ -6,44 +6,68 @@ import asyncio
 from collections.abc import Awaitable, Callable, Hashable
 from dataclasses import replace
 from math import inf
-from typing import TYPE_CHECKING, Any, TypeVar
+from threading import get_ident
+from typing import Any, Protocol, TypeVar, Unpack
 
 from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health, NodeRecord
-from busmaster.arbiter.transaction import COMMAND, Priority, Timeline, Transaction
-from busmaster.contract.arguments import seconds, whole_number
+from busmaster.arbiter.transaction import Priority, Timeline, Transaction
+from busmaster.bus.requester import ORDINARY, CommandOptions, Requester, RequestOptions
+from busmaster.bus.samples import Sample
+from busmaster.bus.shared_line import SharedLine
+from busmaster.contract.arguments import seconds
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
-from busmaster.errors import BusError, InvalidCommand, Refused
+from busmaster.errors import BusError, InvalidCommand, Refused, Superseded
 from busmaster.planning import PlannedNode
 from busmaster.planning.merging import Merge
 
-if TYPE_CHECKING:
-    from busmaster.bus.bus import Bus
-    from busmaster.bus.points import Point
-
 T = TypeVar("T")
-MOST_RETRIES = 100
+PROBE = RequestOptions(retries=0)
+REPLIES_REMEMBERED = 256
 
 __all__ = ["Health", "Node", "NodeStatistics", "Priority", "Timeline"]
+
+
+class HasNode(Protocol):
+    """A handle, or a point."""
+
+    @property
+    def node(self) -> Requester: ...
 
 
 class Node:
     """One node, made by `Bus.node` or by a handle. Everything that is asked of it goes through `request`."""
 
-    def __init__(self, bus: Bus, record: NodeRecord) -> None:
-        self.bus = bus
+    def __init__(self, line: SharedLine, record: NodeRecord) -> None:
+        self.shared = line
         self.record = record
         self.timings = record.timings
         """As they were asked for: its record's lateness may have been raised since."""
         self.kinds: dict[Hashable, Command[Any]] = {}
         """Of each kind of command that was asked of it, the first: the worst case reckons with them."""
-        self.touched = -inf
-        """When the last write to it, or to one of its points, ended."""
+        self.reply_time: float | None = None
+        """Seconds from a request to its reply, as poll groups measured them; before, as somebody said, or None."""
+        self._measured = 0
         self.returning = asyncio.Lock()
         """Held while its hook runs."""
         self._on_return: Callable[[Node], Awaitable[None]] | None = None
+
+    @classmethod
+    def of(cls, owner: HasNode) -> Node:
+        """Return the node behind a handle or a point: what more can be asked of it than by those.
+
+        Raises InvalidCommand where its line is not this process's.
+        """
+        if not isinstance(owner.node, cls):
+            raise InvalidCommand(f"{owner.node.label} is no node of a bus in this process")
+        return owner.node
+
+    @property
+    def line(self) -> str:
+        """Return the name of its line's port."""
+        return self.record.line
 
     @property
     def profile(self) -> Profile:
@@ -55,13 +79,40 @@ class Node:
 
     @property
     def label(self) -> str:
-        """ "node 5", as messages call it."""
+        """Return how messages call it: "node 5"."""
         return self.record.label
 
+    def rename(self, label: str) -> None:
+        """Have messages call it so from now on."""
+        self.shared.arbiter.name_node(self.record, label)
+
+    @property
+    def stops(self) -> int:
+        """Return how often it was told to stop, by whatever handle."""
+        return self.record.stops
+
+    def note_stop(self) -> None:
+        """Tell the line that this node is being told to stop: what was decided before must not undo it."""
+        self.shared.arbiter.note_stop(self.record)
+
+    def now(self) -> float:
+        """Return the time of the bus's clock, in seconds."""
+        return self.shared.now()
+
+    def latest(self, point: Any, /) -> Sample[Any] | None:
+        """Return the youngest good sample of a point in any poll group, unless a write has made it stale."""
+        return self.shared.latest(point)
+
     def planned(self) -> PlannedNode:
-        """The node as the planner sees it, with its reply time as measured so far."""
+        """Return the node as the planner sees it, with its reply time as measured so far."""
         record = self.record
-        return PlannedNode(record.profile, record.address, record.timings, record.reply_time)
+        return PlannedNode(record.profile, record.address, record.timings, self.reply_time)
+
+    def note_wait(self, wait: float) -> None:
+        """Note that it took so many seconds to reply: the mean of the last replies is what planning goes by."""
+        self._measured = min(self._measured + 1, REPLIES_REMEMBERED)
+        known = wait if self.reply_time is None else self.reply_time
+        self.reply_time = known + (wait - known) / self._measured
 
     @property
     def health(self) -> Health:
@@ -72,16 +123,17 @@ class Node:
 
     @property
     def on_return(self) -> Callable[[Node], Awaitable[None]] | None:
-        """Awaited when the node comes back from DOWN, before its polls resume: re-send its parameters here.
+        """Return the hook that is awaited when the node is back from DOWN, before its polls resume.
 
-        By default nothing is done: a master that enables a drive or repeats a reference by itself is a danger.
+        Parameters are re-sent in it. By default nothing is done: a master that enables a drive or repeats a reference
+        by itself is a danger.
         """
         return self._on_return
 
     @on_return.setter
     def on_return(self, hook: Callable[[Node], Awaitable[None]] | None) -> None:
         self._on_return = hook
-        self.record.has_hook = hook is not None
+        self.shared.arbiter.expect_hook(self.record, hook is not None)
 
     def check_shared(self, profile: Profile, timings: Timings | None, retries: int | None) -> None:
         """Raise InvalidCommand where somebody asks for this node with anything else than it was first asked with.
@@ -89,6 +141,8 @@ class Node:
         What is None was left open: a profile's `merge` too.
         """
         own = self.profile
+        if profile is own and timings is None and retries is None:
+            return
         wanted = {
             "other timings": timings not in (None, self.timings),
             "other retries": retries not in (None, self.record.retries),
@@ -101,30 +155,28 @@ class Node:
                     "give all handles of an address the same options, or leave them out in all but the first"
                 )
 
-    def merge_reads(self, merge: Merge) -> None:
+    def merge_reads(self, merge: Merge, /) -> None:
         """Have poll groups propose `merge` for this node's reads from now on, in place of what its profile had."""
-        self.record.profile = replace(self.record.profile, merge=merge)
+        self.shared.arbiter.change_profile(self.record, replace(self.record.profile, merge=merge))
 
     async def request(
         self,
         command: Command[T],
         *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-        idempotent: bool | None = None,
-        touches: Point[Any] | None = None,
+        touches: Command[Any] | None = None,
+        stops_seen: int | None = None,
+        **options: Unpack[CommandOptions],
     ) -> T:
-        """Run one command and return its value.
+        """Run one command and return its value. `RequestOptions` says what the options are.
 
-        `priority`, a Priority or its number, defaults to COMMAND. `start_within` (seconds) fails the request with
-        NotStarted if it could not be sent by then. `retries` (0 to 100) overrides the node's; writes are not retried
-        unless the command or `idempotent` says that they may be repeated (R7). `touches` names the point that a write
-        changes: samples older than the write are marked stale; without it, all of the node's.
+        `touches` is the command that reads what a write changes: samples of that which are older than the write are
+        marked stale; without it, all of the node's. With `stops_seen` it raises Superseded, and sends nothing, if the
+        node was told to stop since `stops` was that.
 
         Raises a BusError subclass. Cancelling it frees the caller at once and never disturbs the line (R6).
         """
-        transaction, future = self._start(command, priority, start_within, retries, idempotent, touches=touches)
+        chosen = self._options(options) if options else ORDINARY
+        transaction, future = self._start(command, chosen, False, touches, stops_seen)
         try:
             value: T = await future
         except asyncio.CancelledError:
@@ -132,63 +184,69 @@ class Node:
             raise
         return value
 
-    async def timed_request(
-        self, command: Command[T], *, priority: Priority | None = None, start_within: float | None = None
-    ) -> tuple[T, Timeline]:
-        """Like `request`, with the timeline that says why it took as long as it did."""
-        transaction, future = self._start(command, priority, start_within, None, None)
+    async def timed_request(self, command: Command[T], **options: Unpack[CommandOptions]) -> tuple[T, Timeline]:
+        """Do what `request` does, and return beside the value the timeline that says why it took so long."""
+        transaction, future = self._start(command, self._options(options))
         try:
             return await future, transaction.timeline()
         except asyncio.CancelledError:
             self._give_up(transaction)
             raise
 
+    def _options(self, given: CommandOptions) -> RequestOptions:
+        options = RequestOptions.of(given, self.label)
+        if options.verify:
+            raise InvalidCommand(f"{self.label}: verify is for what writes a value through a handle")
+        return options
+
     def _start(
         self,
         command: Command[Any],
-        priority: Priority | None,
-        start_within: float | None,
-        retries: int | None,
-        idempotent: bool | None,
-        *,
+        options: RequestOptions,
         probe: bool = False,
-        touches: Point[Any] | None = None,
+        touches: Command[Any] | None = None,
+        stops_seen: int | None = None,
     ) -> tuple[Transaction, asyncio.Future[Any]]:
-        record = self.record
-        profile = record.profile
-        if retries is not None:
-            retries = checked_retries(retries, self.label)
-        if start_within is not None:
-            start_within = seconds(start_within, f"{self.label}: start_within")
-        if priority is None:
-            priority = COMMAND
-        elif type(priority) is not Priority:
-            priority = checked_priority(priority)
-        if record.address == profile.broadcast and not command.writes:
-            raise InvalidCommand(f"{profile.name}: address {self.address} is for writes to all; nobody answers a read")
-        bus = self.bus
-        if not bus.running:
-            raise bus.not_open(node=self.label, command=str(command))
-        bus.check_loop()
+        record, line = self.record, self.shared
+        if record.address == record.profile.broadcast and not command.writes:
+            raise InvalidCommand(
+                f"{self.profile.name}: address {self.address} is for writes to all; nobody answers a read"
+            )
+        if get_ident() != line.thread or not line.loop_runs():  # as check_loop does: this is done for every request
+            if not line.running:
+                raise line.not_open(record=record, command=str(command))
+            line.check_loop()
         if type(command) not in self.kinds:
             if not hasattr(command, "open"):
                 raise InvalidCommand(f"{self.label}: {command!r} is no command; read it through a handle, or its point")
             self.kinds[type(command)] = command
-        start_by = inf if start_within is None else bus.now() + start_within
-        transaction = Transaction(record, command, priority, start_by, retries, idempotent, probe)
-        transaction.touches = self if touches is None else touches.quantity
-        return transaction, bus.pump.transact(transaction)
+        if stops_seen is not None and stops_seen != record.stops:
+            raise Superseded("the node was told to stop since this was decided", node=record, command=str(command))
+        transaction = Transaction(
+            record,
+            command,
+            options.priority,
+            inf if options.start_within is None else line.now() + options.start_within,
+            options.retries,
+            options.idempotent,
+            probe,
+            inf if options.finish_within is None else line.now() + options.finish_within,
+        )
+        transaction.touches = self if touches is None else (self, touches)
+        return transaction, line.pump.transact(transaction)
 
     def _give_up(self, transaction: Transaction) -> None:
         """Nobody waits for it any more. A write that is on the wire now is over before anything else can be read."""
-        self.bus.pump.cancel(transaction)
+        line = self.shared
+        line.pump.cancel(transaction)
+        # Its end is told to nobody, but what it may have changed is: samples that were read before it are stale now.
         if transaction.writes and transaction.attempts:
-            self.bus.touched(transaction, self.bus.now())
+            line.touched(transaction, line.now())
 
     async def probe(self) -> bool:
-        """Ask the node's cheapest read now, once; True if it answered (a refusal is an answer), False if not, or if
-        it could not be asked."""
-        transaction, future = self._start(self.profile.probe, None, None, 0, None, probe=True)
+        """Ask the node's cheapest read now, once. Return True if it answered (a refusal is an answer), False if not, or
+        if it could not be asked."""
+        transaction, future = self._start(self.profile.probe, PROBE, probe=True)
         try:
             await future
         except asyncio.CancelledError:
@@ -201,24 +259,14 @@ class Node:
         return True
 
     def suspend(self, for_: float) -> None:
-        """For maintenance: its polls rest and its requests fail with NodeDown for so many seconds, 0 to end it now."""
-        self.bus.suspend(self, seconds(for_, f"{self.label}: a suspension"))
+        """Let it rest for maintenance: no polls, and NodeDown for requests, for so many seconds; 0 ends that now."""
+        self.shared.suspend(self.record, seconds(for_, f"{self.label}: a suspension"))
 
     @property
     def suspended(self) -> bool:
-        return self.bus.now() < self.record.suspended_until
+        return self.shared.now() < self.record.suspended_until
 
     def statistics(self) -> NodeStatistics:
-        """Counts and latencies since the bus was opened or its statistics were reset."""
-        self.bus.check_loop()
+        """Return counts and latencies since the bus was opened or its statistics were reset."""
+        self.shared.check_loop()
         return self.record.counters.snapshot(self.record.lateness)
-
-
-def checked_priority(value: Priority | int) -> Priority:
-    """Return the class that `value` is, or is the number of. Raises InvalidCommand for anything else."""
-    return Priority(whole_number(value, min(Priority), max(Priority), "a priority"))
-
-
-def checked_retries(value: int, label: str) -> int:
-    """Return `value` as an int. Raises InvalidCommand, naming the node, unless it is 0 to 100."""
-    return whole_number(value, 0, MOST_RETRIES, f"{label}: retries")

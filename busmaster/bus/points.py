@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, Unpack
 
+from busmaster.bus.requester import CommandOptions, ReadOptions, Requester
 from busmaster.contract.arguments import seconds
 from busmaster.contract.exchange import Command
 from busmaster.errors import GarbledReply, InvalidCommand
-
-if TYPE_CHECKING:
-    from busmaster.bus.node import Node, Priority
 
 T = TypeVar("T")
 
@@ -27,7 +25,7 @@ class Point(Generic[T]):
     Two points are equal if node, item and command are, so a point may be made anew each time it is asked for.
     """
 
-    node: Node
+    node: Requester
     item: str
     command: Command[Any]
     unit: str = field(default="", compare=False)
@@ -36,16 +34,16 @@ class Point(Generic[T]):
 
     @property
     def key(self) -> str:
-        """ "5/axis0.position": node and item, as JSON output names a sample."""
+        """Return node and item, as JSON output names a sample: "5/axis0.position"."""
         return f"{self.node.address}/{self.item}"
 
     @property
-    def quantity(self) -> tuple[Node, Command[Any]]:
-        """What it reads, by whatever name: a write to one point makes every point of its quantity stale."""
+    def quantity(self) -> tuple[Requester, Command[Any]]:
+        """Return what it reads, by whatever name: a write to one point makes every point of its quantity stale."""
         return self.node, self.command
 
     def value_of(self, raw: Any) -> T:
-        """The value that stands for what its command returned. Raises GarbledReply for what means nothing."""
+        """Return the value that stands for what its command returned. Raises GarbledReply for what means nothing."""
         if self.decode is None:
             value: T = raw
             return value
@@ -53,44 +51,30 @@ class Point(Generic[T]):
             return self.decode(raw)
         except Exception as bad:  # a decoder may be the application's own
             raise GarbledReply(
-                f"{raw!r} is no value of {self.item}: {bad}", node=self.node.label, command=str(self.command)
+                f"{raw!r} is no value of {self.item}: {bad}", node=self.node, command=str(self.command)
             ) from bad
 
     @property
     def writable(self) -> bool:
         return self.encode is not None
 
-    async def read(
-        self,
-        *,
-        max_age: float | None = None,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> T:
-        """Its value now, or, with `max_age` in seconds, a poll group's latest sample if that is young enough."""
+    async def read(self, *, max_age: float | None = None, **options: Unpack[ReadOptions]) -> T:
+        """Return its value now, or, with `max_age` in seconds, a poll group's latest sample if that is young enough.
+
+        `RequestOptions` says what the other options are.
+        """
         if max_age is not None:
             if max_age != inf:
                 max_age = seconds(max_age, f"{self.node.label}: max_age")
-            sample = self.node.bus.latest(self)
-            if sample is not None and sample.error is None and sample.age(self.node.bus.now()) <= max_age:
+            # whichever group has it: two groups may read one quantity, and a write makes both of their samples stale
+            sample = self.node.latest(self)
+            if sample is not None and sample.error is None and sample.age(self.node.now()) <= max_age:
                 value: T = sample.value
                 return value
-        return self.value_of(
-            await self.node.request(self.command, priority=priority, start_within=start_within, retries=retries)
-        )
+        return self.value_of(await self.node.request(self.command, **options))
 
-    async def write(
-        self,
-        value: T,
-        *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> None:
-        """Raises InvalidCommand, before anything is sent, if it is read-only or the value cannot be sent."""
+    async def write(self, value: T, **options: Unpack[CommandOptions]) -> None:
+        """Write a value. Raises InvalidCommand, before anything is sent, if it is read-only or cannot be sent."""
         if self.encode is None:
             raise InvalidCommand(f"{self.node.label}: {self.item} is read-only")
-        await self.node.request(
-            self.encode(value), priority=priority, start_within=start_within, retries=retries, touches=self
-        )
+        await self.node.request(self.encode(value), touches=self.command, **options)

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Generator, Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from math import inf
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.schedule import Poll, line_time, set_members
 from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.bus.node import Node
 from busmaster.bus.points import Point
-from busmaster.bus.samples import NO_SAMPLES, GroupStatistics, Quality, Sample, Snapshot, Stream, Tally
+from busmaster.bus.samples import Quality, Sample
+from busmaster.bus.shared_line import SharedLine
+from busmaster.bus.snapshots import NO_SAMPLES, GroupStatistics, Snapshot, Stream, Tally
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Batch
 from busmaster.errors import BusClosed, GarbledReply, InvalidCommand, Refused
 from busmaster.planning import PlannedGroup, shape
 from busmaster.planning.merging import WEIGHING, Merge, Served, cheapest
 
-if TYPE_CHECKING:
-    from busmaster.bus.bus import Bus
-    from busmaster.bus.node import Node
-
 __all__ = ["GroupStatistics", "PollGroup", "Quality", "Sample", "Snapshot", "Stream"]
 
-REPLIES_REMEMBERED = 256
 WEIGHED_AGAIN = 8
 """Cycles after which merges are weighed once more: by then reply times are measured."""
 
@@ -49,8 +47,8 @@ class _Read(NamedTuple):
 
     @property
     def line_time(self) -> float:
-        """Seconds of the line that it takes, by the node's reply time as measured so far."""
-        wait = self.node.record.reply_time
+        """Return the seconds of the line that it takes, by the node's reply time as measured so far."""
+        wait = self.node.reply_time
         return self.guess if wait is None else self.unwaited + self.legs * wait
 
 
@@ -59,7 +57,7 @@ class PollGroup:
 
     def __init__(
         self,
-        bus: Bus,
+        line: SharedLine,
         name: str,
         period: float,
         points: Iterable[Point[Any]],
@@ -67,23 +65,27 @@ class PollGroup:
         phase: float | None,
         priority: Priority,
         merge: Sequence[Merge],
+        on_close: Callable[[PollGroup], None],
     ) -> None:
         self.name = name
         self.latest: Snapshot | None = None
-        self._bus = bus
+        """That of its last cycle."""
+        self._line = line
+        self._on_close = on_close
         self._priority = priority
         self._merge = tuple(merge)
         self._refused: set[tuple[Node, Command[Any]]] = set()
         self._poll = Poll(name, period, phase=phase)
         self._poll.waiter = self
-        self._points: dict[Point[Any], None] = {}
+        self._points: dict[Point[Any], Node] = {}
         self._consumers: list[Stream[Snapshot]] = []
         self._tally = Tally(self._poll)
         # the cycle that runs
         self._cycle = 0
-        self._samples: dict[Point[Any], Sample] = {}
+        self._samples: dict[Point[Any], Sample[Any]] = {}
         self._qualities: dict[Quality, int] = {}
         self._line_time = 0.0
+        self._wall_offset = line.wall_offset()
         self._refusals: list[_Read] = []
         self.add(*points)
 
@@ -97,7 +99,7 @@ class PollGroup:
 
     @property
     def poll(self) -> Poll:
-        """The arbiter's side of the group."""
+        """Return the arbiter's side of the group."""
         return self._poll
 
     @property
@@ -110,47 +112,53 @@ class PollGroup:
         Points that it has already are left alone. Raises InvalidCommand for a point of another bus, and for one of the
         address at which all nodes listen and none answers.
         """
-        self._bus.check_loop()
-        fresh = [point for point in dict.fromkeys(points) if point not in self._points]
-        for point in fresh:
+        self._line.check_loop()
+        fresh: dict[Point[Any], Node] = {}
+        for point in points:
             node = point.node
-            if node.bus is not self._bus:
+            if not isinstance(node, Node) or node.shared is not self._line:
                 raise InvalidCommand(f"poll group {self.name!r}: {point.key} belongs to another bus")
             if node.address == node.profile.broadcast:
                 raise InvalidCommand(
                     f"poll group {self.name!r}: nobody answers a read of {point.key}, which is for all"
                 )
-        self._points.update(dict.fromkeys(fresh))
+            if point not in self._points:
+                fresh[point] = node
+        self._points.update(fresh)
         self._choose()
 
     def remove(self, *points: Point[Any]) -> None:
         """Read these no more, from the next cycle on; with hundreds of points, some milliseconds later."""
-        self._bus.check_loop()
+        self._line.check_loop()
         for point in points:
             self._points.pop(point, None)
         self._choose()
 
     def pause(self) -> None:
-        """No cycle starts, and none is counted missed, until `resume`."""
+        """Start no cycle, and count none missed, until `resume`."""
         self._poll.paused = True
 
     def resume(self) -> None:
-        """Back on the grid."""
+        """Go back on the grid."""
         self._poll.paused = False
 
     def demand(self) -> None:
         """Poll now, off the grid. A cycle that is running serves."""
-        self._bus.demand(self._poll)
+        self._line.demand(self._poll)
 
     def close(self) -> None:
         """End the group; its consumers end after what they hold."""
-        self._bus.remove_group(self)
+        self._line.check_loop()
+        if self._poll.active:
+            self._on_close(self)
+            self._line.latest_of.pop(self.name, None)
+            self._line.remove_poll(self._poll)
         for consumer in list(self._consumers):
             consumer.close()
 
     def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
-        """A consumer with a buffer of so many snapshots. Close it when it is not read any more."""
-        self._bus.check_loop()
+        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
+        self._line.check_loop()
         if not self._poll.active:
             raise BusClosed(f"poll group {self.name!r} is closed")
         return Stream(self._consumers, buffer)
@@ -164,8 +172,8 @@ class PollGroup:
             consumer.close()
 
     def statistics(self) -> GroupStatistics:
-        """An immutable snapshot of its counts."""
-        self._bus.check_loop()
+        """Return an immutable snapshot of its counts."""
+        self._line.check_loop()
         return self._tally.statistics(self._poll)
 
     def reset_statistics(self) -> None:
@@ -174,23 +182,24 @@ class PollGroup:
         self._tally = Tally(self._poll)
 
     def planned(self) -> PlannedGroup:
-        """The group as the planner sees it, with reply times as measured so far."""
-        nodes = {node: node.planned() for node in {point.node for point in self._points}}
+        """Return the group as the planner sees it, with reply times as measured so far."""
+        nodes = {node: node.planned() for node in set(self._points.values())}
         for node, plan in nodes.items():
             if self._refused and plan.profile.merge is not None:
                 nodes[node] = replace(plan, profile=replace(plan.profile, merge=self._sound(plan.profile.merge, node)))
-        reads = [(nodes[point.node], point.command) for point in self._points]
+        reads = [(nodes[node], point.command) for point, node in self._points.items()]
         merges = [self._sound(merge) for merge in self._merge]
         return PlannedGroup(self.name, self._poll.period, reads, self._poll.phase, self._priority, merges)
 
     def sampled(self, transaction: Transaction) -> None:
-        """One exchange of the cycle is over: make its samples. Runs in the pump: no user code but decoders."""
+        """Make the samples of an exchange that is over. Runs in the pump: no user code but decoders."""
         read: _Read = transaction.waiter
         if self._cycle != self._poll.cycles:
             self._cycle = self._poll.cycles
             self._samples = read.blank.copy()
             self._qualities = NO_SAMPLES.copy()
             self._line_time = 0.0
+            self._wall_offset = self._line.wall_offset()
             self._refusals = []
         self._line_time += read.line_time
         if transaction.error is None:
@@ -203,7 +212,7 @@ class PollGroup:
             self._qualities[sample.quality] += 1
 
     def cycle_finished(self) -> None:
-        """All exchanges of a cycle are over: hand its snapshot round. Runs in the pump: no user code."""
+        """Hand the snapshot of a cycle round whose exchanges are over. Runs in the pump: no user code."""
         poll = self._poll
         if poll.fresh is None:
             poll.cost = self._line_time
@@ -213,56 +222,62 @@ class PollGroup:
         self._age()
         self._tally.note(poll, self._qualities)
         started = poll.started if poll.started > -inf else None
-        snapshot = Snapshot(self.name, poll.cycles, poll.due, started, poll.finished, poll.missed, self._samples)
-        self.latest = snapshot
+        wall = poll.finished + self._wall_offset
+        snapshot = Snapshot(self.name, poll.cycles, poll.due, started, poll.finished, poll.missed, wall, self._samples)
+        self.latest = self._line.latest_of[self.name] = snapshot
         for consumer in self._consumers:
             consumer.put(snapshot)
+        # Once: choosing anew whenever a mean moves would make the cycles differ for ever.
         if poll.cycles == WEIGHED_AGAIN:
             self._choose()
 
-    def _sample(self, point: Point[Any], place: int | None, transaction: Transaction) -> Sample:
+    def _sample(self, point: Point[Any], place: int | None, transaction: Transaction) -> Sample[Any]:
         error = transaction.error
         value = None
         quality = Quality.BAD
         if error is None:
             quality = Quality.LATE if transaction.late else Quality.GOOD
-            if point.node.touched > transaction.started and self._bus.is_stale(point, transaction.started):
+            if self._line.last_touched > transaction.started and self._line.is_stale(point, transaction.started):
                 quality = Quality.STALE
             try:
                 value = point.value_of(transaction.value if place is None else transaction.value[place])
             except GarbledReply as bad:
                 error, quality = bad, Quality.BAD
         timeline = transaction.timeline()
-        return Sample(value, error, self._poll.due, timeline.started, transaction.ended_at, quality, timeline)
+        finished = transaction.ended_at
+        wall = finished + self._wall_offset
+        return Sample(value, error, self._poll.due, timeline.started, finished, quality, timeline, wall)
 
     def _age(self) -> None:
         """Mark the samples that were read before a write to their point that ended meanwhile."""
-        if self._bus.last_touched <= self._poll.started:
+        if self._line.last_touched <= self._poll.started:
             return
-        for point, sample in self._samples.items():
-            fine = sample.quality in (Quality.GOOD, Quality.LATE)
-            if not fine or sample.started is None or point.node.touched <= sample.started:
+        for transaction in self._poll.results:
+            if not self._line.written_since(transaction.node, transaction.started):
                 continue
-            if self._bus.is_stale(point, sample.started):
-                self._qualities[sample.quality] -= 1
-                self._qualities[Quality.STALE] += 1
-                self._samples[point] = sample._replace(quality=Quality.STALE)
+            for point, _ in transaction.waiter.points:
+                sample = self._samples[point]
+                fine = sample.quality in (Quality.GOOD, Quality.LATE)
+                if fine and sample.started is not None and self._line.is_stale(point, sample.started):
+                    self._qualities[sample.quality] -= 1
+                    self._qualities[Quality.STALE] += 1
+                    self._samples[point] = sample._replace(quality=Quality.STALE)
 
     # which exchanges bring the values
 
     def _choose(self) -> None:
         """Choose the exchanges anew: a piece at a time, so that the line goes on (see Schedule.prepare)."""
         self._poll.preparation = self._choosing()
-        self._bus.prepare(self._poll)
+        self._line.prepare(self._poll)
 
     def _choosing(self) -> Iterator[int]:
         """Give the poll its transactions and its cost, if they are other ones than it has."""
-        for merged in (True, False):
+        for merged in (True, False):  # a merge that fails costs its savings, not the group
             try:
                 reads = yield from self._reads(merged)
                 break
             except Exception as bug:  # a merge may be the application's own
-                self._bus.failed_choice(self.name, bug)
+                self._line.logbook.failed_choice(self.name, bug)
         else:
             return
         poll = self._poll
@@ -280,15 +295,15 @@ class PollGroup:
     def _reads(self, merged: bool) -> Generator[int, None, list[_Read]]:
         """Two points with one command behind them cost one exchange, and merges are taken where they are cheaper."""
         behind: dict[Node, dict[Command[Any], list[Point[Any]]]] = {}
-        for point in tuple(self._points):
-            behind.setdefault(point.node, {}).setdefault(point.command, []).append(point)
+        for point, node in tuple(self._points.items()):
+            behind.setdefault(node, {}).setdefault(point.command, []).append(point)
             yield 2
         reads: list[_Read] = []
         blank: dict[Point[Any], Any] = {}
         for node, wanted in behind.items():
             merges = (*self._merge, node.profile.merge) if node.profile.merge else self._merge
             sound = [self._sound(merge, node) for merge in merges] if merged else []
-            cost = partial(node.planned().line_time, byte_time=self._bus.byte_time)
+            cost = partial(node.planned().line_time, byte_time=self._line.arbiter.byte_time)
             points = tuple(wanted.values())
             for served in (yield from cheapest(tuple(wanted), sound, cost)):
                 serves = tuple(
@@ -307,7 +322,7 @@ class PollGroup:
         points: tuple[tuple[Point[Any], int | None], ...],
         blank: dict[Point[Any], Any],
     ) -> _Read:
-        exchange, byte_time = node.planned().open(served.command), self._bus.byte_time
+        exchange, byte_time = node.planned().open(served.command), self._line.arbiter.byte_time
         node.kinds.setdefault((type(served.command), *shape(exchange)), served.command)
         unwaited, guess = line_time(exchange, byte_time, 0.0), line_time(exchange, byte_time)
         bytes_time = unwaited - exchange.closing * byte_time - exchange.timing.turnaround
@@ -326,14 +341,10 @@ class PollGroup:
         """A batch that was refused says nothing of its commands: they are asked at once, one by one."""
         self._refused |= {(read.node, read.served.command) for read in self._refusals}
         self._choose()
-        self._bus.demand(self._poll)
+        self._line.demand(self._poll)
 
 
 def _measure(transaction: Transaction, read: _Read) -> None:
     """The mean of what the node takes to reply, over the last of its replies."""
-    node = transaction.node
-    if transaction.attempts == 1:
-        wait = (transaction.last_byte - transaction.started - read.bytes_time) / read.legs
-        node.measured = min(node.measured + 1, REPLIES_REMEMBERED)
-        known = wait if node.reply_time is None else node.reply_time
-        node.reply_time = known + (wait - known) / node.measured
+    if transaction.attempts == 1:  # of a repeated one, the time includes what the failed attempts cost
+        read.node.note_wait((transaction.last_byte - transaction.started - read.bytes_time) / read.legs)

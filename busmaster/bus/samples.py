@@ -1,23 +1,11 @@
-"""What the consumers of a poll group get: samples, snapshots, statistics, and the streams they come in."""
+"""What a cycle brings of one point: its value, when it was asked for, and how good it is."""
 
 from __future__ import annotations
 
 import enum
-import sys
-from collections import deque
-from collections.abc import AsyncIterator, Iterator, Mapping
-from dataclasses import dataclass
-from math import inf
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
-import anyio
-
-from busmaster.arbiter.counters import Quantiles
-from busmaster.arbiter.histogram import Histogram
-from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Timeline
-from busmaster.bus.points import Point
-from busmaster.contract.arguments import whole_number
 from busmaster.errors import BusError
 
 T = TypeVar("T")
@@ -32,156 +20,22 @@ class Quality(enum.Enum):
     BAD = "bad"
 
 
-NO_SAMPLES = dict.fromkeys(Quality, 0)
-"""To be copied: a count of each quality."""
+class Sample(NamedTuple, Generic[T]):
+    """One point's outcome in one cycle. Times are the bus's clock (`bus.now()`), in seconds.
 
+    `value` is None where there is an `error`. `wall` is `finished` by the machine's clock, in seconds since 1970: one
+    look at that clock serves a cycle, and one that was set is followed with the next.
+    """
 
-class Sample(NamedTuple):
-    """One point's outcome in one cycle. Times are the bus's clock (`bus.now()`), in seconds."""
-
-    value: Any
+    value: T
     error: BusError | None
     due: float
     started: float | None
     finished: float
     quality: Quality
     timeline: Timeline
+    wall: float
 
     def age(self, now: float) -> float:
-        """Seconds since the value was asked for."""
+        """Return the seconds since the value was asked for."""
         return now - (self.finished if self.started is None else self.started)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Snapshot(Mapping[Point[Any], Sample]):
-    """One cycle of a poll group. `missed` counts the cycles that could not start since the group was made."""
-
-    group: str
-    cycle: int
-    due: float
-    started: float | None
-    finished: float
-    missed: int
-    samples: dict[Point[Any], Sample]
-
-    def __getitem__(self, point: Point[Any]) -> Sample:
-        return self.samples[point]
-
-    def __iter__(self) -> Iterator[Point[Any]]:
-        return iter(self.samples)
-
-    def __len__(self) -> int:
-        return len(self.samples)
-
-
-@dataclass(frozen=True, slots=True)
-class GroupStatistics:
-    """Of a group since it was made, or its statistics were reset; times in seconds.
-
-    `period` as asked, `achieved` as seen (mean). `jitter` runs from a cycle's due time to its start, `cycle_time` to
-    its last value. `good`, `late`, `stale` and `bad` count samples. What its cycles waited for before they started, on
-    average: `exchanges_ahead` of others, and `settling_ahead` seconds after somebody's uncertain outcome.
-    """
-
-    cycles: int
-    missed: int
-    period: float
-    achieved: float
-    jitter: Quantiles
-    cycle_time: Quantiles
-    good: int
-    late: int
-    stale: int
-    bad: int
-    exchanges_ahead: float
-    settling_ahead: float
-
-
-class Tally:
-    """What a group counts; the rest is counted by its poll."""
-
-    __slots__ = ("cycle_time", "cycles", "exchanges_ahead", "first", "last", "missed", "samples", "settling_ahead")
-
-    def __init__(self, poll: Poll) -> None:
-        self.missed = poll.missed
-        """Missed before the count began."""
-        self.cycles = 0
-        self.first: float | None = None
-        self.last = 0.0
-        self.exchanges_ahead = 0
-        self.settling_ahead = 0.0
-        self.cycle_time = Histogram()
-        self.samples = NO_SAMPLES.copy()
-
-    def note(self, poll: Poll, qualities: Mapping[Quality, int]) -> None:
-        """A cycle is over, with so many samples of each quality.
-
-        What its first exchange waited for is what the cycle waited for.
-        """
-        for quality, number in qualities.items():
-            self.samples[quality] += number
-        begun = poll.started if poll.started > -inf else poll.due
-        if self.first is None:
-            self.first = begun
-        self.last = begun
-        self.cycles += 1
-        self.cycle_time.record(poll.finished - poll.due)
-        for transaction in poll.results[:1]:
-            if transaction.started > -inf:
-                self.exchanges_ahead += transaction.exchanges_ahead
-                self.settling_ahead += transaction.settling_ahead
-
-    def statistics(self, poll: Poll) -> GroupStatistics:
-        cycles = self.cycles
-        return GroupStatistics(
-            cycles=cycles,
-            missed=poll.missed - self.missed,
-            period=poll.period,
-            achieved=(self.last - self.first) / (cycles - 1) if self.first is not None and cycles > 1 else 0.0,
-            jitter=Quantiles.of(poll.jitter),
-            cycle_time=Quantiles.of(self.cycle_time),
-            good=self.samples[Quality.GOOD],
-            late=self.samples[Quality.LATE],
-            stale=self.samples[Quality.STALE],
-            bad=self.samples[Quality.BAD],
-            exchanges_ahead=self.exchanges_ahead / cycles if cycles else 0.0,
-            settling_ahead=self.settling_ahead / cycles if cycles else 0.0,
-        )
-
-
-class Stream(Generic[T]):
-    """One consumer, at its own pace: bounded, it drops the oldest and counts them in `dropped`."""
-
-    def __init__(self, listeners: list[Stream[T]], buffer: int) -> None:
-        self._listeners = listeners
-        self._items: deque[T] = deque(maxlen=whole_number(buffer, 1, sys.maxsize, "a buffer"))
-        self._arrived = anyio.Event()
-        self._closed = False
-        self.dropped = 0
-        listeners.append(self)
-
-    def __aiter__(self) -> AsyncIterator[T]:
-        return self
-
-    async def __anext__(self) -> T:
-        while not self._items:
-            if self._closed:
-                raise StopAsyncIteration
-            if self._arrived.is_set():
-                self._arrived = anyio.Event()
-            await self._arrived.wait()
-        return self._items.popleft()
-
-    def close(self) -> None:
-        """It gets nothing more; what it holds can still be read."""
-        self._closed = True
-        if self in self._listeners:
-            self._listeners.remove(self)
-        self._arrived.set()
-
-    def put(self, item: T) -> None:
-        """Give the consumer one more; the oldest is dropped where it does not keep up."""
-        if len(self._items) == self._items.maxlen:
-            self.dropped += 1
-        self._items.append(item)
-        self._arrived.set()

@@ -1,81 +1,69 @@
 """From what was sent and heard to the packets of a capture: one a frame, each exchange with its outcome.
 
-The outcome is the master's where it came in time, else the listener's own reading of the frames. The master tells it
-only after it has sent the next request, so an exchange is held back until then: at most two are.
+The owner of a line tells whose every byte is, and how each attempt ended. On a line that is only listened to, the
+frames say it, as well as they can.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
-from typing import NamedTuple
 
+from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.capture.decode import Decoder
 from busmaster.capture.frames import UNACKED, UNASKED, Direction, Frame, Kind
 from busmaster.capture.pcapng import Outcome, Packet
-from busmaster.registry import find, kinds
-
-SAME_CALLBACK = 0.005
-"""Seconds: a verdict that comes later than this after a request is not of the exchange before it."""
-REQUESTS_KEPT = 4096
-"""Requests of which is remembered what protocol they speak."""
+from busmaster.registry import NodeKind, find, protocols
 
 
-class Verdict(NamedTuple):
-    """What the master made of an exchange. `outcome` None: the frames say it better (an unconfirmed write)."""
+class _Exchange:
+    """One exchange whose packets wait for its outcome. `attempt` is None on a line that is only listened to.
 
-    request: bytes
-    outcome: Outcome | None
-    comment: str
-
-
-def protocol_of(request: bytes, declared: str = "") -> str:
-    """Return the protocol of what a master says, or "" if it begins no exchange: an acknowledgement, say.
-
-    It is the one that is `declared` if that has such a request, else the first that has: they are tried in the order
-    in which captures came to know them.
+    `kind` is that of its node, None where the protocol is not known here.
     """
-    known = sorted(kinds().values(), key=lambda kind: (not kind.capture_id, kind.capture_id))
-    names = (declared, *(kind.name for kind in known))
-    return next((name for name in names if name and _is_request(request, name)), "")
 
-
-def _is_request(said: bytes, protocol: str) -> bool:
-    dialect = find(protocol).protocol.dialect()
-    if not said or dialect.size(said, Direction.HOST) != len(said):
-        return False
-    frame = dialect.explain(said, Direction.HOST)
-    return frame.kind in (Kind.READ, Kind.WRITE) and not frame.fault and not frame.continues
-
-
-def _is_broadcast(request: Frame, protocol: str) -> bool:
-    return request.node is not None and bool(protocol) and request.node == find(protocol).profile.broadcast
-
-
-class _Held:
-    """One exchange whose packets wait for its verdict."""
-
-    def __init__(self, request: Frame | None, protocol: str = "") -> None:
+    def __init__(self, kind: NodeKind | None, attempt: Attempt | None = None, request: Frame | None = None) -> None:
+        self.kind = kind
+        self.attempt = attempt
         self.request = request
-        self.broadcast = request is not None and _is_broadcast(request, protocol)
-        self.last: Frame | None = None
         self.packets: list[Packet] = []
+        self.last: Frame | None = None
         self.answer: Packet | None = None
-        self.verdict: Verdict | None = None
         self.released = False
 
-    def is_of(self, verdict: Verdict) -> bool:
-        return not self.released and self.request is not None and self.request.raw == verdict.request
+    @property
+    def node(self) -> int | None:
+        if self.attempt is None:
+            return None if self.request is None else self.request.node
+        return self.attempt.address if self.kind is None or self.kind.profile.addressed else None
 
-    def is_stray(self, frame: Frame) -> bool:
-        """It came from a node, or from who knows where, after the exchange was over, or before any."""
-        if frame.sender is Direction.HOST:
-            return False
+    @property
+    def over(self) -> bool:
+        """Nothing more can be said of it."""
+        return self.attempt is None or self.attempt.verdict is not None
+
+    @property
+    def is_broadcast(self) -> bool:
+        return self.kind is not None and self.node is not None and self.node == self.kind.profile.broadcast
+
+    def is_behind(self, frame: Frame) -> bool:
+        """By the frames alone: it came from a node after the answer, or before anything was asked."""
+        if self.attempt is not None and self.request is None:
+            return False  # its protocol is not known here: the frames say nothing
         if frame.fault == UNASKED or self.request is None or self.released:
             return True
         last = self.last
-        over = last is not None and self.judge()[0] is not Outcome.NO_REPLY
-        return over and (frame.kind is Kind.NOISE or (last is not None and last.kind is Kind.NOISE))
+        if last is None or self.kind is None or self.judge()[0] is Outcome.NO_REPLY:
+            return False
+        if last.kind is Kind.NOISE:
+            return not self.kind.profile.noise_tolerant
+        return frame.kind is Kind.NOISE
+
+    def outcome(self) -> tuple[Outcome, str]:
+        """How it ended, and that in words."""
+        attempt = self.attempt
+        if attempt is None or attempt.verdict is None:
+            return self.judge()
+        return Outcome[attempt.verdict.name], str(attempt)
 
     def judge(self) -> tuple[Outcome, str]:
         """By the frames alone."""
@@ -83,7 +71,7 @@ class _Held:
         if asked is None:
             return Outcome.NONE, ""
         if last is None:
-            return (Outcome.OK, "") if self.broadcast else (Outcome.NO_REPLY, "no reply")
+            return (Outcome.OK, "") if self.is_broadcast else (Outcome.NO_REPLY, "no reply")
         if last.fault == UNACKED:
             return Outcome.NO_REPLY, "no ACK came, only a packet that may answer something older"
         if last.fault:
@@ -98,88 +86,127 @@ class _Held:
 class Assembler:
     """Makes packets and hands them to `write`, in order. `now` is in seconds, and `offset` what makes it 1970's.
 
-    `protocol` is needed where requests do not tell it: of two kinds of nodes that speak alike, and on a line that is
-    listened to. With `echo` what the host sends is received too, and left out.
+    `protocol` is what is spoken where nobody says it: on a line that is listened to, and before anything was asked. It
+    also names the kind of node, where several speak that protocol. With `echo` what the host sends is received too, and
+    left out.
     """
 
     def __init__(
         self, write: Callable[[Packet], object], *, protocol: str = "", echo: bool = False, offset: float = 0.0
     ) -> None:
         self._write = write
-        kinds()  # they are looked for now, not while the line runs
-        self._protocol_of = lru_cache(REQUESTS_KEPT)(partial(protocol_of, declared=protocol))
+        self._kinds = {spoken.name: spoken.kinds[0] for spoken in protocols()}
+        self._kind = find(protocol) if protocol else None
+        if self._kind is not None:
+            self._kinds[self._kind.protocol.name] = self._kind
         self._echo = echo
         self._echo_owed = b""
         self._sent = b""
         self._offset = offset
         self._decoders: dict[str, Decoder] = {}
-        self._protocol = ""
-        self._previous: _Held | None = None
-        self._current = _Held(None)
+        self._asked: Attempt | None = None
+        self._told = False
+        self._sender = Direction.UNKNOWN
+        self._exchange = _Exchange(self._kind)
         self._now = 0.0
-        self._speak(protocol)
 
-    def passed(self, now: float, data: bytes, sender: Direction) -> None:
-        """Bytes were on the line. From the HOST: whole frames. UNKNOWN: a line that is only listened to."""
-        self._now = now
-        if sender is Direction.HOST:
+    def overheard(self, now: float, data: bytes, sender: Direction = Direction.UNKNOWN) -> None:
+        """Take bytes of a line that is only listened to."""
+        self._now, self._told = now, False
+        self._decode(now, data, sender)
+
+    def passed(self, now: float, data: bytes, sender: Direction, attempt: Attempt | None) -> None:
+        """Take bytes of a line of ours, and what was on the wire then: those of the HOST are whole frames."""
+        if sender is not self._sender or sender is Direction.HOST:
             self._rest()
-            self._speak(self._protocol_of(data))
-            if self._echo:
-                self._echo_owed += data
-                self._sent = data
+        self._now, self._told, self._sender, self._asked = now, True, sender, attempt
+        if sender is Direction.HOST and self._echo:
+            self._echo_owed += data
+            self._sent = data
         elif self._echo_owed:
             data = self._strip_echo(data)
-        if data:
-            self._release_previous()
-            self._decode(now, data, sender)
+        if attempt is not None and attempt is not self._exchange.attempt:
+            request = attempt.request
+            if sender is Direction.HOST and data.endswith(request):
+                self._decode(now, data[: -len(request)], sender)  # what closes the exchange before
+                data = request
+            self._begin(attempt)
+        self._decode(now, data, sender)
 
-    def completed(self, now: float, verdict: Verdict) -> None:
-        """The master is done with an exchange."""
-        self._now = now
-        current, previous = self._current, self._previous
-        if previous and current.request and now - current.request.time > SAME_CALLBACK:
-            self._release_previous()
-        if (previous := self._previous) and previous.is_of(verdict):
-            previous.verdict = verdict
-            self._release_previous()
-        elif current.is_of(verdict):
-            current.verdict = verdict
+    def attempted(self, attempt: Attempt) -> None:
+        """Take it that an attempt is over, and how it ended."""
+        if attempt is self._exchange.attempt:
+            self._now = max(self._now, attempt.ended_at)
             self._rest()
-            self._release_previous()
-            self._release(current)
-
-    def take(self, frame: Frame) -> None:
-        """One frame, whoever decoded it."""
-        packet = Packet(self._micros(frame.time), self._protocol, frame.sender, frame.raw, frame.node)
-        if frame.sender is Direction.HOST and frame.kind in (Kind.READ, Kind.WRITE):
-            self._previous, self._current = self._current, _Held(frame, self._protocol)
-        held = self._current
-        if held.is_stray(frame):
-            packet.outcome = Outcome.STRAY
-        elif frame.sender is not Direction.HOST:
-            held.last, held.answer = frame, packet
-        elif frame.kind is Kind.NAK:
-            held.last = None  # MSC: the packet again
-        elif frame.fault:
-            packet.comment = frame.fault
-        if held.released:
-            self._write(packet)
-        else:
-            held.packets.append(packet)
+            self._release()
 
     def idle(self, now: float) -> None:
-        """Nothing has happened for long: nothing is held back any longer."""
+        """Hold back nothing that is over: for long nothing has happened."""
         self._now = now
         self._rest()
-        self._release_previous()
-        self._release(self._current)
+        if self._exchange.over:
+            self._release()
 
-    def _speak(self, protocol: str) -> None:
-        """The next bytes are of this protocol; of the same as before if it is "" (an acknowledgement)."""
-        self._protocol = protocol or self._protocol
-        if protocol and protocol not in self._decoders:
-            self._decoders[protocol] = Decoder(find(protocol).protocol.dialect())
+    def finish(self, now: float) -> None:
+        """Hold back nothing."""
+        self._now = now
+        self._rest()
+        self._release()
+
+    def _begin(self, attempt: Attempt) -> None:
+        self._rest()
+        self._release()
+        self._kind = self._kinds.get(attempt.protocol)
+        self._exchange = _Exchange(self._kind, attempt)
+
+    def _take(self, frame: Frame) -> None:
+        """Make the packet of one frame."""
+        if self._told:
+            frame.sender = self._sender  # which its bytes may not tell
+        from_host = frame.sender is Direction.HOST
+        asks = from_host and frame.kind in (Kind.READ, Kind.WRITE)
+        if asks and not self._told:
+            self._release()
+            self._exchange = _Exchange(self._kind, None, frame)
+        exchange = self._exchange
+        if asks and exchange.request is None:
+            exchange.request = frame
+        packet = Packet(self._micros(frame.time), self._name, frame.sender, frame.raw, frame.node, joined=frame.joined)
+        unasked = self._told and self._asked is None and not from_host
+        if not (unasked or exchange.released):
+            self._mark(packet)
+        if unasked or (not from_host and exchange.is_behind(frame)):
+            packet.outcome = Outcome.STRAY
+            packet.comment = self._straggler()
+        elif not from_host:
+            exchange.last, exchange.answer = frame, packet
+        elif frame.kind is Kind.NAK:
+            exchange.last = None  # the host wants it again
+        elif frame.fault and not self._told:
+            packet.comment = frame.fault
+        if exchange.released:
+            self._write(packet)
+        else:
+            exchange.packets.append(packet)
+
+    def _mark(self, packet: Packet) -> None:
+        """Say whose packet it is."""
+        exchange = self._exchange
+        attempt = exchange.attempt
+        if packet.node is None:
+            packet.node = exchange.node
+        if attempt is not None:
+            packet.transaction, packet.attempt = attempt.transaction, attempt.number
+
+    def _straggler(self) -> str:
+        """What a stray may be, if that is known."""
+        attempt = self._exchange.attempt
+        late = self._told and attempt is not None and attempt.verdict is Verdict.NO_REPLY
+        return f"perhaps a late answer to {attempt.command}" if late and attempt is not None else ""
+
+    @property
+    def _name(self) -> str:
+        return "" if self._kind is None else self._kind.name
 
     def _strip_echo(self, data: bytes) -> bytes:
         """What is not the echo of what was sent last, or before that (MSC's closing ACK comes with the next request).
@@ -194,47 +221,68 @@ class Assembler:
         self._echo_owed = b""
         return data
 
+    def _decoder(self) -> Decoder | None:
+        """Of what is spoken; None where that is not known."""
+        if self._name and self._name not in self._decoders:
+            self._decoders[self._name] = Decoder(find(self._name).protocol.dialect())
+        return self._decoders.get(self._name)
+
     def _decode(self, now: float, data: bytes, sender: Direction) -> None:
-        decoder = self._decoders.get(self._protocol)
+        if not data:
+            return
+        decoder = self._decoder()
         if decoder is None:
-            self.take(Frame(Kind.NOISE, sender, data, time=now))
+            self._take(Frame(Kind.NOISE, sender, data, time=now))
             return
         for frame in decoder.feed(data, now, sender):
-            self.take(frame)
+            self._take(frame)
 
     def _rest(self) -> None:
         """What the node left unfinished stays so."""
-        decoder = self._decoders.get(self._protocol)
+        decoder = self._decoder()
         for frame in decoder.quiet() if decoder else ():
-            self.take(frame)
+            self._take(frame)
 
-    def _release_previous(self) -> None:
-        if self._previous is not None:
-            self._release(self._previous)
-            self._previous = None
-
-    def _release(self, held: _Held) -> None:
-        if held.released:
+    def _release(self) -> None:
+        exchange = self._exchange
+        if exchange.released:
             return
-        held.released = True
-        outcome, comment = held.judge()
-        if held.verdict is not None:
-            outcome, comment = held.verdict.outcome or outcome, held.verdict.comment
-        asked, answer = held.request, held.answer
-        if asked is not None:
-            if answer is None and not held.broadcast:
-                answer = Packet(self._end_of(held), held.packets[0].protocol, Direction.NODE, b"", asked.node)
-                held.packets.append(answer)
-            target = answer or held.packets[0]
-            target.outcome, target.comment = outcome, comment
-        for packet in held.packets:
+        exchange.released = True
+        if exchange.request is not None or exchange.attempt is not None:
+            self._conclude(exchange)
+        for packet in exchange.packets:
             self._write(packet)
-        held.packets.clear()
+        exchange.packets.clear()
 
-    def _end_of(self, held: _Held) -> int:
-        """When an unanswered exchange was over: at the latest when the next began."""
-        after = self._current.packets
-        return after[0].micros if held is not self._current and after else self._micros(self._now)
+    def _conclude(self, exchange: _Exchange) -> None:
+        """Write down the outcome: on the last packet from the node, of a broadcast on its own."""
+        outcome, comment = exchange.outcome()
+        attempt, target = exchange.attempt, exchange.answer
+        if exchange.packets and attempt is not None:
+            exchange.packets[0].comment = why_asked(attempt)
+        if target is None and exchange.packets and (exchange.is_broadcast or outcome is Outcome.OK):
+            target = exchange.packets[0]
+        elif target is None:
+            ended = self._now if attempt is None or attempt.verdict is None else attempt.ended_at
+            name = "" if exchange.kind is None else exchange.kind.name
+            target = Packet(self._micros(ended), name, Direction.NODE, b"", exchange.node)
+            self._mark(target)
+            exchange.packets.append(target)
+        target.notes = tuple(note for note in (target.comment, *asides(attempt)) if note)
+        target.outcome, target.comment = outcome, comment
 
     def _micros(self, now: float) -> int:
         return round((now + self._offset) * 1e6)
+
+
+def why_asked(attempt: Attempt) -> str:
+    """Say of a request what nobody sees in its bytes: "poll axes, attempt 2"; empty for a caller's first attempt."""
+    again = f"attempt {attempt.number}" if attempt.number > 1 else ""
+    return ", ".join(part for part in (attempt.purpose, again) if part)
+
+
+def asides(attempt: Attempt | None) -> list[str]:
+    """Return what is to be said of how an attempt ended, beside its result."""
+    if attempt is None or attempt.verdict is None:
+        return []
+    return ["late"] * attempt.late + ["cancelled"] * (not attempt.heard)

@@ -1,7 +1,7 @@
 """A passive decoder: what passes on a line, cut into frames and put into words.
 
 It hears both directions, mixed, and mostly does not know who speaks; so it is not the master's reader. Frames are cut
-by position, as PROTOCOLS 1.1 demands. Silence ends a frame only to give it up.
+by position: any byte may be a check. Silence ends a frame only to give it up.
 """
 
 from __future__ import annotations
@@ -51,6 +51,9 @@ class Decoder:
         self._buffer = bytearray()
         self._rejected = bytearray()
         self._rejected_at = 0.0
+        self._rejected_joined = False
+        self._joined = False
+        """What is in the buffer came in one piece with what was before it."""
         self._started = 0.0
         self._heard = 0.0
         self._spoken = 0.0
@@ -61,6 +64,7 @@ class Decoder:
         frames = self.quiet() if now - self._heard > self._gap or sender is not self._sender else []
         if not self._buffer:
             self._started = now
+            self._joined = False
         self._buffer += data
         self._heard = now
         self._sender = sender
@@ -92,9 +96,11 @@ class Decoder:
                 self._flush(frames)
                 frames.append(self._timed(self._dialect.explain(raw, self._sender)))
             self._started = self._heard
+            self._joined = bool(self._buffer)
 
     def _timed(self, frame: Frame) -> Frame:
         frame.time = self._started
+        frame.joined = self._joined
         if frame.answers:
             frame.delay = self._started - self._spoken
         if frame.sender is Direction.HOST or frame.answers:
@@ -106,6 +112,7 @@ class Decoder:
             self._flush(frames)
         if not self._rejected:
             self._rejected_at = self._started
+            self._rejected_joined = self._joined
         self._rejected += raw
 
     def _flush(self, frames: list[Frame]) -> None:
@@ -115,4 +122,6 @@ class Decoder:
         raw = bytes(self._rejected)
         self._rejected.clear()
         fault = f"cut short after {len(raw)} bytes" if raw[0] in self._dialect.starts and len(raw) > 1 else "no frame"
-        frames.append(Frame(Kind.NOISE, self._sender, raw, fault=fault, time=self._rejected_at))
+        frames.append(
+            Frame(Kind.NOISE, self._sender, raw, fault=fault, joined=self._rejected_joined, time=self._rejected_at)
+        )

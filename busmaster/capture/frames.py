@@ -53,6 +53,8 @@ class Frame:
     """It ends what the last request asked for, or one leg of it."""
     continues: bool = False
     """It is what the host says in the midst of an exchange, and begins none."""
+    joined: bool = False
+    """It came in one piece with the end of the frame before."""
     time: float = 0.0
     """Seconds, when its first byte was heard, on the clock of whoever heard it."""
     delay: float | None = None

@@ -1,18 +1,25 @@
 """Capture files: the few pcapng blocks that a serial line needs, written and read.
 
-Every packet is one frame on the line. Its bytes follow a header of our own, six bytes, so that a dissector knows
-what no byte of an anonymous reply tells:
+Every packet is one frame on the line. Its bytes follow a header of our own, twelve bytes, so that a dissector knows
+what no byte of an anonymous reply tells; numbers are big-endian:
 
-    0      version of this header, 1
+    0      version of this header, 2
     1      the protocol's capture id, 0 where it has none
     2      direction: 0 unknown, 1 from a node, 2 from the host (the codes of the packet's own flags option)
     3      outcome of the exchange, see `Outcome`; on the last packet from the node, 0 on the others
-    4, 5   node, big-endian; FFFF where unknown or the protocol has none
+    4-5    node; FFFF where unknown or the protocol has none
+    6-9    the request to which the frame belongs, numbered from 1 in the order in which they began (a cycle of a poll
+           anew); 0 where it belongs to none (a stray) or nobody knows (a line that was only listened to)
+    10     which attempt at that request it is, from 1; 0 likewise
+    11     1 where the frame came in one piece with the end of the one before, else 0
 
-The protocol's name is the description of the packet's interface: a file has an interface for each protocol on the line,
-all named for the port. In files of older versions, which have one interface without a description, the id tells it.
+Version 1 ends before byte 6. The protocol's name is the description of the packet's interface: a file has an interface
+for each protocol on the line, all named for the port. In the oldest files, which have one interface without a
+description, the id tells it.
 
-An exchange that nobody answered ends in a packet of the header alone. Times are whole microseconds since 1970.
+A packet's first comment says what came of the exchange, or why it was asked; further comments are notes on that, "late"
+or "cancelled". An exchange that nobody answered ends in a packet of the header alone. Times are whole microseconds
+since 1970.
 The link type is `LINK_TYPE`, one of those set aside for private use.
 """
 
@@ -29,10 +36,10 @@ from busmaster.registry import find, kinds
 
 LINK_TYPE = 157
 """LINKTYPE_USER10: private, and not the first of them, which other people's dissectors take."""
-HEADER_VERSION = 1
+HEADER_VERSION = 2
 NO_NODE = 0xFFFF
 
-_HEADER = struct.Struct(">BBBBH")
+_HEADERS = {1: struct.Struct(">BBBBH"), HEADER_VERSION: struct.Struct(">BBBBHIBB")}
 _SECTION, _INTERFACE, _PACKET, _STATISTICS = 0x0A0D0D0A, 1, 6, 5
 _BYTE_ORDER = 0x1A2B3C4D
 _COMMENT, _FLAGS, _DROPPED = 1, 2, 4
@@ -46,7 +53,7 @@ class CaptureError(ValueError):
 
 
 class Outcome(enum.IntEnum):
-    """How an exchange ended."""
+    """How an exchange ended, or that a frame is of none (STRAY). Those from DOUBTED on are a master's alone."""
 
     NONE = 0
     OK = 1
@@ -54,6 +61,12 @@ class Outcome(enum.IntEnum):
     GARBLED = 3
     REFUSED = 4
     STRAY = 5
+    DOUBTED = 6
+    """A good answer came and was not believed, since it may have been another request's."""
+    SPOILT = 7
+    """What came was not read: the port said that it was damaged, or it came too early, or the echo was another."""
+    CUT_OFF = 8
+    """The line was lost."""
 
 
 @dataclass(slots=True)
@@ -69,6 +82,13 @@ class Packet:
     comment: str = ""
     dropped: int = 0
     """Events that the recorder had to drop between the packet before and this one."""
+    notes: tuple[str, ...] = ()
+    """What is to be said beside the comment."""
+    transaction: int = 0
+    attempt: int = 0
+    """To which request of the master, and which attempt at it, the frame belongs; 0 where that is not known."""
+    joined: bool = False
+    """It came in one piece with the end of the frame before."""
 
 
 class PcapngWriter:
@@ -86,11 +106,13 @@ class PcapngWriter:
         node = NO_NODE if packet.node is None else packet.node
         capture_id = find(packet.protocol).capture_id if packet.protocol else 0
         head = (HEADER_VERSION, capture_id, packet.direction, packet.outcome, node)
-        data = _HEADER.pack(*head) + packet.frame
+        of = (packet.transaction & 0xFFFFFFFF, min(packet.attempt, 0xFF), packet.joined)
+        data = _HEADERS[HEADER_VERSION].pack(*head, *of) + packet.frame
+        comments = (packet.comment, *packet.notes) if packet.notes or packet.comment else ()
         options = _options(
-            (_COMMENT, packet.comment.encode()),
-            (_FLAGS, struct.pack("<I", packet.direction) if packet.direction else b""),
-            (_DROPPED, struct.pack("<Q", packet.dropped) if packet.dropped else b""),
+            *((_COMMENT, comment.encode()) for comment in comments),
+            (_FLAGS, struct.pack("<I", packet.direction) if packet.direction else None),
+            (_DROPPED, struct.pack("<Q", packet.dropped) if packet.dropped else None),
         )
         fixed = struct.pack("<IIIII", interface, packet.micros >> 32, packet.micros & 0xFFFFFFFF, len(data), len(data))
         self._write(_PACKET, fixed + _padded(data) + options)
@@ -105,8 +127,8 @@ class PcapngWriter:
         if protocol not in self._interfaces:
             self._interfaces[protocol] = len(self._interfaces)
             options = _options(
-                (_NAME, self._port.encode()),
-                (_DESCRIPTION, protocol.encode()),
+                (_NAME, self._port.encode() or None),
+                (_DESCRIPTION, protocol.encode() or None),
                 (_RESOLUTION, bytes([_MICROSECONDS])),
             )
             self._write(_INTERFACE, struct.pack("<HHI", LINK_TYPE, 0, 0) + options)
@@ -131,7 +153,7 @@ def read_packets(file: BinaryIO) -> Iterator[Packet]:
                 raise CaptureError(f"not a capture of a serial line: no link type {LINK_TYPE}")
             interface = interfaces[number]
             micros = ((high << 32) | low) * 1_000_000 // interface.ticks
-            options = dict(_read_options(body[20 + size + -size % 4 :], order))
+            options = list(_read_options(body[20 + size + -size % 4 :], order))
             yield _packet(micros, interface.protocol, body[20 : 20 + size], options, order)
 
 
@@ -153,23 +175,30 @@ def _interface(body: bytes, order: str) -> _Interface:
     )
 
 
-def _packet(micros: int, protocol: str, data: bytes, options: dict[int, bytes], order: str) -> Packet:
-    if len(data) < _HEADER.size or data[0] != HEADER_VERSION:
+def _packet(micros: int, protocol: str, data: bytes, options: list[tuple[int, bytes]], order: str) -> Packet:
+    header = _HEADERS.get(data[0]) if data else None
+    if header is None or len(data) < header.size:
         raise CaptureError("a packet without our header, or of a later version")
-    _, capture_id, direction, outcome, node = _HEADER.unpack_from(data)
+    _, capture_id, direction, outcome, node, transaction, attempt, joined = (*header.unpack_from(data), 0, 0, 0)[:8]
+    comment, *notes = [value.decode(errors="replace") for code, value in options if code == _COMMENT] or [""]
+    dropped = dict(options).get(_DROPPED)
     try:
         return Packet(
             micros,
             protocol or _by_id()[capture_id],
             Direction(direction),
-            data[_HEADER.size :],
+            data[header.size :],
             None if node == NO_NODE else node,
             Outcome(outcome),
-            options.get(_COMMENT, b"").decode(errors="replace"),
-            struct.unpack(f"{order}Q", options[_DROPPED])[0] if _DROPPED in options else 0,
+            comment,
+            0 if dropped is None else struct.unpack(f"{order}Q", dropped)[0],
+            tuple(notes),
+            transaction,
+            attempt,
+            bool(joined),
         )
     except (KeyError, ValueError) as error:
-        raise CaptureError(f"a packet with a header that means nothing: {data[: _HEADER.size].hex(' ')}") from error
+        raise CaptureError(f"a packet with a header that means nothing: {data[: header.size].hex(' ')}") from error
 
 
 def _by_id() -> dict[int, str]:
@@ -204,9 +233,10 @@ def _padded(data: bytes) -> bytes:
     return data + bytes(-len(data) % 4)
 
 
-def _options(*options: tuple[int, bytes]) -> bytes:
-    """The options that are not empty, and their end; nothing at all if every one is."""
-    coded = b"".join(struct.pack("<HH", code, len(value)) + _padded(value) for code, value in options if value)
+def _options(*options: tuple[int, bytes | None]) -> bytes:
+    """The options that are not None, and their end; nothing at all if every one is."""
+    given = ((code, value) for code, value in options if value is not None)
+    coded = b"".join(struct.pack("<HH", code, len(value)) + _padded(value) for code, value in given)
     return coded + bytes(4) if coded else b""
 
 

@@ -1,7 +1,6 @@
 """Recording a line while it runs, at no cost to it: the owner of the line only notes what passed, a thread writes.
 
-A tap has three methods, called on the loop that owns the line: `transmitted` and `received`, as soon as bytes have
-left or come, and `completed`, when a transaction has ended.
+It is a `Tap`: the owner of the line calls it on its loop, as soon as bytes have left or come and an attempt has ended.
 """
 
 from __future__ import annotations
@@ -11,15 +10,12 @@ import threading
 import time
 from collections import deque
 from types import TracebackType
-from typing import Any, BinaryIO, TypeAlias
+from typing import BinaryIO
 
-from busmaster.arbiter.transaction import Transaction
-from busmaster.capture.assemble import Assembler, Verdict
+from busmaster.arbiter.tap import Attempt
+from busmaster.capture.assemble import Assembler
 from busmaster.capture.frames import Direction
-from busmaster.capture.pcapng import Outcome, Packet, PcapngWriter
-from busmaster.contract.exchange import Command
-from busmaster.contract.timing import Timings
-from busmaster.errors import BusError, GarbledReply, NoReply, Refused
+from busmaster.capture.pcapng import Packet, PcapngWriter
 
 CAPACITY = 50_000
 """Events that may wait for the disk: minutes of a line at 57600 baud."""
@@ -29,63 +25,26 @@ SLICE = 10
 """Events handled before the thread lets go of the interpreter."""
 PAUSE = 0.0002
 IDLE = 3.0
-"""Seconds without an event after which nothing is held back: longer than any exchange."""
+"""Seconds without an event after which nothing is held back that is over: longer than any node needs to go on."""
 
 
 class _Passed:
-    """Bytes that were on the line."""
+    """Bytes that were on the line. `attempt` is None, too, on one that is only listened to."""
 
-    __slots__ = ("data", "now", "sender")
+    __slots__ = ("attempt", "data", "now", "sender")
 
-    def __init__(self, now: float, data: bytes, sender: Direction) -> None:
+    def __init__(self, now: float, data: bytes, sender: Direction, attempt: Attempt | None = None) -> None:
         self.now = now
         self.data = data
         self.sender = sender
-
-
-class _Ended:
-    """A copy: a poll's transaction lives on and is run again."""
-
-    __slots__ = ("address", "command", "error", "late", "now", "timings", "value")
-
-    def __init__(self, transaction: Transaction) -> None:
-        self.now = transaction.ended_at
-        self.command: Command[Any] = transaction.command
-        self.address = transaction.node.address
-        self.timings: Timings = transaction.node.timings
-        self.value: Any = transaction.value
-        self.error = transaction.error
-        self.late = transaction.late
-
-    def verdict(self) -> Verdict:
-        request = self.command.open(self.address, self.timings).request
-        if self.error is not None:
-            return Verdict(request, outcome_of(self.error), f"{self.command}: {self.error}")
-        value = "ok" if self.value is None else repr(self.value)
-        return Verdict(request, Outcome.OK, f"{self.command}: {value}" + (" (late)" if self.late else ""))
-
-
-_Event: TypeAlias = _Passed | _Ended
-
-
-def outcome_of(error: BusError) -> Outcome | None:
-    """None where the error does not say what was on the wire."""
-    match error:
-        case NoReply():
-            return Outcome.NO_REPLY
-        case GarbledReply():
-            return Outcome.GARBLED
-        case Refused():
-            return Outcome.REFUSED
-        case _:
-            return None
+        self.attempt = attempt
 
 
 class Recorder:
     """A tap that writes a capture. Raises OSError if `path` cannot be written; later errors are kept in `error`.
 
-    `port` names the line in the file; `protocol` is needed where requests do not tell it (see `Assembler`); `echo`
-    says that what is sent is received too. Close it off the loop: closing waits for the disk.
+    `port` names the line in the file; `protocol` is needed where nobody tells it (see `Assembler`); `echo` says that
+    what is sent is received too. Close it off the loop: closing waits for the disk.
     """
 
     def __init__(
@@ -101,7 +60,7 @@ class Recorder:
         """Events that came while `capacity` of them waited for the disk, or after it had failed."""
         self.error: OSError | None = None
         self._capacity = capacity
-        self._events: deque[_Event] = deque()
+        self._events: deque[_Passed | Attempt] = deque()
         self._stop = threading.Event()
         self._file: BinaryIO = open(path, "wb")  # noqa: SIM115  # held open until close()
         self._writer = PcapngWriter(self._file, port=port)
@@ -113,21 +72,23 @@ class Recorder:
 
     # on the loop that owns the line
 
-    def transmitted(self, now: float, data: bytes) -> None:
-        """`data` was handed to the port at `now`, in seconds of `time.monotonic()`."""
-        self._note(_Passed(now, data, Direction.HOST))
+    def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        """Note what was handed to the port at `now`, in seconds of `time.monotonic()`."""
+        self._note(_Passed(now, data, Direction.HOST, attempt))
 
-    def received(self, now: float, data: bytes) -> None:
-        self._note(_Passed(now, data, Direction.NODE))
+    def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        """Note what came."""
+        self._note(_Passed(now, data, Direction.NODE, attempt))
+
+    def attempted(self, attempt: Attempt, /) -> None:
+        """Note that an attempt is over."""
+        self._note(attempt)
 
     def overheard(self, now: float, data: bytes) -> None:
-        """Bytes of a line that is only listened to: who sent them is worked out from what they say."""
+        """Note bytes of a line that is only listened to: who sent them is worked out from what they say."""
         self._note(_Passed(now, data, Direction.UNKNOWN))
 
-    def completed(self, transaction: Transaction) -> None:
-        self._note(_Ended(transaction))
-
-    def _note(self, event: _Event) -> None:
+    def _note(self, event: _Passed | Attempt) -> None:
         if len(self._events) < self._capacity and self.error is None:
             self._events.append(event)
         else:
@@ -164,7 +125,7 @@ class Recorder:
                         self._assembler.idle(busy)
                         self._file.flush()
                 self._drain()
-                self._assembler.idle(time.monotonic())
+                self._assembler.finish(time.monotonic())
                 self._writer.finish(round(time.time() * 1e6), self.dropped)
         except OSError as error:
             self.error = error
@@ -180,11 +141,13 @@ class Recorder:
             if handled % SLICE == 0 and not self._stop.is_set():
                 time.sleep(PAUSE)
 
-    def _handle(self, event: _Event) -> None:
-        if type(event) is _Ended:
-            self._assembler.completed(event.now, event.verdict())
-        elif type(event) is _Passed:
-            self._assembler.passed(event.now, event.data, event.sender)
+    def _handle(self, event: _Passed | Attempt) -> None:
+        if isinstance(event, Attempt):
+            self._assembler.attempted(event)
+        elif event.sender is Direction.UNKNOWN:
+            self._assembler.overheard(event.now, event.data)
+        else:
+            self._assembler.passed(event.now, event.data, event.sender, event.attempt)
 
     def _write(self, packet: Packet) -> None:
         dropped = self.dropped

@@ -6,17 +6,23 @@ nothing came nothing comes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from busmaster.capture.decode import Decoder
 from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.capture.pcapng import Outcome, Packet
-from busmaster.contract.exchange import Command, Done, Exchange, Expect, FrameError, Step
+from busmaster.contract.driver import Driver, Ending
+from busmaster.contract.exchange import Abandonable, Command, FrameError
+from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.registry import Protocol, find
+
+UNREAD = (Outcome.NONE, Outcome.SPOILT, Outcome.CUT_OFF)
+"""Outcomes that are no reader's doing."""
+FAILED = (Outcome.NO_REPLY, Outcome.GARBLED)
 
 
 @dataclass(slots=True)
@@ -58,7 +64,7 @@ class Replayed:
     @property
     def judged(self) -> bool:
         """There is something to compare with."""
-        return self.recorded.outcome is not Outcome.NONE
+        return self.recorded.outcome not in UNREAD
 
     @property
     def changed(self) -> bool:
@@ -79,23 +85,36 @@ class _Heard:
         asks = self.packet.direction is Direction.HOST and frame.kind in (Kind.READ, Kind.WRITE)
         return asks and not frame.continues
 
+    @property
+    def exchange(self) -> tuple[int, int]:
+        """Which exchange it is of, as far as its recorder knew that."""
+        return self.packet.transaction, self.packet.attempt
+
 
 class _Run:
-    """One exchange of today's, fed with what was recorded."""
+    """One exchange of today's, driven with what was recorded."""
 
-    def __init__(self, asked: _Heard, command: Command[Any], exchange: Exchange[Any]) -> None:
-        self._asked = asked
+    def __init__(self, asked: _Heard, command: Command[Any], profile: Profile) -> None:
+        self.asked = asked
         self._command = command
-        self._exchange = exchange
-        self._owed = b""
-        self._started = False
+        exchange = command.open(asked.frame.node or 0, profile.timings)
+        self._driver = Driver(exchange, noise_tolerant=profile.noise_tolerant)
+        self._abandonable = profile.exchange_limit is not None
+        self._answered = False
+        self._heard = b""
+        """What came in one piece, and may go on."""
+        self._unsaid = b""
+        """What the host is to say next."""
+        self._closed = False
         self._over = False
-        self._now: Result | None = None
+        self._differs = ""
+        self._given_up: Result | None = None
+        """What came of it if the host said the last word not to go on, but to end it (R9): the words are the same."""
         self._recorded = Result(Outcome.NONE)
         self._values: list[float] = []
         self.note(asked)
         if exchange.request != asked.packet.frame:
-            self._now = Result(Outcome.NONE, f"the request would be {exchange.request.hex(' ')}")
+            self._differs = f"the request would be {exchange.request.hex(' ')}"
 
     def note(self, heard: _Heard) -> None:
         """Take the recorded outcome and values."""
@@ -106,58 +125,93 @@ class _Run:
             self._values += numbers_in(heard.frame.value)
 
     def node_says(self, heard: _Heard) -> None:
-        if self._over:
+        """Let the reader hear it, if it still listens."""
+        if self._over and not any(heard.exchange):
             return
         self.note(heard)
-        if heard.packet.frame and self._now is None:
-            self._started = True
-            self._attempt(lambda: self._exchange.feed(heard.packet.frame))
+        self._given_up = None
+        if not heard.packet.joined:
+            self._hand_over()
+        self._heard += heard.packet.frame
+        self._answered = self._answered or bool(heard.packet.frame)
 
     def host_says(self, heard: _Heard) -> bool:
-        """True if it is what this exchange says at this point; else the exchange is over."""
-        if self._over:
+        """Return whether it is what this exchange says at this point; else the exchange is over."""
+        if self._over or self._differs:
             return False
-        if not self._owed and self._now is None:
-            self._attempt(lambda: self._exchange.expired(self._started))
-        owed, self._owed = self._owed, b""
-        self._over = owed != heard.packet.frame
+        frame = heard.packet.frame
+        self._hand_over()
+        if not self._unsaid:
+            self._driver.expire()
+            self._gather()
+        if not self._unsaid.startswith(frame):
+            self._abandon()
+        self._over = not self._unsaid.startswith(frame)
         if not self._over:
+            self._unsaid = self._unsaid[len(frame) :]
+            self._given_up = self._if_abandoned(frame)
             self.note(heard)
         return not self._over
 
     def end(self) -> Replayed:
-        for _ in range(_PATIENCE):
-            if self._now is None:
-                self._attempt(lambda: self._exchange.expired(self._started))
-        now = self._now or Result(Outcome.GARBLED, "it never ends")
+        """Return what was recorded, and what comes of it now."""
+        self._hand_over()
+        self._abandon()
+        now = Result(Outcome.NONE, self._differs) if self._differs else result_of(self._driver.run_out())
         recorded, lead = self._recorded, f"{self._command}: "
+        if self._given_up is not None and recorded.outcome is self._given_up.outcome:
+            now = self._given_up  # time decided it, which is not replayed
+        if self._answered and recorded.outcome in FAILED and now.outcome in FAILED:
+            now.outcome = recorded.outcome  # in pieces of what size a later leg began is not recorded
         if recorded.outcome is Outcome.OK:
             recorded.values = self._values
             recorded.text = recorded.text.removeprefix(lead) if recorded.text.startswith(lead) else ""
-        return _replayed(self._asked, str(self._command), recorded, now)
+        elif recorded.outcome is Outcome.DOUBTED and now.outcome is Outcome.OK:
+            now = Result(Outcome.DOUBTED, f"{now.text}, which was not believed")
+        return _replayed(self.asked, str(self._command), recorded, now)
 
-    def _attempt(self, step: Callable[[], Step[Any]]) -> None:
-        try:
-            self._follow(step())
-        except Refused as refusal:
-            self._now = Result(Outcome.REFUSED, refusal.what)
-        except FrameError as error:
-            self._owed += error.send
-            self._now = Result(Outcome.GARBLED if self._started else Outcome.NO_REPLY, error.what)
+    def _hand_over(self) -> None:
+        """Let the reader hear what came, in the pieces in which it came."""
+        heard, self._heard = self._heard, b""
+        if heard and not self._differs and not self._over:
+            self._driver.feed(heard)
+            self._gather()
 
-    def _follow(self, step: Step[Any]) -> None:
-        while isinstance(step, Expect):
-            self._owed += step.send
-            self._started = False
-            step = self._exchange.feed(b"")
-        if isinstance(step, Done):
-            self._owed += step.send
-            text = "ok" if step.value is None else repr(step.value)
-            self._now = Result(Outcome.OK, text, numbers_of(step.value))
+    def _gather(self) -> None:
+        """Take what the exchange wants to say."""
+        driver = self._driver
+        self._unsaid += b"".join(driver.said)
+        driver.said.clear()
+        if driver.ending is not None and not self._closed:
+            self._closed = True
+            self._unsaid += driver.ending.send
+
+    def _if_abandoned(self, said: bytes) -> Result | None:
+        """Return what would have come of it, had it been abandoned with these words."""
+        if not self._abandonable or self._driver.ending is not None:
+            return None
+        failure = cast("Abandonable", self._driver.exchange).abandon()
+        return result_of(Ending(error=failure)) if isinstance(failure, FrameError) and failure.send == said else None
+
+    def _abandon(self) -> None:
+        """It would have said something again, and the host did not: there was no more time for that (R9)."""
+        if self._abandonable and self._unsaid and self._driver.ending is None:
+            self._driver.abandon()
+            self._unsaid = b""
+            self._gather()
 
 
-_PATIENCE = 16
-"""Legs that an exchange may want in which nothing was recorded: MSC sends a request four times."""
+def result_of(ending: Ending) -> Result:
+    """Return what a reader's ending is called."""
+    error = ending.error
+    if error is None:
+        text = "ok" if ending.value is None else repr(ending.value)
+        return Result(Outcome.OK, text, numbers_of(ending.value))
+    if isinstance(error, Refused):
+        return Result(Outcome.REFUSED, error.what)
+    if isinstance(error, FrameError):
+        return Result(Outcome.NO_REPLY if ending.silent else Outcome.GARBLED, error.what)
+    return Result(Outcome.GARBLED, f"a bug in the protocol's reader: {error!r}")
 
 
 def replay(packets: Iterable[Packet]) -> Iterator[Replayed]:
@@ -165,20 +219,21 @@ def replay(packets: Iterable[Packet]) -> Iterator[Replayed]:
     heard = list(listen(packets))
     run: _Run | None = None
     for place, one in enumerate(heard):
-        if one.packet.direction is Direction.HOST:
-            if run is not None and run.host_says(one):
-                continue
-            if one.is_request:
-                if run is not None:
-                    yield run.end()
-                run = None
-                try:
-                    run = open_run(heard, place)
-                except InvalidCommand as error:
-                    recorded = Result(recorded_outcome(heard, place))
-                    yield _replayed(one, one.frame.text, recorded, Result(Outcome.NONE, str(error)))
-        elif run is not None and one.packet.outcome is not Outcome.STRAY:
-            run.node_says(one)
+        of_run = run is not None and one.exchange == run.asked.exchange
+        if one.packet.direction is not Direction.HOST:
+            if run is not None and of_run and (any(one.exchange) or one.packet.outcome is not Outcome.STRAY):
+                run.node_says(one)
+            continue
+        if (run is not None and of_run and run.host_says(one)) or not one.is_request or (of_run and any(one.exchange)):
+            continue
+        if run is not None:
+            yield run.end()
+        run = None
+        try:
+            run = open_run(heard, place)
+        except InvalidCommand as error:
+            recorded = Result(recorded_outcome(heard, place))
+            yield _replayed(one, one.frame.text, recorded, Result(Outcome.NONE, str(error)))
     if run is not None:
         yield run.end()
 
@@ -207,7 +262,7 @@ def open_run(heard: Sequence[_Heard], place: int) -> _Run:
             continued.append(follower.frame)
     protocol = find(asked.packet.protocol).protocol
     command = command_of(protocol, asked.frame, continued)
-    return _Run(asked, command, command.open(asked.frame.node or 0, protocol.profile.timings))
+    return _Run(asked, command, protocol.profile)
 
 
 def command_of(protocol: Protocol, request: Frame, continued: Sequence[Frame] = ()) -> Command[Any]:

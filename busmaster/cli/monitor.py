@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 
+from busmaster.bus.suitability import check_settings
 from busmaster.capture.decode import DEFAULT_GAP, Decoder
 from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.capture.recorder import Recorder
@@ -40,6 +41,7 @@ def command(port: str, protocol: str, baud: int | None, as_json: bool, capture: 
     """
     endpoint = Connection(port, protocol, baud).endpoint()
     kind = find(protocol)
+    check_settings(kind.profile, endpoint)
     names = kind.handle.names_of_items()
     write = json_text if as_json else plain_text
     with capturing(capture, port=endpoint.name, protocol=protocol) as recorder:

@@ -11,7 +11,7 @@ from busmaster.arbiter.transaction import Priority
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import json_option
 from busmaster.cli.lines import file_argument, load
-from busmaster.cli.output import emit, emit_all, json_line
+from busmaster.cli.output import columns, emit, emit_all, json_line
 from busmaster.config import ConfiguredLine
 from busmaster.contract.profile import LineSettings
 from busmaster.planning import GroupPlan, Plan
@@ -42,15 +42,7 @@ def command(path: str, as_json: bool) -> int:
 
 def page(head: str, plan: Plan) -> list[str]:
     """What a person wants to know: a table of the groups, the waits, and what would fit."""
-    rows = [HEAD, *(row(group) for group in plan.groups)]
-    widths = [max(len(cells[column]) for cells in rows) for column in range(len(HEAD))]
-    table = [
-        "  ".join(
-            cell.rjust(width) if column else cell.ljust(width)
-            for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
-        )
-        for cells in rows
-    ]
+    table = columns([HEAD, *(row(group) for group in plan.groups)], right=range(1, len(HEAD)))
     verdict = "it fits" if plan.fits and not plan.advice else "it fits, barely" if plan.fits else "it does not fit"
     share = f"the schedule asks for {plan.utilisation:.0%} of the line"
     waits = (f"{priority.name.lower()} {time_text(plan.worst_waits[priority])}" for priority in SHOWN)

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 import click
 
 from busmaster.cli.parsing import Whole, option_type
-from busmaster.errors import InvalidCommand
-from busmaster.registry import NodeKind, Option, kinds
+from busmaster.registry import NodeKind, Option, find, kinds
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -20,9 +19,7 @@ WIDTH = 77
 
 def parse_protocol(text: str) -> str:
     """The name of a kind of node. Raises InvalidCommand for any other."""
-    if text not in kinds():
-        raise InvalidCommand(f"{text!r} is not one of {', '.join(kinds())}")
-    return text
+    return find(text).name
 
 
 class ProtocolOption(click.Option):
@@ -105,10 +102,11 @@ class NodeCommand(click.Command):
 
 
 class ItemCommand(NodeCommand):
-    """A command on items: its help says what they are."""
+    """A command on items: its help says what they are, and where more is said of each."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        self.epilog = "\n".join(("\b", "ITEM, by protocol:", *item_lines()))
+        head = "ITEM, by protocol (`busmaster items PROTOCOL` says what each is):"
+        self.epilog = "\n".join(("\b", head, *item_lines()))
         super().format_epilog(ctx, formatter)
 
 

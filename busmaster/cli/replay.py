@@ -19,7 +19,8 @@ CHANGED = 1
 def command(capture: str) -> int:
     """Read again what a capture has recorded, and say what comes out otherwise than it was recorded.
 
-    A line for each exchange that has changed, then how many there were. The exit status is 1 if any has.
+    A line for each exchange that has changed, then how many there were. The exit status is 1 if any has. What no
+    reader was asked about is not judged: bytes that the port called damaged, say, or an exchange that was cut off.
     """
     counts: Counter[str] = Counter()
     try:
@@ -43,4 +44,4 @@ def changed_text(one: Replayed) -> str:
 def summary_text(counts: Counter[str]) -> str:
     total = counts.total()
     text = f"{total} exchange{'' if total == 1 else 's'}: {counts['same']} the same, {counts['changed']} changed"
-    return text + (f", {counts['unjudged']} without a recorded outcome" if counts["unjudged"] else "")
+    return text + (f", {counts['unjudged']} not judged" if counts["unjudged"] else "")

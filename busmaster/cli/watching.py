@@ -52,7 +52,7 @@ class Watch:
         self.events: deque[str] = deque(maxlen=KEPT_EVENTS)
         self._periods: dict[str, deque[float]] = {}
         self._started: dict[str, float] = {}
-        self._good: dict[Point[Any], Sample] = {}
+        self._good: dict[Point[Any], Sample[Any]] = {}
         self._counted = -math.inf
         self._node_rows: tuple[NodeRow, ...] = ()
         self._group_rows: tuple[GroupRow, ...] = ()

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import Any
 
+from busmaster.arbiter.tap import Tap
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
+from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.config.names import expanded, listed
 from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
-from busmaster.config.table import nearest
+from busmaster.contract.arguments import guess, is_decimal, meant
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.fan import Fan
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
 from busmaster.transport.endpoints import Endpoint
-from busmaster.transport.pump import Tap
 
 
 class ConfiguredLine:
@@ -93,7 +93,7 @@ class ConfiguredLine:
             PlannedGroup(
                 group.name,
                 group.period,
-                [(point.node.planned(), point.command) for point in self._wanted[group.name]],
+                [(Node.of(point).planned(), point.command) for point in self._wanted[group.name]],
                 phase=group.phase,
                 priority=group.priority,
             )
@@ -107,14 +107,15 @@ class ConfiguredLine:
     def _handle(self, node: NodeSection) -> Handle:
         options = dict(node.options)
         if node.kind.takes_decimals:
-            options["decimals"] = _decimals(node)
+            options["decimals"] = decimals_of(node)
         with node.table.at():
             make: Callable[..., Handle] = node.kind.handle
             handle = make(self.bus, node.address, timings=node.timings, retries=node.retries, **options)
+            own = Node.of(handle)
             if node.reply_time is not None:
-                handle.node.record.reply_time = node.reply_time  # until it is measured
-            if not node.name.isdigit():
-                handle.node.record.label = node.name  # what messages and the screen call it
+                own.reply_time = node.reply_time  # until it is measured
+            if not is_decimal(node.name):
+                own.rename(node.name)  # what messages and the screen call it
         for point in node.points.values():
             with point.table.at(*(["item"] if "item" in point.table else [])):
                 handle.point(point.item)
@@ -125,7 +126,7 @@ class ConfiguredLine:
             with group.table.at("points", number):
                 for name in self._names(text):
                     point = self._point(*name)
-                    point.command.open(point.node.address, point.node.record.timings)
+                    point.command.open(point.node.address, Node.of(point).timings)
                     yield point
 
     def _names(self, text: str) -> Iterator[tuple[str, str]]:
@@ -135,7 +136,7 @@ class ConfiguredLine:
             raise InvalidCommand(f"a point is written NODE/ITEM, not {text!r}")
         for node in (name for part in listed(nodes) for name in expanded(part, self.nodes)):
             if node not in self.nodes:
-                raise InvalidCommand(f"no such node {node!r}; {nearest(node, self.nodes)}")
+                raise InvalidCommand(f"no such node {node!r}; {meant(node, self.nodes)}")
             section = self.file.nodes[node]
             known = {*section.points, *section.options.get("symbols", ())}
             for item in (name for part in listed(items) for name in expanded(part, known)):
@@ -155,7 +156,9 @@ class ConfiguredLine:
             source = _known(handle, name, node.points)
             return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
         decimals = 0 if node.kind.takes_decimals else section.decimals
-        scale = Scale.of(section.factor, section.offset, decimals, whole=node.kind.whole_numbers(section.item))
+        rounds = node.kind.takes_decimals and (section.decimals or node.kind.decimals(section.item))
+        whole = not rounds and node.kind.whole_numbers(section.item)  # else the handle rounds, to its decimals
+        scale = Scale.of(section.factor, section.offset, decimals, whole=whole)
         return NamedPoint.of(handle.point(section.item), where=where, name=name, unit=section.unit, scale=scale)
 
     def _add_outputs(self) -> None:
@@ -163,11 +166,11 @@ class ConfiguredLine:
             table = self.file.table.table("outputs").table(kind)
             writable: dict[str, Point[Any]] = {}
             if isinstance(settings, MqttSettings):
-                for number, text in enumerate(settings.allow):
+                for number, text in enumerate(settings.allow_commands):
                     with table.at("allow_commands", number):
                         writable |= {point.key: point for point in map(self._writable, self._names(text))}
             with table.at():
-                self.outputs.add(kind, settings, title=self.file.title, commands=writable)
+                self.outputs.add(kind, settings, commands=writable)
 
     def _writable(self, name: tuple[str, str]) -> Point[Any]:
         point = self._point(*name)
@@ -180,14 +183,16 @@ def _known(handle: Handle, item: str, points: Iterable[str]) -> Point[Any]:
     try:
         return handle.point(item)
     except InvalidCommand:
-        near = difflib.get_close_matches(item, list(points), n=1)
-        if near:
-            raise InvalidCommand(f"no such item {item!r}: did you mean {near[0]!r}?") from None
+        if near := guess(item, points):
+            raise InvalidCommand(f"no such item {item!r}{near}") from None
         raise
 
 
-def _decimals(node: NodeSection) -> dict[str, int]:
-    """Of each quantity the digits, where the handle rounds by them. What is behind a colon only says how it is sent."""
+def decimals_of(node: NodeSection) -> dict[str, int]:
+    """Return the digits of each quantity whose points have decimals, for a handle that scales or rounds by them.
+
+    What is behind a colon only says how it is sent.
+    """
     decimals: dict[str, int] = {}
     for point in node.points.values():
         parameter = point.item.partition(":")[0]

@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any
+from typing import Any, Unpack
 
 from busmaster.bus.points import Point
+from busmaster.bus.requester import CommandOptions
 from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand
 
@@ -103,7 +104,7 @@ class NamedPoint(Point[Any]):
     def writable(self) -> bool:
         return self.source.writable
 
-    async def write(self, value: Any, **options: Any) -> None:
+    async def write(self, value: Any, **options: Unpack[CommandOptions]) -> None:
         """As `Point.write`. A run is written in as many exchanges as it takes."""
         if self.source.writable and self.encode is None:
             await self.source.write(value if self.scale.trivial else self.scale.write(value), **options)

@@ -1,16 +1,25 @@
-"""What callers hand in as numbers: taken for what it is, or refused in words before anything is sent.
+"""What callers hand in, numbers and names: taken for what it is, or refused in words before anything is sent.
 
 True is no number here, although Python lets it pass for 1: it is what a mistyped call leaves behind.
 """
 
 from __future__ import annotations
 
+import difflib
 import operator
+from collections.abc import Iterable
 from math import inf, nan
 from numbers import Real
-from typing import SupportsIndex
+from typing import NamedTuple, SupportsIndex
 
 from busmaster.errors import InvalidCommand
+
+
+class Between(NamedTuple):
+    """The least and the most that a number may be, bounds included: beside its type, in `Annotated`."""
+
+    least: float
+    most: float = inf
 
 
 def whole_number(value: SupportsIndex, lowest: int, highest: int, what: str) -> int:
@@ -32,3 +41,28 @@ def seconds(value: object, what: str) -> float:
     if not 0 <= number < inf:
         raise InvalidCommand(f"{what} is a time of 0 s or more, not {value!r}")
     return number
+
+
+def is_decimal(text: str) -> bool:
+    """Return whether a text is a whole number without a sign, in digits as the command line takes them."""
+    return text.isascii() and text.isdigit()
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Return that of the known names which may have been meant, or None if none is near."""
+    return next(iter(difflib.get_close_matches(name, list(known), n=1)), None)
+
+
+def guess(name: str, known: Iterable[str]) -> str:
+    """Return "; did you mean 'x'?" for the end of a message, or nothing if no known name is near."""
+    near = nearest(name, known)
+    return "" if near is None else f"; did you mean {near!r}?"
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """Return "did you mean 'x'?" or, if no known name is near, "there are x, y"."""
+    known = tuple(known)
+    near = nearest(name, known)
+    if near is not None:
+        return f"did you mean {near!r}?"
+    return f"there are {', '.join(known)}" if known else "there are none"

@@ -33,7 +33,7 @@ class LineSettings:
 
     @property
     def byte_time(self) -> float:
-        """tau: seconds per byte on the wire."""
+        """Return tau, the seconds per byte on the wire."""
         bits = START_BIT + self.bytesize + (self.parity != "N") + self.stopbits
         return bits / self.baudrate
 
@@ -62,7 +62,8 @@ class Profile:
     asked. `checks` are further cheap reads that harm no node and whose answers differ: where an answer could be
     another request's, one of those is asked that cannot be (R15); a node that refuses one is asked another.
     `exchange_limit` bounds one exchange as a whole, in seconds (MSC: past it a bad packet is ACKed away); its
-    exchanges are `Abandonable`.
+    exchanges are `Abandonable`. `shares_line_with` are the other protocols whose nodes may be on the same line.
+    `fixed_rate`: its devices have the baud rate of `line` and no other.
     """
 
     name: str
@@ -77,16 +78,28 @@ class Profile:
     addressed: bool = True
     retries: int = 2
     noise_tolerant: bool = False
+    shares_line_with: frozenset[str] = frozenset()
+    fixed_rate: bool = False
     exchange_limit: float | None = None
     listen: Callable[[], Listener] | None = field(default=None, compare=False)
     merge: Callable[[Sequence[Command[Any]]], Sequence[Batch]] | None = field(default=None, compare=False)
 
     def label(self, address: int) -> str:
-        """How messages name a node: "node 5", or "the drive" where the protocol has no address."""
+        """Return how messages name a node: "node 5", or "the drive" where the protocol has no address."""
         return f"node {address}" if self.addressed else "the drive"
 
+    def may_share_with(self, other: Profile) -> bool:
+        """Return whether both may be on one line: it is enough that one of them knows the other."""
+        return other.name == self.name or other.name in self.shares_line_with or self.name in other.shares_line_with
+
+    def wrong_rate(self, baudrate: int) -> str:
+        """Return what is wrong with a baud rate, in words; nothing unless its devices cannot have it."""
+        if not self.fixed_rate or baudrate == self.line.baudrate:
+            return ""
+        return f"{self.title} devices speak at {self.line.baudrate} baud alone, not at {baudrate}"
+
     def check_address(self, address: int) -> None:
-        """Raises InvalidCommand unless `address` is a node's, or the broadcast, address."""
+        """Raise InvalidCommand unless `address` is a node's, or the broadcast, address."""
         if isinstance(address, bool) or not isinstance(address, int):
             raise InvalidCommand(f"{self.name}: an address is a whole number, not {address!r}")
         if address in self.addresses or address == self.broadcast:

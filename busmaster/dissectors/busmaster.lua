@@ -2,19 +2,22 @@
 -- frames say is left to Wireshark's own dissector.
 --
 -- Copy it into the folder that Help > About Wireshark > Folders calls "Personal Lua Plugins", or run
--- tshark -X lua_script:busmaster.lua -r line.pcapng. Every packet is one frame on the line behind a header of six bytes
--- (version, protocol, direction, outcome, node), on the private link type 157. Frames are read by position: any byte,
--- a control character too, may be a checksum.
+-- tshark -X lua_script:busmaster.lua -r line.pcapng. Every packet is one frame on the line behind a header (version,
+-- protocol, direction, outcome, node; since version 2 the request and the attempt at it, by number), on the private
+-- link type 157. A protocol that has no number there is called as the packet's interface is described. Frames are read
+-- by position: any byte, a control character too, may be a checksum.
 
-local HEADER, VERSION, NO_NODE = 6, 1, 0xFFFF
+local HEADERS, NO_NODE = { 6, 12 }, 0xFFFF
 local STX, ETX, EOT, ENQ, ACK, BEL, BS, NAK = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x15
 local FROM_NODE, FROM_HOST = 1, 2
 local HCP, HCP2, MICROFLEX, MSC, MENTOR, DC104, MODBUS, CT_ANSI = 1, 2, 3, 4, 5, 6, 7, 8
 
 local TITLES = { [0] = "unknown", "HCP", "HCP2", "MicroFlex", "MSC", "Mentor", "DC104", "Modbus", "CT-ANSI" }
 local DIRECTIONS = { [0] = "unknown", "node to host", "host to node" }
-local OUTCOMES = { [0] = "-", "ok", "no reply", "garbled", "refused", "stray" }
-local NO_REPLY, STRAY = 2, 5
+local OUTCOMES = {
+  [0] = "-", "ok", "no reply", "garbled", "refused", "stray", "not believed", "not read", "cut off",
+}
+local NO_REPLY, STRAY, DOUBTED = 2, 5, 6
 local SHORT_COMMANDS = { [NAK] = "again", [ACK] = "next", [BS] = "previous" }
 local ACKNOWLEDGEMENTS = { [ACK] = "ACK", [NAK] = "NAK", [EOT] = "EOT" }
 
@@ -25,6 +28,9 @@ local f = {
   direction = ProtoField.uint8("busmaster.direction", "Direction", base.DEC, DIRECTIONS),
   outcome = ProtoField.uint8("busmaster.outcome", "Outcome", base.DEC, OUTCOMES),
   node = ProtoField.uint16("busmaster.node", "Node"),
+  transaction = ProtoField.uint32("busmaster.transaction", "Request, by number"),
+  attempt = ProtoField.uint8("busmaster.attempt", "Attempt at it"),
+  joined = ProtoField.bool("busmaster.joined", "In one piece with the end of the frame before"),
   command = ProtoField.string("busmaster.command", "Command"),
   element = ProtoField.uint8("busmaster.element", "Element"),
   parameter = ProtoField.string("busmaster.parameter", "Parameter"),
@@ -54,6 +60,7 @@ local e = {
   silent = ProtoExpert.new("busmaster.silent", "No reply", expert.group.SEQUENCE, expert.severity.WARN),
   echo = ProtoExpert.new("busmaster.echo", "Not what was asked", expert.group.SEQUENCE, expert.severity.WARN),
   stray = ProtoExpert.new("busmaster.stray", "Nobody asked for this", expert.group.SEQUENCE, expert.severity.NOTE),
+  unused = ProtoExpert.new("busmaster.unused", "Not taken for an answer", expert.group.SEQUENCE, expert.severity.WARN),
 }
 line.experts = e
 
@@ -449,9 +456,11 @@ function line.init()
   asked, links = nil, {}
 end
 
--- Filled in the first time a packet is seen, in order; looked up ever after.
+-- Filled in the first time a packet is seen, in order; looked up ever after. Where the master said to which exchange a
+-- packet belongs, only a request of the same one is its request.
 local function link(p, pinfo)
   if not pinfo.visited then
+    if p.exchange and asked and asked.exchange ~= p.exchange then asked = nil end
     if p.direction == FROM_NODE then
       links[pinfo.number] = asked
     elseif p.kind == "short" then
@@ -461,9 +470,11 @@ local function link(p, pinfo)
       local item = menu and string.format("%s.%02d", menu, number + step)
       if asked then
         asked = { number = pinfo.number, time = pinfo.rel_ts, item = item, what = item, node = asked.node, kind = "read" }
+        asked.exchange = p.exchange
       end
     elseif p.direction == FROM_HOST and p.kind and p.kind ~= "ACK" and p.kind ~= "NAK" then
       asked = { number = pinfo.number, time = pinfo.rel_ts, item = p.item, what = p.what, node = p.node, kind = p.kind }
+      asked.exchange = p.exchange
     elseif p.direction == FROM_HOST then
       links[pinfo.number] = asked
     end
@@ -497,14 +508,26 @@ local function add_outcome(p, outcome, whole, size)
   if size > 0 and not whole then p.tree:add_proto_expert_info(e.broken) end
   if outcome == NO_REPLY then p.tree:add_proto_expert_info(e.silent) end
   if outcome == STRAY then p.tree:add_proto_expert_info(e.stray) end
+  if outcome >= DOUBTED then
+    p.tree:add_proto_expert_info(e.unused, "Not taken for an answer: " .. (OUTCOMES[outcome] or ""))
+  end
   if size == 0 then return (p.node and "node " .. p.node .. " " or "") .. (OUTCOMES[outcome] or "") end
   local text = info(p)
   if not whole then text = text .. " (" .. size .. (size == 1 and " byte)" or " bytes)") end
   return p.bad and text .. " [bad checksum]" or text
 end
 
+local has_description, description = pcall(Field.new, "frame.interface_description")
+
+local function title(protocol)
+  if protocol ~= 0 then return TITLES[protocol] end
+  local described = has_description and description()
+  return described and described.value ~= "" and described.value or TITLES[0]
+end
+
 function line.dissector(tvb, pinfo, root)
-  if tvb:len() < HEADER or tvb(0, 1):uint() ~= VERSION then return 0 end
+  local header = tvb:len() > 0 and HEADERS[tvb(0, 1):uint()]
+  if not header or tvb:len() < header then return 0 end
   local tree = root:add(line, tvb())
   local protocol, direction, outcome = tvb(1, 1):uint(), tvb(2, 1):uint(), tvb(3, 1):uint()
   tree:add(f.protocol, tvb(1, 1))
@@ -512,8 +535,14 @@ function line.dissector(tvb, pinfo, root)
   tree:add(f.outcome, tvb(3, 1))
 
   local p = { tree = tree, protocol = protocol, direction = direction }
-  local size, reader = tvb:len() - HEADER, READERS[protocol]
-  local whole = size > 0 and reader ~= nil and direction ~= 0 and reader(p, tvb(HEADER):tvb())
+  if header > 6 and tvb(6, 4):uint() > 0 then
+    tree:add(f.transaction, tvb(6, 4))
+    tree:add(f.attempt, tvb(10, 1))
+    p.exchange = tvb(6, 5):bytes():tohex()
+  end
+  if header > 6 and tvb(11, 1):uint() > 0 then tree:add(f.joined, tvb(11, 1)) end
+  local size, reader = tvb:len() - header, READERS[protocol]
+  local whole = size > 0 and reader ~= nil and direction ~= 0 and reader(p, tvb(header):tvb())
   if not whole then p.kind, p.say = nil, nil end
   local in_frame = p.node
   if not in_frame and tvb(4, 2):uint() ~= NO_NODE then p.node = tvb(4, 2):uint() end
@@ -523,12 +552,12 @@ function line.dissector(tvb, pinfo, root)
   if p.leg then tree:add(f.leg, p.leg):set_generated() end
   if protocol == MODBUS and size > 0 then
     local found, own = pcall(Dissector.get, "mbrtu")
-    if found and own then own:call(tvb(HEADER):tvb(), pinfo, root) end
+    if found and own then own:call(tvb(header):tvb(), pinfo, root) end
   end
 
   local text = add_outcome(p, outcome, whole, size)
-  tree:append_text(", " .. (TITLES[protocol] or "") .. ", " .. text)
-  pinfo.cols.protocol = TITLES[protocol] or "serial"
+  tree:append_text(", " .. (title(protocol) or "") .. ", " .. text)
+  pinfo.cols.protocol = title(protocol) or "serial"
   pinfo.cols.info = text
   local node = p.node and "node " .. p.node or "node"
   if direction == FROM_NODE then pinfo.cols.src, pinfo.cols.dst = node, "host" end

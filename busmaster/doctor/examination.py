@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeAlias
 import anyio.to_thread
 
 from busmaster.arbiter.events import Mark
+from busmaster.arbiter.tap import Tap
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings
 from busmaster.doctor import adapters, diagnosis, uart
@@ -19,7 +20,6 @@ from busmaster.doctor.probing import Outcome, Prober, Wire, opened
 from busmaster.errors import LineDown
 from busmaster.registry import find
 from busmaster.transport.endpoints import Endpoint
-from busmaster.transport.pump import Tap
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
@@ -117,13 +117,13 @@ def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
     """What can be said of an open port."""
     where = patient.endpoint
     assert wire.transport is not None
+    profile = None if patient.protocol is None else patient.profile
+    advice = "" if profile is None or where.settings is None else profile.wrong_rate(where.settings.baudrate)
     if where.settings is None or isinstance(where, TcpPort):
-        yield Finding("open", True, "it opens")
+        yield Finding("open", True, "it opens", advice)
         return
-    usual = where.settings if patient.protocol is None else patient.profile.line
-    advice = ""
-    if where.settings != usual:
-        advice = f"{patient.profile.title} usually has {diagnosis.speed(usual)}"
+    if profile is not None and where.settings != profile.line:
+        advice = advice or f"{profile.title} usually has {diagnosis.speed(profile.line)}"
     yield Finding("open", True, f"it opens at {diagnosis.speed(where.settings)}", advice)
     device = wire.transport.get_extra_info("serial")
     if device is not None:

@@ -11,24 +11,25 @@ from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import anyio
 
 from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import Mark
-from busmaster.contract.exchange import Command, Done, Exchange, Expect, FrameError
+from busmaster.arbiter.strays import QUIET
+from busmaster.arbiter.tap import Attempt, Tap, Verdict
+from busmaster.contract.driver import Driver
+from busmaster.contract.exchange import Command, Exchange, FrameError
 from busmaster.contract.profile import Profile
-from busmaster.contract.timing import ReplyTiming, Timings
+from busmaster.contract.timing import Timings
 from busmaster.errors import LineDown, Refused
 from busmaster.outputs.values import value_text
 from busmaster.transport.clock import clock_of
 from busmaster.transport.endpoints import Endpoint, is_paced
 from busmaster.transport.kernel import OpenPort, open_port
-from busmaster.transport.pump import Tap
 
-QUIET = 0.02
-"""Seconds of silence, at least, after which nothing more is expected."""
 BABBLE = 1.0
 """Seconds after which a line that does not fall silent is left alone."""
 MUCH = 16384
@@ -46,6 +47,8 @@ class Wire(asyncio.Protocol):
         self.port: OpenPort | None = None
         self.marked: Counter[Mark] = Counter()
         self.closed = anyio.Event()
+        self.attempt: Attempt | None = None
+        """What is asked now, for the tap."""
         self._tap = tap
         self._cause: Exception | None = None
         self._chunks: deque[tuple[float, bytes]] = deque()
@@ -64,7 +67,7 @@ class Wire(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         now = self.clock()
         if self._tap is not None:
-            self._tap.received(now, data)
+            self._tap.received(now, data, self.attempt)
         self._chunks.append((now, data))
         self._arrived.set()
 
@@ -80,8 +83,14 @@ class Wire(asyncio.Protocol):
         self.transport.write(data)
         now = self.clock()
         if self._tap is not None:
-            self._tap.transmitted(now, data)
+            self._tap.transmitted(now, data, self.attempt)
         return now
+
+    def attempted(self, attempt: Attempt) -> None:
+        """Tell the tap that this is over."""
+        self.attempt = None
+        if self._tap is not None:
+            self._tap.attempted(attempt)
 
     async def hear(self, until: float) -> tuple[float, bytes] | None:
         """The next bytes and their time; None if nothing has come by `until`. Raises LineDown if the port is lost."""
@@ -161,30 +170,38 @@ class Prober:
         self._timings = timings
         self.byte_time = byte_time
         self._echo = Echo(echo)
+        self._numbers = count(1)
 
     async def ask(self, address: int, *, patience: float | None = None, alone: bool = False) -> Probe:
         """`patience`: seconds to wait for the first byte, the lateness by default. Raises LineDown.
 
         `alone`: whatever still comes within the lateness is this node's doing, and not left for the next request.
         """
-        exchange: Exchange[Any] = self._profile.probe.open(address, self._timings)
+        profile, wire = self._profile, self._wire
+        command = profile.probe
+        hearing = _Hearing(command, command.open(address, self._timings))
+        attempt = Attempt(
+            profile.name, address, command, self._timings, transaction=next(self._numbers), purpose="probe"
+        )
         self._echo.forget()
-        end = self._say(exchange.request)
-        wait = exchange.timing.lateness if patience is None else patience
-        attempt = _Attempt(self._profile.probe, exchange, end)
-        until = end + wait + self._wire.latency
-        while (chunk := await self._wire.hear(until)) is not None:
+        wire.attempt = attempt
+        hearing.asked = self._say(hearing.driver.exchange.request)
+        wait = hearing.driver.timing.lateness if patience is None else patience
+        until = hearing.asked + wait + wire.latency
+        while (chunk := await wire.hear(until)) is not None:
             data = self._echo.strip(chunk[1])
             if data is None:
-                attempt.fail("what came back differs from what was sent: a collision", chunk[1])
+                hearing.collide(chunk[1])
             elif data:
-                until = attempt.take(chunk[0], data, self._say) + self._wire.latency
-            if attempt.over:
+                until = hearing.take(chunk[0], data, self._say) + wire.latency
+            if hearing.driver.ending is not None:
                 break
+        attempt.end(*hearing.verdict(), wire.clock())
+        wire.attempted(attempt)
         rest = b""
-        if attempt.start is not None:
-            rest = await self._wire.hear_all(wait if alone else max(QUIET, exchange.timing.byte_gap))
-        return attempt.probe(self._echo.strip(rest) or b"")
+        if hearing.start is not None:
+            rest = await wire.hear_all(wait if alone else max(QUIET, hearing.driver.timing.byte_gap))
+        return hearing.probe(self._echo.strip(rest) or b"")
 
     def _say(self, data: bytes) -> float:
         """Returns when it will have left: at once, where nobody knows how long it takes."""
@@ -192,66 +209,62 @@ class Prober:
         return self._wire.say(data) + (len(data) * self.byte_time if self._wire.paced else 0.0)
 
 
-class _Attempt:
-    """What an exchange makes of the bytes that come."""
+class _Hearing:
+    """What an exchange makes of the bytes that come. `asked`: when its request had left."""
 
-    def __init__(self, command: Command[Any], exchange: Exchange[Any], end: float) -> None:
+    def __init__(self, command: Command[Any], exchange: Exchange[Any]) -> None:
+        self.driver = Driver(exchange)
+        self.asked = 0.0
         self.start: float | None = None
-        self.over = False
         self._command = command
-        self._exchange = exchange
-        self._timing: ReplyTiming = exchange.timing
-        self._end = end
         self._raw = b""
-        self._outcome = Outcome.GARBLED
-        self._text = "cut short"
-        self._again = b""
+        self._collided = False
 
     def take(self, now: float, data: bytes, say: Callable[[bytes], float]) -> float:
         """Returns until when to wait for more."""
+        driver = self.driver
         self._hear(now, data)
-        wait = self._timing.byte_gap
-        try:
-            step = self._exchange.feed(data)
-            while isinstance(step, Expect):
-                self._timing = step.timing
-                wait = step.timing.lateness
-                if step.send:
-                    now = say(step.send)
-                step = self._exchange.feed(b"")
-        except FrameError as error:
-            if error.send:
-                say(error.send)
-            self._finish(Outcome.GARBLED, error.what)
-        except Refused as refusal:
-            self._finish(Outcome.ANSWERED, f"{self._command}: {refusal.what}")
-        else:
-            if isinstance(step, Done):
-                if step.send:
-                    say(step.send)
-                self._again = step.rest
-                self._finish(Outcome.ANSWERED, f"{self._command}: {value_text(step.value)}")
-        return now + wait
+        driver.said.clear()
+        driver.feed(data)
+        for send in driver.said:
+            now = say(send)
+        if driver.ending is not None and driver.ending.send:
+            say(driver.ending.send)
+        return now + (driver.timing.byte_gap if driver.begun else driver.timing.lateness)
 
-    def fail(self, what: str, data: bytes) -> None:
-        self._hear(self._end, data)
-        self._finish(Outcome.GARBLED, what)
+    def collide(self, data: bytes) -> None:
+        """Take it that this came in place of the echo."""
+        self._hear(self.asked, data)
+        self._collided = True
+        self.driver.fail(FrameError("what came back differs from what was sent: a collision"))
+
+    def verdict(self) -> tuple[Verdict, Any]:
+        """Return how it ended, and the value or what was wrong. Raises what a bug of the protocol raised."""
+        ending = self.driver.ending
+        if ending is None:
+            return (Verdict.NO_REPLY, "no reply") if self.start is None else (Verdict.GARBLED, "cut short")
+        match ending.error:
+            case None:
+                return Verdict.OK, ending.value
+            case Refused() as refusal:
+                return Verdict.REFUSED, refusal.what
+            case FrameError() as error:
+                return (Verdict.SPOILT if self._collided else Verdict.GARBLED), error.what
+            case bug:
+                raise bug
 
     def probe(self, rest: bytes) -> Probe:
         """`rest` came after all was over."""
+        verdict, result = self.verdict()
         if self.start is None:
             return Probe(Outcome.SILENT)
-        again = self._again + rest
-        if self._outcome is Outcome.GARBLED:
-            return Probe(self._outcome, self.start, self._text, self._raw + again)
-        return Probe(self._outcome, self.start, self._text, self._raw, again)
+        if verdict not in (Verdict.OK, Verdict.REFUSED):
+            return Probe(Outcome.GARBLED, self.start, result, self._raw + rest)
+        text = value_text(result) if verdict is Verdict.OK else result
+        left_over = b"" if self.driver.ending is None else self.driver.ending.rest
+        return Probe(Outcome.ANSWERED, self.start, f"{self._command}: {text}", self._raw, left_over + rest)
 
     def _hear(self, now: float, data: bytes) -> None:
         if self.start is None:
-            self.start = now - self._end
+            self.start = now - self.asked
         self._raw += data
-
-    def _finish(self, outcome: Outcome, text: str) -> None:
-        self.over = True
-        self._outcome = outcome
-        self._text = text

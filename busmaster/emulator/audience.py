@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from busmaster.emulator.device import NEVER, Chance, Device
-from busmaster.emulator.faults import misses
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import NEVER, Device
+from busmaster.emulator.disturbance import misses
 from busmaster.emulator.wave import Wave
 
 Say = Callable[[Device, float, bytes], None]

@@ -24,38 +24,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol, final
+from typing import final
 
+from busmaster.emulator.chance import Chance, NoChance
 from busmaster.emulator.faults import Faults
 from busmaster.errors import InvalidCommand
 
 NEVER = math.inf
 NAK = b"\x15"
-
-
-class Chance(Protocol):
-    """What the emulator uses of a seeded `random.Random`, which is handed in: the same seed, the same line."""
-
-    def random(self) -> float: ...
-    def uniform(self, a: float, b: float) -> float: ...
-    def randrange(self, start: int, stop: int) -> int: ...
-    def getrandbits(self, k: int) -> int: ...
-
-
-class NoChance:
-    """Stands in where no random.Random was handed in: says so as soon as chance is needed."""
-
-    def random(self) -> float:
-        raise ValueError("hand a random.Random(seed) to the Line: a delay or a fault on it is random")
-
-    def uniform(self, a: float, b: float) -> float:
-        return self.random()
-
-    def randrange(self, start: int, stop: int) -> int:
-        return int(self.random())
-
-    def getrandbits(self, k: int) -> int:
-        return int(self.random())
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +72,13 @@ class Delay:
         return self.low if self.high is None else chance.uniform(self.low, self.high)
 
 
+def held(value: float, low: int, high: int, what: str) -> int:
+    """Return a value as the whole number that a device can hold. Raises InvalidCommand, naming it `what`."""
+    if not low <= value <= high or value != int(value):
+        raise InvalidCommand(f"{what} holds a whole number, {low} to {high}, not {value:g}")
+    return int(value)
+
+
 class Device(ABC):
     """One slave on the line. A kind of device writes `hear_byte`, its `routes`, and `take` for speed.
 
@@ -127,6 +110,16 @@ class Device(ABC):
         """Added to every delay: how a fault makes one reply late."""
         self.away_until = 0.0
         """A fault took it off the line until then."""
+
+    # Before it joins a line
+
+    def preset(self, item: str, *values: float) -> None:
+        """Hold `values` from the start: in `item`, written as on the command line, and in those after it.
+
+        A value is the number that the line carries. A kind of device whose values can be set writes this. Raises
+        InvalidCommand for an item that it does not have, or that cannot hold the value.
+        """
+        raise InvalidCommand(f"{type(self).__name__} takes no initial values")
 
     # What the line calls
 

@@ -25,8 +25,10 @@ from heapq import heapify, heappop, heappush
 
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.audience import Audience
-from busmaster.emulator.device import NEVER, Chance, Device, NoChance
-from busmaster.emulator.faults import Faults, Said, distort, flipped
+from busmaster.emulator.chance import Chance, NoChance
+from busmaster.emulator.device import NEVER, Device
+from busmaster.emulator.disturbance import Said, distort, flipped
+from busmaster.emulator.faults import Faults
 from busmaster.emulator.wave import Wave
 
 PIECE = 0.005

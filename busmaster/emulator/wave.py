@@ -9,7 +9,8 @@ import math
 from collections.abc import Iterator
 
 from busmaster.contract.profile import LineSettings
-from busmaster.emulator.device import Chance, Device
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import Device
 
 IDLE = 1
 START = 0

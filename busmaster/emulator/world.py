@@ -12,8 +12,9 @@ from itertools import count
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, Event, LineChanged, NodeChanged
+from busmaster.arbiter.events import Event, LineChanged, NodeChanged, Overdue
 from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
@@ -33,7 +34,8 @@ class World:
 
     `on_event` is called with each event of the arbiter; it may submit, cancel and so on. `record`, if given, is called
     with every step as a line of text: the same seeds give the same transcript.
-    The port opens at once; `unplug` and `plug` take it away and give it back. `strict` is the arbiter's (R15).
+    The port opens at once; `unplug` and `plug` take it away and give it back. `strict` is the arbiter's (R15); `tap`
+    sees what passes, as on a bus.
     """
 
     def __init__(
@@ -46,6 +48,7 @@ class World:
         now: float = 0.0,
         jitter: Callable[[], float] = lambda: 0.5,
         strict: bool = False,
+        tap: Tap | None = None,
     ) -> None:
         self.line = line
         line.prompt = False
@@ -59,7 +62,9 @@ class World:
             capacity=capacity,
             jitter=jitter,
             strict=strict,
+            tapped=tap is not None,
         )
+        self.tap = tap
         self._on_event = on_event
         self._record = record
         self._actions: list[tuple[float, int, Callable[[], object]]] = []
@@ -77,7 +82,7 @@ class World:
     def request(
         self, node: NodeRecord, command: Command[Any], priority: Priority = Priority.COMMAND, **options: Any
     ) -> Transaction:
-        """Submits it now; `options` are those of Transaction. Its end comes as a Completed event, perhaps at once."""
+        """Submits it now; `options` are those of Transaction. Its end comes as an event, perhaps at once."""
         transaction = Transaction(node, command, priority=priority, **options)
         self.arbiter.submit(transaction, self.now)
         return transaction
@@ -140,11 +145,8 @@ class World:
 
     def _step(self, now: float, due_at: float) -> None:
         data = self.line.receive(now)
-        if data and self.plugged:
-            if self._record is not None:
-                self._record(f"{now:.6f} < {data.hex(' ')}")
-            self.arbiter.data_received(data, now)
-            self._pump()
+        if data:
+            self._hear(data)
         if due_at <= now:
             self.arbiter.handle_timeout(now)
             self._pump()
@@ -153,20 +155,40 @@ class World:
             heapq.heappop(actions)[2]()
             self._pump()
 
+    def _hear(self, data: bytes) -> None:
+        """Hand the arbiter what came off the line."""
+        if self.plugged:
+            if self._record is not None:
+                self._record(f"{self.now:.6f} < {data.hex(' ')}")
+            if self.tap is not None:
+                self.tap.received(self.now, data, self.arbiter.attempt)
+            self.arbiter.data_received(data, self.now)
+            self._pump()
+
+    def _say(self, data: bytes) -> None:
+        """Put on the line what the arbiter says."""
+        if self._record is not None:
+            self._record(f"{self.now:.6f} > {data.hex(' ')}")
+        if self.plugged:
+            self.line.send(data, self.now)
+            if self.tap is not None:
+                self.tap.transmitted(self.now, data, self.arbiter.attempt)
+
     def _pump(self) -> None:
         """What the arbiter says goes on the line, and its events to whom they concern."""
         arbiter = self.arbiter
         while True:
             data = arbiter.poll_transmit()
             if data is not None:
-                if self._record is not None:
-                    self._record(f"{self.now:.6f} > {data.hex(' ')}")
-                if self.plugged:
-                    self.line.send(data, self.now)
+                self._say(data)
             event = arbiter.poll_event()
             if event is None:
                 if data is None:
                     return
+                continue
+            if type(event) is Attempt:
+                if self.tap is not None:
+                    self.tap.attempted(event)
                 continue
             if self._record is not None:
                 self._record(f"{self.now:.6f} {told(event)}")
@@ -177,9 +199,11 @@ class World:
 def told(event: Event) -> str:
     """An event in a line of text, the same on every run."""
     match event:
-        case Completed(transaction):
-            outcome = transaction.value if transaction.error is None else repr(transaction.error)
-            return f"{transaction.node.label}: {transaction.command} -> {outcome}"
+        case Transaction():
+            outcome = event.value if event.error is None else repr(event.error)
+            return f"{event.node.label}: {event.command} -> {outcome}"
+        case Overdue(transaction, error):
+            return f"{transaction.node.label}: {transaction.command} -> {error!r}"
         case LineChanged(change, cause):
             return f"line {change.value} {cause}".rstrip()
         case NodeChanged(node, before, after):

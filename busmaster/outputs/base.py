@@ -37,13 +37,11 @@ BATCH = 2_000
 """Values that are written at once."""
 FIRST_RETRY, LAST_RETRY = 0.5, 10.0
 """Seconds from a failure to the next try: doubled each time."""
-CLOCK_WAS_SET = 0.005
-"""Seconds by which two clocks do not differ by themselves between two looks at them."""
 ERROR_NUMBER = re.compile(r"^\[Errno -?\d+\] ")
 
 
 class Happening(NamedTuple):
-    """An event, as a sentence. `node` is its label, "" for the line as a whole; `time` is the bus's."""
+    """An event, as a sentence. `node` is its label, "" for the line as a whole; `time` is in seconds since 1970."""
 
     time: float
     node: str
@@ -84,8 +82,13 @@ def reason(error: BaseException) -> str:
 
 
 def check_folder(path: str) -> None:
-    """Raises InvalidCommand where no file can ever be made: that is better said before anything starts."""
+    """Raise InvalidCommand where no file can ever be made: that is better said before anything starts.
+
+    Folders whose names hold fields of a date are made when their time comes.
+    """
     folder = os.path.dirname(path)
+    while "%" in folder:
+        folder = os.path.dirname(folder)
     if folder and not os.path.isdir(folder):
         raise InvalidCommand(f"{path}: there is no folder {folder}")
 
@@ -99,7 +102,7 @@ def check_extra(package: str, extra: str) -> None:
 
 
 class Output(ABC):
-    """One output. `clock` is the bus's; `say` is called from any thread with what happens to the output."""
+    """One output. `say` is called from any thread with what happens to the output."""
 
     what: ClassVar[str] = "written"
 
@@ -107,7 +110,6 @@ class Output(ABC):
         self,
         kind: str,
         settings: Settings,
-        clock: Callable[[], float] = time.monotonic,
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.kind = kind
@@ -115,12 +117,10 @@ class Output(ABC):
         self.error = ""
         self.offered = self.dropped = self.written = 0
         self._capacity = settings.buffer
-        self._clock = clock
         self._say = say
         self._waiting: deque[Item] = deque()
         self._stop = threading.Event()
         self._retry = FIRST_RETRY
-        self._offset = 0.0
         self._thread = threading.Thread(target=self._run, name=f"busmaster {kind}", daemon=True)
 
     # on the loop that owns the line
@@ -183,17 +183,6 @@ class Output(ABC):
             self.error = text
             self._say(f"{self.kind} is down: {text}")
 
-    def wall_clock(self) -> Callable[[float], float]:
-        """From the bus's time to seconds since 1970, by the machine's clock.
-
-        What is sent twice has the same time twice, unless that clock was set meanwhile.
-        """
-        offset = time.time() - self._clock()
-        if abs(offset - self._offset) > CLOCK_WAS_SET:
-            self._offset = offset
-        offset = self._offset
-        return lambda moment: round(moment + offset, 6)
-
     def _run(self) -> None:
         """Whatever goes wrong is told and tried again: it must not end the thread."""
         while True:
@@ -216,15 +205,14 @@ class BatchOutput(Output, Generic[Formatted]):
         self,
         kind: str,
         settings: Settings,
-        clock: Callable[[], float] = time.monotonic,
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(kind, settings, clock, say)
+        super().__init__(kind, settings, say)
         self._batch: list[Formatted] = []
         self._size = 0
 
     @abstractmethod
-    def format(self, item: Item, time_of: Callable[[float], float]) -> Formatted | None:
+    def format(self, item: Item) -> Formatted | None:
         """None for what is not written here."""
 
     @abstractmethod
@@ -249,7 +237,7 @@ class BatchOutput(Output, Generic[Formatted]):
         finally:
             self.shut()
 
-    def unhurried(self, snapshot: Snapshot) -> Iterator[tuple[Point[Any], Sample]]:
+    def unhurried(self, snapshot: Snapshot) -> Iterator[tuple[Point[Any], Sample[Any]]]:
         """Its points and samples; the thread lets go of the interpreter after each PIECE, so that a cycle of hundreds
         of points keeps the line's loop no longer than one of a few."""
         for number, item in enumerate(snapshot.samples.items(), 1):
@@ -260,7 +248,7 @@ class BatchOutput(Output, Generic[Formatted]):
     def _fill(self) -> bool:
         """Format what waits, up to a batch; the batch that could not be written first."""
         for item in self._items():
-            formatted = self.format(item, self.wall_clock())
+            formatted = self.format(item)
             if formatted is not None:
                 self._batch.append(formatted)
             self._size += size_of(item)

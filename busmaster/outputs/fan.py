@@ -16,7 +16,7 @@ from busmaster.outputs.base import Happening, Output, OutputStatistics
 from busmaster.outputs.files import CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings, MetricsSettings, MqttSettings, Settings, SqliteSettings
 from busmaster.outputs.sqlite import SqliteOutput
-from busmaster.outputs.values import event_text
+from busmaster.outputs.values import event_text, micros
 
 WAITING = 256
 """Cycles of a group that may wait for a loop that is busy with other things."""
@@ -34,11 +34,9 @@ class Fan:
         self._tasks: list[asyncio.Task[None]] = []
         self._loop: asyncio.AbstractEventLoop | None = None
 
-    def add(
-        self, kind: str, settings: Settings, *, title: str = "", commands: Mapping[str, Point[Any]] | None = None
-    ) -> None:
+    def add(self, kind: str, settings: Settings, *, commands: Mapping[str, Point[Any]] | None = None) -> None:
         """One more. `commands`: the points that it lets others write. Raises InvalidCommand if an extra is missing."""
-        self._outputs.append(self._make(kind, settings, title, commands or {}))
+        self._outputs.append(self._make(kind, settings, commands or {}))
 
     def start(self, groups: Iterable[PollGroup]) -> None:
         """From now on, until `close`."""
@@ -84,7 +82,7 @@ class Fan:
             if text:
                 node = event.node.label if isinstance(event, NodeChanged | LatenessRaised) else ""
                 for output in self._outputs:
-                    output.offer(Happening(self._bus.now(), node, text))
+                    output.offer(Happening(micros(self._bus.wall_time()), node, text))
 
     def _say(self, text: str) -> None:
         """From any thread, to the loop; when that is gone nobody listens any more."""
@@ -94,16 +92,16 @@ class Fan:
             except RuntimeError:
                 pass
 
-    def _make(self, kind: str, settings: Settings, title: str, commands: Mapping[str, Point[Any]]) -> Output:
+    def _make(self, kind: str, settings: Settings, commands: Mapping[str, Point[Any]]) -> Output:
         match settings:
             case FileSettings():
-                return (CsvOutput if kind == "csv" else JsonlOutput)(kind, settings, self._bus.now, self._say)
+                return (CsvOutput if kind == "csv" else JsonlOutput)(kind, settings, self._say)
             case SqliteSettings():
-                return SqliteOutput(kind, settings, self._bus.now, self._say)
+                return SqliteOutput(kind, settings, self._say)
             case MqttSettings():
                 from busmaster.outputs.mqtt import MqttOutput
 
-                return MqttOutput(kind, settings, self._bus, self._say, title=title, commands=commands)
+                return MqttOutput(kind, settings, self._bus, self._say, commands=commands)
             case MetricsSettings():
                 from busmaster.outputs.metrics import MetricsOutput
 

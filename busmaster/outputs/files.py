@@ -4,86 +4,69 @@ from __future__ import annotations
 
 import csv
 import io
-import os
-import time
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
+from typing import Any
 
-from busmaster.bus.polling import Snapshot
+from busmaster.bus.polling import Sample, Snapshot
 from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
+from busmaster.outputs.growing_file import GrowingFile
 from busmaster.outputs.settings import FileSettings
-from busmaster.outputs.values import cycle_fields, json_line, value_text
+from busmaster.outputs.values import cycle_fields, json_line, micros, value_text
 
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""What a spreadsheet takes for the beginning of a formula."""
 COLUMNS = ("time", "group", "cycle", "node", "item", "value", "unit", "quality", "error")
 
 
 class FileOutput(BatchOutput[bytes]):
-    """Appends to the file; begins another when the date in its name changes."""
+    """Appends to the file; begins another when the date in its name changes, or when it was moved away."""
+
+    head = b""
+    """What a file begins with."""
 
     def __init__(
         self,
         kind: str,
         settings: FileSettings,
-        clock: Callable[[], float] = time.monotonic,
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(kind, settings, clock, say)
-        check_folder(time.strftime(settings.path))
-        self._pattern = settings.path
-        self._path = ""
-        self._descriptor: int | None = None
-
-    def head(self) -> bytes:
-        """What a file begins with."""
-        return b""
+        super().__init__(kind, settings, say)
+        check_folder(settings.path)
+        self._file = GrowingFile(
+            settings.path,
+            mode=settings.mode,
+            sync_every=settings.sync_every,
+            head=self.head,
+            tell=lambda text: say(f"{kind}: {text}"),
+        )
 
     def commit(self, batch: list[bytes]) -> None:
-        """A batch that the disk has no room for is cut off again."""
-        descriptor = self._open()
-        end = os.lseek(descriptor, 0, os.SEEK_END)
-        rest = memoryview((b"" if end else self.head()) + b"".join(batch))
-        try:
-            while rest:
-                rest = rest[os.write(descriptor, rest) :]
-        except OSError:
-            os.ftruncate(descriptor, end)
-            raise
+        self._file.append(b"".join(batch))
 
     def shut(self) -> None:
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
-
-    def _open(self) -> int:
-        path = time.strftime(self._pattern)
-        if path != self._path:
-            self.shut()
-            self._path = path
-        if self._descriptor is None:
-            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
-        return self._descriptor
+        self._file.close()
 
 
 class CsvOutput(FileOutput):
-    """A line a value. Times are UTC, to the millisecond."""
+    """A line a value. Times are UTC, to the millisecond. No name is taken for a formula by a spreadsheet."""
 
-    def head(self) -> bytes:
-        return csv_lines([COLUMNS])
+    head = ",".join(COLUMNS).encode() + b"\n"
 
-    def format(self, item: Item, time_of: Callable[[float], float]) -> bytes | None:
+    def format(self, item: Item) -> bytes | None:
         if isinstance(item, Happening):
             return None
         return csv_lines(
             (
-                utc(time_of(sample.finished)),
-                item.group,
+                utc(micros(sample.wall)),
+                no_formula(item.group),
                 item.cycle,
-                point.key.partition("/")[0],
-                point.item,
-                "" if sample.error else value_text(sample.value),
-                point.unit,
+                no_formula(point.key.partition("/")[0]),
+                no_formula(point.item),
+                value_cell(sample),
+                no_formula(point.unit),
                 sample.quality.value,
-                sample.error.what if sample.error else "",
+                no_formula(sample.error.what) if sample.error else "",
             )
             for point, sample in self.unhurried(item)
         )
@@ -92,11 +75,11 @@ class CsvOutput(FileOutput):
 class JsonlOutput(FileOutput):
     """A line a cycle, as `busmaster run --json` prints it, and a line an event. Times are seconds since 1970."""
 
-    def format(self, item: Item, time_of: Callable[[float], float]) -> bytes:
+    def format(self, item: Item) -> bytes:
         if isinstance(item, Snapshot):
-            fields = cycle_fields(item, time_of)
+            fields = cycle_fields(item, item.wall_at)
         else:
-            fields = {"event": item.text, "node": item.node or None, "time": time_of(item.time)}
+            fields = {"event": item.text, "node": item.node or None, "time": item.time}
         return json_line(**fields).encode() + b"\n"
 
 
@@ -104,6 +87,19 @@ def csv_lines(rows: Iterable[Iterable[object]]) -> bytes:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue().encode()
+
+
+def value_cell(sample: Sample[Any]) -> str:
+    """A value as text; only one that is a text itself could be taken for a formula."""
+    if sample.error:
+        return ""
+    text = value_text(sample.value)
+    return no_formula(text) if isinstance(sample.value, str) else text
+
+
+def no_formula(text: str) -> str:
+    """The text, behind an apostrophe where a spreadsheet would otherwise compute it."""
+    return f"'{text}" if text[:1] in FORMULA else text
 
 
 def utc(moment: float) -> str:

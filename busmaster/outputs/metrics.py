@@ -77,7 +77,7 @@ class MetricsOutput(Output):
         outputs: Callable[[], Sequence[OutputStatistics]] = tuple,
     ) -> None:
         check_extra("prometheus_client", "metrics")
-        super().__init__(kind, settings, bus.now, say)
+        super().__init__(kind, settings, say)
         self.port = settings.port
         """The one that is served, where 0 was asked for."""
         self._host = settings.host

@@ -35,7 +35,7 @@ from busmaster.bus.polling import Snapshot
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.outputs.base import TICK, Item, Output, check_extra, reason, size_of
 from busmaster.outputs.settings import MqttSettings
-from busmaster.outputs.values import cycle_fields, json_line, sample_fields
+from busmaster.outputs.values import cycle_fields, json_line, micros, sample_fields
 
 if TYPE_CHECKING:
     from aiomqtt import Client, Message
@@ -69,15 +69,13 @@ class MqttOutput(Output):
         bus: Bus,
         say: Callable[[str], None] = lambda _: None,
         *,
-        title: str = "",
         commands: Mapping[str, Point[Any]] | None = None,
     ) -> None:
         check_extra("aiomqtt", "mqtt")
-        super().__init__(kind, settings, bus.now, say)
+        super().__init__(kind, settings, say)
         self._settings = settings
         self._secrets = secrets(settings)
         self._bus = bus
-        self._title = title
         self._commands = {topic_part(key): point for key, point in (commands or {}).items()}
         self._owner: asyncio.AbstractEventLoop | None = None
         self._held: list[Item] = []
@@ -163,17 +161,16 @@ class MqttOutput(Output):
         return bool(self._held)
 
     def _messages(self, item: Item) -> Iterator[Outgoing]:
-        time_of = self.wall_clock()
         settings = self._settings
         if not isinstance(item, Snapshot):
-            payload = json_line(time=time_of(item.time), node=item.node or None, text=item.text)
+            payload = json_line(time=item.time, node=item.node or None, text=item.text)
             yield Outgoing(self._topic("events"), payload)
         elif settings.messages == "cycle":
-            payload = json_line(**cycle_fields(item, time_of))
+            payload = json_line(**cycle_fields(item, item.wall_at))
             yield Outgoing(self._topic("cycles", item.group), payload, settings.retain)
         else:
             for point, sample in item.samples.items():
-                payload = json_line(time=time_of(sample.finished), unit=point.unit, **sample_fields(sample))
+                payload = json_line(time=micros(sample.wall), unit=point.unit, **sample_fields(sample))
                 yield Outgoing(self._topic("values", topic_part(point.key)), payload, settings.retain)
 
     def _changes(self) -> Iterator[Outgoing]:

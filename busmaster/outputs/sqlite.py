@@ -6,16 +6,17 @@ select * from history where node = 'winder' and item = 'position' and time > uni
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
-import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeAlias
 
 from busmaster.bus.points import Point
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
+from busmaster.outputs.retention import Retention
 from busmaster.outputs.settings import SqliteSettings
-from busmaster.outputs.values import json_value
+from busmaster.outputs.values import json_value, micros
 
 VERSION = 1
 SCHEMA = """
@@ -30,16 +31,16 @@ create table if not exists samples (
     error text
 );
 create index if not exists samples_of_point on samples (point, time);
+create index if not exists samples_by_time on samples (time);
 create table if not exists events (time real not null, node text, text text not null);
+create index if not exists events_by_time on events (time);
 create view if not exists history as
     select time, node, item, value, unit, quality, error from samples join points on points.id = samples.point;
 """
 BUSY = 1.0
 """Seconds for which a lock of another program is waited for, before the batch is kept for later."""
-CLEAN_EVERY = 60.0
-CLEANED_AT_ONCE = 20_000
-"""Rows; so that no deletion holds the file for long."""
-DAY = 86_400.0
+DATED = ("samples", "events")
+"""Tables whose rows are forgotten when they are too old."""
 
 SampleRow: TypeAlias = tuple[float, int, Any, str, str | None]
 
@@ -58,23 +59,22 @@ class SqliteOutput(BatchOutput[Rows]):
         self,
         kind: str,
         settings: SqliteSettings,
-        clock: Callable[[], float] = time.monotonic,
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(kind, settings, clock, say)
+        super().__init__(kind, settings, say)
         check_folder(settings.path)
         self._path = settings.path
-        self._keep_days = settings.keep_days
-        self._cleaned = 0.0
+        self._mode = settings.mode
+        self._retention = Retention(settings.keep_days, settings.keep_mb, lambda text: say(f"{kind}: {text}"))
         self._database: sqlite3.Connection | None = None
         self._numbers: dict[str, int] = {}
 
-    def format(self, item: Item, time_of: Callable[[float], float]) -> Rows:
+    def format(self, item: Item) -> Rows:
         if isinstance(item, Happening):
-            return Rows([], (time_of(item.time), item.node or None, item.text))
+            return Rows([], (item.time, item.node or None, item.text))
         samples = [
             (
-                time_of(sample.finished),
+                micros(sample.wall),
                 point,
                 column(sample.value),
                 sample.quality.value,
@@ -86,8 +86,8 @@ class SqliteOutput(BatchOutput[Rows]):
 
     def commit(self, batch: list[Rows]) -> None:
         database = self._open()
-        self._clean(database)
         with database:
+            self._retention.apply(database, DATED)
             samples = list(self._samples(database, batch))
             database.executemany("insert into samples values (?, ?, ?, ?, ?)", samples)
             events = [rows.event for rows in batch if rows.event is not None]
@@ -110,6 +110,7 @@ class SqliteOutput(BatchOutput[Rows]):
 
     def _open(self) -> sqlite3.Connection:
         if self._database is None:
+            os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, self._mode))
             database = self._database = sqlite3.connect(self._path, timeout=BUSY)
             [version] = database.execute("pragma user_version").fetchone()
             [tables] = database.execute("select count(*) from sqlite_master").fetchone()
@@ -120,18 +121,6 @@ class SqliteOutput(BatchOutput[Rows]):
             database.executescript(SCHEMA)
             database.execute(f"pragma user_version = {VERSION}")
         return self._database
-
-    def _clean(self, database: sqlite3.Connection) -> None:
-        """Delete the oldest, a piece at a time."""
-        now = time.time()
-        if self._keep_days is None or now < self._cleaned + CLEAN_EVERY:
-            return
-        self._cleaned = now
-        with database:
-            database.execute(
-                "delete from samples where time < ? and rowid < (select coalesce(min(rowid), 0) from samples) + ?",
-                (now - self._keep_days * DAY, CLEANED_AT_ONCE),
-            )
 
 
 def number_of(database: sqlite3.Connection, point: Point[Any]) -> int:

@@ -83,20 +83,29 @@ def json_line(**fields: Any) -> str:
     return json.dumps(fields, ensure_ascii=False, default=str)
 
 
+def micros(moment: float) -> float:
+    """To the microsecond: what is behind that is noise."""
+    return round(moment, 6)
+
+
 def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[str, Any]:
-    """One cycle as a JSON object; `time_of` makes its times of the bus's."""
+    """One cycle as a JSON object; `time_of` makes its times, to the microsecond, of the bus's."""
+
+    def at(moment: float) -> float:
+        return micros(time_of(moment))
+
     return {
         "group": snapshot.group,
         "cycle": snapshot.cycle,
-        "due": time_of(snapshot.due),
-        "started": None if snapshot.started is None else time_of(snapshot.started),
-        "finished": time_of(snapshot.finished),
+        "due": at(snapshot.due),
+        "started": None if snapshot.started is None else at(snapshot.started),
+        "finished": at(snapshot.finished),
         "missed": snapshot.missed,
         "samples": {point.key: sample_fields(sample) for point, sample in snapshot.samples.items()},
     }
 
 
-def sample_fields(sample: Sample) -> dict[str, Any]:
+def sample_fields(sample: Sample[Any]) -> dict[str, Any]:
     """A value, or what went wrong."""
     return {
         "value": json_value(sample.value),

@@ -7,14 +7,16 @@ import pkgutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
 from busmaster.registry.protocol import NodeKind, Option, Protocol
 
 if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
     from busmaster.emulator.device import Delay, Device
     from busmaster.emulator.oracle import Oracle
 
@@ -29,6 +31,8 @@ def protocols() -> tuple[Protocol, ...]:
 
     A protocol of another package that cannot be loaded, or whose names are taken, is left out with a warning.
     """
+    from importlib.metadata import entry_points  # it takes longer to import than all protocols together
+
     found = list(_own())
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         try:
@@ -53,7 +57,7 @@ def find(name: str) -> NodeKind:
     """Return the kind of node that goes by a name. Raises InvalidCommand if there is none."""
     kind = kinds().get(name)
     if kind is None:
-        raise InvalidCommand(f"no such protocol {name!r}: use {', '.join(kinds())}")
+        raise InvalidCommand(f"no such protocol {name!r}; {meant(name, kinds())}")
     return kind
 
 
@@ -64,11 +68,16 @@ def make_device(
     delay: Delay | None = None,
     oracle: Oracle | None = None,
     lively: bool = False,
+    **options: Any,
 ) -> Device:
-    """Make an emulated device of a kind. Raises InvalidCommand for a kind that does not exist, see `DeviceMaker`."""
+    """Make an emulated device of a kind; `options` are those of `NodeKind.emulated`.
+
+    Raises InvalidCommand for a kind that does not exist, see `DeviceMaker`.
+    """
     from busmaster.emulator.device import Delay
 
-    return find(name).make_device(address, delay=Delay() if delay is None else delay, oracle=oracle, lively=lively)
+    delay = Delay() if delay is None else delay
+    return find(name).make_device(address, delay=delay, oracle=oracle, lively=lively, **options)
 
 
 def _own() -> Iterator[Protocol]:

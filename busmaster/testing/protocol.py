@@ -12,7 +12,7 @@
             invalid=[lambda: ReadRegister(70000)],
         )
 
-A few cases say what the document says: a command, the node, what that node answers, and the value. From them the kit
+A few cases say what the manual says: a command, the node, what that node answers, and the value. From them the kit
 derives what the arbiter relies on (`busmaster.contract.exchange`), and raises `NotConformant` with all that does not
 hold:
 
@@ -38,6 +38,7 @@ from itertools import islice
 from random import Random
 from typing import Any
 
+from busmaster.contract.driver import Driver, Ending
 from busmaster.contract.exchange import Command, Done, Exchange, FrameError, Listener
 from busmaster.contract.profile import Profile
 from busmaster.errors import Refused
@@ -45,7 +46,6 @@ from busmaster.testing.answers import check_exchangeable, check_good_reply
 from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen
 from busmaster.testing.commands import check_addresses, check_checks, check_command, check_invalid
 from busmaster.testing.damage import MANY_BYTES, bytewise, flips, garbage_chunks, splits
-from busmaster.testing.listening import Ending, Listening
 
 FINDINGS_EACH = 3
 """How many findings of one kind a case may add: the rest would only repeat them."""
@@ -65,7 +65,7 @@ def check_protocol(
     garbage: int = 100,
     seed: int = 0,
 ) -> Tally:
-    """Raises NotConformant unless the protocol keeps the contract for all of `cases`, see the module's text.
+    """Raise NotConformant unless the protocol keeps the contract for all of `cases`, see the module's text.
 
     `names(command, address)` is what a reply to it names: where it is equal for two cases, the reply to one may be
     taken for the other's. `device` is told what the host says, and returns what the device says at once (see
@@ -112,21 +112,21 @@ class _Kit:
         self._needed: set[Unseen] = set()
         self._random = random
 
-    def listen(self, command: Command[Any], address: int) -> Listening:
-        return Listening(command.open(address, self.profile.timings))
+    def listen(self, command: Command[Any], address: int) -> Driver:
+        return Driver(command.open(address, self.profile.timings))
 
-    def hear(self, case: Case, *chunks: bytes) -> Listening:
+    def hear(self, case: Case, *chunks: bytes) -> Driver:
         return self.listen(case.command, case.address).feed(*chunks)
 
     def turns(self, case: Case) -> list[list[bytes]]:
         """The legs, those in one list that come without a word of the host between: they may come in one chunk."""
-        listening = self.listen(case.command, case.address)
+        driver = self.listen(case.command, case.address)
         turns: list[list[bytes]] = [[]]
         for leg in case.legs:
-            said = len(listening.said)
-            listening.feed(leg)
+            said = len(driver.said)
+            driver.feed(leg)
             turns[-1].append(leg)
-            if len(listening.said) > said:
+            if len(driver.said) > said:
                 turns.append([])
         return turns
 
@@ -140,14 +140,14 @@ class _Kit:
 
     def check_reply(self, case: Case) -> Iterator[str]:
         """The reply as it stands, and silence in its place."""
-        listening = self.listen(case.command, case.address)
-        exchange = listening.exchange
+        driver = self.listen(case.command, case.address)
+        exchange = driver.exchange
         if case.request is not None and exchange.request != case.request:
             yield f"{case}: sends {exchange.request.hex(' ')} in place of {case.request.hex(' ')}"
-        silence = self.listen(case.command, case.address).expire()
+        silence = self.listen(case.command, case.address).run_out()
         if silence.delivered is exchange.answered or silence.is_bug or silence.is_whole:
             yield f"{case}: with no reply at all it ends with {silence}"
-        ending = listening.feed(*case.legs).ending if exchange.answered else listening.expire()
+        ending = driver.feed(*case.legs).ending if exchange.answered else driver.run_out()
         if ending is None:
             yield f"{case}: the reply {_hex(case.legs)} does not end it"
         elif case.raises is not None:
@@ -155,7 +155,7 @@ class _Kit:
                 yield f"{case}: the reply {_hex(case.legs)} gives {ending} in place of {case.raises.__name__}"
         elif not ending.delivered or ending.value != case.value or ending.rest:
             yield f"{case}: the reply {_hex(case.legs)} gives {ending} in place of {case.value!r}"
-        elif exchange.answered and len(b"".join(listening.said)) == sum(leg.sent for leg in exchange.later):
+        elif exchange.answered and len(b"".join(driver.said)) == sum(leg.sent for leg in exchange.later):
             yield from self._check_announced(case, exchange, ending)
 
     def _check_announced(self, case: Case, exchange: Exchange[Any], ending: Ending) -> Iterator[str]:
@@ -189,11 +189,11 @@ class _Kit:
         for before, run in self.runs(case):
             for length in range(1, len(run)):
                 self.tally["truncations"] += 1
-                listening = self.hear(case, *before)
-                said = len(listening.said)
-                listening.feed(run[:length])
-                early = listening.ending is not None or len(listening.said) > said
-                ending = listening.expire()
+                driver = self.hear(case, *before)
+                said = len(driver.said)
+                driver.feed(run[:length])
+                early = driver.ending is not None or len(driver.said) > said
+                ending = driver.run_out()
                 if early or ending.delivered or ending.is_whole or ending.is_bug:
                     when = "at once" if early else "when time runs out"
                     yield f"{case}: {length} of the {len(run)} bytes {run.hex(' ')} end {when} with {ending}"
@@ -204,7 +204,7 @@ class _Kit:
                 self.tally["flips"] += 1
                 ways = [[heard], bytewise(heard)] if len(heard) <= MANY_BYTES else [[heard]]
                 for chunks in ways:
-                    ending = self.hear(case, *before, *chunks).expire()
+                    ending = self.hear(case, *before, *chunks).run_out()
                     if (ending.delivered and not self._is_exempt(run, heard)) or ending.is_bug:
                         yield f"{case}: {heard.hex(' ')} in place of {run.hex(' ')} gives {ending}"
                         break
@@ -228,15 +228,15 @@ class _Kit:
             yield f"{case}: its reply begins with {case.legs[0][0]:02x}, which is not in starts"
         for byte in range(1 << self.profile.line.bytesize):
             if byte not in starts:
-                ending = self.hear(case, bytes((byte,)), *case.legs).expire()
+                ending = self.hear(case, bytes((byte,)), *case.legs).run_out()
                 if ending.delivered or isinstance(ending.error, Refused) or ending.is_bug:
-                    yield f"{case}: {byte:02x} and then the reply gives {ending}"
+                    yield f"{case}: {byte:02x}, which is not in starts, and then the reply gives {ending}"
 
     def check_garbage(self, case: Case, count: int) -> Iterator[str]:
         for _ in range(count):
             self.tally["garbage"] += 1
             chunks = list(garbage_chunks(self._random, b"".join(case.legs)))
-            ending = self.hear(case, *chunks).expire()
+            ending = self.hear(case, *chunks).run_out()
             if ending.is_bug:
                 yield f"{case}: {_hex(chunks)} gives {ending}"
             if self.profile.listen is not None:
@@ -282,8 +282,8 @@ class _Kit:
 
     def _first_turn(self, case: Case) -> bytes:
         """Empty for a broadcast, a refusal, and where something had to be repeated: that shows not what a reply is."""
-        listening = self.hear(case, *case.legs)
-        repeated = len(b"".join(listening.said)) != sum(leg.sent for leg in listening.exchange.later)
+        driver = self.hear(case, *case.legs)
+        repeated = len(b"".join(driver.said)) != sum(leg.sent for leg in driver.exchange.later)
         return b"" if repeated or case.raises is not None else b"".join(self.turns(case)[0])
 
     def check_foreign(self, foreign: Iterable[Foreign]) -> Iterator[str]:
@@ -295,7 +295,7 @@ class _Kit:
     ) -> Iterator[str]:
         """`good` replies may stand at the front of `heard`: what follows them is left over and settles the line."""
         self.tally["foreign"] += 1
-        ending = self.listen(command, address).feed(heard).expire()
+        ending = self.listen(command, address).feed(heard).run_out()
         taken = heard.removesuffix(ending.rest)
         if (ending.delivered and (taken == heard or taken not in good)) or ending.is_whole or ending.is_bug:
             yield f"{command} of {address}: {why}, {heard.hex(' ')}, gives {ending}"
@@ -318,11 +318,11 @@ class _Kit:
                 yield f"{command}, then {trip.read} gives {read}"
 
     def _converse(self, command: Command[Any], address: int, device: Callable[[bytes], bytes]) -> Ending:
-        listening = self.listen(command, address)
-        listening.feed(device(listening.exchange.request))
-        for said in listening.said:
-            listening.feed(device(said))
-        ending = listening.expire()
+        driver = self.listen(command, address)
+        driver.feed(device(driver.exchange.request))
+        for said in driver.said:
+            driver.feed(device(said))
+        ending = driver.run_out()
         if ending.send:
             device(ending.send)
         return ending

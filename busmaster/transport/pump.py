@@ -11,17 +11,19 @@ import asyncio
 import time
 from collections.abc import Callable
 from math import inf
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import DriverErrors
-from busmaster.arbiter.events import Completed, Event, Mark, Polled, Sampled
+from busmaster.arbiter.events import Event, Mark, Overdue, Polled, Sampled
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import LineState
+from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import LineDown
+from busmaster.transport.alarm import Alarm
 from busmaster.transport.clock import clock_of
 from busmaster.transport.kernel import OpenPort, open_port
 
@@ -29,19 +31,6 @@ STUCK_AFTER = 5.0
 """Seconds after which output that has not left is discarded with its connection. Flow control, a busy adapter and a
 network that lost a segment let go within one or two; whatever holds it longer does not mend by itself, and a request
 that old may move a machine when nobody expects it any more."""
-
-
-class Tap(Protocol):
-    """Sees what passes (a capture). Must not block, nor raise.
-
-    `transmitted` hears of bytes when they have been handed to the port, with the time of that.
-    """
-
-    def transmitted(self, now: float, data: bytes) -> None: ...
-
-    def received(self, now: float, data: bytes) -> None: ...
-
-    def completed(self, transaction: Transaction) -> None: ...
 
 
 class Pump(asyncio.Protocol):
@@ -57,7 +46,7 @@ class Pump(asyncio.Protocol):
         on_sample: Callable[[Poll, Transaction], None],
         on_cycle: Callable[[Poll], None],
         on_event: Callable[[Event], None],
-        on_written: Callable[[Transaction], None] = lambda _: None,
+        on_written: Callable[[Transaction, float], None] = lambda *_: None,
         paced: Callable[[asyncio.BaseTransport], bool] = lambda _: False,
         tap: Tap | None = None,
         name: str = "the port",
@@ -78,7 +67,7 @@ class Pump(asyncio.Protocol):
         self._paused = False
         self._held_since = inf
         self._gave_up = ""
-        self._timer: asyncio.TimerHandle | None = None
+        self._alarm: Alarm | None = None
         self._armed = inf
         self._run_out: anyio.Event | None = None
 
@@ -86,6 +75,7 @@ class Pump(asyncio.Protocol):
         """Keep this loop's time."""
         self._loop = loop
         self.clock = clock_of(loop)
+        self._alarm = Alarm(loop, self._on_time)
 
     # what the bus calls
 
@@ -110,18 +100,33 @@ class Pump(asyncio.Protocol):
             self._written = now = self.clock()  # again: the process may have stood still before it got here
             arbiter.transmitted(now)
             if self.tap is not None:
-                self.tap.transmitted(now, data)
+                self.tap.transmitted(now, data, arbiter.attempt)
             if self._paused:
                 self._check_output(now)
-        while (event := arbiter.poll_event()) is not None:
-            if type(event) is Completed:
-                self._resolve(event.transaction)
+        event = arbiter.poll_event()
+        while event is not None:
+            if type(event) is Transaction:
+                if event.writes and event.attempts:
+                    self._on_written(event, event.ended_at)
+                future = event.waiter
+                if future is None or future.done():
+                    pass  # nobody waits for it any more
+                elif event.error is None:
+                    future.set_result(event.value)
+                else:
+                    future.set_exception(event.error)
             elif type(event) is Sampled:
                 self._on_sample(event.poll, event.transaction)
             elif type(event) is Polled:
                 self._on_cycle(event.poll)
+            elif type(event) is Overdue:
+                self._give_up_on(event)
+            elif type(event) is Attempt:
+                if self.tap is not None:
+                    self.tap.attempted(event)
             else:
                 self._on_event(event)
+            event = arbiter.poll_event() if arbiter.events else None
         due = arbiter.poll_timeout()
         if due < self._armed:
             self._arm(due)
@@ -144,9 +149,9 @@ class Pump(asyncio.Protocol):
 
     def stop(self) -> None:
         """No timer any more: the bus is closed."""
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+        if self._alarm is not None:
+            self._alarm.close()
+            self._alarm = None
         self._loop = None
 
     # what asyncio calls
@@ -162,7 +167,7 @@ class Pump(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         now = self.clock()
         if self.tap is not None:
-            self.tap.received(now, data)
+            self.tap.received(now, data, self.arbiter.attempt)
         if self._held_since < inf:  # what was held may have left since: only then can this be its answer
             self._check_output(now)
         self.arbiter.data_received(data, now)
@@ -172,7 +177,7 @@ class Pump(asyncio.Protocol):
         """The UART found this byte damaged."""
         now = self.clock()
         if self.tap is not None:
-            self.tap.received(now, byte)
+            self.tap.received(now, byte, self.arbiter.attempt)
         self.arbiter.byte_marked(mark, now)
         self.turn()
 
@@ -198,35 +203,30 @@ class Pump(asyncio.Protocol):
 
     # inside
 
-    def _resolve(self, transaction: Transaction) -> None:
-        if self.tap is not None:
-            self.tap.completed(transaction)
-        if transaction.writes and transaction.attempts:
-            self._on_written(transaction)
+    def _give_up_on(self, late: Overdue) -> None:
+        """Its caller goes, the exchange stays: a write that is on the wire is over before anything else can be read."""
+        transaction = late.transaction
+        if transaction.writes:
+            self._on_written(transaction, self.clock())
         future = transaction.waiter
-        if future is None or future.done():
-            return
-        if transaction.error is None:
-            future.set_result(transaction.value)
-        else:
-            future.set_exception(transaction.error)
+        if future is not None and not future.done():
+            future.set_exception(late.error)
 
     def _arm(self, due: float) -> None:
-        if self._loop is None:
-            return
-        if self._timer is not None:
-            self._timer.cancel()
-        self._armed = due
-        self._timer = self._loop.call_at(self._loop.time() + max(0.0, due - self.clock()), self._on_time)
+        if self._alarm is not None:
+            self._armed = due
+            self._alarm.set(due - self.clock())
 
     def _on_time(self) -> None:
-        self._timer = None
         self._armed = inf
         now = self.clock()
         unread = False
-        if self._port is not None and self.arbiter.line_due(now):
-            unread = self._port.unread()
-            self._check_output(now)
+        if self._port is not None:
+            line_due = self.arbiter.line_due(now)
+            if line_due or self.arbiter.answer_counts(now):
+                unread = self._port.unread()
+            if line_due:
+                self._check_output(now)
         self.arbiter.handle_timeout(now, unread=unread)
         self.turn()
 

@@ -6,7 +6,7 @@ from math import inf
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, Event, Polled
+from busmaster.arbiter.events import Event, Polled
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import Poll, set_members
 from busmaster.arbiter.state import LineState
@@ -65,8 +65,9 @@ class Bench:
         latency: float = 0.0,
         capacity: int = 1000,
         strict: bool = False,
+        tapped: bool = False,
     ) -> None:
-        self.arbiter = Arbiter(TAU, echo=echo, receive_latency=latency, capacity=capacity, strict=strict)
+        self.arbiter = Arbiter(TAU, echo=echo, receive_latency=latency, capacity=capacity, strict=strict, tapped=tapped)
         self.unsent: int | None = None
         """How many bytes the port has not sent yet, for ports that can tell."""
         self.held = False
@@ -184,7 +185,7 @@ class Bench:
 
     def ended(self, transaction: Transaction) -> int:
         """How often it was reported as completed."""
-        return sum(isinstance(e, Completed) and e.transaction is transaction for e in self.events)
+        return sum(e is transaction for e in self.events)
 
 
 def heard(bench: Bench) -> NodeRecord:

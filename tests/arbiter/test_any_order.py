@@ -13,7 +13,7 @@ from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, NodeChanged, Polled
+from busmaster.arbiter.events import NodeChanged, Polled
 from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
 from busmaster.arbiter.schedule import Poll, set_members
 from busmaster.arbiter.state import LineState
@@ -199,7 +199,7 @@ class AnyOrder(RuleBasedStateMachine):
             self.asked_until = self.now + len(data) * TAU + LATENESS + TAU
         while (event := self.arbiter.poll_event()) is not None:
             match event:
-                case Completed(transaction):
+                case Transaction() as transaction:
                     self.check(transaction)
                 case Polled(poll):
                     self.check_cycle(poll)

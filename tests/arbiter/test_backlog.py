@@ -130,7 +130,7 @@ def test_cancelled_transactions_do_not_pile_up() -> None:
             transaction = waiting(priority)
             backlog.push(transaction)
             backlog.discard(transaction, Phase.ENDED)
-        assert len(backlog._queues[priority]._entries) <= SLACK + 1
+        assert len(backlog.queues[priority]._entries) <= SLACK + 1
 
 
 def longest_wait(served: Sequence[Priority], priority: Priority) -> int:

@@ -17,7 +17,6 @@ REQUEST = 8 * TAU
 URGENT, COMMAND, POLL, BACKGROUND = Priority
 MOST_ALIKE = 32
 WRITE_0 = "07 30 31 02 30 31 30 03 31"
-WRITE_5_OF_2 = "07 30 32 02 30 31 35 03 37"
 
 
 def write(value: int = 5, *, idempotent: bool = False) -> hcp2.Write:
@@ -290,3 +289,31 @@ def test_r15_after_one_doubled_reply_among_equal_reads_at_most_32_values_are_ano
     wrong = [pair for pair in values if pair[0] != pair[1]]
     assert 0 < len(wrong) <= MOST_ALIKE
     assert len(values) > 120
+
+
+def test_r15_a_node_that_owes_what_it_is_to_be_asked_for_is_asked_something_else_first() -> None:
+    """Another node's answer has shown that the line is in step, but for this node's own: that would not be believed."""
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, node)
+    node.unheard = SILENT - 1
+    bench.served(bench.ask(other, hcp2.Read(3)))
+    bench.wait(0.010)
+    read = bench.ask(node)
+    bench.until_sent()
+    assert bench.answer() == request_of(2), "a check, of that node"
+    bench.until_sent()
+    assert bench.answer(7) == request_of(1)
+    assert read.value == 7.0
+
+
+def test_r15_a_node_that_is_likely_to_be_dead_is_not_asked_something_else_first() -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, node)
+    node.unheard = SILENT
+    bench.served(bench.ask(other, hcp2.Read(3)))
+    bench.wait(0.010)
+    bench.ask(node)
+    bench.until_sent()
+    assert bench.sent() == request_of(1)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from busmaster.arbiter.state import LineState
-from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.arbiter.transaction import Priority
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import NoReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor

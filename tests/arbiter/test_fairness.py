@@ -62,7 +62,7 @@ class Desk:
                 transaction.node.health = Health.UP
                 transaction.node.failures = 0
         self.start()
-        self.dispatcher.note_successes()
+        self.dispatcher.note_success()
 
     def run_out(self) -> None:
         while self.on_wire is not None:

@@ -15,6 +15,7 @@ import pytest
 from anyio.from_thread import start_blocking_portal
 
 from busmaster.bus.bus import Bus
+from busmaster.bus.node import Node
 from busmaster.bus.polling import PollGroup
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
@@ -103,7 +104,7 @@ def test_a_closed_bus_sets_no_timer() -> None:
             dead = Hcp2Controller(bus, 9)
             bus.poll_group("dead", period=0.5, points=[dead.point("1")])
             await asyncio.sleep(3.0)
-        dead.node.suspend(5.0)
+        Node.of(dead).suspend(5.0)
         with pytest.raises(RuntimeError, match="no timer is set"):
             await asyncio.Event().wait()
 
@@ -115,7 +116,12 @@ def test_a_bus_that_was_not_entered_says_so_and_is_entered_once() -> None:
     async def story() -> None:
         bus = slow_bus()
         axis = Hcp2Controller(bus, 1)
-        for use in (axis.read(1), axis.write(1, 2.0), axis.node.timed_request(hcp2.Read(1)), axis.node.request(READ)):
+        for use in (
+            axis.read(1),
+            axis.write(1, 2.0),
+            Node.of(axis).timed_request(hcp2.Read(1)),
+            axis.node.request(READ),
+        ):
             with pytest.raises(BusClosed, match=r"node 1: the bus is not open .*; use the bus inside `async with`"):
                 await use
         with pytest.raises(BusClosed, match="the bus is not open"):
@@ -131,27 +137,27 @@ def test_a_bus_that_was_not_entered_says_so_and_is_entered_once() -> None:
 
 
 READ = hcp2.Read(1)
-USES: dict[str, Callable[[Hcp2Controller, PollGroup], Any]] = {
-    "a request": lambda axis, _: axis.read(1),
-    "a write": lambda axis, _: axis.write(1, 2.0),
-    "a point": lambda axis, _: axis.element(1).read(),
-    "a timed request": lambda axis, _: axis.node.timed_request(READ),
-    "a probe": lambda axis, _: axis.node.probe(),
-    "a node's statistics": lambda axis, _: axis.node.statistics(),
-    "suspend": lambda axis, _: axis.node.suspend(1.0),
-    "a new node": lambda axis, _: Hcp2Controller(axis.node.bus, 2),
-    "a new group": lambda axis, _: axis.node.bus.poll_group("other", period=1.0, points=[]),
-    "a group's points": lambda axis, group: group.add(axis.element(2)),
-    "a group's statistics": lambda _, group: group.statistics(),
-    "demand": lambda _, group: group.demand(),
-    "subscribe": lambda _, group: group.subscribe(),
-    "close": lambda _, group: group.close(),
-    "statistics": lambda axis, _: axis.node.bus.statistics(),
-    "resetting statistics": lambda axis, _: axis.node.bus.reset_statistics(),
-    "plan": lambda axis, _: axis.node.bus.plan(),
-    "the longest wait": lambda axis, _: axis.node.bus.worst_case_wait(),
-    "events": lambda axis, _: axis.node.bus.events(),
-    "leaving": lambda axis, _: axis.node.bus.__aexit__(None, None, None),
+USES: dict[str, Callable[[Bus, Hcp2Controller, PollGroup], Any]] = {
+    "a request": lambda _, axis, group: axis.read(1),
+    "a write": lambda _, axis, group: axis.write(1, 2.0),
+    "a point": lambda _, axis, group: axis.element(1).read(),
+    "a timed request": lambda _, axis, group: Node.of(axis).timed_request(READ),
+    "a probe": lambda _, axis, group: Node.of(axis).probe(),
+    "a node's statistics": lambda _, axis, group: Node.of(axis).statistics(),
+    "suspend": lambda _, axis, group: Node.of(axis).suspend(1.0),
+    "a new node": lambda bus, *_: Hcp2Controller(bus, 2),
+    "a new group": lambda bus, *_: bus.poll_group("other", period=1.0, points=[]),
+    "a group's points": lambda _, axis, group: group.add(axis.element(2)),
+    "a group's statistics": lambda _, axis, group: group.statistics(),
+    "demand": lambda _, axis, group: group.demand(),
+    "subscribe": lambda _, axis, group: group.subscribe(),
+    "close": lambda _, axis, group: group.close(),
+    "statistics": lambda bus, *_: bus.statistics(),
+    "resetting statistics": lambda bus, *_: bus.reset_statistics(),
+    "plan": lambda bus, *_: bus.plan(),
+    "the longest wait": lambda bus, *_: bus.worst_case_wait(),
+    "events": lambda bus, *_: bus.events(),
+    "leaving": lambda bus, *_: bus.__aexit__(None, None, None),
 }
 
 
@@ -173,7 +179,7 @@ def test_a_bus_used_from_another_thread_says_at_once_what_to_do_instead() -> Non
         group = portal.call(lambda: bus.poll_group("group", period=100.0, phase=50.0, points=[axis.element(1)]))
         for name, use in USES.items():
             with pytest.raises(InvalidCommand, match=r"used from thread .* hand the call to that loop, with portal"):
-                in_a_loop_of_its_own(name, partial(use, axis, group))
+                in_a_loop_of_its_own(name, partial(use, bus, axis, group))
         assert portal.call(bus.statistics).exchanges == 0
         assert portal.call(axis.read, 1) == 0.0
 
@@ -208,3 +214,28 @@ def test_another_loop_of_the_same_thread_is_told_so_and_a_loop_that_pauses_is_no
     first.run_until_complete(bus.__aexit__(None, None, None))
     first.close()
     second.close()
+
+
+def test_a_bus_that_is_entered_under_another_library_than_asyncio_says_what_it_needs_and_opens_nothing() -> None:
+    """Trio awaits as this does: it sends into the coroutine, and no loop of asyncio runs."""
+    bus = slow_bus()
+    with pytest.raises(InvalidCommand, match=r"needs asyncio's event loop.* not by trio"):
+        bus.__aenter__().send(None)
+    assert not bus.running
+
+
+def test_anyios_cancel_scopes_and_task_groups_work_around_a_bus() -> None:
+    async def story() -> list[float]:
+        read: list[float] = []
+        async with slow_bus() as bus, anyio.create_task_group() as tasks:
+            axis = Hcp2Controller(bus, 1)
+            with anyio.move_on_after(0.01) as scope:
+                await axis.read(1)
+            assert scope.cancelled_caught
+            tasks.start_soon(lambda: collect(axis, read))
+        return read
+
+    async def collect(axis: Hcp2Controller, read: list[float]) -> None:
+        read.append(await axis.read(1))
+
+    assert anyio.run(story) == [0.0]

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from itertools import pairwise
 from typing import Any
 
 import pytest
 
 from busmaster.bus.bus import Bus
+from busmaster.bus.node import Node
 from busmaster.bus.points import Point
-from busmaster.bus.polling import Quality
+from busmaster.bus.polling import Quality, Sample
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.errors import GarbledReply, NoReply, Refused
@@ -32,7 +34,7 @@ def test_two_consumers_of_a_group_cost_one_wire_read() -> None:
         group = bus.poll_group("g", period=0.1, points=[point])
         first, second = await asyncio.gather(cycles(group, 5), cycles(group, 5))
         assert [s.cycle for s in first] == [s.cycle for s in second]
-        assert point.node.statistics().attempts == first[-1].cycle
+        assert Node.of(point).statistics().attempts == first[-1].cycle
 
     on_a_bus(story)
 
@@ -243,14 +245,14 @@ def test_reading_with_a_greatest_age_takes_the_polled_sample_until_a_write_makes
         point = Hcp2Controller(bus, 1).point("1")
         group = bus.poll_group("g", period=1.0, points=[point])
         await cycles(group, 1)
-        asked = point.node.statistics().attempts
+        asked = Node.of(point).statistics().attempts
         assert await point.read(max_age=0.5) == 0.0
-        assert point.node.statistics().attempts == asked
+        assert Node.of(point).statistics().attempts == asked
         await point.write(5.0)
         assert await point.read(max_age=0.5) == 5.0
         await asyncio.sleep(0.6)
         await point.read(max_age=0.5)
-        assert point.node.statistics().attempts == asked + 3
+        assert Node.of(point).statistics().attempts == asked + 3
 
     on_a_bus(story)
 
@@ -274,7 +276,7 @@ def test_neighbouring_values_come_in_one_exchange_and_points_stay_what_they_are(
         snapshot = (await cycles(group, 1))[0]
         assert [snapshot[point].value for point in points] == [100 + n for n in range(8)]
         assert [snapshot[flag].value for flag in flags] == [True, False]
-        assert press.node.statistics().attempts == 2
+        assert Node.of(press).statistics().attempts == 2
         merged = bus.plan().groups[0].merged
         assert [m.serves for m in merged] == [8, 2]
 
@@ -291,7 +293,7 @@ def test_what_is_merged_is_weighed_again_when_reply_times_are_known() -> None:
         group = bus.poll_group("g", period=1.0, points=[press.point(str(2000 + 4 * n)) for n in range(3)])
         assert bus.plan().groups[0].exchanges == 1
         await cycles(group, 9)
-        assert press.node.statistics().attempts == 8 + 3
+        assert Node.of(press).statistics().attempts == 8 + 3
         assert bus.plan().groups[0].exchanges == 3
 
     device, settings = mscs()
@@ -385,7 +387,8 @@ def test_a_value_that_cannot_be_decoded_is_an_error_of_its_point_alone() -> None
         group = bus.poll_group("g", period=0.1, points=[good, bad])
         snapshot = (await cycles(group, 2))[-1]
         assert snapshot[good].value == 0.0
-        assert (snapshot[bad].value, snapshot[bad].quality) == (None, Quality.BAD)
+        sample: Sample[Any] = snapshot[bad]
+        assert (sample.value, sample.quality) == (None, Quality.BAD)
         assert isinstance(snapshot[bad].error, GarbledReply)
         assert bus.statistics().losses == 0
         with pytest.raises(GarbledReply, match="colour"):
@@ -399,5 +402,26 @@ def test_two_tasks_may_share_a_stream() -> None:
         stream = bus.poll_group("g", period=0.1, points=[Hcp2Controller(bus, 1).point("7")]).subscribe()
         first, second = await asyncio.gather(anext(stream), anext(stream))
         assert {first.cycle, second.cycle} == {1, 2}
+
+    on_a_bus(story)
+
+
+def test_samples_carry_the_time_of_day_which_follows_a_clock_that_was_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(bus: Bus) -> None:
+        def machine(seconds: float) -> None:
+            monkeypatch.setattr(time, "time", lambda: bus.now() + seconds)
+
+        axis = Hcp2Controller(bus, 1)
+        points = [axis.element(1), axis.element(2)]
+        group = bus.poll_group("g", period=0.1, points=points)
+        found = []
+        for offset in (1000.0, 1000.002, 5000.0, 400.0):
+            machine(offset)
+            [_, snapshot] = await cycles(group, 2)
+            found.append({round(snapshot[point].wall - snapshot[point].finished, 6) for point in points})
+            assert snapshot.wall_at(snapshot.finished) == snapshot.wall
+            assert snapshot.wall_at(snapshot.due) == pytest.approx(snapshot.wall - (snapshot.finished - snapshot.due))
+            assert bus.wall_time() - bus.now() == pytest.approx(min(found[-1]))
+        assert found == [{1000.0}, {1000.0}, {5000.0}, {400.0}]  # 2 ms is two clocks read one after the other
 
     on_a_bus(story)

@@ -14,9 +14,9 @@ from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import line_time
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node, Priority
-from busmaster.bus.polling import PollGroup
 from busmaster.emulator.device import Delay
 from busmaster.errors import BusError, InvalidCommand, NodeDown, NoReply
+from busmaster.planning import PlannedGroup
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
@@ -52,17 +52,9 @@ def test_a_plan_of_what_might_be_added() -> None:
         axis = Hcp2Controller(bus, 1)
         group = bus.poll_group("now", period=0.1, points=[axis.point("1")])
         await cycles(group, 10)
-        greedy = PollGroup(
-            bus,
-            "greedy",
-            0.05,
-            [axis.point(str(e)) for e in range(1, 40)],
-            phase=None,
-            priority=Priority.POLL,
-            merge=(),
-        )
+        greedy = PlannedGroup("greedy", 0.05, [(Node.of(axis).planned(), hcp2.Read(e)) for e in range(1, 40)])
         assert bus.plan().fits
-        assert not bus.plan(greedy.planned()).fits
+        assert not bus.plan(greedy).fits
 
     on_a_bus(story)
 
@@ -103,7 +95,7 @@ def test_r11_the_hook_of_a_node_that_returns_runs_before_its_polls_and_health_is
             await point.write(42.0)
             order.append("hook ends")
 
-        point.node.on_return = restore
+        Node.of(point).on_return = restore
         health = bus.events()
         group = bus.poll_group("g", period=0.1, points=[point])
         await cycles(group, 3)
@@ -134,12 +126,12 @@ def test_r11_a_node_that_returns_again_while_its_hook_runs_gets_another_run_afte
             await asyncio.sleep(20.0)
             order.append("ends")
 
-        point.node.on_return = restore
+        Node.of(point).on_return = restore
         group = bus.poll_group("g", period=0.5, points=[point])
         await cycles(group, 3)
 
         async def wait_for(health: Health) -> None:
-            while point.node.health is not health:
+            while Node.of(point).health is not health:
                 await cycles(group, 1)
                 with contextlib.suppress(BusError):
                     await point.read()
@@ -171,7 +163,7 @@ def test_a_suspended_node_rests_and_comes_back_by_itself() -> None:
         point = Hcp2Controller(bus, 1).point("7")
         group = bus.poll_group("g", period=0.1, points=[point])
         await cycles(group, 1)
-        point.node.suspend(for_=2.0)
+        Node.of(point).suspend(for_=2.0)
         with pytest.raises(NodeDown, match="suspended"):
             await point.read()
         assert isinstance((await cycles(group, 3))[-1][point].error, NodeDown)
@@ -199,7 +191,7 @@ def test_what_a_cycle_takes_is_a_guess_until_it_is_measured() -> None:
 
 def test_a_refused_probe_of_a_suspect_is_an_answer_and_a_request_that_was_not_sent_is_none() -> None:
     async def story(bus: Bus) -> None:
-        node = Hcp2Controller(bus, 1).node
+        node = Node.of(Hcp2Controller(bus, 1))
         await node.request(hcp2.Read(1))
         assert await node.probe()
         node.suspend(10.0)
@@ -218,7 +210,7 @@ def test_a_second_handle_with_the_same_timings_is_welcome_after_lateness_was_rai
     async def story(bus: Bus) -> None:
         timings = hcp2.PROFILE.timings.with_window(0.12)
         first = Hcp2Controller(bus, 1, timings=timings)
-        first.node.record.timings = timings.with_lateness(0.3)
+        Node.of(first).record.timings = timings.with_lateness(0.3)
         assert Hcp2Controller(bus, 1, timings=timings).node is first.node
         with pytest.raises(InvalidCommand, match="other timings"):
             Hcp2Controller(bus, 1, timings=hcp2.PROFILE.timings)

@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from random import Random
 from typing import Any
 
-from busmaster.emulator.device import Chance, Delay, Device
+from busmaster.emulator.chance import Chance
+from busmaster.emulator.device import Delay, Device
 from busmaster.protocols.dc104.device import EmulatedDc104
 from busmaster.protocols.msc.device import EmulatedMsc
 from tests.campaigns.kinds import Kind

@@ -12,10 +12,11 @@ from itertools import count
 from random import Random
 from typing import Any
 
-from busmaster.arbiter.events import Completed, Event, LatenessRaised, NodeChanged, Polled
+from busmaster.arbiter.events import Event, LatenessRaised, NodeChanged, Polled
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import Poll, line_time, set_members
 from busmaster.arbiter.state import LineState
+from busmaster.arbiter.tap import Tap
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.emulator.device import Delay
@@ -53,12 +54,14 @@ class Hunt:
         record: Callable[[str], None] | None = None,
         *,
         strict: bool = False,
+        tap: Tap | None = None,
     ) -> None:
         self.kind = KINDS[protocol]
         self.mix: Mix = MIXES[mix]
         self.name = f"{protocol}/{mix}/{seed}"
         self.random = Random(self.name)
         self._record = record
+        self._tap = tap
         chance = self.random
         ledger = self._ledger()
         nodes = chance.randrange(3, 8) if self.mix.equal else chance.randrange(1, 7)
@@ -128,6 +131,7 @@ class Hunt:
 
     def _world(self, strict: bool) -> World:
         options: dict[str, Any] = {"on_event": self._on_event, "record": self._record, "strict": strict}
+        options["tap"] = self._tap
         options["jitter"] = Random(f"{self.name} probes").random
         if self.mix.stands is None:
             return World(self.line, **options)
@@ -292,7 +296,7 @@ class Hunt:
 
     def _on_event(self, event: Event) -> None:
         match event:
-            case Completed(transaction):
+            case Transaction() as transaction:
                 self._completed(transaction)
             case Polled(poll):
                 self.judge.polled(poll)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from math import inf
 from typing import Any
 
-from busmaster.arbiter.events import Completed, Event, NodeChanged, Polled
+from busmaster.arbiter.events import Event, NodeChanged, Polled
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.schedule import Poll, line_time, set_members
 from busmaster.arbiter.transaction import Priority, Transaction
@@ -134,8 +134,8 @@ class Load:
             self.cycles[poll.name].append((poll.due, poll.started, poll.finished))
             for transaction in poll.results:
                 self.good[transaction.node.address] += transaction.error is None
-        elif isinstance(event, Completed):
-            self.on_completed(event.transaction)
+        elif isinstance(event, Transaction):
+            self.on_completed(event)
         elif isinstance(event, NodeChanged):
             self.changes.append((self.now, event))
             self.on_change(event)

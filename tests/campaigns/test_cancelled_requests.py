@@ -12,7 +12,6 @@ from itertools import count
 import pytest
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Transaction
 from busmaster.errors import BusError
@@ -112,8 +111,8 @@ class Campaign:
                     end = self.now + len(request) * TAU + delay + len(frame) * TAU
                     at(end, partial(deliver, frame))
             while (event := arbiter.poll_event()) is not None:
-                if isinstance(event, Completed) and event.transaction.waiter is not None:
-                    self.check(event.transaction, slave)
+                if isinstance(event, Transaction) and event.waiter is not None:
+                    self.check(event, slave)
 
     def check(self, transaction: Transaction, slave: Slave) -> None:
         number = transaction.waiter

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 import pytest
 
 from busmaster import Bus, BusError, MicroFlexDrive, Priority, WriteUnconfirmed
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.tap import Attempt
+from busmaster.bus.node import Node
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
@@ -35,12 +36,12 @@ class Sent:
 
     frames: list[tuple[float, bytes]] = field(default_factory=list)
 
-    def transmitted(self, now: float, data: bytes) -> None:
+    def transmitted(self, now: float, data: bytes, _attempt: Attempt | None, /) -> None:
         self.frames.append((now, data))
 
-    def received(self, now: float, data: bytes) -> None: ...
+    def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None: ...
 
-    def completed(self, transaction: Transaction) -> None: ...
+    def attempted(self, attempt: Attempt, /) -> None: ...
 
     def first(self, request: bytes, since: float) -> float:
         return next(now for now, data in self.frames if now >= since and request in data)
@@ -100,7 +101,7 @@ def trial(
             except BusError:
                 confirmed = False
             await asyncio.gather(write, return_exceptions=True)
-            request = DISABLE.open(1, drives[0].node.timings).request
+            request = DISABLE.open(1, Node.of(drives[0]).timings).request
             obeyed = not devices[0].command_word
             return Trial(sent.first(request, called) - called, bound, confirmed, obeyed)
 

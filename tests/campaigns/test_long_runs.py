@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.arbiter.in_step import LONGEST_ALIKE
+from busmaster.arbiter.alike import LONGEST_ALIKE
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.planning import Plan, PlannedGroup, PlannedNode, plan
 from busmaster.protocols.hcp2 import codec as hcp2

@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
-from busmaster.capture.assemble import Assembler, Verdict
+from dataclasses import replace
+from itertools import count
+from typing import Any
+
+import pytest
+
+from busmaster.arbiter.tap import Attempt, Verdict
+from busmaster.capture.assemble import Assembler
 from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, Packet
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
+from busmaster.protocols.ct_ansi import codec as ct_ansi
+from busmaster.protocols.hcp import codec as hcp
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
 
 READ = bytes.fromhex("07 30 32 02 30 31 05 04")
 VALUE = bytes.fromhex("02 30 31 35 03 37")
 OTHER = bytes.fromhex("07 46 46 02 36 39 05 08")
 ACK, NAK = b"\x06", b"\x15"
-NONE, OK, NO_REPLY, GARBLED, REFUSED, STRAY = Outcome
+NONE, OK, NO_REPLY, GARBLED, REFUSED, STRAY, *_ = Outcome
 HOST, NODE = Direction.HOST, Direction.NODE
+READ_PACKET = bytes.fromhex("02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74")
+READ_REPLY = bytes.fromhex("02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D")
 
 
 class Tape:
@@ -20,81 +36,124 @@ class Tape:
     def __init__(self, protocol: str = "", echo: bool = False) -> None:
         self.packets: list[Packet] = []
         self.assembler = Assembler(self.packets.append, protocol=protocol, echo=echo, offset=100.0)
+        self.attempt: Attempt | None = None
+        self._numbers = count(1)
+
+    def asked(
+        self, now: float, profile: Profile, command: Command[Any], address: int, before: bytes = b"", **more: Any
+    ) -> Attempt:
+        """Transmit its request, behind what closes the exchange before."""
+        options = {"transaction": next(self._numbers), **more}
+        self.attempt = Attempt(profile.name, address, command, profile.timings, **options)
+        self.assembler.passed(now, before + self.attempt.request, HOST, self.attempt)
+        return self.attempt
+
+    def read(self, now: float) -> Attempt:
+        return self.asked(now, hcp2.PROFILE, hcp2.Read(1), 2)
 
     def sent(self, now: float, data: bytes) -> None:
-        self.assembler.passed(now, data, HOST)
+        self.assembler.passed(now, data, HOST, self.attempt)
 
     def heard(self, now: float, data: bytes) -> None:
-        self.assembler.passed(now, data, NODE)
+        self.assembler.passed(now, data, NODE, self.attempt)
+
+    def over(self, now: float, verdict: Verdict, result: object, attempt: Attempt | None = None) -> None:
+        """Tell how an attempt ended: the one that is on the wire, if none is given."""
+        ended = attempt or self.attempt
+        assert ended is not None
+        if ended is self.attempt:
+            self.attempt = None
+        ended.end(verdict, result, now)
+        self.assembler.attempted(ended)
 
     def overheard(self, now: float, data: bytes) -> None:
-        self.assembler.passed(now, data, Direction.UNKNOWN)
-
-    def said(self, now: float, request: bytes, outcome: Outcome | None, comment: str) -> None:
-        self.assembler.completed(now, Verdict(request, outcome, comment))
+        self.assembler.overheard(now, data)
 
     def lines(self) -> list[tuple[Direction, bytes, Outcome, str]]:
-        self.assembler.idle(9.0)
+        self.assembler.finish(9.0)
         return [(packet.direction, packet.frame, packet.outcome, packet.comment) for packet in self.packets]
 
 
 def test_a_reply_in_pieces_is_one_packet_with_the_time_of_its_first_byte_and_the_requests_node() -> None:
     tape = Tape()
-    tape.sent(1.0, READ)
+    tape.read(1.0)
     tape.heard(1.002, VALUE[:3])
     tape.heard(1.004, VALUE[3:])
-    assert tape.lines() == [(HOST, READ, NONE, ""), (NODE, VALUE, OK, "")]
+    tape.over(1.004, Verdict.OK, 5.0)
+    assert tape.lines() == [(HOST, READ, NONE, ""), (NODE, VALUE, OK, "read element 1: 5.0")]
     assert [(packet.micros, packet.node) for packet in tape.packets] == [(101_000_000, 2), (101_002_000, 2)]
     assert {packet.protocol for packet in tape.packets} == {"hcp2"}
 
 
-def test_the_masters_verdict_comes_after_the_next_request_and_goes_to_the_right_exchange() -> None:
+def test_a_verdict_that_is_told_after_the_next_request_goes_to_the_right_exchange() -> None:
     tape = Tape()
-    tape.sent(1.0, READ)
+    first = tape.read(1.0)
     tape.heard(1.002, VALUE)
-    tape.sent(1.0021, OTHER)
-    tape.said(1.0022, READ, OK, "read element 1: 5.0")
+    first.end(Verdict.OK, 5.0, 1.002)
+    tape.asked(1.0021, hcp2.PROFILE, hcp2.Read(105), 255)
+    tape.over(1.002, Verdict.OK, 5.0, first)
     tape.heard(1.004, NAK)
-    tape.said(1.0041, OTHER, REFUSED, "read element 105: node 255: refused")
+    tape.over(1.0041, Verdict.REFUSED, "refused")
     assert tape.lines() == [
         (HOST, READ, NONE, ""),
         (NODE, VALUE, OK, "read element 1: 5.0"),
         (HOST, OTHER, NONE, ""),
-        (NODE, NAK, REFUSED, "read element 105: node 255: refused"),
+        (NODE, NAK, REFUSED, "read element 105: refused"),
     ]
+    assert [(packet.transaction, packet.attempt) for packet in tape.packets] == [(1, 1), (1, 1), (2, 1), (2, 1)]
 
 
-def test_the_same_request_twice_running_gets_its_verdicts_in_order() -> None:
+def test_each_attempt_has_its_own_verdict_and_why_it_was_asked() -> None:
     tape = Tape()
-    tape.sent(1.0, READ)
-    tape.heard(1.002, VALUE)
-    tape.sent(1.0021, READ)
-    tape.said(1.0022, READ, OK, "first")
-    tape.heard(1.004, VALUE)
-    tape.said(1.0041, READ, OK, "second")
-    assert [comment for *_, comment in tape.lines()] == ["", "first", "", "second"]
-
-
-def test_a_failed_attempt_ends_in_an_empty_packet_and_the_last_one_carries_the_verdict() -> None:
-    tape = Tape()
-    tape.sent(1.0, READ)
-    tape.sent(1.15, READ)
-    tape.said(1.3, READ, NO_REPLY, "read element 1: node 2: no reply within 100 ms, 2 attempts")
+    tape.asked(1.0, hcp2.PROFILE, hcp2.Read(1), 2, transaction=7, purpose="poll axes")
+    tape.over(1.13, Verdict.NO_REPLY, "no reply within 100 ms")
+    retry = tape.asked(1.15, hcp2.PROFILE, hcp2.Read(1), 2, transaction=7, number=2, purpose="poll axes")
+    retry.late, retry.heard = True, False
+    tape.heard(1.22, VALUE)
+    tape.over(1.22, Verdict.OK, 5.0)
     assert tape.lines() == [
-        (HOST, READ, NONE, ""),
-        (NODE, b"", NO_REPLY, "no reply"),
-        (HOST, READ, NONE, ""),
-        (NODE, b"", NO_REPLY, "read element 1: node 2: no reply within 100 ms, 2 attempts"),
+        (HOST, READ, NONE, "poll axes"),
+        (NODE, b"", NO_REPLY, "read element 1: no reply within 100 ms"),
+        (HOST, READ, NONE, "poll axes, attempt 2"),
+        (NODE, VALUE, OK, "read element 1: 5.0"),
     ]
-    assert [packet.micros for packet in tape.packets] == [101_000_000, 101_150_000, 101_150_000, 101_300_000]
+    assert [packet.micros for packet in tape.packets] == [101_000_000, 101_130_000, 101_150_000, 101_220_000]
+    assert [(packet.transaction, packet.attempt) for packet in tape.packets] == [(7, 1), (7, 1), (7, 2), (7, 2)]
+    assert tape.packets[-1].notes == ("late", "cancelled")
+
+
+def test_a_verdict_that_did_not_fit_into_the_recorders_memory_is_told_by_the_attempt_itself() -> None:
+    tape = Tape()
+    tape.read(1.0).end(Verdict.NO_REPLY, "no reply within 100 ms", 1.1)
+    tape.read(1.2)
+    assert tape.lines()[1] == (NODE, b"", NO_REPLY, "read element 1: no reply within 100 ms")
+
+
+def test_an_exchange_that_goes_on_is_not_written_for_all_its_silence() -> None:
+    tape = Tape()
+    tape.read(1.0)
+    tape.assembler.idle(5.0)
+    assert tape.packets == []
+    tape.heard(6.0, VALUE)
+    tape.over(6.0, Verdict.OK, 5.0)
+    assert [packet.outcome for packet in tape.packets] == [NONE, OK]
+
+
+@pytest.mark.parametrize("verdict", [Verdict.DOUBTED, Verdict.SPOILT, Verdict.CUT_OFF])
+def test_what_only_a_master_can_say_is_on_the_answer(verdict: Verdict) -> None:
+    tape = Tape()
+    tape.read(1.0)
+    tape.heard(1.002, VALUE)
+    tape.over(1.003, verdict, "so it was")
+    assert tape.lines()[1] == (NODE, VALUE, Outcome[verdict.name], "read element 1: so it was")
 
 
 def test_without_a_verdict_the_frames_are_judged() -> None:
-    tape = Tape()
+    tape = Tape("hcp2")
     for reply in (VALUE, NAK, VALUE[:-1] + b"\x38", VALUE[:3], b"\x02\x30\x32\x35\x03\x34", b""):
-        tape.sent(1.0, READ)
+        tape.assembler.overheard(1.0, READ, HOST)
         if reply:
-            tape.heard(1.0, reply)
+            tape.assembler.overheard(1.0, reply, NODE)
     outcomes = [(outcome, comment) for direction, _, outcome, comment in tape.lines() if direction is NODE]
     assert outcomes == [
         (OK, ""),
@@ -106,135 +165,186 @@ def test_without_a_verdict_the_frames_are_judged() -> None:
     ]
 
 
-def test_an_unconfirmed_write_keeps_what_the_frames_say() -> None:
-    tape = Tape()
-    write = bytes.fromhex("07 30 31 02 30 31 35 03 34")
-    tape.sent(1.0, write)
-    tape.said(1.1, write, None, "write element 1 = 5: node 1: no reply within 100 ms, 1 attempt")
-    assert tape.lines()[1][2:] == (NO_REPLY, "write element 1 = 5: node 1: no reply within 100 ms, 1 attempt")
-
-
-def test_strays_are_marked_and_never_taken_for_a_reply() -> None:
-    tape = Tape()
+def test_what_comes_while_nothing_is_asked_is_a_stray_whatever_it_looks_like() -> None:
+    tape = Tape("hcp2")
     tape.heard(0.5, b"\xff")
-    tape.sent(1.0, READ)
+    tape.read(1.0)
     tape.heard(1.002, VALUE)
-    tape.said(1.0021, READ, OK, "read element 1: 5.0")
+    tape.over(1.0021, Verdict.OK, 5.0)
     tape.heard(1.1, VALUE)
+    tape.sent(1.15, ACK)
     tape.heard(1.2, b"\x00")
     assert tape.lines() == [
         (NODE, b"\xff", STRAY, ""),
         (HOST, READ, NONE, ""),
         (NODE, VALUE, OK, "read element 1: 5.0"),
         (NODE, VALUE, STRAY, ""),
+        (HOST, ACK, NONE, ""),
         (NODE, b"\x00", STRAY, ""),
     ]
+    assert [packet.transaction for packet in tape.packets] == [0, 1, 1, 0, 0, 0]
 
 
 def test_noise_behind_a_reply_leaves_its_outcome_alone() -> None:
     tape = Tape()
-    tape.sent(1.0, READ)
+    tape.read(1.0)
     tape.heard(1.002, VALUE + b"\x00\x00")
-    tape.sent(1.1, READ)
-    assert tape.lines()[1:3] == [(NODE, VALUE, OK, ""), (NODE, b"\x00\x00", STRAY, "")]
+    tape.over(1.002, Verdict.OK, 5.0)
+    assert [line[1:3] for line in tape.lines()] == [(READ, NONE), (VALUE, OK), (b"\x00\x00", STRAY)]
 
 
 def test_a_reply_behind_noise_is_none_for_no_reader_looks_for_its_start() -> None:
     tape = Tape()
-    tape.sent(1.0, READ)
+    tape.read(1.0)
     tape.heard(1.002, b"\x05" + NAK)
+    tape.over(1.002, Verdict.GARBLED, "not a reply")
     assert [line[1:3] for line in tape.lines()] == [(READ, NONE), (b"\x05", GARBLED), (NAK, STRAY)]
 
 
 def test_a_bad_packet_that_is_sent_again_ends_well() -> None:
     tape = Tape()
-    request = bytes.fromhex("02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74")
-    reply = bytes.fromhex("02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D")
-    tape.sent(1.0, request)
-    tape.heard(1.02, ACK + reply[:5])
+    tape.asked(1.0, msc.PROFILE, msc.DataRead(2008), 1)
+    tape.heard(1.02, ACK + READ_REPLY[:5])
     tape.sent(1.2, NAK)
-    tape.heard(1.22, reply)
+    tape.heard(1.22, READ_REPLY)
     tape.sent(1.23, ACK)
+    tape.over(1.23, Verdict.OK, 1234)
     assert [line[1:3] for line in tape.lines()] == [
-        (request, NONE),
+        (READ_PACKET, NONE),
         (ACK, NONE),
-        (reply[:5], NONE),
+        (READ_REPLY[:5], NONE),
         (NAK, NONE),
-        (reply, OK),
+        (READ_REPLY, OK),
         (ACK, NONE),
+    ]
+    assert {packet.transaction for packet in tape.packets} == {1}
+
+
+def test_a_request_that_is_said_again_in_the_same_exchange_begins_no_other() -> None:
+    tape = Tape()
+    request = tape.asked(1.0, msc.PROFILE, msc.SetFlag(5), 2).request
+    tape.heard(1.02, NAK)
+    tape.sent(1.03, request)
+    tape.heard(1.05, ACK)
+    tape.over(1.05, Verdict.OK, None)
+    assert [line[1:] for line in tape.lines()] == [
+        (request, NONE, ""),
+        (NAK, NONE, ""),
+        (request, NONE, ""),
+        (ACK, OK, "set flag 5: ok"),
     ]
 
 
 def test_a_packet_whose_ack_was_lost_is_no_reply() -> None:
-    tape = Tape()
-    tape.sent(1.0, bytes.fromhex("02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74"))
-    tape.heard(1.02, bytes.fromhex("02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"))
-    tape.sent(1.03, ACK)
+    tape = Tape("msc")
+    tape.assembler.overheard(1.0, READ_PACKET, HOST)
+    tape.assembler.overheard(1.02, READ_REPLY, NODE)
+    tape.assembler.overheard(1.03, ACK, HOST)
     assert [line[2] for line in tape.lines()] == [NONE, NO_REPLY, NONE]
 
 
-def test_a_reply_after_the_masters_verdict_is_a_stray() -> None:
+def test_a_reply_after_the_masters_verdict_is_a_stray_that_may_be_late() -> None:
     tape = Tape()
-    tape.sent(1.0, READ)
-    tape.said(1.1, READ, NO_REPLY, "read element 1: node 2: no reply within 100 ms, 1 attempt")
+    tape.read(1.0)
+    tape.over(1.1, Verdict.NO_REPLY, "no reply within 100 ms")
     tape.heard(1.12, VALUE)
-    assert [line[1:3] for line in tape.lines()] == [(READ, NONE), (b"", NO_REPLY), (VALUE, STRAY)]
+    assert [line[1:] for line in tape.lines()][1:] == [
+        (b"", NO_REPLY, "read element 1: no reply within 100 ms"),
+        (VALUE, STRAY, "perhaps a late answer to read element 1"),
+    ]
 
 
 def test_a_broadcast_is_over_when_it_is_sent() -> None:
-    tape = Tape()
     everybody = bytes.fromhex("04 30 30 30 30 02 30 31 31 37 2B 30 30 30 30 03 2F")
-    tape.sent(1.0, everybody)
-    assert tape.lines() == [(HOST, everybody, OK, "")]
+    tape, overheard = Tape(), Tape("mentor")
+    tape.asked(1.0, mentor.PROFILE, mentor.Write(1, 17, 0), 0)
+    tape.over(1.1, Verdict.OK, None)
+    assert tape.lines() == [(HOST, everybody, OK, "write 01.17 = +0000: ok")]
     assert tape.packets[0].protocol == "mentor"
+    overheard.assembler.overheard(1.0, everybody, HOST)
+    assert overheard.lines() == [(HOST, everybody, OK, "")]
 
 
-def test_an_msc_read_is_four_packets_and_its_reply_has_the_outcome() -> None:
+def test_a_read_of_several_legs_is_closed_by_what_comes_with_the_next_request() -> None:
     tape = Tape()
-    request = bytes.fromhex("02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74")
-    reply = bytes.fromhex("02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D")
-    tape.sent(1.0, request)
-    tape.heard(1.02, ACK + reply)
-    tape.sent(1.0201, ACK)
-    tape.said(1.0202, request, OK, "read 2008: 1234")
+    first = tape.asked(1.0, msc.PROFILE, msc.DataRead(2008), 1)
+    tape.heard(1.02, ACK + READ_REPLY)
+    first.end(Verdict.OK, 1234, 1.02)
+    tape.asked(1.0201, msc.PROFILE, msc.DataRead(2008), 1, before=ACK)
+    tape.heard(1.04, ACK)
+    tape.over(1.9, Verdict.NO_REPLY, "no packet followed the ACK")
     assert tape.lines() == [
-        (HOST, request, NONE, ""),
+        (HOST, READ_PACKET, NONE, ""),
         (NODE, ACK, NONE, ""),
-        (NODE, reply, OK, "read 2008: 1234"),
+        (NODE, READ_REPLY, OK, "read data 2008: 1234"),
         (HOST, ACK, NONE, ""),
+        (HOST, READ_PACKET, NONE, ""),
+        (NODE, ACK, NO_REPLY, "read data 2008: no packet followed the ACK"),
     ]
-    tape.sent(2.0, request)
-    tape.heard(2.02, ACK)
-    assert tape.lines()[-1] == (NODE, ACK, NO_REPLY, "nothing came after the ACK")
+    assert [packet.transaction for packet in tape.packets] == [1, 1, 1, 1, 2, 2]
+
+
+def test_of_protocols_that_speak_alike_each_frame_has_its_own() -> None:
+    """A CT-ANSI drive and a Mentor II answer the same request with the same bytes."""
+    tape = Tape()
+    reply = bytes.fromhex("02 30 31 31 37 2D 30 34 37 36 03 2C")
+    for now, profile, read in (
+        (1.0, mentor.PROFILE, mentor.Read(1, 17)),
+        (2.0, ct_ansi.PROFILE, ct_ansi.Read(1, 17)),
+        (3.0, mentor.PROFILE, mentor.Read(1, 17)),
+    ):
+        tape.asked(now, profile, read, 12)
+        tape.heard(now + 0.01, reply)
+        tape.over(now + 0.01, Verdict.OK, -476)
+    assert len({packet.frame for packet in tape.packets}) == 2
+    assert [packet.protocol for packet in tape.packets] == ["mentor"] * 2 + ["ct-ansi"] * 2 + ["mentor"] * 2
 
 
 def test_two_protocols_may_share_a_line() -> None:
     tape = Tape()
-    hcp = bytes.fromhex("04 32 32 02 30 31 05")
-    for request in (READ, hcp, READ):
-        tape.sent(1.0, request)
+    for profile, read in ((hcp2.PROFILE, hcp2.Read(1)), (hcp.PROFILE, hcp.Read(1)), (hcp2.PROFILE, hcp2.Read(1))):
+        tape.asked(1.0, profile, read, 2)
         tape.heard(1.0, VALUE)
+        tape.over(1.0, Verdict.OK, 5.0)
     assert [outcome for _, _, outcome, _ in tape.lines()] == [NONE, OK] * 3
     assert [packet.protocol for packet in tape.packets] == ["hcp2", "hcp2", "hcp", "hcp", "hcp2", "hcp2"]
 
 
 def test_hcp2_nodes_may_be_declared_as_drives() -> None:
     tape = Tape("microflex")
-    tape.sent(1.0, READ)
+    tape.read(1.0)
     tape.lines()
     assert tape.packets[0].protocol == "microflex"
 
 
+def test_a_protocol_that_nobody_knows_here_is_recorded_as_it_passed() -> None:
+    tape = Tape()
+    tape.asked(1.0, replace(hcp2.PROFILE, name="of my own"), hcp2.Read(1), 2)
+    tape.heard(1.01, VALUE[:3])
+    tape.heard(1.02, VALUE[3:])
+    tape.over(1.02, Verdict.OK, 5.0)
+    assert tape.lines() == [
+        (HOST, READ, NONE, ""),
+        (NODE, VALUE[:3], NONE, ""),
+        (NODE, VALUE[3:], OK, "read element 1: 5.0"),
+    ]
+    assert {(packet.protocol, packet.node) for packet in tape.packets} == {("", 2)}
+
+
 def test_an_echo_is_left_out_and_one_that_differs_is_kept() -> None:
     tape = Tape(echo=True)
-    tape.sent(1.0, READ)
+    tape.read(1.0)
     tape.heard(1.001, READ[:5])
     tape.heard(1.002, READ[5:] + VALUE)
-    tape.sent(2.0, READ)  # its echo never comes
-    tape.sent(3.0, OTHER)
+    tape.over(1.002, Verdict.OK, 5.0)
+    tape.read(2.0)  # its echo never comes
+    tape.over(2.1, Verdict.NO_REPLY, "no reply")
+    tape.asked(3.0, hcp2.PROFILE, hcp2.Read(105), 255)
     tape.heard(3.001, OTHER + NAK)
-    tape.sent(4.0, READ)
+    tape.over(3.001, Verdict.REFUSED, "refused")
+    tape.read(4.0)
     tape.heard(4.001, READ[:3] + b"\xff")
+    tape.over(4.001, Verdict.SPOILT, "the echo differs")
     assert [line[1:3] for line in tape.lines()] == [
         (READ, NONE),
         (VALUE, OK),
@@ -243,34 +353,42 @@ def test_an_echo_is_left_out_and_one_that_differs_is_kept() -> None:
         (OTHER, NONE),
         (NAK, REFUSED),
         (READ, NONE),
-        (READ[:3] + b"\xff", GARBLED),
+        (READ[:3] + b"\xff", Outcome.SPOILT),
     ]
 
 
 def test_a_line_that_is_only_listened_to_is_recorded_the_same() -> None:
     told, untold = Tape("hcp2"), Tape("hcp2")
-    for now, request, reply in ((1.0, READ, VALUE), (2.0, OTHER, NAK), (3.0, READ, VALUE[:4]), (4.0, READ, VALUE)):
-        told.sent(now, request)
+    for now, command, address, reply in (
+        (1.0, hcp2.Read(1), 2, VALUE),
+        (2.0, hcp2.Read(105), 255, NAK),
+        (3.0, hcp2.Read(1), 2, VALUE[:4]),
+        (4.0, hcp2.Read(1), 2, VALUE),
+    ):
+        request = told.asked(now, hcp2.PROFILE, command, address).request
         told.heard(now + 0.01, reply)
         untold.overheard(now, request + reply[:1])
         untold.overheard(now + 0.01, reply[1:])
     assert [line[1:3] for line in untold.lines()] == [line[1:3] for line in told.lines()]
+    assert {packet.transaction for packet in untold.packets} == {0}
 
 
 def test_an_echo_that_never_came_does_not_use_up_the_next_one() -> None:
     tape = Tape(echo=True)
-    write, read = bytes.fromhex("04 31 31 02 31 30 35 03 37"), bytes.fromhex("04 31 31 02 31 30 05")
-    tape.sent(1.0, write)
-    tape.sent(2.0, read)
+    reply = bytes.fromhex("02 31 30 33 03 31")
+    tape.asked(1.0, hcp.PROFILE, hcp.Write(10, (5.0,)), 1)
+    tape.over(1.1, Verdict.NO_REPLY, "no reply")
+    read = tape.asked(2.0, hcp.PROFILE, hcp.Read(10), 1).request
     tape.heard(2.001, read[:5])
-    tape.heard(2.002, read[5:] + bytes.fromhex("02 31 30 33 03 31"))
-    assert [line[1:3] for line in tape.lines()][2:] == [(read, NONE), (bytes.fromhex("02 31 30 33 03 31"), OK)]
+    tape.heard(2.002, read[5:] + reply)
+    tape.over(2.002, Verdict.OK, 3.0)
+    assert [line[1:3] for line in tape.lines()][2:] == [(read, NONE), (reply, OK)]
 
 
 def test_mscs_closing_ack_is_echoed_into_the_next_exchange() -> None:
     tape = Tape(echo=True)
-    request = bytes.fromhex("02 01 00 0D 00 00 44 57 52 49 54 45 2C 07 D8 00 00 04 D2 03 BE")
     tape.sent(1.0, ACK)
-    tape.sent(1.0, request)
+    request = tape.asked(1.0, msc.PROFILE, msc.DataWrite(2008, 1234), 1).request
     tape.heard(1.02, ACK + request + ACK)
+    tape.over(1.02, Verdict.OK, None)
     assert [line[1:3] for line in tape.lines()][-2:] == [(request, NONE), (ACK, OK)]

@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from busmaster.capture.assemble import protocol_of
 from busmaster.capture.decode import Decoder
 from busmaster.capture.frames import Frame, Kind
 from busmaster.errors import InvalidCommand
@@ -19,14 +18,6 @@ def test_every_frame_of_the_documents_is_one_frame_with_nothing_wrong(protocol: 
     (frame,) = Decoder(find(protocol).protocol.dialect()).feed(raw, 0.0, sender_of(name))
     assert frame.raw == raw
     assert frame.fault == ("unasked" if frame.sender is NODE else "")
-
-
-@pytest.mark.parametrize(("protocol", "name", "raw"), vectors())
-def test_a_request_tells_its_protocol(protocol: str, name: str, raw: bytes) -> None:
-    if sender_of(name) is NODE:
-        assert protocol_of(raw[:1]) == ""
-    else:
-        assert protocol_of(raw) == protocol
 
 
 def test_hcp_in_both_directions() -> None:
@@ -320,7 +311,7 @@ def test_a_request_that_the_host_receives_is_no_answer_to_it(protocol: str, requ
 
 
 def test_a_protocol_that_does_not_exist_is_refused_by_name() -> None:
-    with pytest.raises(InvalidCommand, match=r"'hcp3'.*hcp, hcp2"):
+    with pytest.raises(InvalidCommand, match="no such protocol 'hcp3'; did you mean 'hcp'"):
         find("hcp3").protocol.dialect()
 
 

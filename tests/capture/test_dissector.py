@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import random
 import shutil
+import struct
 import subprocess
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from busmaster.capture import DISSECTOR
+from busmaster.capture import DISSECTOR, pcapng
 from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Outcome, Packet, PcapngWriter
 from busmaster.protocols._comms.elements import Element
@@ -275,6 +277,42 @@ def test_replies_are_tied_to_requests_and_what_is_odd_is_noted(tmp_path: Path) -
     assert "Nobody asked" in rows[7][3]
     assert "No such parameter" in rows[9][3]
     assert rows[0][5] == "0"
+
+
+def test_a_reply_is_tied_to_the_request_of_its_own_exchange_and_to_no_other(tmp_path: Path) -> None:
+    packets = [
+        replace(packet(0, "hcp2", HOST, "07 30 32 02 30 31 05 04"), transaction=70_000, attempt=2),
+        replace(packet(3, "hcp2", NODE, "02 30 31 35 03 37"), transaction=70_000, attempt=2, outcome=Outcome.DOUBTED),
+        replace(packet(4, "hcp2", NODE, "02 30 31 35 03 37"), transaction=70_001, attempt=1),
+        packet(5, "hcp2", NODE, "02 30 31 35 03 37"),
+    ]
+    fields = ("busmaster.transaction", "busmaster.attempt", "busmaster.request_in", EXPERT)
+    told = "Not taken for an answer: not believed"
+    assert dissect(tmp_path, packets, *fields) == [
+        ["70000", "2", "", ""],
+        ["70000", "2", "1", told],
+        ["70001", "1", "", ""],
+        ["", "", "", ""],
+    ]
+
+
+def test_a_capture_of_an_older_version_reads_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    packets = [
+        packet(0, "hcp2", HOST, "07 30 32 02 30 31 05 04"),
+        packet(3, "hcp2", NODE, "02 30 31 35 03 37"),
+    ]
+    fields = (*FIELDS, "busmaster.request_in")
+    today = dissect(tmp_path, packets, *fields)
+
+    class Short:
+        """The header that ended before the number of the request."""
+
+        def pack(self, _version: int, *head: int) -> bytes:
+            return struct.pack(">BBBBH", 1, *head[:4])
+
+    monkeypatch.setitem(pcapng._HEADERS, pcapng.HEADER_VERSION, Short())
+    assert dissect(tmp_path, packets, *fields) == today
+    assert today[1][-1] == "1"
 
 
 def test_no_bytes_however_garbled_upset_it(tmp_path: Path) -> None:

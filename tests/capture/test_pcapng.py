@@ -18,6 +18,7 @@ HEAD = bytes.fromhex(
     "01000000 28000000 9d00 0000 00000000 0200 0300 434f4d00 0900 0100 06000000 00000000 28000000"
 )
 """Section header and interface description of the pcapng format: little-endian, link type 157, microseconds."""
+NODE = Direction.NODE
 EMPTY = Packet(0, "", Direction.HOST, b"")
 
 
@@ -34,15 +35,16 @@ def test_the_head_of_a_file() -> None:
 
 
 def test_a_packet_byte_by_byte() -> None:
-    ack = Packet(0x0006_2345_6789_ABCD, "hcp2", Direction.NODE, b"\x06", 5, Outcome.OK, "done", 3)
+    ack = Packet(0x0006_2345_6789_ABCD, "hcp2", NODE, b"\x06", 5, Outcome.OK, "done", 3, ("late",), 7, 2, True)
     assert written(ack, port="COM")[len(HEAD) :] == bytes.fromhex(
         "01000000 30000000 9d00 0000 00000000 0200 0300 434f4d00 0300 0400 68637032"  # interface 1: port, protocol
         "0900 0100 06000000 00000000 30000000"
-        "06000000 48000000 01000000"  # enhanced packet block, interface 1
-        "45230600 cdab8967 07000000 07000000"  # time, captured and original length
-        "01 02 01 01 0005 06 00"  # our header (HCP2, from a node, ok, node 5), ACK, padding
-        "0100 0400 646f6e65  0200 0400 01000000  0400 0800 0300000000000000  00000000"  # comment, inbound, dropped, end
-        "48000000"
+        "06000000 58000000 01000000"  # enhanced packet block, interface 1
+        "45230600 cdab8967 0d000000 0d000000"  # time, captured and original length
+        "02 02 01 01 0005 00000007 02 01 06 000000"  # our header (HCP2, a node, ok, node 5, request 7.2, joined), ACK
+        "0100 0400 646f6e65  0100 0400 6c617465"  # comments
+        "0200 0400 01000000  0400 0800 0300000000000000  00000000"  # inbound, dropped, end
+        "58000000"
     )
 
 
@@ -66,6 +68,10 @@ packets = st.builds(
     outcome=st.sampled_from(Outcome),
     comment=st.text(max_size=30),
     dropped=st.integers(0, 2**40),
+    notes=st.lists(st.text(max_size=10), max_size=3).map(tuple),
+    transaction=st.integers(0, 2**32 - 1),
+    attempt=st.integers(0, 255),
+    joined=st.booleans(),
 )
 
 

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from typing import TypeAlias
+
 import pytest
 
-from busmaster.capture.assemble import Assembler, Verdict
+from busmaster.arbiter.tap import Attempt, Verdict
+from busmaster.capture.assemble import Assembler
 from busmaster.capture.frames import Direction
-from busmaster.capture.pcapng import Outcome, Packet
+from busmaster.capture.pcapng import Outcome, Packet, read_packets
 from busmaster.capture.replay import Replayed, replay
 from busmaster.contract.exchange import Command
-from busmaster.contract.timing import Timings
+from busmaster.contract.profile import Profile
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -21,21 +27,41 @@ ACK, NAK, EOT = "06", "15", "04"
 FLAGS_REPLY = "02 03 00 27 00 00 52 46 4C 41 47 53 2C 01 02 00 80" + " 00" * 27 + " 80 03 18"
 
 
-def recorded(*turns: tuple[Direction, str]) -> list[Packet]:
+Turn: TypeAlias = tuple[Direction | Attempt, str]
+"""Who says what; an attempt says its request."""
+
+
+def recorded(*turns: Turn) -> list[Packet]:
     """What a recorder makes of these turns; nobody tells it the master's verdict."""
     packets: list[Packet] = []
     assembler = Assembler(packets.append)
+    attempt: Attempt | None = None
     for turn, (sender, frame) in enumerate(turns):
-        assembler.passed(float(turn), bytes.fromhex(frame), sender)
-    assembler.idle(100.0)
+        if isinstance(sender, Attempt):
+            attempt, sender = sender, HOST
+        assembler.passed(float(turn), bytes.fromhex(frame), sender, attempt)
+    assembler.finish(100.0)
     return packets
 
 
-def exchange(command: Command[object], address: int, timings: Timings, *replies: str) -> list[tuple[Direction, str]]:
-    return [(HOST, command.open(address, timings).request.hex()), *((NODE, reply) for reply in replies)]
+def overheard(*turns: Turn) -> list[Packet]:
+    """What a listener makes of these turns of one protocol, as recorders did that were told of no attempts."""
+    packets: list[Packet] = []
+    protocol = next(sender.protocol for sender, _ in turns if isinstance(sender, Attempt))
+    assembler = Assembler(packets.append, protocol=protocol)
+    for turn, (sender, frame) in enumerate(turns):
+        assembler.overheard(float(turn), bytes.fromhex(frame), HOST if isinstance(sender, Attempt) else sender)
+    assembler.finish(100.0)
+    return packets
 
 
-HCP, HCP2, MSC, MENTOR, DC104 = (p.PROFILE.timings for p in (hcp, hcp2, msc, mentor, dc104))
+def exchange(command: Command[object], address: int, profile: Profile, *replies: str) -> list[Turn]:
+    asked = Attempt(profile.name, address, command, profile.timings, transaction=next(NUMBERS))
+    return [(asked, asked.request.hex()), *((NODE, reply) for reply in replies)]
+
+
+NUMBERS = count(1)
+HCP, HCP2, MSC, MENTOR, DC104 = (p.PROFILE for p in (hcp, hcp2, msc, mentor, dc104))
 GOOD = [
     exchange(hcp.Read(1), 2, HCP, "02 30 31 31 32 33 2E 34 35 36 03 2B"),
     exchange(hcp.Write(1, (123.456,)), 2, HCP, ACK),
@@ -65,7 +91,7 @@ GOOD = [
         (HOST, ACK),
     ],
     exchange(msc.DataWrite(2008, 1234), 1, MSC, ACK),
-    [*exchange(msc.SetFlag(5), 2, MSC, NAK), *exchange(msc.SetFlag(5), 2, MSC, ACK)],
+    [*exchange(msc.SetFlag(5), 2, MSC, NAK), (HOST, "02 02 00 08 00 00 53 46 4C 41 47 2C 00 05 01 A8"), (NODE, ACK)],
     exchange(msc.ClearFlag(5), 2, MSC),
     [*exchange(msc.ReadFlag(255), 15, MSC, ACK, "02 0F 00 08 00 00 52 46 4C 41 47 2C 00 01 01 B0"), (HOST, ACK)],
     [*exchange(msc.ReadFlags(), 3, MSC, ACK, FLAGS_REPLY), (HOST, ACK)],
@@ -86,20 +112,23 @@ GOOD = [
 ]
 
 
+@pytest.mark.parametrize("record", [recorded, overheard])
 @pytest.mark.parametrize("turns", GOOD, ids=range(len(GOOD)))
 def test_what_todays_readers_make_of_a_recorded_exchange_is_what_was_recorded(
-    turns: list[tuple[Direction, str]],
+    turns: list[Turn], record: Callable[..., list[Packet]]
 ) -> None:
-    (one,) = replay(recorded(*turns))
+    (one,) = replay(record(*turns))
     assert one.judged
     assert not one.changed, f"was {one.recorded}, is {one.now}"
 
 
 def test_a_whole_capture_is_cut_into_its_exchanges() -> None:
     everything = list(replay(recorded(*(turn for turns in GOOD for turn in turns))))
-    assert len(everything) == len(GOOD)
-    assert not any(one.changed for one in everything)
-    assert {one.recorded.outcome for one in everything} == set(Outcome) - {Outcome.NONE, Outcome.STRAY}
+    heard = list(replay(packet for turns in GOOD for packet in overheard(*turns)))
+    assert len(everything) == len(heard) == len(GOOD)
+    assert not any(one.changed for one in everything + heard)
+    by_frames = {Outcome.OK, Outcome.NO_REPLY, Outcome.GARBLED, Outcome.REFUSED}
+    assert {one.recorded.outcome for one in everything} == by_frames
 
 
 READ = exchange(hcp2.Read(105), 255, HCP2, "02 36 39 34 30 39 36 03 07")
@@ -137,31 +166,96 @@ def test_without_a_recorded_value_the_replys_own_numbers_are_compared() -> None:
     assert str(only(packets).recorded) == "ok: 4096"
 
 
+WRITE = Attempt("hcp2", 1, hcp2.Write(1, (5.0,)), HCP2.timings)
+
+
 def test_a_request_that_would_be_written_otherwise_is_a_change() -> None:
-    one = only(recorded((HOST, "07 30 31 02 30 31 2B 35 03 1F"), (NODE, ACK)))
+    one = only(overheard((WRITE, "07 30 31 02 30 31 2B 35 03 1F"), (NODE, ACK)))
     assert one.changed
     assert str(one.now) == "the request would be 07 30 31 02 30 31 35 03 34"
 
 
 def test_a_request_that_no_command_sends_is_a_change_if_it_was_answered() -> None:
-    one = only(recorded((HOST, "07 30 30 02 30 30 05 07"), (NODE, NAK)))
+    one = only(overheard((WRITE, "07 30 30 02 30 30 05 07"), (NODE, NAK)))
     assert "1 to 255" in str(one.now)
     assert one.changed
 
 
+def test_a_file_of_the_first_version_which_numbers_no_requests_replays() -> None:
+    with (Path(__file__).parent / "version1.pcapng").open("rb") as file:
+        exchanges = list(replay(read_packets(file)))
+    assert not any(one.changed for one in exchanges)
+    assert all(one.judged for one in exchanges)
+    assert len(exchanges) == 13
+    assert [(one.packet, one.node, str(one.recorded)[:30]) for one in exchanges[:5]] == [
+        (1, 1, "ok: ok"),
+        (3, 1, "ok: -2.0"),
+        (5, 7, "ok: 64.0"),
+        (7, 2, "refused"),
+        (9, 2, "refused: write element 100 = 3"),
+    ]
+
+
 def test_strays_and_what_comes_before_the_first_request_are_left_out() -> None:
-    packets = recorded((NODE, "15"), *READ, (NODE, "02 36 39 34 30 39 36 03 07"))
+    packets = overheard((NODE, "15"), *READ, (NODE, "02 36 39 34 30 39 36 03 07"))
     assert [packet.outcome for packet in packets] == [Outcome.STRAY, Outcome.NONE, Outcome.OK, Outcome.STRAY]
     assert not only(packets).changed
 
 
-def test_the_masters_own_verdict_is_what_counts() -> None:
+def told(verdict: Verdict, result: object, *turns: Turn) -> Replayed:
+    """What comes of one exchange of which the master said that."""
     packets: list[Packet] = []
     assembler = Assembler(packets.append)
-    command = hcp2.Read(105)
-    request = command.open(255, HCP2).request
-    assembler.passed(1.0, request, HOST)
-    assembler.passed(1.01, bytes.fromhex(READ[1][1]), NODE)
-    assembler.completed(1.011, Verdict(request, Outcome.NO_REPLY, "read element 105: node 255: no reply"))
-    assert str(only(packets).now) == "ok: 4096.0"
-    assert only(packets).changed
+    attempt = turns[0][0]
+    assert isinstance(attempt, Attempt)
+    for turn, (sender, frame) in enumerate(turns):
+        assembler.passed(float(turn), bytes.fromhex(frame), sender if isinstance(sender, Direction) else HOST, attempt)
+    attempt.end(verdict, result, 50.0)
+    assembler.attempted(attempt)
+    return only(packets)
+
+
+def read(*replies: str) -> list[Turn]:
+    return exchange(hcp2.Read(105), 255, HCP2, *replies)
+
+
+VALUE = "02 36 39 34 30 39 36 03 07"
+
+
+def test_the_masters_own_verdict_is_what_counts() -> None:
+    one = told(Verdict.NO_REPLY, "no reply", *read(VALUE))
+    assert one.changed
+    assert (str(one.recorded), str(one.now)) == ("no reply: read element 105: no reply", "ok: 4096.0")
+
+
+def test_an_answer_that_was_not_believed_is_read_as_one_and_still_not_believed() -> None:
+    one = told(Verdict.DOUBTED, "two answers came where one was due", *read(VALUE))
+    assert one.judged
+    assert not one.changed
+    assert told(Verdict.DOUBTED, "two answers came where one was due", *read(NAK)).changed
+
+
+@pytest.mark.parametrize("verdict", [Verdict.SPOILT, Verdict.CUT_OFF])
+def test_what_no_reader_was_asked_about_is_not_judged(verdict: Verdict) -> None:
+    one = told(verdict, "whatever", *read(VALUE))
+    assert not one.judged
+    assert not one.changed
+    assert one.recorded.outcome is Outcome[verdict.name]
+
+
+BAD_PACKET = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D3 02 6D"
+
+
+def test_a_packet_that_was_not_asked_for_again_since_time_was_up_is_judged_so() -> None:
+    """R9: the arbiter abandons an exchange that would say NAK, and acknowledges what came."""
+    turns = exchange(msc.DataRead(2008), 1, MSC, ACK, BAD_PACKET)
+    one = told(Verdict.GARBLED, "bad checksum", *turns, (HOST, ACK))
+    assert not one.changed
+    assert str(one.now) == "garbled: bad checksum"
+
+
+def test_an_exchange_in_which_the_host_said_something_else_is_a_change() -> None:
+    turns = exchange(msc.SetFlag(5), 2, MSC, NAK)
+    one = told(Verdict.OK, None, *turns, (HOST, ACK), (NODE, ACK))
+    assert one.judged
+    assert one.changed

@@ -122,6 +122,13 @@ def test_every_protocol_is_asked_its_cheapest_read(protocol: str) -> None:
     assert str(find(protocol).profile.probe) in findings.on(label).what
 
 
+def test_a_rate_that_no_device_of_the_protocol_has_is_a_note_and_nothing_to_mend() -> None:
+    line = Line(LineSettings(19200), [EmulatedMsc(3)], chance=random.Random(1))
+    findings = examined(line, (3,), "msc")
+    assert findings.wrong == set()
+    assert findings.on("open").advice == "MSC devices speak at 9600 baud alone, not at 19200"
+
+
 def test_a_node_is_left_with_nothing_unacknowledged() -> None:
     """MSC sends a packet again until the host ACKs it."""
 
@@ -321,7 +328,12 @@ def test_a_tcp_port_is_examined_as_far_as_it_can_be(busmaster: Command, controll
     assert "MEND  node 77     does not answer\n" in done.out
     assert done.err == f"busmaster: {controllers.path.removeprefix('socket://')}: 1 thing to mend\n"
     with file.open("rb") as capture:
-        assert bytes.fromhex("07 30 38 02 30 31 05 0E") in [packet.frame for packet in read_packets(capture)]
+        packets = list(read_packets(capture))
+    assert bytes.fromhex("07 30 38 02 30 31 05 0E") in [packet.frame for packet in packets]
+    told = {(packet.node, packet.outcome.name, packet.comment) for packet in packets}
+    assert (8, "NONE", "probe") in told
+    assert (8, "OK", "read element 1: 0.0") in told
+    assert (77, "NO_REPLY", "read element 1: no reply") in told
 
 
 @pytest.mark.usefixtures("hasty")
@@ -360,7 +372,7 @@ def test_while_another_program_has_the_port_it_is_not_even_opened(busmaster: Com
         (("PORT", "--protocol", "mentor", "--nodes", "0-3"), "means all of them"),
         (("PORT", "--protocol", "dc104", "--nodes", "1"), "has no addresses"),
         (("PORT?baud=3",), "did you mean 'baudrate'?"),
-        (("PORT", "--protocol", "hcp4"), "is not one of"),
+        (("PORT", "--protocol", "hcp4"), "no such protocol 'hcp4'; did you mean 'hcp'?"),
     ],
 )
 def test_wrong_usage_is_status_2_and_nothing_is_examined(

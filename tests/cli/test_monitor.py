@@ -140,3 +140,13 @@ def test_the_command_from_end_to_end(tmp_path: Path) -> None:
         ("microflex", 255, Outcome.NONE),
         ("microflex", 255, Outcome.OK),
     ]
+
+
+def test_a_rate_that_no_device_of_the_protocol_has_is_said() -> None:
+    with line_that_says(bytes.fromhex(MSC)) as port:
+        arguments = ["monitor", f"{port}?baudrate=4800", "--protocol", "msc"]
+        done = subprocess.run(
+            [sys.executable, "-m", "busmaster", *arguments], capture_output=True, text=True, timeout=50, check=False
+        )
+    assert "flags" in done.stdout
+    assert done.stderr.splitlines()[0].endswith("MSC devices speak at 9600 baud alone, not at 4800")

@@ -1,8 +1,9 @@
-"""The items of each protocol, as CLI.md lists them, written to and read from an emulated drive."""
+"""The items of each protocol, written to and read from an emulated drive."""
 
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -133,3 +134,20 @@ def test_hcp_elements_end_at_99(busmaster: Command) -> None:
         assert busmaster("read", server.path, *hcp, "98", "99").lines == ["98 0.5", "99 -1"]
         assert busmaster("read", server.path, *hcp, "100").status == 2
         assert busmaster("write", server.path, *hcp, "99=1,2").status == 2
+
+
+@pytest.mark.parametrize("arguments", [("read", "status"), ("scan", "--nodes", "3")])
+def test_a_rate_that_no_device_has_is_said_once_and_the_command_goes_on(
+    busmaster: Command, mscs: TcpServer, arguments: tuple[str, ...]
+) -> None:
+    verb, *rest = arguments
+    node = ("--node", "3") if verb == "read" else ()
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        done = busmaster(verb, f"{mscs.path}?baudrate=19200", "--protocol", "msc", *node, *rest)
+    assert done.status == 0
+    assert done.out
+    told = done.err.splitlines()
+    assert [line for line in told if "warning" in line] == [
+        f"busmaster: warning: {mscs.path.removeprefix('socket://')}: MSC devices speak at 9600 baud alone, not at 19200"
+    ]

@@ -25,8 +25,8 @@ def capture(folder: Path, *outcomes: Outcome) -> str:
 
 
 def test_nothing_has_changed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["replay", capture(tmp_path, Outcome.OK, Outcome.OK, Outcome.NONE)]) == 0
-    assert capsys.readouterr().out == "3 exchanges: 2 the same, 0 changed, 1 without a recorded outcome\n"
+    assert main(["replay", capture(tmp_path, Outcome.OK, Outcome.OK, Outcome.NONE, Outcome.SPOILT)]) == 0
+    assert capsys.readouterr().out == "4 exchanges: 2 the same, 0 changed, 2 not judged\n"
 
 
 def test_what_has_changed_is_a_line_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

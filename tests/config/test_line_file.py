@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from busmaster import Priority, SerialPort, TcpPort
+from busmaster.bus.node import Node
 from busmaster.config import ConfiguredLine, FileError, LineFile, emulated_line, load
 from busmaster.config.sections import read
 from busmaster.config.source import Source
@@ -18,6 +19,7 @@ from busmaster.protocols.msc.handle import MscController
 from busmaster.registry import kinds
 
 EXAMPLES = sorted((Path(__file__).parent.parent.parent / "examples").glob("*.toml"))
+SLOW = 'port = "/dev/ttyUSB0?baudrate=9600"\n'
 HEAD = 'port = "/dev/ttyUSB0?baudrate=57600"\n'
 NODE = '[nodes.winder]\nprotocol = "hcp2"\naddress = 5\n'
 PRESS = '[nodes.press]\nprotocol = "msc"\naddress = 1\n'
@@ -67,9 +69,21 @@ def test_a_tcp_port_is_a_url_or_a_table() -> None:
     assert parse(f'[port]\nhost = "10.0.0.5"\nport = 4001\nbaudrate = 57600\n{NODE}').port == wanted
 
 
-def test_protocols_meant_for_different_lines_want_the_line_said() -> None:
-    with pytest.raises(FileError, match="'baudrate' is missing"):
-        parse(f'[port]\npath = "/dev/ttyS0"\n{NODE}{PRESS}')
+def test_protocols_that_cannot_share_a_line_are_refused_where_the_second_stands() -> None:
+    with pytest.raises(FileError, match=r"line\.toml:6: nodes\.press\.protocol: msc and hcp2 nodes cannot share"):
+        parse(f'port = "/dev/ttyS0"\n{NODE}{PRESS}')
+
+
+def test_protocols_that_may_share_a_line_share_it() -> None:
+    other = '[nodes.reel]\nprotocol = "hcp"\naddress = 5\n'
+    assert list(line(f"{HEAD}{NODE}{other}").nodes) == ["winder", "reel"]
+
+
+def test_a_rate_that_no_device_of_the_protocol_has_is_warned_about_once() -> None:
+    feeder = PRESS.replace("press", "feeder").replace("1", "2")
+    with pytest.warns(UserWarning, match="MSC devices speak at 9600 baud alone, not at 57600") as told:
+        line(f"{HEAD}{PRESS}{feeder}")
+    assert len(told) == 1
 
 
 # nodes and points
@@ -98,7 +112,7 @@ def test_a_node_overrides_its_protocol_and_the_protocol_its_document() -> None:
 
 def test_a_node_without_a_word_on_timing_has_its_protocols() -> None:
     assert parse(HEAD + NODE).nodes["winder"].timings is None
-    assert line(HEAD + NODE).nodes["winder"].node.record.timings == hcp2.PROFILE.timings
+    assert Node.of(line(HEAD + NODE).nodes["winder"]).timings == hcp2.PROFILE.timings
 
 
 def test_messages_and_the_screen_call_a_node_by_its_name() -> None:
@@ -132,9 +146,28 @@ def test_a_mentor_drives_decimals_are_its_handles_own() -> None:
         assert decode(-476) == -47.6
 
 
+@pytest.mark.parametrize(
+    ("point", "sent", "shown"),
+    [
+        ('{ item = "1.17", decimals = 1, factor = 2 }', "+0051", 10.2),
+        ('{ item = "1.17", decimals = 1, offset = 0.5 }', "+0097", 5.6),
+        ('{ item = "1.17:hires", decimals = 1, factor = 2 }', "+00510", 10.2),
+        ('{ item = "1.17", factor = 0.1 }', "+0102", 5.1),
+        ('{ item = "speed_reference_1" }', "+0102", 5.1),
+        ('{ item = "speed_reference_1", factor = 2 }', "+0051", 10.2),
+        ('{ item = "15.60", factor = 0.1 }', "00102", 5.1),
+    ],
+)
+def test_a_scaled_value_keeps_the_decimals_that_the_drive_has(point: str, sent: str, shown: float) -> None:
+    configured = line(f"{HEAD}{SCREW}points = {{ speed = {point} }}\n").point("screw/speed")
+    assert configured.encode is not None
+    assert str(configured.encode(10.2)).endswith(f"= {sent}")
+    assert configured.value_of(51) == shown
+
+
 def test_an_msc_has_its_symbols_step_and_model() -> None:
     protocol = '[protocols.msc]\naddress_step = 4\nmodel = "MSC-250"\n'
-    text = f"{HEAD}{protocol}{PRESS}symbols = {{ count = 2008, a1-3 = 3000 }}\n"
+    text = f"{SLOW}{protocol}{PRESS}symbols = {{ count = 2008, a1-3 = 3000 }}\n"
     handle = line(text).nodes["press"]
     assert isinstance(handle, MscController)
     assert (handle.address_step, handle.model, handle.address_of("a1-3")) == (4, "MSC-250", 3000)
@@ -255,7 +288,7 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
             "line.toml:7: groups.g.points[1]: no such item 'axis0.postion'",
         ),
         (
-            f"{HEAD}{PRESS}address_step = 4\n[groups.g]\nperiod = 1\npoints = ['press/2000:33']",
+            f"{SLOW}{PRESS}address_step = 4\n[groups.g]\nperiod = 1\npoints = ['press/2000:33']",
             "line.toml:8: groups.g.points[1]: a point that is polled has at most 32 values",
         ),
         (f"{HEAD}[outputs.sqlit]\npath = 'x'", "line.toml:2: outputs.sqlit: no such key; did you mean 'sqlite'?"),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from busmaster.config.names import expanded
 from busmaster.config.points import Scale
 from busmaster.errors import InvalidCommand
-from busmaster.protocols.msc.codec import ProgramStatus
+from busmaster.protocols.msc.status import ProgramStatus
 
 factors = st.sampled_from([1, 0.1, 0.001, 0.25, -2, 1.75, 1e-6, 3])
 offsets = st.sampled_from([0, -40, 0.5, 273.15])

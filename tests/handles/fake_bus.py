@@ -5,15 +5,15 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any, Unpack
 
 import anyio.lowlevel
 
-from busmaster.bus.bus import Bus
-from busmaster.bus.node import Priority
+from busmaster.bus.requester import CommandOptions, Priority
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
+from busmaster.errors import Superseded
 from busmaster.planning.merging import Merge
 
 Answer = Callable[[Command[Any]], Any]
@@ -26,7 +26,18 @@ class FakeNode:
         self.bus = bus
         self.profile = profile
         self.address = address
+        self.line = "a fake line"
         self.label = profile.label(address)
+        self.stops = 0
+
+    def note_stop(self) -> None:
+        self.stops += 1
+
+    def now(self) -> float:
+        return self.bus.now()
+
+    def latest(self, point: object, /) -> None:
+        """Nothing is polled."""
 
     def merge_reads(self, merge: Merge) -> None:
         self.profile = replace(self.profile, merge=merge)
@@ -35,15 +46,17 @@ class FakeNode:
         self,
         command: Command[Any],
         *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-        idempotent: bool | None = None,
-        touches: object = None,
+        touches: Command[Any] | None = None,
+        stops_seen: int | None = None,
+        **options: Unpack[CommandOptions],
     ) -> Any:
         exchange = command.open(self.address, self.profile.timings)
         assert exchange.request
-        self.bus.log.append((self.address, str(command), priority))
+        if stops_seen not in (None, self.stops):
+            raise Superseded("told to stop", node=self)
+        priority = options.get("priority")
+        self.bus.log.append((self.address, str(command), None if priority is Priority.COMMAND else priority))
+        self.bus.options.append(options)
         self.bus.grown.set()
         await anyio.lowlevel.checkpoint()
         return self.bus.answer(command)
@@ -53,6 +66,7 @@ class FakeBus:
     def __init__(self, answer: Answer) -> None:
         self.answer = answer
         self.log: list[tuple[int, str, Priority | None]] = []
+        self.options: list[CommandOptions] = []
         self.grown = asyncio.Event()
         self.time = 0.0
         self.nodes: dict[tuple[str, int], FakeNode] = {}
@@ -77,8 +91,3 @@ class FakeBus:
     def asked(self) -> list[str]:
         """The commands so far, in words."""
         return [command for _, command, _ in self.log]
-
-    @property
-    def bus(self) -> Bus:
-        """Itself, as what it stands for."""
-        return cast("Bus", self)

@@ -43,7 +43,7 @@ def line() -> CommsArray:
 
 @pytest.fixture(params=[HcpController, Hcp2Controller])
 def controller(request: pytest.FixtureRequest, line: CommsArray) -> CommsHandle:
-    handle: CommsHandle = request.param(line.bus, 5)
+    handle: CommsHandle = request.param(line, 5)
     return handle
 
 
@@ -90,8 +90,9 @@ async def test_a_verified_write_reads_every_element_back(controller: CommsHandle
 @pytest.mark.asyncio
 async def test_a_write_that_reads_back_otherwise_is_told(controller: CommsHandle, line: CommsArray) -> None:
     line.answer = lambda command: None if command.writes else 5.0
-    with pytest.raises(VerifyFailed, match=r"node 5: element 11 reads 5\.0 after 6 was written"):
+    with pytest.raises(VerifyFailed, match=r"node 5: element 11 reads 5\.0 after 6 was written") as caught:
         await controller.write(10, 5, 6, verify=True)
+    assert (caught.value.line, caught.value.label, caught.value.address) == ("a fake line", "node 5", 5)
 
 
 @pytest.mark.asyncio
@@ -100,7 +101,7 @@ async def test_priority_and_idempotence_are_handed_on(controller: CommsHandle, l
     line.answer = seen.append
     await controller.write(1, 5, idempotent=True, priority=Priority.URGENT)
     await controller.write(1, 5)
-    assert [command.idempotent for command in seen] == [True, False]
+    assert [options.get("idempotent") for options in line.options] == [True, None]
     assert [priority for _, _, priority in line.log] == [Priority.URGENT, None]
 
 
@@ -114,7 +115,7 @@ async def test_a_number_is_a_point(controller: CommsHandle, line: CommsArray) ->
 
 
 def test_hcp_knows_no_names(line: CommsArray) -> None:
-    controller = HcpController(line.bus, 5)
+    controller = HcpController(line, 5)
     assert controller.items() == ()
     for item in ("position", "0", "100", "1.5", "-1", "", "\u0661"):
         with pytest.raises(InvalidCommand):
@@ -123,14 +124,14 @@ def test_hcp_knows_no_names(line: CommsArray) -> None:
 
 def test_a_node_of_hcp_is_at_most_15(line: CommsArray) -> None:
     with pytest.raises(InvalidCommand):
-        HcpController(line.bus, 16)
+        HcpController(line, 16)
 
 
 # names
 
 
 def test_every_name_of_the_extended_comms_array_is_a_point(line: CommsArray) -> None:
-    controller = Hcp2Controller(line.bus, 5)
+    controller = Hcp2Controller(line, 5)
     for name in controller.items():
         point = controller.point(name)
         assert point.command == hcp2.Read(comms_array.ELEMENTS[name].number)
@@ -138,7 +139,7 @@ def test_every_name_of_the_extended_comms_array_is_a_point(line: CommsArray) -> 
 
 
 def test_axes_and_io_are_the_same_points_as_their_names(line: CommsArray) -> None:
-    controller = Hcp2Controller(line.bus, 5)
+    controller = Hcp2Controller(line, 5)
     for number in range(8):
         axis = controller.axis(number)
         for name in ("position", "velocity", "mode", "axis_error", "demand", "encoder", "idle", "following_error"):
@@ -151,7 +152,7 @@ def test_axes_and_io_are_the_same_points_as_their_names(line: CommsArray) -> Non
 
 @pytest.mark.parametrize("number", [-1, 8])
 def test_there_are_8_axes_and_8_analogue_channels(line: CommsArray, number: int) -> None:
-    controller = Hcp2Controller(line.bus, 5)
+    controller = Hcp2Controller(line, 5)
     with pytest.raises(InvalidCommand, match="must be 0 to 7"):
         controller.axis(number)
     with pytest.raises(InvalidCommand, match="must be 0 to 7"):
@@ -160,12 +161,12 @@ def test_there_are_8_axes_and_8_analogue_channels(line: CommsArray, number: int)
 
 def test_a_mistyped_name_gets_the_nearest_one(line: CommsArray) -> None:
     with pytest.raises(InvalidCommand, match=r"did you mean 'axis0\.position'"):
-        Hcp2Controller(line.bus, 5).point("axis0.positon")
+        Hcp2Controller(line, 5).point("axis0.positon")
 
 
 @pytest.mark.asyncio
 async def test_elements_are_read_and_written_by_name(line: CommsArray) -> None:
-    controller = Hcp2Controller(line.bus, 5)
+    controller = Hcp2Controller(line, 5)
     line.elements[105] = 4096.0
     assert await controller.read("axis0.encoder") == 4096.0
     await controller.write("outputs", 5)
@@ -175,7 +176,7 @@ async def test_elements_are_read_and_written_by_name(line: CommsArray) -> None:
 
 @pytest.mark.asyncio
 async def test_a_name_that_is_read_only_is_refused_and_its_number_is_sent(line: CommsArray) -> None:
-    controller = Hcp2Controller(line.bus, 5)
+    controller = Hcp2Controller(line, 5)
     with pytest.raises(InvalidCommand, match="read-only"):
         await controller.write("inputs", 1)
     with pytest.raises(InvalidCommand, match="read-only"):
@@ -187,7 +188,7 @@ async def test_a_name_that_is_read_only_is_refused_and_its_number_is_sent(line: 
 
 @pytest.mark.asyncio
 async def test_an_item_that_is_a_number_is_named_as_such(line: CommsArray) -> None:
-    controller = Hcp2Controller(line.bus, 5)
+    controller = Hcp2Controller(line, 5)
     with pytest.raises(InvalidCommand, match=r"an item is text, such as '1', not 1"):
         controller.point(1)  # type: ignore[arg-type]  # a caller without a type checker
     with pytest.raises(InvalidCommand, match="no such item"):
@@ -196,7 +197,7 @@ async def test_an_item_that_is_a_number_is_named_as_such(line: CommsArray) -> No
 
 
 def test_named_levels_may_be_repeated_and_numbers_not(line: CommsArray) -> None:
-    controller = Hcp2Controller(line.bus, 5)
+    controller = Hcp2Controller(line, 5)
     assert controller.io.outputs.encode is not None
     assert controller.io.outputs.encode(5).idempotent
     number = controller.element(222)
@@ -205,7 +206,7 @@ def test_named_levels_may_be_repeated_and_numbers_not(line: CommsArray) -> None:
 
 
 def test_every_name_of_microflex_is_an_attribute(line: CommsArray) -> None:
-    drive = MicroFlexDrive(line.bus, 7)
+    drive = MicroFlexDrive(line, 7)
     for name in drive.items():
         assert getattr(drive, name) == drive.point(name)
     assert MicroFlexDrive.bus_voltage.element is microflex.BUS_VOLTAGE

@@ -36,7 +36,7 @@ def line() -> Parameters:
 
 @pytest.mark.asyncio
 async def test_a_written_parameter_is_read_back(line: Parameters) -> None:
-    drive = Dc104Drive(line.bus)
+    drive = Dc104Drive(line)
     await drive.write(12, 500, verify=True)
     assert await drive.read(12, priority=Priority.URGENT) == 500
     assert line.asked == ["write parameter 12 = 500", "read parameter 12", "read parameter 12"]
@@ -46,21 +46,21 @@ async def test_a_written_parameter_is_read_back(line: Parameters) -> None:
 @pytest.mark.asyncio
 async def test_a_value_that_the_drive_limits_fails_its_verification(line: Parameters) -> None:
     with pytest.raises(VerifyFailed, match="parameter 12 reads 1000 after 1500 was written"):
-        await Dc104Drive(line.bus).write(12, 1500, verify=True)
+        await Dc104Drive(line).write(12, 1500, verify=True)
 
 
 @pytest.mark.asyncio
 async def test_a_parameter_is_a_point(line: Parameters) -> None:
-    point = Dc104Drive(line.bus).point("12")
+    point = Dc104Drive(line).point("12")
     await point.write(7)
     assert await point.read() == 7
-    assert point == Dc104Drive(line.bus).parameter(12)
+    assert point == Dc104Drive(line).parameter(12)
     assert point.key == "0/12"
 
 
 @pytest.mark.asyncio
 async def test_what_the_drive_does_not_have_is_never_sent(line: Parameters) -> None:
-    drive = Dc104Drive(line.bus, maximum=120)
+    drive = Dc104Drive(line, maximum=120)
     with pytest.raises(InvalidCommand):
         await drive.read(121)
     with pytest.raises(InvalidCommand):
@@ -75,7 +75,7 @@ async def test_what_the_drive_does_not_have_is_never_sent(line: Parameters) -> N
 
 @pytest.mark.asyncio
 async def test_parameter_0_is_there_for_those_who_allow_it(line: Parameters) -> None:
-    drive = Dc104Drive(line.bus, allow_zero=True)
+    drive = Dc104Drive(line, allow_zero=True)
     await drive.write(0, 1)
     assert await drive.read(0) == 1
     await drive.point("0").write(1)
@@ -83,6 +83,6 @@ async def test_parameter_0_is_there_for_those_who_allow_it(line: Parameters) -> 
 
 def test_there_is_one_drive_a_line(line: Parameters) -> None:
     with pytest.raises(InvalidCommand):
-        Dc104Drive(line.bus, 1)
+        Dc104Drive(line, 1)
     with pytest.raises(InvalidCommand):
-        Dc104Drive(line.bus, maximum=256)
+        Dc104Drive(line, maximum=256)

@@ -34,7 +34,7 @@ from busmaster.protocols.dc104 import device as dc104
 from busmaster.protocols.mentor import device as mentor
 from busmaster.protocols.msc import codec as msc_commands
 from busmaster.protocols.msc import device as msc
-from busmaster.protocols.msc.codec import ProgramStatus
+from busmaster.protocols.msc.status import ProgramStatus
 from busmaster.testing.virtual_time import run_in_virtual_time
 
 Story = Callable[[], Coroutine[Any, Any, None]]
@@ -193,6 +193,10 @@ async def test_mentor_parameters_with_and_without_decimals_wide_and_fine() -> No
         with pytest.raises(Refused):
             await drive.write("1.17", 100.1)
         assert await drive.read_run("1.17", 3) == await drive.read_run("1.17", 3, chain=True) == (-47.6, 0, 0)
+        assert await drive.read_run("1.19", 3, step=-1) == (0, 0, -47.6)
+        assert await drive.read_run("1.19", 3, step=-1, chain=True) == (0, 0, -47.6)
+        assert await drive.read_run("1.17", 3, step=0, chain=True) == (-47.6, -47.6, -47.6)
+        await drive.write("15.61", 65535, verify=True)
 
 
 @in_virtual_time
@@ -228,7 +232,7 @@ async def test_neighbouring_parameters_are_polled_as_runs_where_that_is_allowed(
 
 @in_virtual_time
 async def test_dc104_parameters() -> None:
-    device = dc104.EmulatedDc104(last_parameter=100)
+    device = dc104.EmulatedDc104(maximum=100)
     async with line_of(Dc104Drive, device) as bus:
         drive = Dc104Drive(bus)
         await drive.write(12, 1500, verify=True)

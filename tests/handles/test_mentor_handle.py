@@ -28,7 +28,7 @@ class Parameters(FakeBus):
         if isinstance(command, Read):
             return self.table.get((command.menu, command.number), 0)
         assert isinstance(command, ReadRun)
-        return tuple(self.table.get((command.menu, command.number + i), 0) for i in range(command.count))
+        return tuple(self.table.get((command.menu, command.number + command.step * i), 0) for i in range(command.count))
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def line() -> Parameters:
 
 @pytest.fixture
 def drive(line: Parameters) -> MentorDrive:
-    return MentorDrive(line.bus, 14, decimals={"1.17": 1, "01.18": 0})
+    return MentorDrive(line, 14, decimals={"1.17": 1, "01.18": 0})
 
 
 @pytest.mark.asyncio
@@ -103,15 +103,69 @@ async def test_a_run_is_read_singly_or_in_one_exchange(drive: MentorDrive, line:
 
 
 @pytest.mark.asyncio
+async def test_a_run_goes_back_or_stays_where_that_is_asked(drive: MentorDrive, line: Parameters) -> None:
+    line.table = {(1, 17): 476, (1, 16): 5, (1, 15): 7}
+    assert await drive.read_run("1.17", 3, step=-1) == (47.6, 5, 7)
+    assert line.asked == ["read 01.17", "read 01.16", "read 01.15"]
+    line.log.clear()
+    assert await drive.read_run("1.17", 2, step=0) == (47.6, 47.6)
+    await drive.read_run("1.17", 3, step=-1, chain=True)
+    assert line.asked == ["read 01.17", "read 01.17", "read 01.17 to 01.15"]
+    with pytest.raises(InvalidCommand, match="last parameter number"):
+        await drive.read_run("1.01", 3, step=-1)
+
+
+@pytest.mark.asyncio
+async def test_what_the_guide_calls_wide_is_written_so_by_itself(drive: MentorDrive, line: Parameters) -> None:
+    for parameter in ("13.14", "15.60", "15.61", "15.62", "15.63"):
+        await drive.write(parameter, 54321)
+        await drive.point(parameter).write(7)
+    await drive.write_all("15.60", 7)
+    assert [command.partition(" = ")[2] for command in line.asked] == ["54321", "00007"] * 5 + ["00007"]
+    for parameter in ("13.13", "13.15", "15.59", "15.64"):
+        with pytest.raises(InvalidCommand, match="not declared wide"):
+            await drive.write(parameter, 54321)
+    with pytest.raises(InvalidCommand, match="0 to 65535"):
+        await drive.write("15.60", -1)
+    await drive.write("15.60", 7, high_resolution=True)
+    assert line.asked[-1] == "write 15.60 = +00007"
+
+
+@pytest.mark.asyncio
+async def test_a_parameter_that_the_guide_names_goes_by_its_name(line: Parameters) -> None:
+    drive = MentorDrive(line, 14)
+    await drive.write("speed_reference_1", -47.6, verify=True)
+    assert line.asked == ["write 01.17 = -0476", "read 01.17"]
+    assert await drive.read("speed_reference_1") == -47.6
+    assert await drive.read("1.17") == -476
+    point = drive.point("speed_reference_1")
+    assert (point.unit, await point.read()) == ("%", -47.6)
+    fine = drive.point("speed_reference_1:hires")
+    await fine.write(47.65)
+    assert line.asked[-1] == "write 01.17 = +04765"
+    assert await fine.read() == 47.6
+    assert drive.items() == ("speed_reference_1", "serial_address", "serial_mode")
+    with pytest.raises(InvalidCommand, match="did you mean 'speed_reference_1'"):
+        drive.point("speed_reference")
+
+
+def test_declared_decimals_go_before_the_guides_and_must_agree(line: Parameters) -> None:
+    drive = MentorDrive(line, 14, decimals={"speed_reference_1": 2})
+    assert drive.point("1.17").value_of(4765) == drive.point("speed_reference_1").value_of(4765) == 47.65
+    with pytest.raises(InvalidCommand, match=r"01\.17 has 1 decimals by another name, not 2"):
+        MentorDrive(line, 14, decimals={"1.17": 1, "01.17": 2})
+
+
+@pytest.mark.asyncio
 async def test_all_drives_are_written_at_address_0(drive: MentorDrive, line: Parameters) -> None:
     await drive.write_all("1.17", 0)
-    await MentorDrive(line.bus, 0).write("1.17", 0)
+    await MentorDrive(line, 0).write("1.17", 0)
     assert [(address, command) for address, command, _ in line.log] == [(0, "write 01.17 = +0000")] * 2
 
 
 @pytest.mark.asyncio
 async def test_all_drives_are_never_read(line: Parameters) -> None:
-    everyone = MentorDrive(line.bus, 0)
+    everyone = MentorDrive(line, 0)
     with pytest.raises(InvalidCommand, match="all drives"):
         await everyone.read("1.17")
     with pytest.raises(InvalidCommand, match="all drives"):
@@ -158,17 +212,17 @@ def test_other_items_do_not_exist(drive: MentorDrive, item: str) -> None:
 @pytest.mark.parametrize("address", [1, 9, 10, 90])
 def test_an_address_that_later_products_take_for_a_group_warns(line: Parameters, address: int) -> None:
     with pytest.warns(UserWarning, match=f"address {address} means a group"):
-        MentorDrive(line.bus, address)
+        MentorDrive(line, address)
 
 
 @pytest.mark.parametrize("address", [0, 11, 99])
 def test_other_addresses_do_not(line: Parameters, address: int) -> None:
-    MentorDrive(line.bus, address)
+    MentorDrive(line, address)
 
 
 def test_runs_in_poll_groups_are_opted_into(line: Parameters) -> None:
-    assert MentorDrive(line.bus, 14).node.profile is PROFILE
-    assert MentorDrive(line.bus, 15, chained=True).node.profile is CHAINED
+    assert MentorDrive(line, 14).node.profile is PROFILE
+    assert MentorDrive(line, 15, chained=True).node.profile is CHAINED
 
 
 @pytest.mark.parametrize(

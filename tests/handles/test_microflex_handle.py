@@ -40,11 +40,11 @@ class Drive(FakeBus):
             known = {108: float(self.command), 109: float(self.status)}
             return {**self.elements, **known}[command.element]
         assert isinstance(command, Write)
-        assert command.idempotent
         value = command.values[0]
         if command.element != 108:
             self.elements[command.element] = value
             return None
+        assert command.idempotent
         failure = next(self.failures, None)
         self.words.append(int(value))
         if not isinstance(failure, Superseded):
@@ -64,7 +64,7 @@ def line() -> Drive:
 @pytest.fixture
 def drive(line: Drive, monkeypatch: pytest.MonkeyPatch) -> MicroFlexDrive:
     monkeypatch.setattr(module, "LOOK_AGAIN", 0)
-    return MicroFlexDrive(line.bus, 7)
+    return MicroFlexDrive(line, 7)
 
 
 @pytest.mark.asyncio
@@ -249,7 +249,7 @@ async def test_a_disable_in_between_is_not_undone(drive: MicroFlexDrive, line: D
     """Through another handle of the same drive, at each moment of cancel_errors."""
     await drive.enable()
     line.log.clear()
-    other = MicroFlexDrive(line.bus, 7)
+    other = MicroFlexDrive(line, 7)
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(drive.cancel_errors)
         await line.requests(at)
@@ -265,7 +265,7 @@ async def test_a_clear_that_a_disable_dropped_is_decided_anew(drive: MicroFlexDr
 
     def overtaken(command: Command[Any]) -> float | None:
         if str(command) == "write element 108 = 128" and len(line.words) == 1:
-            module._disables[drive.node] = module._disables.get(drive.node, 0) + 1
+            drive.node.note_stop()
             line.failures = iter([Superseded("overtaken")])
         return line.obey(command)
 
@@ -301,6 +301,20 @@ async def test_read_only_names_are_refused_before_anything_is_sent(drive: MicroF
         with pytest.raises(InvalidCommand, match="read-only"):
             await drive.write(item, 1)
     assert line.asked == []
+
+
+@pytest.mark.asyncio
+async def test_by_number_too_since_every_drive_has_the_same_map(drive: MicroFlexDrive, line: Drive) -> None:
+    for element, name in ((109, "status_word"), (222, "outputs"), (119, "speed_demand")):
+        with pytest.raises(InvalidCommand, match=f"{name} is read-only"):
+            await drive.write(element, 1)
+        with pytest.raises(InvalidCommand, match=f"{element} is read-only"):
+            await drive.point(str(element)).write(1)
+        assert not drive.element(element).writable
+    assert line.asked == []
+    for element in (118, 50):  # 50 is not in the map: the drive's to refuse
+        assert drive.element(element).writable
+        assert [str(command) for command in drive.writes(element, (5,))] == [f"write element {element} = 5"]
 
 
 @pytest.mark.asyncio

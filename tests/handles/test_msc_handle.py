@@ -15,13 +15,13 @@ from busmaster.protocols.msc.codec import (
     ClearFlag,
     DataRead,
     DataWrite,
-    ProgramStatus,
     ReadFlag,
     ReadFlags,
     ReadStatus,
     SetFlag,
 )
 from busmaster.protocols.msc.handle import MscController
+from busmaster.protocols.msc.status import ProgramStatus
 from tests.handles.fake_bus import FakeBus
 
 FIRST = 2000
@@ -77,7 +77,7 @@ def line() -> Controller:
 
 @pytest.fixture
 def press(line: Controller) -> MscController:
-    return MscController(line.bus, 3, symbols={"count": 2008, "cam": 2000}, address_step=4)
+    return MscController(line, 3, symbols={"count": 2008, "cam": 2000}, address_step=4)
 
 
 # single values
@@ -107,13 +107,13 @@ async def test_an_unknown_symbol_is_never_asked_for(press: MscController, line: 
 @pytest.mark.parametrize("symbols", [{"": 1}, {"flags": 1}, {"12": 1}, {"a:b": 1}, {"count": 65536}])
 def test_a_symbol_that_could_not_be_told_from_an_item_is_refused(line: Controller, symbols: dict[str, int]) -> None:
     with pytest.raises(InvalidCommand):
-        MscController(line.bus, 3, symbols=symbols)
+        MscController(line, 3, symbols=symbols)
 
 
 def test_there_are_fifteen_units_and_a_step_of_at_least_one(line: Controller) -> None:
     for unit, step in ((0, 4), (16, 4), (1, 0)):
         with pytest.raises(InvalidCommand):
-            MscController(line.bus, unit, address_step=step)
+            MscController(line, unit, address_step=step)
 
 
 # blocks
@@ -140,7 +140,7 @@ async def test_whole_blocks_are_one_exchange_and_the_rest_is_written_value_by_va
 
 @pytest.mark.asyncio
 async def test_while_the_step_is_unknown_only_what_needs_no_step_is_sent(line: Controller) -> None:
-    press = MscController(line.bus, 3)
+    press = MscController(line, 3)
     await press.write_block(2000, range(32), verify=True)
     await press.write(2000, 5, verify=True)
     assert await press.read_block(2000, 5) == (5, 1, 2, 3, 4)
@@ -157,14 +157,14 @@ async def test_while_the_step_is_unknown_only_what_needs_no_step_is_sent(line: C
 @pytest.mark.asyncio
 async def test_the_last_values_of_the_data_area_are_read_one_by_one(line: Controller) -> None:
     line.data = list(range(40))
-    press = MscController(line.bus, 3, address_step=4)
+    press = MscController(line, 3, address_step=4)
     assert await press.read_block(2000, 40) == tuple(range(40))
     assert line.asked[1:3] == ["read 32 values from data 2128", "read data 2128"]
 
 
 @pytest.mark.asyncio
 async def test_a_refusal_that_no_single_read_would_mend_is_the_callers(line: Controller) -> None:
-    known, unknown = MscController(line.bus, 3, address_step=4), MscController(line.bus, 4)
+    known, unknown = MscController(line, 3, address_step=4), MscController(line, 4)
     with pytest.raises(Refused):
         await known.read_block(1000, 32)
     with pytest.raises(Refused):
@@ -205,7 +205,7 @@ async def test_a_cam_table_is_written_verified_and_shows_its_progress(press: Msc
 async def test_a_wrong_address_step_never_verifies(step: int, given: int) -> None:
     """Blocks too far apart leave gaps that reading the same blocks back would not show."""
     line = Controller(size=5000, step=step)
-    press = MscController(line.bus, 3, address_step=given)
+    press = MscController(line, 3, address_step=given)
     with pytest.raises((VerifyFailed, Refused)):
         await press.load_cam(2000, range(1, 101))
 
@@ -218,7 +218,7 @@ async def test_a_wrong_address_step_never_verifies(step: int, given: int) -> Non
 async def test_the_address_step_is_found_on_values_that_differ(step: int) -> None:
     line = Controller(step=step)
     line.data = [3 * i * i for i in range(1200)]
-    press = MscController(line.bus, 3, symbols={"table": 2000})
+    press = MscController(line, 3, symbols={"table": 2000})
     assert await press.find_address_step("table") == step
     assert await press.read_block("table", 100) == tuple(line.data[:100])
     assert all(asked.startswith("read") for asked in line.asked)
@@ -229,7 +229,7 @@ async def test_the_address_step_is_found_on_values_that_differ(step: int) -> Non
 async def test_values_that_do_not_tell_the_step_leave_it_unknown(step: int, values: list[int]) -> None:
     line = Controller(step=step)
     line.data = values
-    press = MscController(line.bus, 3)
+    press = MscController(line, 3)
     with pytest.raises(InvalidCommand, match="do not tell"):
         await press.find_address_step(2000)
     assert press.address_step is None
@@ -252,7 +252,7 @@ async def test_all_flags_take_one_exchange_where_the_model_can(
     line: Controller, model: str | None, exchanges: int
 ) -> None:
     line.flags = {0, 9, 255}
-    assert await MscController(line.bus, 3, model=model).flags() == {0, 9, 255}
+    assert await MscController(line, 3, model=model).flags() == {0, 9, 255}
     assert len(line.asked) == exchanges
 
 
@@ -311,7 +311,7 @@ async def test_a_run_of_more_than_a_block_is_read_and_written_and_cannot_be_poll
     with pytest.raises(InvalidCommand, match="at most 32 values, not 100"):
         point.command.open(3, press.profile.timings)
     with pytest.raises(InvalidCommand, match="address_step"):
-        MscController(line.bus, 4).point("2000:100")
+        MscController(line, 4).point("2000:100")
 
 
 def test_points_are_equal_if_they_ask_the_same(press: MscController) -> None:
@@ -321,11 +321,11 @@ def test_points_are_equal_if_they_ask_the_same(press: MscController) -> None:
 
 def test_each_value_of_a_run_has_a_name(press: MscController, line: Controller) -> None:
     assert press.run_items("cam:3", 3) == ("2000", "2004", "2008")
-    assert MscController(line.bus, 4).run_items("2000:2", 2) == ("2000[0]", "2000[1]")
+    assert MscController(line, 4).run_items("2000:2", 2) == ("2000[0]", "2000[1]")
 
 
 def test_poll_groups_merge_by_what_is_known(line: Controller) -> None:
-    press = MscController(line.bus, 3, model="MSC-250")
+    press = MscController(line, 3, model="MSC-250")
     commands: list[Command[Any]] = [DataRead(2000), DataRead(2004), ReadFlag(1), ReadFlag(2)]
 
     def served() -> list[tuple[int, ...]]:

@@ -29,13 +29,16 @@ def point(item: str) -> Point[Any]:
 def cycle(number: int, *values: Any, group: str = "axes", at: float | None = None) -> Snapshot:
     """A cycle that read these values of elements 1, 2, ...; an exception is what went wrong with one."""
     now = time.monotonic() if at is None else at
+    wall = time.time() - time.monotonic() + now + 0.001
     samples = {}
     for element, value in enumerate(values, 1):
         error = value if isinstance(value, NoReply) else None
         quality = Quality.GOOD if error is None else Quality.BAD
         timeline = Timeline(now, now, now, now, 1, 0, 0.0)
-        samples[point(str(element))] = Sample(None if error else value, error, now, now, now + 0.001, quality, timeline)
-    return Snapshot(group, number, now, now, now + 0.002, 0, samples)
+        samples[point(str(element))] = Sample(
+            None if error else value, error, now, now, now + 0.001, quality, timeline, wall
+        )
+    return Snapshot(group, number, now, now, now + 0.002, 0, wall, samples)
 
 
 def settled(output: Output) -> bool:

@@ -22,7 +22,7 @@ class Shelf(BatchOutput[Item]):
         self.let.set()
         self.broken: Exception | None = None
 
-    def format(self, item: Item, time_of: Callable[[float], float]) -> Item | None:
+    def format(self, item: Item) -> Item | None:
         return None if isinstance(item, Happening) else item
 
     def commit(self, batch: list[Item]) -> None:

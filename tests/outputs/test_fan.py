@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from busmaster import MemoryPort
+from busmaster.bus.node import Node
 from busmaster.config import ConfiguredLine, FileError, emulated_line
 from busmaster.config.sections import read
 from busmaster.config.source import Source
@@ -70,7 +71,7 @@ async def test_nothing_is_lost_between_the_line_and_an_output(tmp_path: Path) ->
 async def test_an_output_gets_the_groups_that_it_asked_for_and_all_events(tmp_path: Path) -> None:
     line = opened(tmp_path)
     async with line:
-        await line.nodes["away"].node.probe()
+        await Node.of(line.nodes["away"]).probe()
         async for _ in line.groups["slow"]:
             break
     objects = [json.loads(text) for text in (tmp_path / "x.jsonl").read_text().splitlines()]

@@ -13,9 +13,9 @@ import pytest
 
 from busmaster.errors import InvalidCommand, NoReply
 from busmaster.outputs.base import Happening
-from busmaster.outputs.files import CsvOutput, JsonlOutput
+from busmaster.outputs.files import COLUMNS, CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings
-from busmaster.protocols.msc.codec import ProgramStatus
+from busmaster.protocols.msc.status import ProgramStatus
 from tests.outputs.cycles import cycle
 
 
@@ -47,7 +47,7 @@ def test_json_lines_are_cycles_and_events(tmp_path: Path) -> None:
     output = JsonlOutput("jsonl", FileSettings(path=str(path)))
     output.start()
     output.offer(cycle(1, 12.0, NoReply("no reply")))
-    output.offer(Happening(time.monotonic(), "winder", "winder is down, was suspect"))
+    output.offer(Happening(time.time(), "winder", "winder is down, was suspect"))
     output.close(5)
     first, second = map(json.loads, written(path))
     assert first["samples"] == {
@@ -60,11 +60,11 @@ def test_json_lines_are_cycles_and_events(tmp_path: Path) -> None:
 
 
 def test_a_new_file_begins_when_the_date_in_its_name_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    days = iter([1, 1, 2])
+    days = iter([1, 2])
     monkeypatch.setattr(time, "strftime", lambda pattern: pattern.replace("%d", str(next(days, 2))))
     output = CsvOutput("csv", FileSettings(path=str(tmp_path / "x-%d.csv")))
     for number in (1, 2):
-        output.commit([output.format(cycle(number, number), lambda t: t) or b""])
+        output.commit([output.format(cycle(number, number)) or b""])
     output.shut()
     assert [len(written(tmp_path / f"x-{day}.csv")) for day in (1, 2)] == [2, 2]
 
@@ -95,3 +95,110 @@ def test_a_batch_that_the_disk_has_no_room_for_leaves_no_half_line(
 def test_a_folder_that_is_not_there_is_said_before_anything_starts(tmp_path: Path) -> None:
     with pytest.raises(InvalidCommand, match="there is no folder"):
         CsvOutput("csv", FileSettings(path=str(tmp_path / "none" / "x.csv")))
+
+
+def test_a_file_that_was_moved_away_or_removed_is_begun_anew_and_that_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "x.jsonl"
+    told: list[str] = []
+    output = JsonlOutput("jsonl", FileSettings(path=str(path)), say=told.append)
+    output.commit([b"first\n"])
+    path.rename(tmp_path / "x.jsonl.1")
+    output.commit([b"second\n"])
+    path.unlink()
+    output.commit([b"third\n"])
+    output.shut()
+    assert written(tmp_path / "x.jsonl.1") == ["first"]
+    assert written(path) == ["third"]
+    assert told == [f"jsonl: {path} was moved or removed: another is begun"] * 2
+
+
+def test_a_file_that_is_removed_while_it_is_written_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x.csv"
+    output = CsvOutput("csv", FileSettings(path=str(path)))
+    output.commit([b"first\n"])
+    write = os.write
+
+    def remove_and_write(descriptor: int, data: bytes) -> int:
+        if path.exists() and b"second" in bytes(data):
+            monkeypatch.setattr(os, "write", write)
+            path.unlink()
+        return write(descriptor, data)
+
+    monkeypatch.setattr(os, "write", remove_and_write)
+    output.commit([b"second\n"])
+    output.shut()
+    assert written(path) == [",".join(COLUMNS), "second"]
+
+
+def test_a_file_that_was_emptied_begins_with_its_head_again(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    output = CsvOutput("csv", FileSettings(path=str(path)))
+    output.commit([b"first\n"])
+    os.truncate(path, 0)
+    output.commit([b"second\n"])
+    output.shut()
+    assert written(path) == [",".join(COLUMNS), "second"]
+
+
+def test_a_half_line_that_a_crash_left_is_closed_off_and_that_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "x.jsonl"
+    path.write_bytes(b'{"whole": 1}\n{"half')
+    told: list[str] = []
+    output = JsonlOutput("jsonl", FileSettings(path=str(path)), say=told.append)
+    output.commit([b"{}\n"])
+    output.shut()
+    assert written(path) == ['{"whole": 1}', '{"half', "{}"]
+    assert told == [f"jsonl: {path} ended in the middle of a line, which was closed off"]
+
+
+def test_folders_of_dated_paths_are_made_when_their_time_comes(tmp_path: Path) -> None:
+    pattern = tmp_path / "%Y" / "%m" / "x-%d.csv"
+    output = CsvOutput("csv", FileSettings(path=str(pattern)))
+    output.commit([b"first\n"])
+    output.shut()
+    [path] = tmp_path.rglob("*.csv")
+    assert path.parent.parent.parent == tmp_path
+    with pytest.raises(InvalidCommand, match="there is no folder"):
+        CsvOutput("csv", FileSettings(path=str(tmp_path / "none" / "%Y" / "x.csv")))
+
+
+@pytest.mark.parametrize(
+    ("mode", "umask", "becomes"), [(0o640, 0o022, 0o640), (0o666, 0o027, 0o640), (0o600, 0, 0o600)]
+)
+def test_a_new_file_has_the_mode_that_was_asked_for_narrowed_by_the_umask(
+    tmp_path: Path, mode: int, umask: int, becomes: int
+) -> None:
+    path = tmp_path / "x.csv"
+    before = os.umask(umask)
+    try:
+        output = CsvOutput("csv", FileSettings(path=str(path), mode=mode))
+        output.commit([b"first\n"])
+        output.shut()
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == becomes
+
+
+@pytest.mark.parametrize("name", ["=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(1)", "\tx"])
+def test_no_name_is_a_formula_to_a_spreadsheet(name: str) -> None:
+    output = CsvOutput("csv", FileSettings(path="x.csv"))
+    snapshot = cycle(1, -47.6, NoReply(name), group=name)
+    line, bad = csv.reader((output.format(snapshot) or b"").decode().splitlines())
+    assert (line[1], bad[8]) == (f"'{name}", f"'{name}")
+    assert line[5] == "-47.6"
+
+
+def test_what_was_written_is_synced_when_it_is_due_and_when_the_file_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fsync", synced.append)
+    for every, times in ((0.0, 3), (1e9, 1)):
+        synced.clear()
+        output = JsonlOutput("jsonl", FileSettings(path=str(tmp_path / f"{every}.jsonl"), sync_every=every))
+        output.commit([b"{}\n"])
+        output.commit([b"{}\n"])
+        output.shut()
+        assert len(synced) == times

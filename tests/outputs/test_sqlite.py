@@ -12,11 +12,12 @@ from typing import Any
 import pytest
 
 from busmaster.errors import NoReply
-from busmaster.outputs import sqlite
+from busmaster.outputs import retention, sqlite
 from busmaster.outputs.base import Happening
+from busmaster.outputs.retention import DAY, Retention
 from busmaster.outputs.settings import SqliteSettings
-from busmaster.outputs.sqlite import DAY, SqliteOutput, column
-from busmaster.protocols.msc.codec import ProgramStatus
+from busmaster.outputs.sqlite import DATED, SqliteOutput, column
+from busmaster.protocols.msc.status import ProgramStatus
 from tests.outputs.cycles import cycle, settled, until
 
 
@@ -26,8 +27,8 @@ def test_a_column_holds_whatever_a_value_is() -> None:
 
 
 @contextmanager
-def recording(path: Path, keep_days: float | None = None) -> Iterator[SqliteOutput]:
-    output = SqliteOutput("sqlite", SqliteSettings(path=str(path), keep_days=keep_days))
+def recording(path: Path, keep_days: float | None = None, keep_mb: float | None = None) -> Iterator[SqliteOutput]:
+    output = SqliteOutput("sqlite", SqliteSettings(path=str(path), keep_days=keep_days, keep_mb=keep_mb))
     output._retry = 0.01
     output.start()
     try:
@@ -46,7 +47,7 @@ def test_values_events_and_errors_are_there_under_their_names(tmp_path: Path) ->
     with recording(path) as output:
         output.offer(cycle(1, 12.5, 3, (1, 2), NoReply("no reply")))
         output.offer(cycle(2, 13.5, 4, (3, 4), 5.0))
-        output.offer(Happening(time.monotonic(), "winder", "winder is down, was suspect"))
+        output.offer(Happening(time.time(), "winder", "winder is down, was suspect"))
     assert output.statistics().written == 9
     history = query(path, "select node, item, value, quality, error from history order by time, item")
     assert history[:4] == [
@@ -102,8 +103,109 @@ def test_what_is_too_old_is_deleted_from_the_oldest_on(tmp_path: Path, monkeypat
     with recording(path) as output:
         for number in range(6):
             output.offer(cycle(number, number, at=now - (5 - number) * DAY))
-    monkeypatch.setattr(sqlite, "CLEANED_AT_ONCE", 2)
+            output.offer(Happening(time.time() - (5 - number) * DAY, "winder", f"event {number}"))
+    monkeypatch.setattr(retention, "AT_ONCE", 2)
     for left in ([2, 3, 4, 5, 9], [3, 4, 5, 9, 9]):
         with recording(path, keep_days=2.5) as output:
             output.offer(cycle(9, 9))
         assert [value for (value,) in query(path, "select value from samples order by rowid")] == left
+    assert query(path, "select text from events order by rowid") == [("event 3",), ("event 4",), ("event 5",)]
+
+
+class Clocks:
+    """Clocks that are set by hand."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.wall, self.steady = 1_800_000_000.0, 5_000.0
+        monkeypatch.setattr(retention, "time", self)
+
+    def time(self) -> float:
+        return self.wall
+
+    def monotonic(self) -> float:
+        return self.steady
+
+    def run(self, seconds: float) -> None:
+        self.wall += seconds
+        self.steady += seconds
+
+
+def database_of(*times: float) -> sqlite3.Connection:
+    database = sqlite3.connect(":memory:")
+    database.executescript("create table samples (time real); create table events (time real)")
+    database.executemany("insert into samples values (?)", [(moment,) for moment in times])
+    return database
+
+
+def left_in(database: sqlite3.Connection, table: str = "samples") -> int:
+    [count] = database.execute(f"select count(*) from {table}").fetchone()
+    return int(count)
+
+
+def test_a_clock_that_was_set_ahead_deletes_nothing_for_a_day(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks, told = Clocks(monkeypatch), list[str]()
+    database = database_of(*(clocks.wall - hour * 3600 for hour in range(10)))
+    keeping = Retention(30, None, told.append)
+    keeping.apply(database, DATED)
+    clocks.wall += 365 * DAY
+    for _ in range(23):
+        clocks.run(3600)
+        keeping.apply(database, DATED)
+        assert left_in(database) == 10
+    assert told == ["the clock was set by +31536000 s: nothing is deleted for a day"]
+    clocks.wall -= 365 * DAY  # and back again, before anything was lost
+    for _ in range(48):
+        clocks.run(3600)
+        keeping.apply(database, DATED)
+    assert left_in(database) == 10
+    clocks.run(30 * DAY)
+    keeping.apply(database, DATED)
+    assert left_in(database) == 0
+
+
+def test_a_start_with_a_wrong_clock_deletes_nothing_for_a_day(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks, told = Clocks(monkeypatch), list[str]()
+    database = database_of(clocks.wall - 365 * DAY)
+    keeping = Retention(30, None, told.append)
+    keeping.apply(database, DATED)
+    assert left_in(database) == 1
+    assert told == ["by the clock all values are older than 30 days: nothing is deleted for a day"]
+    clocks.run(DAY + 1)
+    keeping.apply(database, DATED)
+    assert left_in(database) == 0
+
+
+def test_what_is_kept_holds_at_any_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two thousand values a batch, twenty batches a second: what is older than its limit goes as fast as it comes."""
+    clocks = Clocks(monkeypatch)
+    monkeypatch.setattr(retention, "AT_ONCE", 200)
+    database = database_of()
+    keeping = Retention(60 / DAY, None)
+    for _ in range(3 * 60 * 20):
+        database.executemany("insert into samples values (?)", [(clocks.wall,)] * 20)
+        keeping.apply(database, DATED)
+        clocks.run(0.05)
+    assert left_in(database) <= 20 * (2 * 60 * 20 + 10)
+
+
+def test_a_limit_in_megabytes_forgets_the_oldest_and_the_events_of_that_time(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    now = time.monotonic()
+    with recording(path, keep_mb=0.5) as output:
+        output.offer(Happening(time.time() - 2000, "winder", "long ago"))
+        for number in range(1000):
+            output.offer(cycle(number, *range(40), at=now - 1000 + number))
+            if number % 40 == 0:
+                until(lambda: settled(output))
+    assert path.stat().st_size < 3_000_000
+    [(first, last)] = query(path, "select min(time), max(time) from samples")
+    assert abs(last - time.time()) < 60
+    assert first > time.time() - 990
+    assert query(path, "select count(*) from events") == [(0,)]
+
+
+def test_a_new_file_is_for_its_owner_and_group(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    with recording(path) as output:
+        output.offer(cycle(1, 1.0))
+    assert path.stat().st_mode & 0o007 == 0

@@ -11,13 +11,12 @@ import pytest
 from hypothesis import given, settings
 
 from busmaster import planning
-from busmaster.arbiter import backlog, choice, strays
 from busmaster.arbiter.transaction import Priority
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import LineSettings
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
-from busmaster.planning import Bounds, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan, worst_case
+from busmaster.planning import Bounds, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -38,12 +37,6 @@ def group(name: str, period: float, count: int, *, node: PlannedNode = NODE, **o
 
 def planned(*groups: PlannedGroup, **options: Any) -> Plan:
     return plan(groups, line=LINE, **options)
-
-
-def test_the_planner_reckons_with_what_the_arbiter_does() -> None:
-    """It may not import them, so it repeats them."""
-    assert (planning.SHARE, planning.QUIET, planning.NOISY_AFTER) == (backlog.SHARE, strays.QUIET, strays.NOISY_AFTER)
-    assert worst_case.MOST_BEFORE == choice.MOST_BEFORE
 
 
 # how busy
@@ -160,6 +153,17 @@ def test_the_lowest_baud_rate_that_fits_is_offered() -> None:
 
 def test_no_baud_rate_is_offered_where_the_replies_alone_take_too_long() -> None:
     assert planned(group("a", 0.02, 8, node=PlannedNode(hcp2.PROFILE, 1, reply_time=0.01))).fitting_baudrate is None
+
+
+def test_no_baud_rate_is_offered_to_devices_that_have_but_one() -> None:
+    node = PlannedNode(msc.PROFILE, 1, reply_time=0.002)
+    groups = [PlannedGroup("a", 0.1, [(node, msc.DataRead(address)) for address in range(4)])]
+    prediction = plan(groups, line=msc.PROFILE.line)
+    assert prediction.utilisation > 1
+    assert prediction.fitting_baudrate is None
+    selectable = PlannedNode(replace(msc.PROFILE, fixed_rate=False), 1, reply_time=0.002)
+    groups = [replace(groups[0], reads=[(selectable, command) for _, command in groups[0].reads])]
+    assert plan(groups, line=msc.PROFILE.line).fitting_baudrate is not None
 
 
 def test_merged_reads_are_told_with_what_they_save() -> None:

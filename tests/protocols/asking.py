@@ -1,4 +1,4 @@
-"""Ask an exchange as the arbiter does, and take the documents' frames from the vectors."""
+"""Ask an exchange as the arbiter does, and take the manuals' frames from the vectors."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from busmaster.contract.exchange import MORE, Done, Exchange, Expect, FrameError
-from busmaster.errors import Refused
+from busmaster.contract.driver import Driver
+from busmaster.contract.exchange import MORE, Exchange
 
 VECTORS = Path(__file__).parent.parent / "vectors" / "frames.json"
 
@@ -25,32 +25,26 @@ def answer(exchange: Exchange[Any], *chunks: bytes) -> Any:
 
     Bytes after the reply fail the test: it says so where it wants them.
     """
-    value: Any = MORE
-    for chunk in chunks:
-        step = exchange.feed(chunk)
-        while isinstance(step, Expect):
-            step = exchange.feed(b"")
-        if isinstance(step, Done):
-            assert not step.rest
-            value = step.value
-    return value
+    ending = Driver(exchange).feed(*chunks).ending
+    if ending is None:
+        return MORE
+    if ending.error is not None:
+        raise ending.error
+    assert not ending.rest
+    return ending.value
 
 
 def outcome(exchange: Exchange[Any], chunks: Iterable[bytes]) -> object:
-    """What happens first, in a form that can be compared: a value, MORE, or the kind of failure.
+    """What these bytes bring, in a form that can be compared: a value, MORE, or the kind of failure.
 
-    Feeding stops there, as the arbiter's does.
+    A bug is raised.
     """
-    try:
-        for chunk in chunks:
-            step = exchange.feed(chunk)
-            while isinstance(step, Expect):
-                step = exchange.feed(b"")
-            if isinstance(step, Done):
-                return "value", step.value
-    except (FrameError, Refused) as error:
-        return type(error)
-    return MORE
+    ending = Driver(exchange).feed(*chunks).ending
+    if ending is None:
+        return MORE
+    if ending.error is not None and ending.is_bug:
+        raise ending.error
+    return ("value", ending.value) if ending.error is None else type(ending.error)
 
 
 def single_bytes(data: bytes) -> list[bytes]:

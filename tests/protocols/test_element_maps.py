@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from enum import IntFlag
+
 import pytest
 
 from busmaster.protocols._comms.elements import Element, whole
@@ -13,12 +15,12 @@ from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
     ("name", "number"),
     [
         ("axis0.position", 100),
-        ("axis0.encoder", 105),  # the document's own example
+        ("axis0.encoder", 105),  # AN00129's own example
         ("axis0.following_error", 107),
         ("axis1.position", 115),
         ("axis7.following_error", 212),
         ("inputs", 220),
-        ("outputs", 222),  # the document's own example
+        ("outputs", 222),  # AN00129's own example
         ("adc0", 224),
         ("adc7", 231),
         ("error", 232),
@@ -87,6 +89,48 @@ def test_a_microflex_has_27_names_of_which_three_are_writable() -> None:
 def test_names_come_in_the_order_of_their_numbers(elements: dict[str, Element[object]]) -> None:
     numbers = [element.number for element in elements.values()]
     assert numbers == sorted(set(numbers))
+
+
+@pytest.mark.parametrize(
+    ("name", "keyword"),
+    [
+        ("axis0.position", "POS(0)"),
+        ("axis1.velocity", "VEL(1)"),
+        ("axis2.mode", "AXISMODE(2)"),
+        ("axis3.axis_error", "AXISERROR(3)"),
+        ("axis4.demand", "DAC(4)"),
+        ("axis5.encoder", "ENCODER(5)"),
+        ("axis6.idle", "IDLE(6)"),
+        ("axis7.following_error", "FOLERROR(7)"),
+        ("inputs", "IN"),
+        ("outputs", "OUT"),
+        ("adc3", "ADC(3)"),
+        ("error", "Err"),
+        ("error_line", "Erl"),
+        ("error_axis", "ErrAxis"),
+        ("running", ""),
+        ("line_number", ""),
+        ("firmware", "FIRMWARERELEASE"),
+    ],
+)
+def test_an_element_has_the_mint_keyword_that_the_document_gives(name: str, keyword: str) -> None:
+    assert comms_array.ELEMENTS[name].keyword == keyword
+
+
+@pytest.mark.parametrize("elements", [comms_array.ELEMENTS, microflex.ELEMENTS])
+def test_every_element_is_described_once_in_the_lists(elements: dict[str, Element[object]]) -> None:
+    for element in elements.values():
+        item = element.item
+        assert (item.item, item.number, item.unit) == (element.name, str(element.number), element.unit)
+        assert item.access == ("read/write" if element.writable else "read")
+        assert item.meaning
+
+
+@pytest.mark.parametrize(
+    ("word", "element"), [(CommandWord, microflex.COMMAND_WORD), (StatusWord, microflex.STATUS_WORD)]
+)
+def test_every_defined_bit_of_a_word_is_described(word: type[IntFlag], element: Element[object]) -> None:
+    assert {bit.name: 1 << bit.number for bit in element.item.bits} == {flag.name: flag.value for flag in word}
 
 
 def test_words_are_flags_and_keep_what_the_document_does_not_define() -> None:

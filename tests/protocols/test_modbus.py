@@ -257,9 +257,9 @@ def test_a_value_that_differs_after_writing_is_told() -> None:
 
 def test_a_write_to_all_reaches_every_unit() -> None:
     async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
-        everyone = ModbusUnit(unit.node.bus, 0)
+        everyone = ModbusUnit(unit.bus, 0)
         await everyone.write("holding:100", 5)
-        assert await unit.read("holding:100") == await ModbusUnit(unit.node.bus, 3).read("holding:100") == 5
+        assert await unit.read("holding:100") == await ModbusUnit(unit.bus, 3).read("holding:100") == 5
         with pytest.raises(InvalidCommand):
             await everyone.read("holding:100")
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from busmaster.contract.exchange import Command, Done, Expect, FrameError
+from busmaster.contract.driver import Driver, Ending
+from busmaster.contract.exchange import Command, FrameError
 from busmaster.contract.profile import Batch
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.msc.codec import (
@@ -22,13 +23,13 @@ from busmaster.protocols.msc.codec import (
     Merging,
     PickedData,
     PickedFlags,
-    ProgramStatus,
     ReadFlag,
     ReadFlags,
     ReadStatus,
     SetFlag,
 )
 from busmaster.protocols.msc.exchange import packet
+from busmaster.protocols.msc.status import ERRORS, STATUS_BITS, WARNINGS, ProgramStatus
 from tests.protocols.asking import vectors
 
 FRAMES = vectors("MSC")
@@ -57,12 +58,10 @@ REPLIES: dict[str, tuple[Command[Any], int, object]] = {
 
 def answer(command: Command[Any], unit: int, reply: bytes) -> Any:
     """The value of an exchange that is answered with an ACK and this packet in one chunk."""
-    exchange = command.open(unit, PROFILE.timings)
-    assert isinstance(exchange.feed(ACK + reply), Expect)
-    done = exchange.feed(b"")
-    assert isinstance(done, Done)
-    assert (done.send, done.rest) == (ACK, b"")
-    return done.value
+    driver = Driver(command.open(unit, PROFILE.timings)).feed(ACK + reply)
+    assert driver.said == []
+    assert driver.ending == Ending(driver.ending and driver.ending.value, send=ACK)
+    return driver.ending.value
 
 
 def test_every_frame_of_the_vectors_is_tested() -> None:
@@ -120,6 +119,26 @@ def test_a_flag_is_on_or_off_and_nothing_else() -> None:
 def test_the_status_word_has_the_documents_sixteen_bits() -> None:
     assert sum(ProgramStatus) == 0xFFFF
     assert ProgramStatus(65).name == "PROGRAM_RUNNING|AUTO_START_ENABLED"
+    assert [1 << bit.number for bit in STATUS_BITS] == [1 << number for number in range(16)]
+
+
+def test_the_errors_of_the_status_word_are_those_that_the_document_calls_so() -> None:
+    errors = (8, 9, 11, 12, 13, 14, 15)
+    assert sum(1 << number for number in errors) == ERRORS
+    assert [bit.number for bit in STATUS_BITS if bit.severity == "error"] == list(errors)
+    assert not ERRORS & WARNINGS
+    assert [bit.number for bit in STATUS_BITS if bit.severity == "warning"] == [1, 2, 3, 5]
+
+
+def test_a_status_word_says_what_is_wrong_and_what_it_means() -> None:
+    healthy, ill = ProgramStatus(65), ProgramStatus(2 | 64 | 4096 | 8192)
+    assert not healthy.errors
+    assert not healthy.warnings
+    assert healthy.texts == ("the program runs", "the program starts on power-up")
+    assert ill.errors == ProgramStatus.BAD_OPCODE | ProgramStatus.STACK_OVERFLOW
+    assert ill.warnings == ProgramStatus.BATTERY_LOW
+    assert len(ill.texts) == 4
+    assert ProgramStatus(0).texts == ()
 
 
 @pytest.mark.parametrize("tail", [b"", b"\0" * 6, b"\xff" * 7])

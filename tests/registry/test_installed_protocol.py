@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import shutil
 import sys
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import Any
 import pytest
 
 from busmaster import Bus, MemoryPort
-from busmaster.capture.pcapng import Outcome, read_packets
+from busmaster.capture.frames import Direction
+from busmaster.capture.pcapng import Outcome, Packet, read_packets
 from busmaster.capture.recorder import Recorder
 from busmaster.capture.replay import replay
 from busmaster.config import ConfiguredLine
@@ -23,6 +25,7 @@ from busmaster.emulator.serve import TcpServer, serve_tcp
 from busmaster.registry import discovery, find, kinds, make_device, protocols
 from busmaster.testing.fixtures import LineFactory, emulated_line, virtual_time
 from busmaster.testing.virtual_time import run_in_virtual_time
+from tests.capture.test_dissector import dissect
 from tests.cli.conftest import Command, busmaster
 
 __all__ = ["busmaster", "emulated_line", "virtual_time"]
@@ -99,6 +102,28 @@ def test_the_help_names_it_with_its_items_and_options(tally: None, busmaster: Co
     assert "--gate N tally: which counter the gate has, 1 for a." in said
 
 
+def test_its_items_are_listed(tally: None, busmaster: Command) -> None:
+    assert [line.split()[0] for line in busmaster("items", "tally", "passed").lines] == [
+        "ITEM",
+        *"abcdefghijklmnopqrstuvwxyz",
+    ]
+    assert busmaster("items", "taly").err.endswith("no such protocol 'taly'; did you mean 'tally'?\n")
+
+
+SCREW = '[nodes.screw]\nprotocol = "mentor"\naddress = 14\n'
+
+
+def test_it_shares_a_line_with_whom_it_knows_and_then_wants_the_line_said(tally: None) -> None:
+    both = FILE + SCREW
+    with pytest.raises(FileError, match="no baud rate given"):  # for the two are meant for different lines
+        read(Source("line.toml", both))
+    file = read(Source("line.toml", both.replace("ttyS0", "ttyS0?baudrate=9600&bytesize=7&parity=E")))
+    with pytest.warns(UserWarning, match="tally is meant for 8N1, but /dev/ttyS0 is 7E1"):
+        assert list(ConfiguredLine(file, outputs=False).nodes) == ["west", "screw"]
+    with pytest.raises(FileError, match="hcp2 and tally nodes cannot share a line"):
+        read(Source("line.toml", both.replace('"mentor"', '"hcp2"')))
+
+
 def test_an_option_of_its_own_is_no_option_of_others(tally: None, busmaster: Command) -> None:
     wrong = busmaster("read", "/dev/null", "--protocol", "hcp2", "--node", "1", "1", "--gate", "2")
     assert wrong.status == 2
@@ -130,6 +155,18 @@ def test_a_line_file_has_nodes_of_it_with_its_options(tally: None) -> None:
     assert run_in_virtual_time(poll()) == (3, 1.5)
 
 
+def test_its_emulated_device_is_as_the_file_says(tally: None) -> None:
+    file = read(Source("line.toml", f"{FILE}[emulator.nodes.west]\nvalues = {{ people = 21, c = 5 }}\n"))
+
+    async def ask() -> Any:
+        async with ConfiguredLine(file, port=MemoryPort(line_of_file(file))) as line:
+            return [await line.point(f"west/{point}").read() for point in ("people", "b", "c", "a")]
+
+    assert run_in_virtual_time(ask()) == [21, 42, 5, 0]
+    with pytest.raises(FileError, match=r"line\.toml:13: emulator\.nodes\.west\.values\.C: a turnstile has no counter"):
+        line_of_file(read(Source("line.toml", f"{FILE}[emulator.nodes.west]\nvalues.C = 5\n")))
+
+
 def test_a_wrong_key_in_a_line_file_says_whose_it_is(tally: None) -> None:
     with pytest.raises(FileError, match="only nodes of tally have this, not those of hcp2"):
         read(Source("line.toml", FILE.replace('protocol = "tally"', 'protocol = "hcp2"\ngate = 1')))
@@ -156,6 +193,12 @@ def test_a_capture_names_it_by_text_and_is_replayed(tally: None, tmp_path: Path,
         ("write counter a = 5", False),
         ("read counter a", False),
     ]
+
+
+@pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
+def test_wireshark_calls_it_by_the_name_that_a_capture_has_for_it(tally: None, tmp_path: Path) -> None:
+    packets = [Packet(0, "tally", Direction.HOST, b"?"), Packet(0, "", Direction.NODE, b"!")]
+    assert dissect(tmp_path, packets, "_ws.col.Protocol") == [["tally"], ["unknown"]]
 
 
 def test_the_fixtures_make_lines_of_it(

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import inspect
 import json
+import re
 import subprocess
 import sys
 from typing import Any
@@ -14,8 +15,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from busmaster import Bus, MemoryPort
 from busmaster.contract.exchange import Command, FrameError
 from busmaster.emulator.device import Delay
+from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.protocols.ct_ansi import codec as ct_ansi
 from busmaster.protocols.dc104 import codec as dc104
@@ -43,6 +46,23 @@ def test_a_kind_of_node_has_a_handle_and_a_device_that_speak_its_protocol(kind: 
     assert kind.items
 
 
+@every_kind
+def test_what_the_documents_say_of_items_is_what_the_handle_does(kind: NodeKind) -> None:
+    """A range stands for its first and its last."""
+    assert kind.documented
+    handle = kind.handle(Bus(MemoryPort(Line(kind.profile.line))), kind.profile.addresses[-1])
+    for item in kind.documented:
+        assert item.meaning
+        for name in (re.sub(r"(\d+)-\d+", r"\1", item.item), re.sub(r"\d+-(\d+)", r"\1", item.item)):
+            point = handle.point(name)
+            assert point.writable is (item.access != "read")
+            assert point.unit == item.unit
+    names = [item.item for item in kind.documented]
+    assert len(set(names)) == len(names)
+    assert set(handle.items()) <= set(names)
+    assert set(handle.names_of_items().values()) <= set(names)
+
+
 def test_every_protocol_goes_by_a_name_of_its_own() -> None:
     assert [protocol.name for protocol in protocols()] == sorted({protocol.name for protocol in protocols()})
     assert list(kinds()) == sorted(kinds())
@@ -52,13 +72,15 @@ def test_every_protocol_goes_by_a_name_of_its_own() -> None:
 def test_who_may_share_a_line_is_said_by_both() -> None:
     by_name = {protocol.name: protocol for protocol in protocols()}
     for protocol in protocols():
-        for other in protocol.shares_line_with:
-            assert protocol.name in by_name[other].shares_line_with
+        for other in protocol.profile.shares_line_with:
+            assert protocol.name in by_name[other].profile.shares_line_with
 
 
-def test_a_protocol_that_does_not_exist_is_refused_with_those_that_do() -> None:
-    with pytest.raises(InvalidCommand, match=r"no such protocol 'hcp3': use .*hcp2, .*msc"):
+def test_a_protocol_that_does_not_exist_is_refused_with_the_nearest_or_those_that_do() -> None:
+    with pytest.raises(InvalidCommand, match=r"no such protocol 'hcp3'; did you mean 'hcp'\?"):
         find("hcp3")
+    with pytest.raises(InvalidCommand, match=r"no such protocol 'profibus'; there are ct-ansi, .*hcp2, .*msc"):
+        find("profibus")
 
 
 @every_protocol

@@ -12,6 +12,7 @@ import pytest
 
 from busmaster import Bus, Hcp2Controller, LineDown, MemoryPort, NoReply, SerialPort, TcpPort, WriteUnconfirmed
 from busmaster.arbiter.events import LineChange, LineChanged
+from busmaster.bus.node import Node
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryTransport
@@ -49,6 +50,7 @@ class Ledger:
         self.notes: list[tuple[Any, ...]] = []
         self.has = 0
         self.is_due = False
+        self.is_over = False
 
     # the port
 
@@ -88,6 +90,9 @@ class Ledger:
     def line_due(self, _now: float) -> bool:
         return self.is_due
 
+    def answer_counts(self, _now: float) -> bool:
+        return self.is_over
+
     def unsent(self, count: int, now: float) -> None:
         self.notes.append(("unsent", count, now))
 
@@ -96,7 +101,9 @@ class Ledger:
 
     # both
 
-    def transmitted(self, now: float, data: bytes | None = None) -> None:
+    attempt = None
+
+    def transmitted(self, now: float, data: bytes | None = None, _attempt: object = None, /) -> None:
         self.notes.append(("transmitted", now) if data is None else ("tapped", now, data))
 
 
@@ -128,6 +135,16 @@ def test_what_has_not_left_is_asked_for_only_when_a_deadline_of_the_line_is_due(
     pump._on_time()
     timeout = ("timeout", 0.0, False)
     assert ledger.notes == [timeout, ("unsent", 2, 0.0), timeout, ("unsent", 0, 0.0), timeout]
+
+
+def test_what_lies_unread_is_looked_for_when_a_callers_time_is_over(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    assert pump._port is not None
+    pump._port.unread = lambda: True  # type: ignore[method-assign]  # something does
+    pump._on_time()
+    ledger.is_over = True
+    pump._on_time()
+    assert ledger.notes == [("timeout", 0.0, False), ("timeout", 0.0, True)]
 
 
 def test_a_write_that_the_port_did_not_take_is_told_at_once_and_so_is_its_leaving(ledger: Ledger) -> None:
@@ -173,11 +190,12 @@ def test_a_request_held_back_is_waited_for_and_nothing_else_is_sent_meanwhile(he
             began = bus.now()
             reading = asyncio.gather(first.read(1, retries=0), second.read(1, retries=0))
             await asyncio.sleep(held)
-            assert transport_of(bus).get_write_buffer_size() == len(hcp2.Read(1).open(1, first.node.timings).request)
+            request = hcp2.Read(1).open(1, Node.of(first).timings).request
+            assert transport_of(bus).get_write_buffer_size() == len(request)
             transport_of(bus).release()
             assert tuple(await reading) == (11, 22)
             assert held + 0.18 < bus.now() - began < held + 0.3
-            assert first.node.statistics().no_reply == 0
+            assert Node.of(first).statistics().no_reply == 0
 
     run_in_virtual_time(main())
 

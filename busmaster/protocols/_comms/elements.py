@@ -1,4 +1,4 @@
-"""A named element of a comms array: what its number means."""
+"""Named elements of a comms array: what the number of each means, and what the documents say of it."""
 
 from __future__ import annotations
 
@@ -6,21 +6,40 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+from busmaster.contract.items import Access, Bit, Item
+
 T_co = TypeVar("T_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
 class Element(Generic[T_co]):
-    """One named element: what its number means (`decode`), in which unit, and whether the map says R/W.
+    """Describe one named element: what its number means (`decode`), in which unit, and whether the map says R/W.
 
-    A writable element is a level, such as outputs or a reference: writing it again changes nothing.
+    `keyword` is the Mint keyword that it stands for. A writable element is a level, such as outputs or a reference:
+    writing it again changes nothing.
     """
 
     name: str
     number: int
     decode: Callable[[float], T_co]
+    meaning: str
     unit: str = ""
+    keyword: str = ""
     writable: bool = False
+    bits: tuple[Bit, ...] = ()
+
+    @property
+    def item(self) -> Item:
+        """What the document says of it, as lists show it."""
+        access: Access = "read/write" if self.writable else "read"
+        return Item(self.name, str(self.number), self.meaning, self.unit, access, self.keyword, self.bits)
+
+
+COMMS = (
+    Item("1-5", "1-5", "the program's own; a write starts Event comms1 to comms5", "", "read/write", "COMMS"),
+    Item("6-99", "6-99", "the program's own", "", "read/write", "COMMS"),
+)
+"""The elements that HCP and HCP2 have in common: what each means is for the Mint program in the controller to say."""
 
 
 def whole(value: float) -> int:

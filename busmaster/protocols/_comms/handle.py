@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, overload
+from typing import Any, ClassVar, Generic, TypeVar, Unpack, overload
 
-from busmaster.bus.handle import Handle, Send, is_decimal, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, item_text, unknown_item
 from busmaster.bus.points import Point
+from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
+from busmaster.contract.arguments import is_decimal
 from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols._comms.codec import ReadElement, WriteElements, is_read_back, telegrams
 from busmaster.protocols._comms.elements import Element
-
-if TYPE_CHECKING:
-    from busmaster.bus.node import Priority
 
 T = TypeVar("T")
 
@@ -25,6 +24,8 @@ class CommsHandle(Handle):
     read_command: ClassVar[type[ReadElement]]
     write_command: ClassVar[type[WriteElements]]
     elements: ClassVar[Mapping[str, Element[object]]] = {}
+    definite: ClassVar[bool] = False
+    """Whether every node has the map as it is: what it calls read-only is then refused by number, too."""
     form: ClassVar[str]
     """What an item looks like, for the message to someone who mistyped it."""
 
@@ -43,10 +44,13 @@ class CommsHandle(Handle):
         return self.named(self._lookup(item))
 
     def element(self, number: int) -> Point[float]:
-        """An element by its number: read and written as it is, for the node to refuse."""
-        return Point(
-            self.node, str(number), self.read_command(number), encode=lambda value: self.write_command(number, (value,))
-        )
+        """An element by its number: read and written as it is, for the node to refuse unless the map is definite."""
+
+        def encode(value: float) -> Command[None]:
+            return self.write_command(number, (value,))
+
+        read_only = self.definite and any(e.number == number and not e.writable for e in self.elements.values())
+        return Point(self.node, str(number), self.read_command(number), encode=None if read_only else encode)
 
     def named(self, element: Element[T]) -> Point[T]:
         """An element by what it stands for: decoded, with its unit, and read-only if the map says so."""
@@ -63,29 +67,12 @@ class CommsHandle(Handle):
             encode=encode if element.writable else None,
         )
 
-    async def read(
-        self,
-        element: int | str,
-        *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> float:
+    async def read(self, element: int | str, **options: Unpack[ReadOptions]) -> float:
         """The number that an element holds now. Raises Refused for one that the node does not have."""
         number = element if isinstance(element, int) else self._lookup(element).number
-        return await self.node.request(
-            self.read_command(number), priority=priority, start_within=start_within, retries=retries
-        )
+        return await self.node.request(self.read_command(number), **options)
 
-    async def write(
-        self,
-        element: int | str,
-        *values: float,
-        verify: bool = False,
-        idempotent: bool = False,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-    ) -> None:
+    async def write(self, element: int | str, *values: float, **options: Unpack[WriteOptions]) -> None:
         """Write values to an element and those after it, acknowledged.
 
         A list that does not fit one telegram of 60 characters is sent in several; if one of them fails, those before
@@ -95,24 +82,25 @@ class CommsHandle(Handle):
 
         Raises InvalidCommand before anything is sent for a value that cannot be sent, or a read-only name.
         """
-        commands = self.writes(element, values, idempotent)
+        commands = self.writes(element, values)
+        requests = SeveralRequests(self.node, options)
         for command in commands:
-            await self.node.request(command, priority=priority, start_within=start_within)
-        if verify:
-            for number, value in enumerate(values, commands[0].element):
-                await self._verify(number, value, priority)
+            await requests.request(command)
+        for number, value in enumerate(values if requests.verify else (), commands[0].element):
+            await self._verify(requests, number, value)
 
-    def writes(self, element: int | str, values: Sequence[float], idempotent: bool = False) -> list[WriteElements]:
+    def writes(self, element: int | str, values: Sequence[float]) -> list[WriteElements]:
         """What `write` sends. Raises InvalidCommand for a value that cannot be sent; and where the map has names, for a
-        name that it calls read-only, or that another value of the list would go to."""
+        name that it calls read-only, or that another value of the list would go to; for its number where it is
+        definite."""
         number = element if isinstance(element, int) else self._lookup(element).number
-        if not isinstance(element, int):
+        if self.definite or not isinstance(element, int):
             for known in self.elements.values():
                 if known.number in range(number, number + max(1, len(values))) and not known.writable:
                     raise InvalidCommand(f"{self.node.label}: {known.name} is read-only")
         if not values:
             raise InvalidCommand(f"{self.node.label}: there is no value to write")
-        return [self.write_command(number + offset, part, idempotent) for offset, part in telegrams(values)]
+        return [self.write_command(number + offset, part) for offset, part in telegrams(values)]
 
     def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
         """Consecutive elements, in as many telegrams as it takes."""
@@ -120,13 +108,13 @@ class CommsHandle(Handle):
         self.writes(element, values)
         return [lambda: self.write(element, *values, verify=verify)]
 
-    async def _verify(self, number: int, written: float, priority: Priority | None) -> None:
+    async def _verify(self, requests: SeveralRequests, number: int, written: float) -> None:
         command = self.read_command(number)
-        found = await self.node.request(command, priority=priority)
+        found = await requests.read_back(command)
         if not is_read_back(written, found):
             raise VerifyFailed(
                 f"element {number} reads {found!r} after {written!r} was written",
-                node=self.node.label,
+                node=self.node,
                 command=str(command),
             )
 

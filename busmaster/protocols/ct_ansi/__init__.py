@@ -5,8 +5,9 @@ from __future__ import annotations
 from busmaster.protocols.ct_ansi.capture import CtAnsiDialect
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
-from busmaster.protocols.mentor import CHAIN
-from busmaster.registry import NodeKind, Protocol, device_of
+from busmaster.protocols.mentor import CHAIN, EMULATED
+from busmaster.protocols.mentor.parameters import ANY
+from busmaster.registry import NodeKind, Option, Protocol, device_of
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -16,12 +17,13 @@ PROTOCOL = Protocol(
             CtAnsiDrive,
             device_of("busmaster.protocols.ct_ansi.device"),
             items="1.21 (menu and parameter), 1.21:8 (8 parameters from there on)",
+            documented=(ANY,),
             read_options=(CHAIN,),
             takes_decimals=True,
+            emulated=(*EMULATED, Option("plus", "flag"), Option("width", "whole")),
             capture_id=8,
         ),
     ),
     commands={"read": Read, "read_run": ReadRun, "write": Write},
     dialect=CtAnsiDialect,
-    shares_line_with=frozenset({"mentor"}),
 )

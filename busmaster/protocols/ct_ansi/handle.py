@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from decimal import ROUND_HALF_UP, Decimal
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
-from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
+from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
+from busmaster.contract.arguments import is_decimal
 from busmaster.contract.profile import Profile
+from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.mentor.codec import parse_parameter
-
-if TYPE_CHECKING:
-    from busmaster.bus.bus import Bus
-    from busmaster.bus.node import Priority
-    from busmaster.contract.timing import Timings
 
 FORM = "a parameter such as 1.21, or 1.21:8 for a run of 8"
 
@@ -37,7 +35,7 @@ class CtAnsiDrive(Handle):
 
     def __init__(
         self,
-        bus: Bus,
+        bus: NodeSource,
         address: int,
         *,
         decimals: Mapping[str, int] | None = None,
@@ -60,58 +58,44 @@ class CtAnsiDrive(Handle):
             raise unknown_item(item, (), FORM)
         return Point(self.node, item, ReadRun(menu, number, int(count)))
 
-    async def read(
-        self,
-        parameter: str,
-        *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> float:
+    @classmethod
+    def items(cls) -> tuple[str, ...]:
+        return ()
+
+    async def read(self, parameter: str, **options: Unpack[ReadOptions]) -> float:
         """A parameter's value. Raises NoSuchParameter, or InvalidCommand at address 0."""
-        command = Read(*parse_parameter(parameter))
-        return await self.node.request(command, priority=priority, start_within=start_within, retries=retries)
+        return await self.node.request(Read(*parse_parameter(parameter)), **options)
 
     async def read_run(
-        self, parameter: str, count: int, *, chain: bool = False, priority: Priority | None = None
+        self, parameter: str, count: int, *, step: int = 1, chain: bool = False, **options: Unpack[ReadOptions]
     ) -> tuple[float, ...]:
-        """`count` parameters of one menu, from `parameter` on; with `chain` in one exchange, where that is safe.
+        """`count` parameters of one menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
 
-        It is where no other drive can take or send a lone ACK for its own. Raises NoSuchParameter where the menu has a
-        gap.
+        `step` 0 reads the same one again and again. With `chain` in one exchange, where that is safe: where no other
+        drive can take or send a lone ACK, NAK or BS for its own. Raises NoSuchParameter where the menu has a gap.
         """
-        run = ReadRun(*parse_parameter(parameter), count)
+        run = ReadRun(*parse_parameter(parameter), count, step)
         if chain:
-            return await self.node.request(run, priority=priority)
-        singles = [Read(run.menu, run.number + i) for i in range(count)]
-        return tuple([await self.node.request(single, priority=priority) for single in singles])
+            return await self.node.request(run, **options)
+        requests = SeveralRequests(self.node, options)
+        return tuple([await requests.request(Read(run.menu, run.number + step * i)) for i in range(count)])
 
-    async def write(
-        self,
-        parameter: str,
-        value: float,
-        *,
-        verify: bool = False,
-        idempotent: bool = False,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-    ) -> None:
+    async def write(self, parameter: str, value: float, **options: Unpack[WriteOptions]) -> None:
         """Write a parameter, acknowledged; at address 0 to all drives, which do not answer.
 
         `verify` reads back, and raises VerifyFailed if the value differs. Raises InvalidCommand, before anything is
         sent, for a value that does not fit.
         """
         menu, number = parse_parameter(parameter)
-        command = self._write(menu, number, value, idempotent)
-        await self.node.request(command, priority=priority, start_within=start_within)
-        if verify:
+        command = self._write(menu, number, value)
+        requests = SeveralRequests(self.node, options)
+        await requests.request(command)
+        if requests.verify:
             check = Read(menu, number)
-            found = await self.node.request(check, priority=priority)
+            found = await requests.read_back(check)
             if found != float(command.text):
                 raise VerifyFailed(
-                    f"{parameter} reads {found} after {command.text} was written",
-                    node=self.node.label,
-                    command=str(check),
+                    f"{parameter} reads {found} after {command.text} was written", node=self.node, command=str(check)
                 )
 
     async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
@@ -125,8 +109,8 @@ class CtAnsiDrive(Handle):
         encoder(self.point(item))(value)
         return lambda: self.write(item, value, verify=verify)
 
-    def _write(self, menu: int, number: int, value: float, idempotent: bool = False) -> Write:
+    def _write(self, menu: int, number: int, value: float) -> Write:
         digits = self._decimals.get((menu, number))
         if digits is not None and math.isfinite(value) and not isinstance(value, bool):
             value = float(Decimal(str(value)).quantize(Decimal(1).scaleb(-digits), ROUND_HALF_UP))
-        return Write(menu, number, value, idempotent)
+        return Write(menu, number, value)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from busmaster.contract.items import Item
 from busmaster.protocols.dc104.capture import Dc104Dialect
 from busmaster.protocols.dc104.codec import PROFILE, Read, Write
 from busmaster.protocols.dc104.handle import Dc104Drive
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
+
+MAXIMUM = Option("maximum", "whole")
+ALLOW_ZERO = Option("allow_zero", "flag")
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -15,7 +19,15 @@ PROTOCOL = Protocol(
             Dc104Drive,
             device_of("busmaster.protocols.dc104.device"),
             items="a parameter, 1 to 255",
-            options=(Option("maximum", "whole"), Option("allow_zero", "flag")),
+            documented=(Item("1-255", "1-255", "a parameter, 0 to 65535", access="read/write"),),
+            options=(MAXIMUM, ALLOW_ZERO),
+            emulated=(
+                MAXIMUM,
+                ALLOW_ZERO,
+                Option("read_only", "numbers"),
+                Option("eeprom", "delay"),
+                Option("silent", "flag"),
+            ),
             whole_numbers=everywhere,
             capture_id=6,
         ),

@@ -139,5 +139,6 @@ PROFILE = Profile(
     timings=Timings(_READ_TIMING, _WRITE_TIMING, packet=_READ_TIMING),
     probe=Read(1),
     checks=tuple(Read(parameter) for parameter in range(1, 9)),
+    fixed_rate=True,
 )
 """The document gives no times. A write is answered when it is completed, EEPROM included: hence its longer window."""

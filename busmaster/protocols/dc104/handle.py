@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
-from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
+from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
+from busmaster.contract.arguments import is_decimal
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import VerifyFailed
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.dc104.codec import Read, Write
-
-if TYPE_CHECKING:
-    from busmaster.bus.bus import Bus
-    from busmaster.bus.node import Priority
 
 
 class Dc104Drive(Handle):
@@ -32,7 +30,7 @@ class Dc104Drive(Handle):
 
     def __init__(
         self,
-        bus: Bus,
+        bus: NodeSource,
         address: int = 0,
         *,
         maximum: int = dc104.HIGHEST_PARAMETER,
@@ -59,40 +57,28 @@ class Dc104Drive(Handle):
 
         return Point(self.node, str(number), self._read(number), encode=encode)
 
-    async def read(
-        self,
-        parameter: int,
-        *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> int:
-        """A parameter's value now. Raises Refused where the drive says NAK."""
-        command = self._read(parameter)
-        return await self.node.request(command, priority=priority, start_within=start_within, retries=retries)
+    @classmethod
+    def items(cls) -> tuple[str, ...]:
+        return ()
 
-    async def write(
-        self,
-        parameter: int,
-        value: int,
-        *,
-        verify: bool = False,
-        idempotent: bool = False,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-    ) -> None:
+    async def read(self, parameter: int, **options: Unpack[ReadOptions]) -> int:
+        """A parameter's value now. Raises Refused where the drive says NAK."""
+        return await self.node.request(self._read(parameter), **options)
+
+    async def write(self, parameter: int, value: int, **options: Unpack[WriteOptions]) -> None:
         """Write a parameter: acknowledged when the drive has completed it.
 
         `verify` reads it back, and raises VerifyFailed if it differs. `idempotent` allows a retry after an unknown
         outcome. Raises InvalidCommand, before anything is sent, for a value that is not 0 to 65535.
         """
         command = self._write(parameter, value)
-        await self.node.request(command, priority=priority, start_within=start_within, idempotent=idempotent or None)
-        if verify:
-            found = await self.read(parameter, priority=priority)
+        requests = SeveralRequests(self.node, options)
+        await requests.request(command)
+        if requests.verify:
+            found = await requests.read_back(self._read(parameter))
             if found != command.value:
                 raise VerifyFailed(
-                    f"parameter {parameter} reads {found} after {command.value} was written", node=self.node.label
+                    f"parameter {parameter} reads {found} after {command.value} was written", node=self.node
                 )
 
     def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:

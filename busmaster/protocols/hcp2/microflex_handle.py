@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine
-from typing import Any, ClassVar
-from weakref import WeakKeyDictionary
+from typing import Any, ClassVar, Unpack
 
 import anyio
 
-from busmaster.bus.node import Node, Priority
+from busmaster.bus.requester import CommandOptions, Priority, ReadOptions
 from busmaster.contract.arguments import seconds
 from busmaster.contract.profile import Profile
 from busmaster.errors import BusClosed, BusError, VerifyFailed, WriteUnconfirmed
@@ -24,8 +23,6 @@ LOOK_AGAIN = 0.02
 """Seconds between two looks at the status word."""
 
 _NOTHING = CommandWord(0)
-_disables: WeakKeyDictionary[Node, int] = WeakKeyDictionary()
-"""How often each drive was told to disable, through whichever handle: what was decided before must not undo it."""
 
 
 class MicroFlexDrive(CommsHandle):
@@ -43,6 +40,7 @@ class MicroFlexDrive(CommsHandle):
     read_command = hcp2.Read
     write_command = hcp2.Write
     elements = microflex.ELEMENTS
+    definite = True
     form = "an element number, 1 to 255, or a name such as speed_measured"
 
     position = Named(microflex.POSITION)
@@ -73,16 +71,17 @@ class MicroFlexDrive(CommsHandle):
     firmware = Named(microflex.FIRMWARE)
     temperature = Named(microflex.TEMPERATURE)
 
-    async def status(self, *, priority: Priority | None = None) -> StatusWord:
-        return await self.status_word.read(priority=priority)
+    async def status(self, **options: Unpack[ReadOptions]) -> StatusWord:
+        """The status word."""
+        return await self.status_word.read(**options)
 
-    async def check_firmware(self) -> int:
+    async def check_firmware(self, **options: Unpack[ReadOptions]) -> int:
         """The drive's firmware build. Raises VerifyFailed if it is too old to have this map."""
-        build = await self.firmware.read()
+        build = await self.firmware.read(**options)
         if build < microflex.FIRST_FIRMWARE:
             raise VerifyFailed(
                 f"firmware build {build} is older than {microflex.FIRST_FIRMWARE}, which brought the element map",
-                node=self.node.label,
+                node=self.node,
                 hint="update the drive's firmware",
             )
         return build
@@ -105,8 +104,8 @@ class MicroFlexDrive(CommsHandle):
         A cancelled caller's disable is not sent: shield it where it must go out.
         """
         within = seconds(within, f"{self.node.label}: within")
-        _disables[self.node] = _disables.get(self.node, 0) + 1
-        await self._command(_NOTHING, Priority.URGENT)
+        self.node.note_stop()
+        await self._command(_NOTHING, priority=Priority.URGENT)
         return await self._await_enabled(False, within, Priority.URGENT)
 
     async def cancel_errors(self) -> StatusWord:
@@ -116,43 +115,46 @@ class MicroFlexDrive(CommsHandle):
         WriteUnconfirmed, or what the last attempt raised, if that could not be done: the drive must not be left so.
         Returns the status word after it.
         """
-        disables = _disables.get(self.node, 0)
+        stops = self.node.stops
         word = await self.command_word.read()
 
-        def enable() -> CommandWord:
-            """Decided anew for each write: the drive may have been disabled meanwhile."""
-            return word & CommandWord.ENABLE if _disables.get(self.node, 0) == disables else _NOTHING
+        async def command(cancel: CommandWord) -> None:
+            """Decide anew for each write: the drive may have been disabled meanwhile, by whomever."""
+            kept = word & CommandWord.ENABLE if self.node.stops == stops else _NOTHING
+            await self._command(kept | cancel, stops_seen=stops if kept else None)
 
         try:
-            await self._command(enable() | CommandWord.CANCEL)
+            await command(CommandWord.CANCEL)
         except BaseException:
             try:
-                await _to_the_end(self._clear_cancel(enable))
+                await _to_the_end(self._clear_cancel(command))
             except BusError:
                 pass  # what went wrong first says more
             raise
-        await _to_the_end(self._clear_cancel(enable))
+        await _to_the_end(self._clear_cancel(command))
         return await self.status()
 
-    async def set_speed_reference(self, percent: float) -> None:
+    async def set_speed_reference(self, percent: float, **options: Unpack[CommandOptions]) -> None:
         """In % of the application's maximum speed. Raises Refused unless in speed control with the host as source."""
-        await self.speed_reference.write(percent)
+        await self.speed_reference.write(percent, **options)
 
-    async def set_torque_reference(self, percent: float) -> None:
+    async def set_torque_reference(self, percent: float, **options: Unpack[CommandOptions]) -> None:
         """In % of the rated current. Raises Refused unless in current control with the host as source."""
-        await self.torque_reference.write(percent)
+        await self.torque_reference.write(percent, **options)
 
-    async def _command(self, word: CommandWord, priority: Priority | None = None) -> None:
+    async def _command(
+        self, word: CommandWord, priority: Priority | None = None, stops_seen: int | None = None
+    ) -> None:
         """Write the command word. It changes more than its own point: all samples of the drive are stale after it."""
         command = hcp2.Write(microflex.COMMAND_WORD.number, (word,), idempotent=True)
-        await self.node.request(command, priority=priority)
+        await self.node.request(command, priority=priority, stops_seen=stops_seen)
 
-    async def _clear_cancel(self, enable: Callable[[], CommandWord]) -> None:
+    async def _clear_cancel(self, command: Callable[[CommandWord], Coroutine[Any, Any, None]]) -> None:
         last: BusError | None = None
         with anyio.move_on_after(CLEAR_WITHIN):
             while True:
                 try:
-                    await self._command(enable())
+                    await command(_NOTHING)
                 except BusClosed:
                     raise
                 except BusError as error:
@@ -162,21 +164,21 @@ class MicroFlexDrive(CommsHandle):
                 await anyio.sleep(LOOK_AGAIN)
         raise last or WriteUnconfirmed(
             "the cancel bit of the command word may still be set",
-            node=self.node.label,
+            node=self.node,
             hint="clear it: errors do not latch while it is set",
         )
 
     async def _await_enabled(self, wanted: bool, within: float, priority: Priority) -> StatusWord:
         """Look at the status word until its bit 7 is as wanted."""
-        deadline = self.node.bus.now() + within
+        deadline = self.node.now() + within
         while True:
             status = await self.status(priority=priority)
             if (StatusWord.ENABLED in status) is wanted:
                 return status
-            if self.node.bus.now() >= deadline:
+            if self.node.now() >= deadline:
                 raise VerifyFailed(
                     _why_not(status) if wanted else "still enabled",
-                    node=self.node.label,
+                    node=self.node,
                     command=str(self.status_word.command),
                 )
             await anyio.sleep(LOOK_AGAIN)

@@ -5,9 +5,29 @@ from __future__ import annotations
 from busmaster.protocols.mentor.capture import MentorDialect
 from busmaster.protocols.mentor.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.mentor.handle import MentorDrive
+from busmaster.protocols.mentor.parameters import ITEMS, NAMED
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
 CHAIN = Option("chain", "flag", "read a run in one exchange, where no other drive can mistake it")
+
+EMULATED = (
+    Option("acceleration", "positive"),
+    Option("ripple", "share"),
+    Option("short_after_write", "flag"),
+    Option("refuse_malformed", "flag"),
+    Option(
+        "parameters",
+        "tables",
+        fields=(
+            Option("low", "number"),
+            Option("high", "number"),
+            Option("read_only", "flag"),
+            Option("wide", "flag"),
+            Option("fine", "flag"),
+        ),
+    ),
+)
+"""What can be said of an emulated drive. `fine`: it may be written in high resolution."""
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -16,15 +36,17 @@ PROTOCOL = Protocol(
             "mentor",
             MentorDrive,
             device_of("busmaster.protocols.mentor.device"),
-            items="1.17 (menu and parameter), 15.60:wide, 1.17:hires, 1.17:20 (20 parameters from there on)",
+            items="1.17 (menu and parameter), 15.60:wide, 1.17:hires, 1.17:20 (20 parameters from there on), or a "
+            f"name: {' '.join(NAMED)}",
+            documented=ITEMS,
             options=(Option("chained", "flag"),),
             read_options=(CHAIN,),
             whole_numbers=everywhere,
             takes_decimals=True,
+            emulated=EMULATED,
             capture_id=5,
         ),
     ),
     commands={"read": Read, "read_run": ReadRun, "write": Write},
     dialect=MentorDialect,
-    shares_line_with=frozenset({"ct-ansi"}),
 )

@@ -6,27 +6,39 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar, Unpack
 
-from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
-from busmaster.contract.arguments import whole_number
+from busmaster.bus.requester import CommandOptions, NodeSource, ReadOptions, SeveralRequests, WriteOptions
+from busmaster.contract.arguments import is_decimal, whole_number
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.mentor.codec import Read, ReadRun, Write, parse_parameter
-
-if TYPE_CHECKING:
-    from busmaster.bus.bus import Bus
-    from busmaster.bus.node import Node, Priority
+from busmaster.protocols.mentor.parameters import NAMED, WIDE
 
 T = TypeVar("T")
 
 _BEYOND_ANY_FORM = 1e9
 MOST_DECIMALS = 9
-FORM = "a parameter such as 1.17, 15.60:wide, 1.17:hires, or 1.17:20 for a run of 20"
+FORM = "a parameter such as 1.17, 15.60:wide, 1.17:hires, 1.17:20 for a run of 20, or a name"
+
+
+class Place(NamedTuple):
+    """Where a parameter is, and how many of its last digits are decimals: None where a value is the number itself."""
+
+    menu: int
+    number: int
+    decimals: int | None
+
+    def write(self, value: float, *, wide: bool, high_resolution: bool) -> Write:
+        """The command that writes a value; one that the guide calls wide is sent so. Raises InvalidCommand."""
+        decimals = self.decimals if self.decimals is None else self.decimals + high_resolution
+        wide = wide or (not high_resolution and self[:2] in WIDE)
+        return Write(self.menu, self.number, to_line(value, decimals), wide, high_resolution)
 
 
 class MentorDrive(Handle):
@@ -37,16 +49,17 @@ class MentorDrive(Handle):
         speed = await drive.read("1.17")
 
     The line carries whole numbers. `decimals` says of how many digits a parameter's last ones are decimals: its values
-    are then in its own unit, rounded to that; without an entry a value is the number on the line. `chained` lets poll
-    groups read neighbouring parameters of this drive as runs, whichever handle they are from: see `read_run` for when
-    that is safe. The first handle of a drive says so, or none.
+    are then in its own unit, rounded to that; without an entry a value is the number on the line. A parameter that the
+    guide names goes by that name too, and then has the guide's decimals: `read("speed_reference_1")` is in %. `chained`
+    lets poll groups read neighbouring parameters of this drive as runs, whichever handle they are from: see `read_run`
+    for when that is safe. The first handle of a drive says so, or none.
     """
 
     profile: ClassVar[Profile] = mentor.PROFILE
 
     def __init__(
         self,
-        bus: Bus,
+        bus: NodeSource,
         address: int,
         *,
         decimals: Mapping[str, int] | None = None,
@@ -54,13 +67,13 @@ class MentorDrive(Handle):
         timings: Timings | None = None,
         retries: int | None = None,
     ) -> None:
-        self.node: Node = bus.node(
-            mentor.CHAINED if chained else mentor.PROFILE, address, timings=timings, retries=retries
-        )
-        self._decimals = {
-            parse_parameter(text): whole_number(digits, 0, MOST_DECIMALS, f"the decimals of {text}")
-            for text, digits in (decimals or {}).items()
-        }
+        profile = mentor.CHAINED if chained else mentor.PROFILE
+        super().__init__(bus, address, timings=timings, retries=retries, profile=profile)
+        self._decimals: dict[tuple[int, int], int] = {}
+        for text, digits in (decimals or {}).items():
+            digits = whole_number(digits, 0, MOST_DECIMALS, f"the decimals of {text}")
+            if (known := self._decimals.setdefault(place_of(text), digits)) != digits:
+                raise InvalidCommand(f"{text} has {known} decimals by another name, not {digits}")
         if address and (address < 10 or address % 10 == 0):
             warnings.warn(
                 f"mentor: address {address} means a group to later Control Techniques products: "
@@ -68,67 +81,71 @@ class MentorDrive(Handle):
                 stacklevel=2,
             )
 
+    @classmethod
+    def items(cls) -> tuple[str, ...]:
+        return tuple(NAMED)
+
+    @classmethod
+    def names_of_items(cls) -> Mapping[str, str]:
+        return {f"{parameter.menu:02d}.{parameter.number:02d}": name for name, parameter in NAMED.items()}
+
     def point(self, item: str) -> Point[Any]:
-        """A parameter ("1.17"), one written as a wide integer ("15.60:wide") or in high resolution ("1.17:hires"), or
-        a run, always read in one exchange ("1.17:20")."""
+        """A parameter ("1.17", "speed_reference_1"), one written as a wide integer ("15.60:wide") or in high resolution
+        ("1.17:hires"), or a run, always read in one exchange ("1.17:20")."""
         text, colon, kind = item_text(item).partition(":")
         try:
-            menu, number = parse_parameter(text)
+            place = self._place(text)
         except InvalidCommand:
-            raise unknown_item(item, (), FORM) from None
+            raise unknown_item(item, NAMED, FORM) from None
         if is_decimal(kind):
-            return self._run_point(item, ReadRun(menu, number, int(kind)))
+            return self._run_point(item, ReadRun(place.menu, place.number, int(kind)))
         if kind not in ("wide", "hires") and colon:
-            raise unknown_item(item, (), FORM)
-        return self._parameter_point(item, Read(menu, number), wide=kind == "wide", high_resolution=kind == "hires")
+            raise unknown_item(item, NAMED, FORM)
+        unit = NAMED[text].unit if text in NAMED else ""
+        return self._parameter_point(item, place, unit, wide=kind == "wide", high_resolution=kind == "hires")
 
-    def _parameter_point(self, item: str, read: Read, *, wide: bool, high_resolution: bool) -> Point[float]:
-        decimals = self._decimals.get((read.menu, read.number))
+    def _parameter_point(
+        self, item: str, place: Place, unit: str, *, wide: bool, high_resolution: bool
+    ) -> Point[float]:
+        decimals = place.decimals
 
         def encode(value: float) -> Command[None]:
-            return self._write(read.menu, read.number, value, wide=wide, high_resolution=high_resolution)
+            return place.write(value, wide=wide, high_resolution=high_resolution)
 
         def decode(number: int) -> float:
             """In the unit in which it is written: without decimals, high resolution counts in tenths."""
             return from_line(number * 10 if high_resolution and decimals is None else number, decimals)
 
-        return ScaledPoint(self.node, item, read, decode=decode, encode=encode, decimals=(decimals,))
+        read = Read(place.menu, place.number)
+        return ScaledPoint(self.node, item, read, unit=unit, decode=decode, encode=encode, decimals=(decimals,))
 
     def _run_point(self, item: str, run: ReadRun) -> Point[tuple[float, ...]]:
         decimals = tuple(self._decimals.get(parameter) for parameter in _parameters(run))
         return ScaledPoint(self.node, item, run, decode=lambda sent: self._values(run, sent), decimals=decimals)
 
-    async def read(
-        self,
-        parameter: str,
-        *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> float:
+    async def read(self, parameter: str, **options: Unpack[ReadOptions]) -> float:
         """A parameter's value; a bit is 0 or 1. Raises NoSuchParameter, or InvalidCommand at address 0."""
         self._check_readable()
-        menu, number = parse_parameter(parameter)
-        command = Read(menu, number)
-        found = await self.node.request(command, priority=priority, start_within=start_within, retries=retries)
-        return from_line(found, self._decimals.get((menu, number)))
+        place = self._place(parameter)
+        found = await self.node.request(Read(place.menu, place.number), **options)
+        return from_line(found, place.decimals)
 
     async def read_run(
-        self, parameter: str, count: int, *, chain: bool = False, priority: Priority | None = None
+        self, parameter: str, count: int, *, step: int = 1, chain: bool = False, **options: Unpack[ReadOptions]
     ) -> tuple[float, ...]:
-        """`count` parameters of one menu, from `parameter` on.
+        """`count` parameters of one menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
 
-        With `chain` all in one exchange, one request byte for each after the first: only where no other drive can take
-        or send that byte for its own (M14), that is where every node of the line is a drive that forgets what it last
-        sent when another is addressed. Raises NoSuchParameter where the menu has a gap.
+        `step` 0 reads the same one again and again. With `chain` all in one exchange, one request byte for each after
+        the first: only where no other drive can take or send that byte for its own, that is where every node of
+        the line is a drive that forgets what it last sent when another is addressed. Raises NoSuchParameter where the
+        menu has a gap.
         """
         self._check_readable()
-        menu, number = parse_parameter(parameter)
-        run = ReadRun(menu, number, count)
+        run = ReadRun(*place_of(parameter), count, step)
         if chain:
-            return self._values(run, await self.node.request(run, priority=priority))
-        singles = [Read(menu, number + i) for i in range(count)]
-        return self._values(run, [await self.node.request(single, priority=priority) for single in singles])
+            return self._values(run, await self.node.request(run, **options))
+        requests = SeveralRequests(self.node, options)
+        return self._values(run, [await requests.request(Read(*place)) for place in _parameters(run)])
 
     async def write(
         self,
@@ -137,39 +154,41 @@ class MentorDrive(Handle):
         *,
         wide: bool = False,
         high_resolution: bool = False,
-        verify: bool = False,
-        idempotent: bool = False,
-        priority: Priority | None = None,
-        start_within: float | None = None,
+        **options: Unpack[WriteOptions],
     ) -> None:
         """Write a parameter, acknowledged; at address 0 to all drives, which do not answer.
 
-        `wide` is for the 16-bit integers (13.14, 15.60 to 15.63). With `high_resolution` a value without declared
-        decimals counts in tenths of what a read returns. `verify` reads back, and raises VerifyFailed if the value
-        differs. Raises InvalidCommand, before anything is sent, for a value that does not fit.
+        `wide` is for 16-bit integers; those of the guide (13.14, 15.60 to 15.63) are sent so by themselves. With
+        `high_resolution` a value without declared decimals counts in tenths of what a read returns. `verify` reads
+        back, and raises VerifyFailed if the value differs. Raises InvalidCommand, before anything is sent, for a value
+        that does not fit.
         """
-        menu, number = parse_parameter(parameter)
-        command = self._write(menu, number, value, wide=wide, high_resolution=high_resolution, idempotent=idempotent)
-        if verify:
+        place = self._place(parameter)
+        command = place.write(value, wide=wide, high_resolution=high_resolution)
+        requests = SeveralRequests(self.node, options)
+        if requests.verify:
             self._check_readable()
-        await self.node.request(command, priority=priority, start_within=start_within)
-        if verify:
-            check = Read(menu, number)
-            found = await self.node.request(check, priority=priority)
+        await requests.request(command)
+        if requests.verify:
+            check = Read(place.menu, place.number)
+            found = await requests.read_back(check)
             if abs(found * 10 - command.value) >= 10 if high_resolution else found != command.value:
                 raise VerifyFailed(
-                    f"{parameter} reads {found} after {command.text} was written",
-                    node=self.node.label,
-                    command=str(check),
+                    f"{parameter} reads {found} after {command.text} was written", node=self.node, command=str(check)
                 )
 
     async def write_all(
-        self, parameter: str, value: float, *, wide: bool = False, high_resolution: bool = False
+        self,
+        parameter: str,
+        value: float,
+        *,
+        wide: bool = False,
+        high_resolution: bool = False,
+        **options: Unpack[CommandOptions],
     ) -> None:
         """Write a parameter of every drive on the line at once (address 0). None answers."""
-        menu, number = parse_parameter(parameter)
-        everyone = self.node.bus.node(mentor.PROFILE, 0)
-        await everyone.request(self._write(menu, number, value, wide=wide, high_resolution=high_resolution))
+        command = self._place(parameter).write(value, wide=wide, high_resolution=high_resolution)
+        await self.bus.node(mentor.PROFILE, 0).request(command, **options)
 
     async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
         """As `point(item).read()`; a run without `chain` parameter by parameter, which is always safe."""
@@ -187,20 +206,11 @@ class MentorDrive(Handle):
         if self.node.address == self.profile.broadcast:
             raise InvalidCommand("mentor: a read cannot go to all drives: they would answer at once")
 
-    def _write(
-        self,
-        menu: int,
-        number: int,
-        value: float,
-        *,
-        wide: bool = False,
-        high_resolution: bool = False,
-        idempotent: bool = False,
-    ) -> Write:
-        decimals = self._decimals.get((menu, number))
-        if decimals is not None:
-            decimals += high_resolution
-        return Write(menu, number, to_line(value, decimals), wide, high_resolution, idempotent)
+    def _place(self, text: str) -> Place:
+        """Where a parameter is, by number or name; a name brings the guide's decimals unless others are declared."""
+        where = place_of(text)
+        decimals = NAMED[text].decimals if text in NAMED else 0
+        return Place(*where, self._decimals.get(where, decimals or None))
 
     def _values(self, run: ReadRun, sent: Sequence[int]) -> tuple[float, ...]:
         parameters = _parameters(run)
@@ -214,8 +224,14 @@ class ScaledPoint(Point[T]):
     decimals: tuple[int | None, ...]
 
 
+def place_of(text: str) -> tuple[int, int]:
+    """Menu and number of "1.17", "01.17", or a name that the guide gives. Raises InvalidCommand for anything else."""
+    named = NAMED.get(str(text))  # whatever it is: what is no text is refused below
+    return parse_parameter(text) if named is None else named.place
+
+
 def _parameters(run: ReadRun) -> list[tuple[int, int]]:
-    return [(run.menu, run.number + i) for i in range(run.count)]
+    return [(run.menu, run.number + run.step * i) for i in range(run.count)]
 
 
 def to_line(value: float, decimals: int | None) -> int:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from busmaster.contract.items import Item
 from busmaster.protocols.modbus.capture import ModbusDialect
 from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
 from busmaster.protocols.modbus.handle import ModbusUnit, is_whole
-from busmaster.registry import NodeKind, Protocol, device_of
+from busmaster.registry import NodeKind, Option, Protocol, device_of
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -17,7 +18,19 @@ PROTOCOL = Protocol(
             items="holding:100, input:100, coil:5, discrete:5 (addresses as sent, 0 to 65535); holding:100:10 (ten "
             "from there on); holding:100:float32 (int16 uint16 int32 uint32 float32 float64, most significant word "
             "first; :swapped behind it for the other order)",
+            documented=(
+                Item("coil:0-65535", "0-65535", "a bit, read by function 1, written by 5 and 15", access="read/write"),
+                Item("discrete:0-65535", "0-65535", "an input bit, read by function 2", access="read"),
+                Item(
+                    "holding:0-65535",
+                    "0-65535",
+                    "a register of 16 bits, read by function 3, written by 6 and 16",
+                    access="read/write",
+                ),
+                Item("input:0-65535", "0-65535", "an input register of 16 bits, read by function 4", access="read"),
+            ),
             whole_numbers=is_whole,
+            emulated=(Option("size", "whole"), Option("functions", "numbers"), Option("read_only", "numbers")),
             capture_id=7,
         ),
     ),

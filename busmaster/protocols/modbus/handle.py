@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
-from busmaster.bus.handle import Handle, Send, is_decimal, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, item_text, unknown_item
 from busmaster.bus.points import Point
+from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
+from busmaster.contract.arguments import is_decimal
 from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols.modbus.codec import (
@@ -21,9 +23,6 @@ from busmaster.protocols.modbus.codec import (
     WriteRegisters,
 )
 from busmaster.protocols.modbus.numbers import FORMS, Number
-
-if TYPE_CHECKING:
-    from busmaster.bus.node import Priority
 
 BITS = ("coil", "discrete")
 WRITABLE = ("coil", "holding")
@@ -80,21 +79,19 @@ class Place:
             return tuple(raw)
         return raw[0] if self.is_bit else self.number.decode(raw)
 
-    def write(self, values: Sequence[Any], idempotent: bool = False) -> list[WriteCoils | WriteRegisters]:
+    def write(self, values: Sequence[Any]) -> list[WriteCoils | WriteRegisters]:
         """What writes the values here and behind, in as many exchanges as it takes. Raises InvalidCommand."""
         if not values or (self.count is not None and len(values) != self.count):
             wanted = "a value" if self.count is None else f"{self.count} values"
             raise InvalidCommand(f"{self.table} {self.first} takes {wanted}, not {len(values)}")
         if self.is_bit:
             return [
-                WriteCoils(self.first + i, tuple(values[i : i + MOST_BITS_WRITTEN]), idempotent)
+                WriteCoils(self.first + i, tuple(values[i : i + MOST_BITS_WRITTEN]))
                 for i in range(0, len(values), MOST_BITS_WRITTEN)
             ]
         words = [word for value in values for word in self.number.encode(value)]
         most = MOST_WRITTEN - MOST_WRITTEN % self.width  # a number is never torn
-        return [
-            WriteRegisters(self.first + i, tuple(words[i : i + most]), idempotent) for i in range(0, len(words), most)
-        ]
+        return [WriteRegisters(self.first + i, tuple(words[i : i + most])) for i in range(0, len(words), most)]
 
 
 def is_whole(item: str) -> bool:
@@ -132,37 +129,27 @@ class ModbusUnit(Handle):
             encode=encode if place.table in WRITABLE else None,
         )
 
-    async def read(
-        self,
-        item: str,
-        *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> Any:
-        """What an item holds now. Raises Refused, with the exception's name, for what the unit does not have."""
-        return await self.point(item).read(priority=priority, start_within=start_within, retries=retries)
+    @classmethod
+    def items(cls) -> tuple[str, ...]:
+        return ()
 
-    async def write(
-        self,
-        item: str,
-        *values: float,
-        verify: bool = False,
-        idempotent: bool = False,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-    ) -> None:
+    async def read(self, item: str, **options: Unpack[ReadOptions]) -> Any:
+        """What an item holds now. Raises Refused, with the exception's name, for what the unit does not have."""
+        return await self.point(item).read(**options)
+
+    async def write(self, item: str, *values: float, **options: Unpack[WriteOptions]) -> None:
         """Write values to an item and what lies behind it, acknowledged; at address 0 to all units: none answers.
 
         More than 123 registers or 1968 coils go in several exchanges: if one fails, those before it are stored.
         `verify` reads back, and raises VerifyFailed where a value differs. `idempotent` allows a retry after an unknown
         outcome. Raises InvalidCommand, before anything is sent, for a value that does not fit.
         """
-        commands = self._writes(item, values, idempotent)
+        commands = self._writes(item, values)
+        requests = SeveralRequests(self.node, options)
         for command in commands:
-            await self.node.request(command, priority=priority, start_within=start_within)
-        for command in commands if verify else ():
-            await self._verify(command, priority)
+            await requests.request(command)
+        for command in commands if requests.verify else ():
+            await self._verify(requests, command)
 
     def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
         """Consecutive places, in as few exchanges as they fit."""
@@ -176,22 +163,22 @@ class ModbusUnit(Handle):
         suffix = f":{kind}" if kind else ""
         return tuple(f"{place.table}:{place.first + i * place.width}{suffix}" for i in range(count))
 
-    def _writes(self, item: str, values: Sequence[Any], idempotent: bool = False) -> list[WriteCoils | WriteRegisters]:
+    def _writes(self, item: str, values: Sequence[Any]) -> list[WriteCoils | WriteRegisters]:
         place = Place.parse(item)
         if place.table not in WRITABLE:
             raise InvalidCommand(f"{self.node.label}: {item} is read-only")
-        return place.write(values, idempotent)
+        return place.write(values)
 
-    async def _verify(self, written: WriteCoils | WriteRegisters, priority: Priority | None) -> None:
+    async def _verify(self, requests: SeveralRequests, written: WriteCoils | WriteRegisters) -> None:
         count = len(written.values)
         check: ReadBits | ReadRegisters = (
             ReadBits(written.first, count) if isinstance(written, WriteCoils) else ReadRegisters(written.first, count)
         )
-        found: tuple[int, ...] = await self.node.request(check, priority=priority)
+        found: tuple[int, ...] = await requests.read_back(check)
         for place, (now, wanted) in enumerate(zip(found, written.values, strict=True), written.first):
             if now != wanted:
                 raise VerifyFailed(
                     f"{check.table} {place} reads {int(now)} after {int(wanted)} was written",
-                    node=self.node.label,
+                    node=self.node,
                     command=str(check),
                 )

@@ -8,7 +8,6 @@ Which data addresses and flags exist, and which may be written, is the controlle
 
 from __future__ import annotations
 
-import enum
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from busmaster.contract.profile import Batch, LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.msc.exchange import UNITS, PacketExchange, Reply, StalePacketListener, packet
+from busmaster.protocols.msc.status import ProgramStatus
 from busmaster.wire.readers import ACK
 
 T = TypeVar("T")
@@ -30,29 +30,6 @@ FLAGS = 256
 HIGHEST_ADDRESS = 0xFFFF
 LOWEST_VALUE = -(2**31)
 HIGHEST_VALUE = 2**31 - 1
-
-
-class ProgramStatus(enum.IntFlag):
-    """The macroprogram status word, by the document's table of that name."""
-
-    PROGRAM_RUNNING = 1
-    BATTERY_LOW = 2
-    RAM_NOT_RELIABLE = 4
-    SYSTEM_RESET = 8
-    """The system has been reset, the program was cleared."""
-    RETURN_INTERRUPT = 16
-    FAULT_INTERRUPT = 32
-    AUTO_START_ENABLED = 64
-    """The program starts on power-up."""
-    SYSTEM_TEST = 128
-    LOAD_OVER_RUNNING_PROGRAM = 256
-    CHECKSUM_INCORRECT = 512
-    LOAD_IN_PROGRESS = 1024
-    LOAD_OUT_OF_SEQUENCE = 2048
-    BAD_OPCODE = 4096
-    STACK_OVERFLOW = 8192
-    STACK_UNDERFLOW = 16384
-    INTERRUPT_TABLE_FULL = 32768
 
 
 class _Reading:
@@ -334,5 +311,6 @@ PROFILE = Profile(
     checks=(ReadStatus(), ReadFlag(0)),
     exchange_limit=2.0,
     listen=StalePacketListener,
+    fixed_rate=True,
 )
 """The document gives no times."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+from typing import Any, ClassVar, NoReturn, Unpack
 
-from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
-from busmaster.bus.node import Node, Priority
+from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
+from busmaster.bus.requester import CommandOptions, NodeSource, Priority, ReadOptions, SeveralRequests, WriteOptions
+from busmaster.contract.arguments import is_decimal
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
@@ -23,15 +24,12 @@ from busmaster.protocols.msc.codec import (
     DataRead,
     DataWrite,
     Merging,
-    ProgramStatus,
     ReadFlag,
     ReadFlags,
     ReadStatus,
     SetFlag,
 )
-
-if TYPE_CHECKING:
-    from busmaster.bus.bus import Bus
+from busmaster.protocols.msc.status import ProgramStatus
 
 MODELS_WITH_RFLAGS = frozenset({"MSC-250", "MSC-850/32"})
 ADDRESS_STEPS = (1, 4)
@@ -57,7 +55,7 @@ class MscController(Handle):
 
     def __init__(
         self,
-        bus: Bus,
+        bus: NodeSource,
         address: int,
         *,
         symbols: Mapping[str, int] | None = None,
@@ -70,11 +68,11 @@ class MscController(Handle):
         self.symbols = dict(symbols or {})
         for name, symbol in self.symbols.items():
             DataRead(symbol)
-            if not name or name in self.items() or name.isdigit() or set(name) & set(":=, "):
+            if not name or name in self.items() or is_decimal(name) or set(name) & set(":=, "):
                 raise InvalidCommand(f"{name!r} cannot be the name of a symbol")
         known = Merging(address_step, model in MODELS_WITH_RFLAGS)
         profile = self.profile if known == Merging() else replace(self.profile, merge=known)
-        self.node: Node = bus.node(profile, address, timings=timings, retries=retries)
+        super().__init__(bus, address, timings=timings, retries=retries, profile=profile)
 
     @property
     def address_step(self) -> int | None:
@@ -157,47 +155,20 @@ class MscController(Handle):
 
     # values
 
-    async def read(
-        self,
-        where: int | str,
-        *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> int:
+    async def read(self, where: int | str, **options: Unpack[ReadOptions]) -> int:
         """The value at a data address or symbol, now. Raises Refused for an address outside the data area."""
-        command = DataRead(self.address_of(where))
-        return await self.node.request(command, priority=priority, start_within=start_within, retries=retries)
+        return await self.node.request(DataRead(self.address_of(where)), **options)
 
-    async def write(
-        self,
-        where: int | str,
-        value: int,
-        *,
-        verify: bool = False,
-        idempotent: bool = False,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-    ) -> None:
+    async def write(self, where: int | str, value: int, **options: Unpack[WriteOptions]) -> None:
         """Write one value, acknowledged.
 
         `verify` reads it back, and raises VerifyFailed if it differs. `idempotent` allows a retry after an unknown
         outcome: not where the program consumes what is written. Raises InvalidCommand, before anything is sent, for
         what is no signed 32-bit number.
         """
-        await self.write_block(
-            where, [value], verify=verify, idempotent=idempotent, priority=priority, start_within=start_within
-        )
+        await self.write_block(where, [value], **options)
 
-    async def read_block(
-        self,
-        where: int | str,
-        count: int,
-        *,
-        priority: Priority | None = None,
-        start_within: float | None = None,
-        retries: int | None = None,
-    ) -> tuple[int, ...]:
+    async def read_block(self, where: int | str, count: int, **options: Unpack[ReadOptions]) -> tuple[int, ...]:
         """`count` consecutive values, 32 an exchange: not all of one moment, if they are more.
 
         Where the last 32 would reach beyond the data area and are refused, the values are read one by one. Raises
@@ -205,8 +176,9 @@ class MscController(Handle):
         """
         address = self.address_of(where)
         values: list[int] = []
+        requests = SeveralRequests(self.node, options)
         for part in reads(address, count, self.address_step):
-            values += await self._read_part(part, priority=priority, start_within=start_within, retries=retries)
+            values += await self._read_part(part, requests.request)
         return tuple(values)
 
     async def write_block(
@@ -214,11 +186,8 @@ class MscController(Handle):
         where: int | str,
         values: Iterable[int],
         *,
-        verify: bool = False,
-        idempotent: bool = False,
-        priority: Priority | None = None,
-        start_within: float | None = None,
         progress: Progress | None = None,
+        **options: Unpack[WriteOptions],
     ) -> None:
         """Write consecutive values: whole blocks of 32, and what is left one by one, so that nothing else is touched.
 
@@ -229,14 +198,13 @@ class MscController(Handle):
         """
         address = self.address_of(where)
         wanted = tuple(values)
-        done = Count(progress, len(wanted) * (1 + verify))
+        requests = SeveralRequests(self.node, options)
+        done = Count(progress, len(wanted) * (1 + requests.verify))
         for command, size in writes(address, wanted, self.address_step):
-            await self.node.request(
-                command, priority=priority, start_within=start_within, idempotent=idempotent or None
-            )
+            await requests.request(command)
             done.add(size)
-        if verify:
-            await self._verify(address, wanted, priority, done)
+        if requests.verify:
+            await self._verify(address, wanted, requests, done)
 
     async def load_cam(
         self,
@@ -244,20 +212,15 @@ class MscController(Handle):
         values: Iterable[int],
         *,
         progress: Progress | None = None,
-        priority: Priority | None = None,
+        **options: Unpack[ReadOptions],
     ) -> None:
         """Write a CAM table and verify it: `write_block` in the background of other traffic, repeated where uncertain.
 
         Load it while the program does not use it. If this raises, part of the table is stored: load it again.
         """
-        await self.write_block(
-            where,
-            values,
-            verify=True,
-            idempotent=True,
-            priority=Priority.BACKGROUND if priority is None else priority,
-            progress=progress,
-        )
+        if options.get("priority") is None:
+            options["priority"] = Priority.BACKGROUND
+        await self.write_block(where, values, progress=progress, verify=True, idempotent=True, **options)
 
     async def find_address_step(self, where: int | str) -> int:
         """Find what the address grows by from one value to the next, and keep it in `address_step`.
@@ -281,27 +244,28 @@ class MscController(Handle):
 
     # flags and status
 
-    async def flag(self, number: int, *, priority: Priority | None = None) -> bool:
+    async def flag(self, number: int, **options: Unpack[ReadOptions]) -> bool:
         """Whether a flag (input, output, timer, motor status or user flag), 0 to 255, is on."""
-        return await self.node.request(ReadFlag(number), priority=priority)
+        return await self.node.request(ReadFlag(number), **options)
 
-    async def set_flag(self, number: int, *, priority: Priority | None = None) -> None:
+    async def set_flag(self, number: int, **options: Unpack[CommandOptions]) -> None:
         """Turn an output flag or user flag on. Raises Refused for another."""
-        await self.node.request(SetFlag(number), priority=priority)
+        await self.node.request(SetFlag(number), **options)
 
-    async def clear_flag(self, number: int, *, priority: Priority | None = None) -> None:
+    async def clear_flag(self, number: int, **options: Unpack[CommandOptions]) -> None:
         """Turn an output flag or user flag off. Raises Refused for another."""
-        await self.node.request(ClearFlag(number), priority=priority)
+        await self.node.request(ClearFlag(number), **options)
 
-    async def flags(self, *, priority: Priority | None = None) -> frozenset[int]:
+    async def flags(self, **options: Unpack[ReadOptions]) -> frozenset[int]:
         """The flags that are on: in one exchange where the model can, else in 256."""
         if self._merging.all_flags:
-            return await self.node.request(ReadFlags(), priority=priority)
-        return frozenset([flag for flag in range(FLAGS) if await self.flag(flag, priority=priority)])
+            return await self.node.request(ReadFlags(), **options)
+        requests = SeveralRequests(self.node, options)
+        return frozenset([flag for flag in range(FLAGS) if await requests.request(ReadFlag(flag))])
 
-    async def status(self, *, priority: Priority | None = None) -> ProgramStatus:
+    async def status(self, **options: Unpack[ReadOptions]) -> ProgramStatus:
         """The macroprogram status word."""
-        return await self.node.request(ReadStatus(), priority=priority)
+        return await self.node.request(ReadStatus(), **options)
 
     # inside
 
@@ -311,25 +275,25 @@ class MscController(Handle):
         merge = self.node.profile.merge
         return merge if isinstance(merge, Merging) else Merging()
 
-    async def _read_part(self, part: Part, **options: Any) -> tuple[int, ...]:
+    async def _read_part(self, part: Part, ask: Callable[[Command[Any]], Awaitable[Any]]) -> tuple[int, ...]:
         step = self.address_step
         try:
-            found = await self.node.request(part.command, **options)
+            found = await ask(part.command)
         except Refused:
             if part.size in (1, BLOCK) or step is None:
                 raise
             places = [place(part.at, i, step) for i in range(part.size)]
-            return tuple([await self.node.request(DataRead(at), **options) for at in places])
+            return tuple([await ask(DataRead(at)) for at in places])
         return found[: part.size] if isinstance(found, tuple) else (found,)
 
-    async def _verify(self, address: int, wanted: Sequence[int], priority: Priority | None, done: Count) -> None:
+    async def _verify(self, address: int, wanted: Sequence[int], requests: SeveralRequests, done: Count) -> None:
         index = 0
         for part in reads_back(address, len(wanted), self.address_step):
-            for found in await self._read_part(part, priority=priority):
+            for found in await self._read_part(part, requests.read_back):
                 if found != wanted[index]:
                     raise VerifyFailed(
                         f"value {index} from data {address} on reads {found} after {wanted[index]} was written",
-                        node=self.node.label,
+                        node=self.node,
                     )
                 index += 1
             done.add(part.size)
@@ -385,14 +349,14 @@ class Run(Point[tuple[int, ...]]):
     def writable(self) -> bool:
         return True
 
-    async def read(self, *, max_age: float | None = None, **options: Any) -> tuple[int, ...]:
+    async def read(self, *, max_age: float | None = None, **options: Unpack[ReadOptions]) -> tuple[int, ...]:
         """As `Point.read`; `MscController.read_block` where it is longer than a block."""
         if self.count <= BLOCK:
             return await Point.read(self, max_age=max_age, **options)
         return await self.handle.read_block(self.address, self.count, **options)
 
-    async def write(self, value: Sequence[int], *, priority: Priority | None = None, **options: Any) -> None:
+    async def write(self, value: Sequence[int], **options: Unpack[WriteOptions]) -> None:
         """As `MscController.write_block`. Raises InvalidCommand unless there are as many values as in the run."""
         if len(value) != self.count:
             raise InvalidCommand(f"{self.node.label}: {self.item} takes {self.count} values, not {len(value)}")
-        await self.handle.write_block(self.address, value, priority=priority, **options)
+        await self.handle.write_block(self.address, value, **options)

@@ -11,16 +11,18 @@ from __future__ import annotations
 import string
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
-from busmaster import InvalidCommand, Point, Refused
-from busmaster.bus.handle import Handle, unknown_item
+from busmaster import InvalidCommand, Point, Refused, VerifyFailed
+from busmaster.bus.handle import Handle, encoder, unknown_item
+from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
 from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import MORE, Command, Done, FrameError, Need, Sizes, no_reply
+from busmaster.contract.items import Item
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
-from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.device import Delay, Device, held
 from busmaster.emulator.oracle import Oracle
 from busmaster.registry import NodeKind, Option, Protocol, everywhere
 from busmaster.wire.readers import SingleLeg
@@ -103,6 +105,7 @@ class Turnstile(Handle):
         line=LineSettings(9600),
         timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.1, lateness=0.15, byte_gap=0.02)),
         probe=Count("a"),
+        shares_line_with=frozenset({"mentor"}),
     )
 
     def __init__(self, bus: Any, address: int, *, gate: int = 1, **options: Any) -> None:
@@ -115,15 +118,35 @@ class Turnstile(Handle):
             raise unknown_item(item, ("gate",), "a counter, a to z, or gate")
         return Point(self.node, item, Count(counter), encode=lambda value: Preset(counter, value))
 
+    async def read(self, item: str, **options: Unpack[ReadOptions]) -> int:
+        return await self.point(item).read(**options)
+
+    async def write(self, item: str, value: int, **options: Unpack[WriteOptions]) -> None:
+        point, requests = self.point(item), SeveralRequests(self.node, options)
+        await requests.request(encoder(point)(value))
+        if requests.verify and await requests.read_back(point.command) != value:
+            raise VerifyFailed(f"{item} is not {value}", node=self.node)
+
+    @classmethod
+    def items(cls) -> tuple[str, ...]:
+        return ("gate",)
+
 
 class EmulatedTurnstile(Device):
     """Counts in memory."""
 
-    def __init__(self, address: int, *, delay: Delay) -> None:
+    def __init__(self, address: int, *, delay: Delay, gate: int) -> None:
         super().__init__(address, delay=delay)
+        self.gate = string.ascii_lowercase[gate - 1]
         self.routes = (b"?%d" % address, b"!%d" % address)
         self.counts = dict.fromkeys(string.ascii_lowercase, 0)
         self._frame = b""
+
+    def preset(self, item: str, *values: float) -> None:
+        counter = self.gate if item == "gate" else item
+        if counter not in self.counts or len(values) != 1:
+            raise InvalidCommand(f"a turnstile has no counter {item!r}")
+        self.counts[counter] = held(values[0], 0, 0xFFFF, f"counter {counter}")
 
     def hear_byte(self, byte: int, now: float) -> None:
         self._frame = bytes((byte,)) if byte in b"?!" else self._frame + bytes((byte,))
@@ -172,10 +195,13 @@ class TallyDialect:
         return Count(request.item) if request.kind is Kind.READ else Preset(request.item, int(request.value))
 
 
-def make_device(address: int, /, *, delay: Delay, oracle: Oracle | None, lively: bool) -> Device:
+def make_device(address: int, /, *, delay: Delay, oracle: Oracle | None, lively: bool, gate: int = 1) -> Device:
     if oracle is not None:
         raise InvalidCommand("a turnstile has no oracle")
-    return EmulatedTurnstile(address, delay=delay)
+    return EmulatedTurnstile(address, delay=delay, gate=gate)
+
+
+GATE = Option("gate", "whole", "which counter the gate has, 1 for a")
 
 
 PROTOCOL = Protocol(
@@ -186,7 +212,15 @@ PROTOCOL = Protocol(
             Turnstile,
             make_device,
             items="a counter, a to z, or gate",
-            options=(Option("gate", "whole", "which counter the gate has, 1 for a"),),
+            documented=(
+                *(
+                    Item(letter, letter, "how many have passed", access="read/write")
+                    for letter in string.ascii_lowercase
+                ),
+                Item("gate", "", "the counter that the gate has", access="read/write"),
+            ),
+            options=(GATE,),
+            emulated=(GATE,),
             whole_numbers=everywhere,
         ),
     ),

@@ -1,0 +1,89 @@
+"""A dispatcher that tells whoever taps the line of each attempt: other lines pay nothing for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+from typing import Any
+
+from busmaster.arbiter.counters import LineCounters
+from busmaster.arbiter.deadlines import Deadlines
+from busmaster.arbiter.dispatcher import Dispatcher
+from busmaster.arbiter.tap import Attempt, Verdict
+from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.trust import SPOILING
+from busmaster.errors import BusError, Refused
+
+
+class TappedDispatcher(Dispatcher):
+    """A dispatcher whose `attempt` is what is on the wire, and whose events tell the end of each one."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._order_of_transactions = count(1)
+        self._numbers: dict[Transaction, int] = {}
+
+    def started(self, transaction: Transaction, now: float) -> None:
+        super().started(transaction, now)
+        if transaction.attempts == 1:
+            self._numbers[transaction] = next(self._order_of_transactions)
+        node = transaction.node
+        self.attempt = Attempt(
+            node.profile.name,
+            node.address,
+            transaction.command,
+            node.timings,
+            transaction=self._numbers[transaction],
+            number=transaction.attempts,
+            purpose=_purpose(transaction),
+        )
+
+    def succeeded(self, transaction: Transaction, value: Any, now: float) -> None:
+        self._over(transaction, Verdict.OK, value, now)
+        super().succeeded(transaction, value, now)
+
+    def attempt_failed(
+        self, transaction: Transaction, no_reply: bool, what: str, now: float, doubted: bool = False
+    ) -> None:
+        verdict = Verdict.NO_REPLY if no_reply else Verdict.SPOILT if what in SPOILING else Verdict.GARBLED
+        self._over(transaction, Verdict.DOUBTED if doubted else verdict, what, now)
+        super().attempt_failed(transaction, no_reply, what, now, doubted)
+
+    def broken(self, transaction: Transaction, bug: Exception, now: float) -> None:
+        self._over(transaction, Verdict.GARBLED, f"a bug in the protocol's reader: {bug!r}", now)
+        super().broken(transaction, bug, now)
+
+    def refused(self, transaction: Transaction, refusal: Refused, certain: bool, now: float) -> None:
+        self._over(transaction, Verdict.REFUSED, refusal.what, now)
+        super().refused(transaction, refusal, certain, now)
+
+    def cut_off(self, transaction: Transaction, error: BusError, now: float) -> None:
+        self._over(transaction, Verdict.CUT_OFF, error.what, now)
+        super().cut_off(transaction, error, now)
+
+    def _over(self, transaction: Transaction, verdict: Verdict, result: Any, now: float) -> None:
+        attempt, self.attempt = self.attempt, None
+        assert attempt is not None
+        attempt.late = transaction.late
+        attempt.heard = transaction.heard or transaction.check
+        attempt.end(verdict, result, now)
+        self.events.append(attempt)
+
+    def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:
+        self._numbers.pop(transaction, None)
+        super()._end(transaction, now, error)
+
+
+def make_dispatcher(
+    tapped: bool, deadlines: Deadlines, counters: LineCounters, now: float, capacity: int, jitter: Callable[[], float]
+) -> Dispatcher:
+    """Return the dispatcher of a line, see `Dispatcher`."""
+    return (TappedDispatcher if tapped else Dispatcher)(deadlines, counters, now, capacity, jitter)
+
+
+def _purpose(transaction: Transaction) -> str:
+    if transaction.check:
+        return "check"
+    if transaction.probe:
+        return "probe"
+    return "" if transaction.poll is None else f"poll {transaction.poll.name}".rstrip()

@@ -1,0 +1,163 @@
+"""What the nodes and the poll groups of one bus share: its line, its clocks, and what writes have made stale."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from math import inf
+from threading import current_thread, get_ident
+from typing import Any
+
+from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.transaction import Transaction
+from busmaster.bus.logbook import Logbook
+from busmaster.bus.points import Point
+from busmaster.bus.samples import Sample
+from busmaster.bus.snapshots import Snapshot
+from busmaster.errors import BusClosed, InvalidCommand
+from busmaster.transport.pump import Pump
+
+CLOCK_WAS_SET = 0.005
+"""Seconds by which two clocks do not differ by themselves between two looks at them."""
+
+
+class SharedLine:
+    """The line of one bus. `name` is its port's."""
+
+    def __init__(self, name: str, arbiter: Arbiter) -> None:
+        self.name = name
+        self.arbiter = arbiter
+        self.pump: Pump
+        self.logbook = Logbook(name)
+        self.closed = False
+        self.thread = 0
+        """In which its loop runs; 0 while the bus is not open."""
+        self.loop_runs: Callable[[], bool] = lambda: False
+        self.latest_of: dict[str, Snapshot] = {}
+        """The latest snapshot of each poll group, by the group's name."""
+        self.last_touched = -inf
+        """When the last write to anything ended."""
+        self._all_touched = -inf
+        self._touched: dict[object, float] = {}
+        self._written: dict[NodeRecord, float] = {}
+        self._wall_offset = inf
+
+    @property
+    def running(self) -> bool:
+        """Whether the bus is open, though its line may be down."""
+        return self.thread != 0
+
+    def bind(self, loop: asyncio.AbstractEventLoop) -> None:
+        """The bus is open from now on, and used from this thread, by this loop."""
+        self.loop_runs = loop.is_running
+        self.pump.bind(loop)
+        self.thread = get_ident()
+
+    def unbind(self) -> None:
+        """It is open no longer."""
+        self.thread = 0
+
+    # time
+
+    def now(self) -> float:
+        """Return the time of the bus's clock, in seconds: all its times are of this clock."""
+        return self.pump.clock()
+
+    def wall_offset(self) -> float:
+        """Return what is to be added to a time of the bus's clock for seconds since 1970, by the machine's clock now.
+
+        It stays the same to the bit until that clock is set.
+        """
+        offset = time.time() - self.now()
+        if abs(offset - self._wall_offset) > CLOCK_WAS_SET:
+            self._wall_offset = offset
+        return self._wall_offset
+
+    # polls
+
+    def prepare(self, poll: Poll) -> None:
+        """Do what a poll group's new preparation says, while the line goes on."""
+        self.arbiter.dispatcher.prepare_poll(poll, self.now())
+        self.pump.turn()
+
+    def demand(self, poll: Poll) -> None:
+        """Do what `PollGroup.demand` does."""
+        self.check_loop()
+        self.arbiter.demand(poll, self.now())
+        self.pump.turn()
+
+    def remove_poll(self, poll: Poll) -> None:
+        """End it; what it has on the wire goes unheard."""
+        self.arbiter.remove_poll(poll, self.now())
+        self.pump.turn()
+
+    def latest(self, point: Point[Any]) -> Sample[Any] | None:
+        """Return the youngest good sample of this point in any group, unless a write has made it stale."""
+        youngest = None
+        for snapshot in self.latest_of.values():
+            sample = snapshot.samples.get(point)
+            if sample is None or sample.error is not None or sample.started is None:
+                continue
+            if (youngest is None or sample.finished > youngest.finished) and not self.is_stale(point, sample.started):
+                youngest = sample
+        return youngest
+
+    # nodes
+
+    def suspend(self, record: NodeRecord, seconds: float) -> None:
+        """Do what `Node.suspend` does."""
+        self.check_loop()
+        self.arbiter.dispatcher.suspend(record, self.now() + seconds)
+        self.pump.turn()
+
+    def touched(self, write: Transaction, when: float) -> None:
+        """Note that a write is over: what was asked before is not newer than what it changed."""
+        self._touched[write.touches] = self._written[write.node] = self.last_touched = when
+        if write.node.address == write.node.profile.broadcast:
+            self._all_touched = when
+
+    def written_since(self, node: NodeRecord, started: float) -> bool:
+        """Return whether a write to this node, or to a point of it, has ended since then."""
+        return max(self._written.get(node, -inf), self._all_touched) > started
+
+    def is_stale(self, point: Point[Any], started: float) -> bool:
+        """Return whether a write to the point's quantity, or to all of its node, has ended since its read began."""
+        touched = self._touched
+        return max(touched.get(point.quantity, -inf), touched.get(point.node, -inf), self._all_touched) > started
+
+    # misuse
+
+    def check_loop(self) -> None:
+        """Raise InvalidCommand where an open bus is used from another thread, or from another event loop."""
+        if self.running and (get_ident() != self.thread or not self.loop_runs()):
+            self._check_elsewhere()
+
+    def _check_elsewhere(self) -> None:
+        """Its loop does not run here: right only in its own thread, between two runs of the loop."""
+        if get_ident() != self.thread or running_loop() is not None:
+            raise InvalidCommand(
+                f"the bus on {self.name} was used from thread {current_thread().name!r} outside the "
+                "event loop that opened it: hand the call to that loop, with portal.call (anyio.from_thread) or "
+                "asyncio.run_coroutine_threadsafe"
+            )
+
+    def not_open(self, *, record: NodeRecord | None = None, command: str | None = None) -> BusClosed:
+        """Return the error for what needs an open bus, before it is entered or after it was left."""
+        if not self.closed:
+            error = BusClosed("the bus is not open", node=record, command=command)
+        else:
+            hint = "make a new Bus: one is opened and closed once"
+            error = BusClosed("the bus was closed", node=record, command=command, hint=hint)
+        error.line = self.name
+        return error
+
+
+def running_loop() -> asyncio.AbstractEventLoop | None:
+    """Return the event loop of asyncio that runs in this thread, or None."""
+    try:
+        return asyncio.get_running_loop()
+    except RuntimeError:
+        return None

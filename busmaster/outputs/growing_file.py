@@ -1,0 +1,114 @@
+"""A file that grows by whole lines, whatever is done to it from outside.
+
+Who rotates it moves it away, who tidies up removes it, who empties it truncates it, and a crash leaves half a line
+behind: each is noticed at the next writing, and nothing goes where nobody looks for it.
+
+What was written survives the end of this process at once, and the end of the machine's power from the next sync on.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+
+FOLDER_MODE = 0o750
+
+
+class GrowingFile:
+    """`pattern` may hold fields of a date, in its folders too, which are then made. `mode` is narrowed by the umask.
+
+    A file that is empty begins with `head`. `tell` is told what somebody else did to it, in a sentence.
+    """
+
+    def __init__(
+        self,
+        pattern: str,
+        *,
+        mode: int = 0o640,
+        sync_every: float = 10.0,
+        head: bytes = b"",
+        tell: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._pattern = pattern
+        self._mode = mode
+        self._sync_every = sync_every
+        self._head = head
+        self._tell = tell
+        self._path = ""
+        self._descriptor: int | None = None
+        self._synced = time.monotonic()
+
+    def append(self, lines: bytes) -> None:
+        """Write whole lines, all of them or none. Raises OSError where that fails."""
+        while True:
+            descriptor = self._current()
+            self._write(descriptor, lines)
+            if os.fstat(descriptor).st_nlink:
+                break
+            self.close()  # it was removed while it was written: nobody will ever read that
+        if time.monotonic() - self._synced >= self._sync_every:
+            os.fsync(descriptor)
+            self._synced = time.monotonic()
+
+    def close(self) -> None:
+        """Let go of it. Never raises."""
+        if self._descriptor is not None:
+            descriptor, self._descriptor = self._descriptor, None
+            try:
+                os.fsync(descriptor)
+            except OSError:
+                pass  # a full or a lost disk has been told when it was written to
+            os.close(descriptor)
+
+    def _current(self) -> int:
+        """The file of today, opened if it is not."""
+        path = time.strftime(self._pattern)
+        if path != self._path:
+            self.close()
+            self._path = path
+        if self._descriptor is not None and not is_at(path, self._descriptor):
+            self._tell(f"{path} was moved or removed: another is begun")
+            self.close()
+        if self._descriptor is None:
+            self._descriptor = self._opened(path)
+        return self._descriptor
+
+    def _opened(self, path: str) -> int:
+        folder = os.path.dirname(path)
+        if folder and "%" in os.path.dirname(self._pattern):
+            os.makedirs(folder, FOLDER_MODE, exist_ok=True)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, self._mode)
+        if ends_in_a_half_line(path):
+            os.write(descriptor, b"\n")
+            self._tell(f"{path} ended in the middle of a line, which was closed off")
+        return descriptor
+
+    def _write(self, descriptor: int, lines: bytes) -> None:
+        """What the disk has no room for is cut off again."""
+        end = os.lseek(descriptor, 0, os.SEEK_END)
+        rest = memoryview(lines if end else self._head + lines)
+        try:
+            while rest:
+                rest = rest[os.write(descriptor, rest) :]
+        except OSError:
+            os.ftruncate(descriptor, end)
+            raise
+
+
+def is_at(path: str, descriptor: int) -> bool:
+    """Whether the open file is still what the path leads to."""
+    try:
+        return os.path.samestat(os.stat(path), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
+
+def ends_in_a_half_line(path: str) -> bool:
+    """Whether its last byte ends no line. A file that may not be read is believed to be whole."""
+    try:
+        with open(path, "rb") as file:
+            end = file.seek(0, os.SEEK_END)
+            return bool(end) and (file.seek(end - 1), file.read(1))[1] != b"\n"
+    except PermissionError:
+        return False

@@ -1,0 +1,107 @@
+"""What a database forgets: the oldest, a piece at a time, and never because somebody set the clock."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Callable
+
+DAY = 86_400.0
+EVERY = 60.0
+"""Seconds between two looks at what is too old, while nothing is."""
+AT_ONCE = 20_000
+"""Rows; so that no deletion holds the file for long. Ten times what one batch brings: it keeps up with any rate."""
+STEADY = DAY
+"""Seconds for which a clock that was set must have run evenly before anything is deleted by it."""
+WAS_SET = 60.0
+"""Seconds by which a clock does not drift from another between two looks: more, and somebody has set it."""
+MEGABYTE = 1_000_000
+
+
+class Retention:
+    """Forgets what is older than `days`, and the oldest of what is more than `megabytes`; None for no such limit.
+
+    A clock that was set is not believed for a day: one that jumps a year ahead must not delete a year of values. Nor is
+    one by which all that there is would be too old, as at a start with a wrong clock.
+    """
+
+    def __init__(
+        self, days: float | None, megabytes: float | None, tell: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self._days = days
+        self._bytes = None if megabytes is None else megabytes * MEGABYTE
+        self._tell = tell
+        self._next = 0.0
+        self._offset: float | None = None
+        self._believed_from = 0.0
+
+    def apply(self, database: sqlite3.Connection, tables: tuple[str, ...]) -> None:
+        """Delete a piece, if there is anything to be deleted; more of it at the next call. Each table has a `time`.
+
+        The first table is the large one: by it the size is brought down.
+        """
+        clock, now = time.time(), time.monotonic()
+        if self._bytes is not None and used(database) > self._bytes:
+            forget_oldest(database, tables)
+        if self._days is None:
+            return
+        trusted = self._trusts(database, tables, clock, now)
+        if now < self._next or not trusted:
+            return
+        deleted = max(delete_older(database, table, clock - self._days * DAY) for table in tables)
+        self._next = now if deleted >= AT_ONCE else now + EVERY
+
+    def _trusts(self, database: sqlite3.Connection, tables: tuple[str, ...], clock: float, now: float) -> bool:
+        """Whether the clock may be believed. It is looked at with every batch, so that no jump is missed."""
+        offset = clock - now
+        if self._offset is None:
+            newest = max((newest_of(database, table) for table in tables), default=None, key=lambda t: t or 0.0)
+            if newest is not None and self._days is not None and clock - newest > self._days * DAY:
+                self._doubt(f"by the clock all values are older than {self._days:g} days", now)
+        elif abs(offset - self._offset) > WAS_SET:
+            self._doubt(f"the clock was set by {offset - self._offset:+.0f} s", now)
+        self._offset = offset
+        return now >= self._believed_from
+
+    def _doubt(self, why: str, now: float) -> None:
+        self._believed_from = now + STEADY
+        self._tell(f"{why}: nothing is deleted for a day")
+
+
+def delete_older(database: sqlite3.Connection, table: str, moment: float) -> int:
+    """Delete a piece of what is older than a moment, the oldest first: how many rows."""
+    return database.execute(
+        f"delete from {table} where rowid in (select rowid from {table} where time < ? order by time limit ?)",
+        (moment, AT_ONCE),
+    ).rowcount
+
+
+def forget_oldest(database: sqlite3.Connection, tables: tuple[str, ...]) -> None:
+    """Delete the oldest piece of the first table, which is the large one, and what is older of the others."""
+    first, *others = tables
+    delete_oldest(database, first)
+    [oldest] = database.execute(f"select min(time) from {first}").fetchone()
+    for table in others if oldest is not None else ():
+        delete_older(database, table, oldest)
+
+
+def delete_oldest(database: sqlite3.Connection, table: str) -> None:
+    """Delete what was written first: a tenth, or a piece where that is more."""
+    first, last = database.execute(f"select min(rowid), max(rowid) from {table}").fetchone()
+    if first is not None:
+        piece = min(AT_ONCE, 1 + (last - first) // 10)
+        database.execute(f"delete from {table} where rowid < ?", (first + piece,))
+
+
+def newest_of(database: sqlite3.Connection, table: str) -> float | None:
+    """The time of the newest row; None if there is none."""
+    [newest] = database.execute(f"select max(time) from {table}").fetchone()
+    return None if newest is None else float(newest)
+
+
+def used(database: sqlite3.Connection) -> int:
+    """Bytes of the file that hold anything; what was deleted is used again before the file grows."""
+    [[pages], [free], [size]] = (
+        database.execute(f"pragma {name}").fetchone() for name in ("page_count", "freelist_count", "page_size")
+    )
+    return int((pages - free) * size)

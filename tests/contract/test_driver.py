@@ -1,0 +1,132 @@
+"""The one loop over feed, expired and Expect, and the host without a clock that is made of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from busmaster.contract.driver import MOST_LEGS, Driver, Ending, EndlessExchange
+from busmaster.contract.exchange import Expect, FrameError, Refused, Sizes, Step
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.msc import codec as msc
+
+ACK, NAK = b"\x06", b"\x15"
+VALUE = bytes.fromhex("02 30 31 35 03 37")
+PACKET = bytes.fromhex("02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D")
+BAD = PACKET[:-1] + b"\x00"
+
+
+def reading() -> Driver:
+    return Driver(hcp2.Read(1).open(1, hcp2.PROFILE.timings))
+
+
+def reading_packet() -> Driver:
+    return Driver(msc.DataRead(2008).open(1, msc.PROFILE.timings))
+
+
+def test_a_reply_ends_it_with_its_value_and_what_comes_later_is_left_over() -> None:
+    driver = reading().feed(VALUE[:2], VALUE[2:] + b"\x00")
+    assert driver.ending == Ending(5.0, rest=b"\x00")
+    driver.feed(b"\x7f")
+    assert driver.ending == Ending(5.0, rest=b"\x00\x7f")
+
+
+def test_it_goes_from_leg_to_leg_with_bytes_that_came_in_one_chunk() -> None:
+    driver = reading_packet().feed(ACK + PACKET)
+    assert driver.ending == Ending(1234, send=ACK)
+    assert driver.said == []
+
+
+def test_the_leg_that_is_awaited_has_its_own_times_and_has_not_begun() -> None:
+    driver = reading_packet()
+    assert (driver.timing, driver.begun) == (msc.PROFILE.timings.read, False)
+    driver.feed(ACK)
+    assert (driver.timing, driver.begun) == (msc.PROFILE.timings.packet, False)
+    driver.feed(PACKET[:4])
+    assert driver.begun
+
+
+def test_what_the_host_says_between_legs_is_told_in_order() -> None:
+    driver = reading_packet().feed(ACK, BAD)
+    assert driver.said == [NAK]
+    assert driver.ending is None
+    driver.feed(PACKET)
+    assert driver.ending == Ending(1234, send=ACK)
+
+
+def test_silence_ends_it_and_says_that_nothing_came() -> None:
+    ending = reading().run_out()
+    assert isinstance(ending.error, FrameError)
+    assert ending.silent
+    cut = reading().feed(VALUE[:3]).run_out()
+    assert isinstance(cut.error, FrameError)
+    assert not cut.silent
+    unfollowed = reading_packet().feed(ACK).run_out()
+    assert (unfollowed.silent, unfollowed.send) == (True, ACK)
+
+
+def test_a_cut_packet_is_asked_for_again_until_there_is_no_more_patience() -> None:
+    driver = reading_packet().feed(ACK, PACKET[:9])
+    ending = driver.run_out()
+    assert driver.said[0] == NAK
+    assert isinstance(ending.error, FrameError)
+
+
+def test_a_refusal_and_a_bug_end_it_too_and_only_one_is_a_bug() -> None:
+    refused = Driver(hcp2.Write(1, (5.0,)).open(1, hcp2.PROFILE.timings)).feed(NAK).ending
+    assert refused is not None
+    assert isinstance(refused.error, Refused)
+    assert not refused.is_bug
+    broken = Driver(Odd(None)).feed(b"1").ending
+    assert broken is not None
+    assert broken.is_bug
+
+
+def test_a_host_in_a_hurry_abandons_what_would_be_said_again() -> None:
+    driver = reading_packet().feed(ACK, BAD)
+    driver.abandon()
+    assert driver.said == []
+    assert driver.ending is not None
+    assert driver.ending.send == ACK
+    assert isinstance(driver.ending.error, FrameError)
+
+
+def test_noise_before_a_reply_is_left_out_for_a_profile_that_tolerates_it() -> None:
+    tolerant = Driver(hcp2.Read(1).open(1, hcp2.PROFILE.timings), noise_tolerant=True)
+    assert tolerant.feed(b"\x00", b"\xff" + VALUE[:1], VALUE[1:]).ending == Ending(5.0)
+    strict = reading().feed(b"\x00").ending
+    assert strict is not None
+    assert isinstance(strict.error, FrameError)
+
+
+@dataclass
+class Odd:
+    """An exchange whose every step is the same; none is a bug of its own."""
+
+    step: Step[Any] | None
+    request: bytes = b"?"
+    timing: Any = hcp2.PROFILE.timings.read
+    sizes: Sizes = field(default_factory=lambda: Sizes(1, 1))
+    later: tuple[Any, ...] = ()
+    closing: int = 0
+    starts: bytes = b"1"
+    answers: tuple[bytes, ...] = (b"1",)
+    owed: tuple[bytes, ...] = (b"1",)
+    answered: bool = True
+
+    def feed(self, _data: bytes, /) -> Step[Any]:
+        if self.step is None:
+            raise ZeroDivisionError("a bug")
+        return self.step
+
+    def expired(self, _started: bool, /) -> Any:
+        return self.step
+
+
+@pytest.mark.parametrize("end", [lambda driver: driver.feed(b"1").ending, lambda driver: driver.run_out()])
+def test_an_exchange_that_wants_one_leg_after_the_other_is_found_out(end: Any) -> None:
+    driver = Driver(Odd(Expect(hcp2.PROFILE.timings.read, Sizes(1, 1), NAK)))
+    assert isinstance(end(driver).error, EndlessExchange)
+    assert len(driver.said) == MOST_LEGS

@@ -1,0 +1,128 @@
+"""`python -m tests.mutation`: are the tests able to notice a change?
+
+    python -m tests.mutation --count 500 --seed 1 --jobs 2
+
+draws mutants of the arbiter, the contract, the wire, the codecs and the pump, runs the tests on each of them in a copy
+of what is committed, and writes each verdict into the session's file, from which the same command goes on after an
+interruption. `--report` only prints what the file holds. It wants the extra `mutation`, and hours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from tests.mutation.places import ROOMS, Mutant, drawn
+from tests.mutation.trial import Verdict, copied, tried
+
+ROOT = Path(__file__).parents[2]
+EQUIVALENT = Path(__file__).with_name("equivalent.json")
+"""Survivors that change nothing anybody can see, or tune what is no promise: each with its reason."""
+
+
+def main() -> None:
+    """Draw, try what has no verdict yet, and report."""
+    parser = argparse.ArgumentParser(prog="python -m tests.mutation", description="Do the tests notice a change?")
+    parser.add_argument("--count", type=int, default=500, help="how many mutants are drawn (500)")
+    parser.add_argument("--seed", type=int, default=1, help="which ones (1)")
+    parser.add_argument("--jobs", type=int, default=1, help="how many are tried at once (1)")
+    parser.add_argument("--rooms", default=",".join(ROOMS), help="of which rooms (all)")
+    parser.add_argument(
+        "--session", type=Path, help="the file of verdicts (mutation-SEED.jsonl, not in the repository)"
+    )
+    parser.add_argument(
+        "--near", action="store_true", help="run only the tests nearest to each room: quick, a lower bound"
+    )
+    parser.add_argument("--report", action="store_true", help="only print what the session's file holds")
+    options = parser.parse_args()
+    session = options.session or ROOT / f"mutation-{options.seed}.jsonl"
+    if not options.report:
+        mutants = drawn(ROOT, options.count, options.seed, frozenset(options.rooms.split(",")))
+        known = {key_of(verdict) for verdict in read(session)}
+        try_all([mutant for mutant in mutants if key_of(mutant.as_fields()) not in known], session, options)
+    report(read(session))
+
+
+def try_all(mutants: list[Mutant], session: Path, options: argparse.Namespace) -> None:
+    """Try them, some at once, each process in a copy of its own, and write each verdict as it comes."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        multiprocessing.Pool(options.jobs, start_in_a_copy, (Path(folder), options.near)) as pool,
+    ):
+        for number, (mutant, verdict) in enumerate(pool.imap_unordered(judged, mutants), 1):
+            fields = mutant.as_fields() | {"outcome": verdict.outcome, "seconds": verdict.seconds, "diff": verdict.diff}
+            with session.open("a") as file:
+                file.write(json.dumps(fields) + "\n")
+            say(f"{number}/{len(mutants)} {verdict.outcome:8} {verdict.seconds:6.0f} s  {mutant.module}:{mutant.line}")
+
+
+COPY: list[tuple[Path, bool]] = []
+"""The copy of this process, and whether only the nearest tests are run in it."""
+
+
+def start_in_a_copy(folder: Path, near: bool) -> None:
+    """Make a process its copy."""
+    COPY.append((copied(ROOT, folder / multiprocessing.current_process().name), near))
+
+
+def judged(mutant: Mutant) -> tuple[Mutant, Verdict]:
+    """Try it in this process's copy."""
+    return mutant, tried(mutant, *COPY[0])
+
+
+def read(session: Path) -> list[dict[str, Any]]:
+    """The verdicts so far."""
+    return [json.loads(line) for line in session.read_text().splitlines()] if session.exists() else []
+
+
+def say(text: str) -> None:
+    """Print it at once."""
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+def key_of(fields: dict[str, Any]) -> tuple[Any, ...]:
+    """What tells one mutant from another."""
+    return tuple(fields[name] for name in ("module", "operator", "occurrence"))
+
+
+def report(verdicts: Iterable[dict[str, Any]]) -> None:
+    """Print each room's score, and the survivors that are not known to be equivalent."""
+    excused = json.loads(EQUIVALENT.read_text()) if EQUIVALENT.exists() else {}
+    counts: Counter[tuple[str, str]] = Counter()
+    survivors = []
+    for verdict in verdicts:
+        outcome = verdict["outcome"]
+        if outcome == "survived" and changed(verdict["diff"]) in excused:
+            outcome = "excused"
+        if outcome == "survived":
+            survivors.append(verdict)
+        counts[verdict["room"], outcome] += 1
+    for verdict in survivors:
+        say(f"\n{verdict['module']}:{verdict['line']} {verdict['operator']}\n{changed(verdict['diff'])}")
+    say(f"\n{'room':10} {'killed':>7} {'excused':>8} {'survived':>9} {'score':>7}")
+    for room in [*ROOMS, "all"]:
+        killed, excused_ones, survived = (
+            sum(count for (where, what), count in counts.items() if what == outcome and room in (where, "all"))
+            for outcome in ("killed", "excused", "survived")
+        )
+        judged_ones = killed + survived
+        if judged_ones:
+            say(f"{room:10} {killed:7} {excused_ones:8} {survived:9} {killed / judged_ones:7.1%}")
+
+
+def changed(diff: str) -> str:
+    """The changed lines of a diff, without where they are: an excuse outlives the moving of a line."""
+    lines = [line for line in diff.splitlines() if line[:1] in "+-" and line[:3] not in ("+++", "---")]
+    return "\n".join(line[:1] + " " + line[1:].strip() for line in lines)
+
+
+if __name__ == "__main__":
+    main()

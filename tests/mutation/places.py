@@ -1,0 +1,112 @@
+"""What may be mutated, room by room, and a seeded sample of it.
+
+The operators are cosmic-ray's. Left out is what no test can notice: annotations, which are never evaluated here, and
+docstrings.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from random import Random
+from typing import Any
+
+ROOMS: dict[str, tuple[str, ...]] = {
+    "arbiter": ("busmaster/arbiter/*.py",),
+    "contract": ("busmaster/contract/*.py",),
+    "wire": ("busmaster/wire/*.py",),
+    "codecs": (
+        "busmaster/protocols/*/codec.py",
+        "busmaster/protocols/*/exchange.py",
+        "busmaster/protocols/*/blocks.py",
+    ),
+    "pump": ("busmaster/transport/pump.py", "busmaster/transport/marks.py"),
+}
+"""The rooms whose mutants count, by patterns of their files."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mutant:
+    """One change of one place: the `occurrence`-th that `operator` could make in `module`."""
+
+    room: str
+    module: str
+    operator: str
+    occurrence: int
+    line: int
+
+    def as_fields(self) -> dict[str, Any]:
+        """The fields by name, for a line of the session's file."""
+        return asdict(self)
+
+
+def places(root: Path) -> Iterator[Mutant]:
+    """All mutants of all rooms, in a fixed order."""
+    for room, patterns in ROOMS.items():
+        for path in sorted({path for pattern in patterns for path in root.glob(pattern)}):
+            yield from mutants_of(room, path, root)
+
+
+def mutants_of(room: str, path: Path, root: Path) -> Iterator[Mutant]:
+    """All mutants of one file."""
+    from cosmic_ray.ast import ast_nodes, get_ast_from_path
+    from cosmic_ray.plugins import get_operator, operator_names
+
+    inert = inert_spans(path.read_text())
+    tree = get_ast_from_path(path)
+    for name in sorted(operator_names()):
+        kind = get_operator(name)
+        if kind.arguments():
+            continue  # it wants a name that somebody has to think of
+        operator = kind()
+        spans = (span for node in ast_nodes(tree) for span in operator.mutation_positions(node))
+        for occurrence, (start, end) in enumerate(spans):
+            if not any(first <= start and end <= last for first, last in inert):
+                yield Mutant(room, str(path.relative_to(root)), name, occurrence, start[0])
+
+
+def inert_spans(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Where annotations, docstrings and imports for types are: (line, column) from the first to behind the last."""
+    found: list[ast.AST] = []
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.FunctionDef() | ast.AsyncFunctionDef():
+                found += [node.returns] if node.returns else []
+            case ast.arg(annotation=ast.expr() as annotation):
+                found.append(annotation)
+            case ast.AnnAssign():
+                found.append(node.annotation)
+                if ast.unparse(node.annotation).endswith("TypeAlias") and node.value:
+                    found.append(node.value)
+            case ast.If() if "TYPE_CHECKING" in ast.unparse(node.test):
+                found.append(node)
+            case ast.Expr(value=ast.Constant(value=str())):
+                found.append(node)
+    return [span_of(node) for node in found]
+
+
+def span_of(node: Any) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Where a node is."""
+    return (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)
+
+
+def drawn(root: Path, count: int, seed: int, rooms: frozenset[str]) -> list[Mutant]:
+    """A sample of `count` places, each with one of the changes that could be made there.
+
+    The same for the same seed and the same tree, in an order that is drawn too. A place counts once, however many
+    operators would fit: an addition has eleven, and ten of them any test notices.
+    """
+    changes: dict[tuple[object, ...], list[Mutant]] = {}
+    for mutant in places(root):
+        if mutant.room in rooms:
+            changes.setdefault(place_of(mutant), []).append(mutant)
+    chance = Random(seed)
+    return [chance.choice(changes[place]) for place in chance.sample(list(changes), min(count, len(changes)))]
+
+
+def place_of(mutant: Mutant) -> tuple[object, ...]:
+    """The place that it changes: operators that replace the same thing by others share it."""
+    replaced = mutant.operator.rpartition("_")[0] or mutant.operator
+    return mutant.module, replaced, mutant.line, mutant.occurrence
