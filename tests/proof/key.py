@@ -63,7 +63,7 @@ class View:
 
 def transactions(world: World) -> list[Transaction]:
     arbiter = world.arbiter
-    every = [t for queue in arbiter.dispatcher.backlog._queues for t in queue]
+    every = [t for queue in arbiter.dispatcher.backlog.queues for t in queue]
     every += [t for node in world.nodes for t in node.writes]
     return every if arbiter._wire.transaction is None else [arbiter._wire.transaction, *every]
 
@@ -92,13 +92,12 @@ def past_legs(view: View) -> None:
     holds moves all of them, so that they stay while it may."""
     world = view.world
     arbiter, leg = world.arbiter, world.arbiter._leg
-    leg.late_after = inf  # a reply that is late counts all the same, and without a raised lateness nothing else
     if view.past(leg.taint_until):
         leg.taint_until = -inf
     if arbiter.state is not EXCHANGE:
         leg.begun = False
         leg.begun_at = leg.taint_until = -inf
-        leg.limit = inf
+        leg.longest = 0
         if leg._follows is None:
             leg._follows_until = -inf
             if view.past(leg.end, leg.timing.lateness + leg.latency + leg.byte_time):
@@ -220,9 +219,7 @@ def past_waiting(view: View) -> None:
     arbiter._cause = ""
     if arbiter.noisy:
         dispatcher.fault = noisy
-    dispatcher._expiries = []
-    dispatcher._order = count()
-    urgent, command, *by_deadline = dispatcher.backlog._queues
+    urgent, command, *by_deadline = dispatcher.backlog.queues
     for first in (urgent, command):
         first._entries = deque(first)
     for other in by_deadline:
@@ -232,7 +229,7 @@ def past_waiting(view: View) -> None:
     backlog = dispatcher.backlog
     if not world.setup.may(setups.HEALTH):
         backlog._streak = 0
-    backlog._before = (0, BACKGROUND)
+    backlog._streak_before, backlog._rotated_before = 0, BACKGROUND
 
 
 def past_wire(view: View) -> None:

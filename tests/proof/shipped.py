@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
-from busmaster.arbiter import choice, health, in_step
+from busmaster.arbiter import alike, health, in_step
 from busmaster.arbiter.choice import Choice, Chosen
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import DOWN, SUSPECT, UP, NodeRecord
@@ -169,7 +169,9 @@ def set_aside(setup: Setup) -> Iterator[None]:
     put(in_step, "LAPSE", setup.lapse)
     put(in_step, "DOUBT_PERIOD", setup.doubt)
     put(in_step, "SAID_MEMORY", setup.said_memory)
-    put(choice, "LONGEST_ALIKE", setup.alike)
+    put(alike, "LONGEST_ALIKE", setup.alike)
+    put(alike, "LONGEST_STEADY", setup.alike + 1)
+    put(alike.Alike, "_was_untimely", _may_be_untimely)
     put(NodeRecord, "note_reply", _untimed(NodeRecord.note_reply) if setup.in_step else _notes_nothing)
     put(NodeRecord, "latest", _as_learned(NodeRecord.latest, setup.slowest))
     put(Strays, "blame", _may_raise if setup.may(RAISED) else _raises_nothing)
@@ -226,7 +228,7 @@ def _asking(right: Callable[..., Any]) -> Callable[..., Any]:
     return next_
 
 
-def _any_of_all(self: Choice, now: float, silent: float) -> Chosen | float | None:
+def _any_of_all(self: Choice, now: float, last_byte: float) -> Chosen | float | None:
     """Choose any time until which to wait, a check of any node, the first that waits, or another of its class."""
     dispatcher = self._dispatcher
     if Asker.saturated[0] or len(dispatcher.backlog):
@@ -243,11 +245,16 @@ def _any_of_all(self: Choice, now: float, silent: float) -> Chosen | float | Non
         return None
     first = transaction, transaction.command.open(transaction.node.address, transaction.node.timings)
     if len(dispatcher.backlog) and choose(2):
-        other = self._another(first, now, lambda answers: False)
+        other = self._another(first, now, lambda answers, node: False)
         if other is not None:
             dispatcher.backlog.restore(transaction)
             return other
     return first
+
+
+def _may_be_untimely(*arguments: Any) -> bool:
+    """How soon an answer came shows that it is its own, or not."""
+    return bool(choose(2))
 
 
 def _notes_nothing(*arguments: Any) -> None:

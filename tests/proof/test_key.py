@@ -65,7 +65,7 @@ def without_end_of_the_leg_on_the_wire(view: View) -> None:
 
 
 def without_limit(view: View) -> None:
-    view.world.arbiter._leg.limit = inf
+    view.world.arbiter._leg.longest = 0
 
 
 def without_taint(view: View) -> None:

@@ -7,7 +7,7 @@ from math import inf
 from typing import Any, ClassVar, TypeAlias
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Completed, Mark
+from busmaster.arbiter.events import Mark
 from busmaster.arbiter.state import EXCHANGE, OFFLINE
 from busmaster.arbiter.transaction import PARKED, URGENT, Transaction
 from busmaster.contract.timing import ReplyTiming, Timings
@@ -23,7 +23,7 @@ Action: TypeAlias = tuple[Any, ...]
 NAK = b"\x15"
 MOST_TURNS = 50
 """Turns of the pump in one event, before it is thought not to rest."""
-SECOND_TIMING = ReplyTiming(0.010, 0.030, 0.060, 0.010, turnaround=0.005)
+SECOND_TIMING = ReplyTiming(0.030, 0.030, 0.060, 0.010, turnaround=0.005)
 
 
 class World:
@@ -40,7 +40,11 @@ class World:
     def prepare(cls, setup: Setup) -> None:
         cls.setup = setup
         kind = KINDS[setup.kind]()
-        cls.kind = replace(kind, profile=replace(kind.profile, checks=(kind.check,)))
+        timings = kind.profile.timings
+        if not setup.in_step:  # `nominal` sorts replies that count into prompt and late ones
+            read, write, packet = (replace(t, nominal=t.window) for t in (timings.read, timings.write, timings.packet))
+            timings = Timings(read, write, packet)
+        cls.kind = replace(kind, profile=replace(kind.profile, checks=(kind.check,), timings=timings))
         cls.byte_time = cls.kind.profile.line.byte_time
 
     def __init__(self, now: Time) -> None:
@@ -143,8 +147,8 @@ class World:
                     self._write(out)
             ended = False
             while (event := arbiter.poll_event()) is not None:
-                if type(event) is Completed:
-                    self._judge(event.transaction, by)
+                if type(event) is Transaction:
+                    self._judge(event, by)
                 ended = True
             if self.frozen or not (self._asks_more() or out or ended):
                 self._check_rest()
@@ -165,7 +169,7 @@ class World:
         arbiter = self.arbiter
         wire = arbiter._wire
         held = [w for node in self.nodes for w in node.writes if w.phase is PARKED]
-        held += [transaction for queue in arbiter.dispatcher.backlog._queues for transaction in queue]
+        held += [transaction for queue in arbiter.dispatcher.backlog.queues for transaction in queue]
         held += [wire.transaction] if wire.transaction is not None else []
         if len(self.live) > sum(transaction.heard and transaction.waiter is not None for transaction in held):
             raise Violation("R8: a request is forgotten")
