@@ -29,7 +29,7 @@ def actions(world: World) -> list[Action]:
     possible += _bytes(world)
     possible += _strays(world)
     if world.unread:
-        possible += [("read", several) for several in {1 if setup.cuts else len(world.unread), len(world.unread)}]
+        possible += [("read", "all"), ("read", "first")] if setup.cuts else [("read", "all")]
     if world.held is not None and (arbiter._wire.output.held or not setup.assumptions.held_until_asked):
         possible.append(("leaves",))
     on_wire = world.on_wire
@@ -143,7 +143,7 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
         world.strays = 0
         world.hear(action[1], STRAY)
     elif what == "read":
-        world.read_unread(action[1])
+        world.read_unread(1 if action[1] == "first" else len(world.unread))
     elif what == "never":
         del world.owed[action[1]]
     elif what == "written":
