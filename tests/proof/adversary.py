@@ -118,7 +118,7 @@ def _instants(times: list[Time]) -> list[Instant]:
 
 def act(world: World, action: Action, now: Instant, later: Instant, script: tuple[int, ...]) -> None:
     """Let it happen now; `later` is any time from now on. Raises Violation, or Outside."""
-    Decided.by_answer[0] = False
+    Decided.by_answer[0] = AnyTime.chosen[0] = False
     Asker.ask[0] = world.ask_one
     Asker.saturated[0] = world.is_saturated
     AnyTime.at[0] = cast("float", later)

@@ -11,7 +11,7 @@ from tests.proof.instants import Bound, Instant, begin_run, instant, noted, set_
 from tests.proof.key import restore, save, share, simplify
 from tests.proof.msc_world import MscWorld
 from tests.proof.setups import Setup
-from tests.proof.shipped import set_aside
+from tests.proof.shipped import AnyTime, set_aside
 from tests.proof.wire import SCRIPT, Outside, Violation
 from tests.proof.world import Action, World
 from tests.proof.zones import Zone, at_most, copied, extended, less_than, opposite, origin, sample, tighten, within
@@ -42,11 +42,12 @@ class Explorer:
     def __init__(self, setup: Setup, progress: Callable[[Found, int], None] = lambda found, done: None) -> None:
         self.found = Found(setup)
         self._progress = progress
-        self._seen: dict[bytes, list[Zone]] = {}
+        self._seen: dict[bytes, list[tuple[Zone, int]]] = {}
+        """The zones of each key, each with its place among the states."""
         self._states: list[tuple[int, Step | None, bytes, Zone]] = []
         """Where each came from, and how; its key and its zone."""
-        self._quiet: dict[int, list[int]] = {}
-        """Where each comes to if nothing but a deadline happens, and nothing leaves."""
+        self._quiet: dict[int, set[int]] = {}
+        """Where each comes to where a deadline passes and nothing comes, waits for R15, or leaves."""
 
     def run(self, limit: float, violations: int = 8) -> Found:
         """Explore for at most so many seconds, or until so many kinds of violation are found."""
@@ -81,13 +82,16 @@ class Explorer:
         self._keep(-1, None, *save(world, zone))
 
     def _keep(self, parent: int, step: Step | None, key: bytes, zone: Zone) -> int:
+        """Remember a state, unless one that is known holds it. Returns the place of either."""
         known = self._seen.setdefault(key, [])
-        if any(within(zone, other) for other in known):
-            return -1
-        known.append(zone)
+        for other, place in known:
+            if within(zone, other):
+                return place
+        place = len(self._states)
+        known.append((zone, place))
         self._states.append((parent, step, key, zone))
         self.found.keys, self.found.zones = len(self._seen), len(self._states)
-        return len(self._states) - 1
+        return place
 
     def _expand(self, place: int) -> None:
         _, _, key, zone = self._states[place]
@@ -125,14 +129,29 @@ class Explorer:
             if problem:
                 self.found.violations.setdefault(problem, [*self.path(place), (action, script)])
             elif not outside:
-                said = world.said
+                waits = AnyTime.chosen[0] or world.held or world.unread or world.said
                 simplify(world, decided)
-                self._keep(place, (action, script), *save(world, decided))
-                if action[0] == "timer" and not said:
-                    pass
+                next_ = self._keep(place, (action, script), *save(world, decided))
+                if action == ("timer", "line") and not waits:
+                    self._quiet.setdefault(place, set()).add(next_)
 
     def _check_progress(self) -> None:
-        pass
+        """If nothing comes, deadlines lead to a request, or to a line that is READY: they never go round."""
+        follows = {place: len(next_) for place, next_ in self._quiet.items()}
+        before: dict[int, list[int]] = {}
+        for place, next_ in self._quiet.items():
+            for other in next_:
+                before.setdefault(other, []).append(place)
+        done = [place for place in before if place not in follows]
+        while done:
+            place = done.pop()
+            for other in before.get(place, ()):
+                follows[other] -= 1
+                if not follows[other]:
+                    done.append(other)
+        round_ = [place for place, left in follows.items() if left]
+        if round_:
+            self.found.violations["progress: deadlines go round and nothing leaves"] = self.path(min(round_))
 
     def path(self, place: int) -> list[Step]:
         """Return how a state was come to."""

@@ -8,7 +8,6 @@ again: then there are times for it, and the earliest are told.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from math import inf
 from typing import Any, TypeAlias
 
 from tests.proof.adversary import act, actions, window
@@ -81,7 +80,7 @@ def _endings(key: bytes, zone: Zone, steps: Sequence[Step], problem: str) -> Ite
 
 def _saved(world: World, zone: Zone) -> tuple[bytes, Zone]:
     simplify(world, zone, [past_waiting])
-    return save(world, zone, inf)
+    return save(world, zone, exact=True)
 
 
 def _timed(world: World, zone: Zone) -> list[Call]:

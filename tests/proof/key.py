@@ -30,7 +30,7 @@ from tests.proof.world import World
 from tests.proof.zones import FREE, Zone, widened
 
 LONGEST = 1.5
-"""Seconds beyond which it is not told apart how long ago something was, or is to be."""
+"""Seconds beyond which it is not told apart how long ago something was, or is to be; or twice R15's wait."""
 
 
 def noisy() -> LineNoisy:
@@ -385,10 +385,10 @@ def simplify(world: World, zone: Zone, forgotten: list[Callable[[View], None]] |
         forget(view)
 
 
-def save(world: World, zone: Zone, longest: float = LONGEST) -> tuple[bytes, Zone]:
+def save(world: World, zone: Zone, exact: bool = False) -> tuple[bytes, Zone]:
     """Return the key of a world that is simple already, and the zone of the instants that are in it. Instant 0 is now.
 
-    Beyond `longest`, in seconds, nothing is told apart.
+    Unless it is to be `exact`, the zone is widened where it is LONGEST.
     """
     _PLACES.begin(zone, world.now)
     into = io.BytesIO()
@@ -397,7 +397,7 @@ def save(world: World, zone: Zone, longest: float = LONGEST) -> tuple[bytes, Zon
     pickler.dump(world)
     kept = _PLACES.kept
     small = [[FREE if zone[i][j] >= FREE else zone[i][j] + 2 * (a - b) for j, b in kept] for i, a in kept]
-    return into.getvalue(), widened(small, ticks(longest)) if longest < inf else small
+    return into.getvalue(), small if exact else widened(small, ticks(max(LONGEST, 2 * world.setup.lapse)))
 
 
 def restore(key: bytes) -> World:

@@ -140,6 +140,8 @@ class AnyTime:
 
     at: ClassVar[list[float]] = [0.0]
     """Any time from now on, of the run."""
+    chosen: ClassVar[list[bool]] = [False]
+    """It was waited for in this step."""
 
 
 ANY_STEP = AnyStep()
@@ -235,6 +237,7 @@ def _any_of_all(self: Choice, now: float, last_byte: float) -> Chosen | float | 
         nodes = [node for node in dispatcher.nodes if node.health is not DOWN]
         which = choose(2 + len(nodes))
         if which == 1:
+            AnyTime.chosen[0] = True
             return AnyTime.at[0]
         if which > 1:
             node = nodes[which - 2]

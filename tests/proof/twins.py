@@ -66,9 +66,9 @@ def walk(setup: Setup, seed: int, forgotten: Sequence[Forgetting] = FORGOTTEN) -
 
 def _twin(world: World, forgotten: list[Forgetting]) -> World:
     simplify(world, origin(), [past_waiting])
-    copy = restore(save(world, origin(), float("inf"))[0])
+    copy = restore(save(world, origin(), exact=True)[0])
     simplify(copy, origin(), forgotten)
-    return restore(save(copy, origin(), float("inf"))[0])
+    return restore(save(copy, origin(), exact=True)[0])
 
 
 def _drop_too_late(world: World) -> None:

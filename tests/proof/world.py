@@ -9,6 +9,7 @@ from typing import Any, ClassVar, TypeAlias
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import Mark
 from busmaster.arbiter.state import EXCHANGE, OFFLINE
+from busmaster.arbiter.strays import QUIET
 from busmaster.arbiter.transaction import PARKED, URGENT, Transaction
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import LineDown, WriteUnconfirmed
@@ -21,6 +22,8 @@ from tests.proof.wire import OLD, OWN, STRAY, Outside, Owed, Ticket, Time, Viola
 
 Action: TypeAlias = tuple[Any, ...]
 NAK = b"\x15"
+LONGEST_FRAME = 256
+"""Bytes."""
 MOST_TURNS = 50
 """Turns of the pump in one event, before it is thought not to rest."""
 SECOND_TIMING = ReplyTiming(0.030, 0.030, 0.060, 0.010, turnaround=0.005)
@@ -177,8 +180,22 @@ class World:
             due: Time = arbiter._deadlines.line
             if type(due) is not Instant:
                 raise Violation(f"progress: {arbiter.state.name} has no end")
+            if due > self.now + self._longest_deadline():
+                raise Violation(f"progress: {arbiter.state.name} ends later than it may")
         elif arbiter.state.name == "READY" and len(arbiter.dispatcher.backlog):
             raise Violation("progress: the line is READY while something waits")
+
+    def _longest_deadline(self) -> float:
+        """No deadline of the line is further away: a lateness, or a window with its bytes, behind all that is being
+        said; or what R15 waits for."""
+        setup, byte_time = self.setup, self.byte_time
+        longest = 0.0
+        for node in self.nodes:
+            for timing in (node.timings.read, node.timings.write, node.timings.packet):
+                whole = timing.window + timing.byte_gap + LONGEST_FRAME * byte_time
+                longest = max(longest, whole, timing.lateness + timing.turnaround)
+        later = 2 * setup.receive_latency + QUIET + LONGEST_FRAME * byte_time
+        return longest + later + setup.lapse
 
     # what is promised
 
