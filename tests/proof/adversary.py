@@ -72,7 +72,9 @@ def _bytes(world: World) -> list[Action]:
             possible.append(("all", place, None))
             if reply.faults:
                 before = len(reply.packet) - len(reply.data)
-                possible += [("all", place, (at - before, bit)) for at, bit in setup.damage if at >= before]
+                possible += [
+                    ("all", place, (at - before, bit)) for at, bit in setup.damage if before <= at < len(reply.packet)
+                ]
             if not setup.bytewise:
                 continue
         possible.append(("byte", place, "right"))

@@ -97,6 +97,10 @@ def run(
                 break
             done, running = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
+                bug = future.exception()
+                if bug is not None:
+                    say(f"a world was not explored: {bug!r}")
+                    continue
                 result = {"code": code, **future.result()}
                 results[result["world"]] = result
                 file.write(json.dumps(result) + "\n")
