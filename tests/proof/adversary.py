@@ -77,6 +77,11 @@ def _bytes(world: World) -> list[Action]:
                 ]
             if not setup.bytewise:
                 continue
+        if setup.whole:
+            possible.append(("whole", place))
+            possible += [("byte", place, "nak")] if setup.may(setups.NAKS) else []
+            possible += [("never", place)] if setup.beyond else []
+            continue
         possible.append(("byte", place, "right"))
         read = world.words_are_read
         if reply.faults and setup.may(setups.LOST) and (read or not setup.assumptions.pauses_hold_the_lost):
@@ -106,9 +111,9 @@ def window(world: World, action: Action) -> tuple[list[Time], list[Time], list[T
             latest.append(world.unread_by)
     if what == "timer":
         earliest.append(getattr(deadlines, action[1]))
-    elif what in ("byte", "echo", "all"):
+    elif what in ("byte", "echo", "all", "whole"):
         reply = world.owed[action[1]]
-        more = len(reply.data) - 1 if what == "all" else 0
+        more = len(reply.data) - 1 if what in ("all", "whole") else 0
         earliest.append(reply.lo + more * world.byte_time)
         (latest if reply.kind == "echo" else before).append(reply.hi + more * reply.gap)
     return _instants(earliest), _instants(latest), _instants(before)
@@ -141,6 +146,10 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
     elif what == "all":
         assert isinstance(world, MscWorld)
         world.hear_all(world.owed[action[1]], action[2])
+    elif what == "whole":
+        reply = world.owed.pop(action[1])
+        world.over(reply)
+        world.hear(reply.data, reply.origin)
     elif what == "stray":
         world.strays = 0
         world.hear(action[1], STRAY)

@@ -114,6 +114,8 @@ class Setup:
     lost_acknowledgements: int = 0
     """Of an MSC's packets: how many closing ACKs of the host are lost in an exchange."""
     retransmissions: int = 1
+    whole: bool = False
+    """Replies come whole, in one chunk."""
     cuts: bool = False
     """What lies in an adapter or the kernel may be read in two pieces; else all of it is read at once."""
     bytewise: bool = False
@@ -124,7 +126,7 @@ class Setup:
     @property
     def name(self) -> str:
         parts = [self.kind, "asks " + ",".join(str(place) for place in self.commands)]
-        parts += [word for word in ("in_step", "paced", "echo", "strict") if getattr(self, word)]
+        parts += [word for word in ("in_step", "whole", "paced", "echo", "strict") if getattr(self, word)]
         if self.receive_latency:
             parts.append(f"latency {self.receive_latency * 1000:g} ms")
         if self.second_timing:

@@ -15,7 +15,7 @@ from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import LineDown, WriteUnconfirmed
 from tests.proof import setups
 from tests.proof.instants import Instant
-from tests.proof.kinds import KINDS, WRITE, Kind
+from tests.proof.kinds import KINDS, READ, WRITE, Kind
 from tests.proof.setups import Setup
 from tests.proof.shipped import ANY_STEP, BUDGET, NO_COUNTERS, Decided, no_jitter
 from tests.proof.wire import OLD, OWN, STRAY, Outside, Owed, Ticket, Time, Violation, choose
@@ -44,10 +44,11 @@ class World:
         cls.setup = setup
         kind = KINDS[setup.kind]()
         timings = kind.profile.timings
+        checks = (kind.commands[READ][1], kind.check) if setup.in_step else (kind.check,)
         if not setup.in_step:  # `nominal` sorts replies that count into prompt and late ones
             read, write, packet = (replace(t, nominal=t.window) for t in (timings.read, timings.write, timings.packet))
             timings = Timings(read, write, packet)
-        cls.kind = replace(kind, profile=replace(kind.profile, checks=(kind.check,), timings=timings))
+        cls.kind = replace(kind, profile=replace(kind.profile, checks=checks, timings=timings))
         cls.byte_time = cls.kind.profile.line.byte_time
 
     def __init__(self, now: Time) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
 
-from tests.proof.kinds import READ, READ_UNLIKE, WRITE, WRITE_THERE
+from tests.proof.kinds import READ, READ_THERE, READ_UNLIKE, WRITE, WRITE_THERE
 from tests.proof.setups import (
     ALL,
     BEYOND,
@@ -115,10 +115,8 @@ def msc_pairs() -> Iterator[Setup]:
 
 def in_step() -> Iterator[Setup]:
     """What is owed told by the shipping code, and replies that come after their lateness, in order (R15)."""
-    for commands in ((READ,), (READ, READ_UNLIKE), (READ, WRITE)):
-        base = replace(_line("hcp2", commands=commands), in_step=True, lapse=0.25)
-        yield base
-        yield replace(base, adversary=(BEYOND,), beyond=0.24)
+    for commands in ((READ,), (WRITE,), (READ, READ_UNLIKE), (READ, WRITE), (READ, READ_THERE)):
+        yield replace(_line("hcp2", BEYOND, commands=commands), in_step=True, whole=True, lapse=0.25, beyond=0.24)
 
 
 GROUPS = {
