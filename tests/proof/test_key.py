@@ -38,7 +38,7 @@ HOLDS = replace(HCP2, adversary=(HELD,))
 MSC = replace(HCP2, kind="msc", lapse=2.5, adversary=(STRAYS, FLIPS), lost_acknowledgements=1)
 OWES = replace(HCP2, in_step=True, adversary=(BEYOND, NAKS), beyond=0.3)
 EVERY = {"hcp2": HCP2, "paced": PACED, "echo": ECHOES, "late": LATE, "queues": QUEUES, "held": HOLDS, "msc": MSC}
-WALKS = 120
+WALKS = 40
 
 
 @pytest.mark.parametrize("setup", [*EVERY.values(), OWES], ids=[*EVERY, "owes"])
@@ -140,7 +140,7 @@ def without_what_is_being_said(view: View) -> None:
     ids=lambda value: value.__name__ if callable(value) else "",
 )
 def test_a_wrong_omission_is_noticed(forget: Callable[[View], None], setup: Setup) -> None:
-    for seed in range(4 * WALKS):
+    for seed in range(12 * WALKS):
         try:
             walk(setup, seed, [*FORGOTTEN, forget])
         except Differs:
