@@ -69,7 +69,7 @@ class LineStatistics:
     exchanges: int
     completed: int
     cancelled: int
-    stray_bytes: int
+    unasked_bytes: int
     noise_bytes: int
     tainted: int
     collisions: int
@@ -156,8 +156,8 @@ class LineCounters:
         "settles",
         "since",
         "spent",
-        "stray_bytes",
         "tainted",
+        "unasked_bytes",
         "waits",
     )
 
@@ -171,7 +171,7 @@ class LineCounters:
 
     def reset(self, state: LineState, since: float) -> None:
         self.since = since
-        self.completed = self.cancelled = self.stray_bytes = self.noise_bytes = 0
+        self.completed = self.cancelled = self.unasked_bytes = self.noise_bytes = 0
         self.tainted = self.collisions = self.settles = self.noisy = self.losses = 0
         self.checks = self.doubted = self.damaged = self.breaks = 0
         self._before = (self.exchanges, self._times(state, since))
@@ -207,7 +207,7 @@ class LineCounters:
             self.exchanges - exchanges,
             self.completed,
             self.cancelled,
-            self.stray_bytes,
+            self.unasked_bytes,
             self.noise_bytes,
             self.tainted,
             self.collisions,
