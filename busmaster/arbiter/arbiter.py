@@ -15,10 +15,9 @@ from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import Event
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.line_machine import LineMachine
-from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import EXCHANGE, READY
 from busmaster.arbiter.tap import Attempt
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed

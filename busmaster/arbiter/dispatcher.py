@@ -7,7 +7,7 @@ and ends every transaction exactly once.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable
 from math import inf
 from typing import Any
@@ -21,10 +21,10 @@ from busmaster.arbiter.events import Event, LatenessLowered, NodeChanged, Overdu
 from busmaster.arbiter.expiries import Expiries
 from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
 from busmaster.arbiter.probes import Probes
-from busmaster.arbiter.schedule import Poll, Schedule
+from busmaster.arbiter.schedule import Schedule
 from busmaster.arbiter.state import SETTLING
 from busmaster.arbiter.tap import Attempt
-from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
+from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Poll, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.errors import (
     BacklogFull,
@@ -61,6 +61,8 @@ class Dispatcher:
         self.backlog = Backlog()
         self.schedule = Schedule()
         self.nodes: list[NodeRecord] = []
+        self.writes: defaultdict[NodeRecord, deque[Transaction]] = defaultdict(deque)
+        """Each node's writes that are not over, in order (R7)."""
         self.counters = counters
         self.fault: Callable[[], BusError] | None = None
         """Makes the error with which everything fails while the line cannot be used."""
@@ -85,14 +87,14 @@ class Dispatcher:
             self._supersede(node, now)
         waiting = self.backlog.queues[transaction.priority].live
         if transaction.writes:
-            waiting = max(waiting, len(node.writes))
+            waiting = max(waiting, len(self.writes[node]))
         if waiting >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return False
         if (node.health is DOWN or now < node.suspended_until) and not self._may_ask(transaction, now):
             return False
         if transaction.writes:
-            node.writes.append(transaction)
+            self.writes[node].append(transaction)
         if transaction.deadline == inf:
             transaction.deadline = now + RETRY_PATIENCE
         if transaction.start_by < inf:
@@ -120,7 +122,7 @@ class Dispatcher:
                 transaction.finish_by <= now or (transaction.queued < now and not transaction.attempts)
             ):
                 self._end(transaction, now, too_late(transaction, now))
-            elif transaction.writes and node.writes[0] is not transaction:
+            elif transaction.writes and self.writes[node][0] is not transaction:
                 self._park(transaction)
             elif (node.health is not DOWN and not node.holds and node.suspended_until <= now) or self._may_ask(
                 transaction, now
@@ -137,7 +139,7 @@ class Dispatcher:
         if node.health is DOWN or node.holds or node.suspended_until > now:
             return False
         in_time = transaction.start_by >= now or (transaction.attempts > 0 and transaction.finish_by > now)
-        return in_time and not (transaction.writes and node.writes[0] is not transaction)
+        return in_time and not (transaction.writes and self.writes[node][0] is not transaction)
 
     def started(self, transaction: Transaction, now: float) -> None:
         """Its next attempt goes out now."""
@@ -263,7 +265,7 @@ class Dispatcher:
         fault = self.fault
         assert fault is not None
         for node in self.nodes:
-            for write in [w for w in node.writes if w.phase is PARKED]:
+            for write in [w for w in self.writes[node] if w.phase is PARKED]:
                 self._end(write, now, name_error(fault(), write))
         for transaction in self.backlog.drain():
             transaction.phase = PARKED
@@ -428,13 +430,13 @@ class Dispatcher:
     def _park(self, write: Transaction) -> None:
         """An earlier write to its node is not over: it waits, and lends that one its class (R7)."""
         write.phase = PARKED
-        first = write.node.writes[0]
+        first = self.writes[write.node][0]
         if first.priority > write.priority and first.phase is QUEUED:
             self.backlog.promote(first, write.priority)
 
     def _supersede(self, node: NodeRecord, now: float) -> None:
         """An urgent write overtakes: what it overtakes is never sent after it, nor if it cannot be sent itself (R7)."""
-        for write in list(node.writes):
+        for write in list(self.writes[node]):
             if write.phase is ON_WIRE:
                 write.superseded = True
             elif write.priority > URGENT:
@@ -479,7 +481,7 @@ class Dispatcher:
         transaction.settling_ahead = self.counters.spent[SETTLING]
 
     def _next_write(self, transaction: Transaction) -> None:
-        writes = transaction.node.writes
+        writes = self.writes[transaction.node]
         if writes and writes[0] is transaction:
             writes.popleft()
             if writes and writes[0].phase is PARKED:

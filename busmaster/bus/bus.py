@@ -330,7 +330,9 @@ class Bus:
             polls=1 + max(polled - low, backlog.waiting(Priority.POLL)),
             background=probed + max(low, backlog.waiting(Priority.BACKGROUND)),
         )
-        parked = sum(write.phase is Phase.PARKED for node in self._nodes.values() for write in node.record.writes)
+        parked = sum(
+            write.phase is Phase.PARKED for writes in self._arbiter.dispatcher.writes.values() for write in writes
+        )
         longest = max((poll.patience for poll in polls if poll.results), default=1.0)
         return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 

@@ -17,11 +17,11 @@ import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import DriverErrors
-from busmaster.arbiter.events import Event, Mark, Overdue, Polled, Sampled
-from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.events import Event, Overdue, Polled, Sampled
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Attempt, Tap
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.errors import LineDown
 from busmaster.transport.alarm import Alarm
 from busmaster.transport.clock import clock_of

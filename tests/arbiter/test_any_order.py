@@ -15,9 +15,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import NodeChanged, Polled
 from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
-from busmaster.arbiter.schedule import Poll, set_members
+from busmaster.arbiter.schedule import set_members
 from busmaster.arbiter.state import LineState
-from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.arbiter.transaction import Phase, Poll, Priority, Transaction
 from busmaster.errors import BusError
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.wire.checks import xor
@@ -251,7 +251,7 @@ class AnyOrder(RuleBasedStateMachine):
         for transaction in self.submitted:
             assert transaction.phase is Phase.ENDED
             assert self.ended[id(transaction)] == (id(transaction) not in self.cancelled)
-        assert not any(node.writes for node in self.nodes)
+        assert not any(self.arbiter.dispatcher.writes.values())
         assert self.arbiter.state is LineState.OFFLINE
 
 
