@@ -37,10 +37,11 @@ from busmaster.arbiter.choice import Choice
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.echo import Echo
-from busmaster.arbiter.events import CameUnasked, LineChange, LineChanged, Mark
+from busmaster.arbiter.events import CameUnasked, LineChange, LineChanged
 from busmaster.arbiter.health import DOWN
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.leg import Leg
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
 from busmaster.arbiter.tapped import make_dispatcher

@@ -51,7 +51,7 @@ def without_quarantine(view: View) -> None:
 
 
 def without_last_byte(view: View) -> None:
-    view.world.arbiter._strays.last_byte = -inf
+    view.world.arbiter._unasked.last_byte = -inf
 
 
 def without_end(view: View) -> None:
