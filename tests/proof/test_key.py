@@ -39,6 +39,7 @@ MSC = replace(HCP2, kind="msc", lapse=2.5, adversary=(STRAYS, FLIPS), lost_ackno
 OWES = replace(HCP2, in_step=True, adversary=(BEYOND, NAKS), beyond=0.3)
 EVERY = {"hcp2": HCP2, "paced": PACED, "echo": ECHOES, "late": LATE, "queues": QUEUES, "held": HOLDS, "msc": MSC}
 WALKS = 40
+pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.mark.parametrize("setup", [*EVERY.values(), OWES], ids=[*EVERY, "owes"])
