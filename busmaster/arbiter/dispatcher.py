@@ -19,12 +19,13 @@ from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.endings import make_error, name_error, too_late
 from busmaster.arbiter.events import Event, LatenessLowered, NodeChanged, Overdue, Polled, Sampled
 from busmaster.arbiter.expiries import Expiries
+from busmaster.arbiter.failing_transactions import FailingTransactions, take_out
 from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
 from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.schedule import Poll, Schedule
 from busmaster.arbiter.state import SETTLING
 from busmaster.arbiter.tap import Attempt
-from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
+from busmaster.arbiter.transaction import BACKGROUND, ENDED, FAILING, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.errors import (
     BacklogFull,
@@ -69,6 +70,7 @@ class Dispatcher:
         self._capacity = capacity
         self._jitter = jitter
         self._expiries = Expiries(deadlines)
+        self.failing = FailingTransactions(deadlines)
 
     # requests
 
@@ -108,7 +110,7 @@ class Dispatcher:
         self.counters.cancelled += 1
         if transaction.phase is QUEUED:
             self.backlog.discard(transaction, PARKED)
-        if transaction.phase is PARKED:
+        if transaction.phase is not ON_WIRE:
             self.probes.budget.refund(transaction.probe_cost)
             self._end(transaction, now)
 
@@ -259,15 +261,15 @@ class Dispatcher:
     # everything at once
 
     def fail_all(self, now: float) -> None:
-        """End whatever waits, with the current fault."""
-        fault = self.fault
-        assert fault is not None
-        for node in self.nodes:
-            for write in [w for w in node.writes if w.phase is PARKED]:
-                self._end(write, now, name_error(fault(), write))
-        for transaction in self.backlog.drain():
-            transaction.phase = PARKED
-            self._end(transaction, now, name_error(fault(), transaction))
+        """Take out whatever waits, to end with the current fault: the first few now, the others with `fail_more`."""
+        assert self.fault is not None
+        self.failing.add(take_out(self.nodes, self.backlog), self.fault())
+        self.fail_more(now)
+
+    def fail_more(self, now: float) -> None:
+        """End a bounded piece of what was taken out: the deadline has passed already while there is more."""
+        for transaction, error in self.failing.next(now):
+            self._end(transaction, now, error)
 
     def expire(self, now: float) -> None:
         """Tell callers whose time is over: nothing was sent, or it was, and how it ends is not known (R12).
@@ -278,6 +280,8 @@ class Dispatcher:
         for transaction in self._expiries.due(now):
             if not transaction.wanted or (transaction.attempts and transaction.finish_by >= now):
                 continue
+            if transaction.phase is FAILING:
+                continue  # it ends next, with what became of the line
             if transaction.phase is ON_WIRE:
                 transaction.wanted = False
                 self.counters.cancelled += 1
