@@ -91,9 +91,9 @@ def test_r8_a_bus_that_is_closed_meanwhile_tells_each_what_it_failed_of() -> Non
     bench.arbiter.line_up(bench.now)
     fresh = bench.ask(asked[0].node)
     bench.arbiter.close(bench.now)
-    assert bench.arbiter.failing
+    failing = [bench.arbiter.failing]
     bench.wait(0.0)
-    assert not bench.arbiter.failing
+    assert [*failing, bench.arbiter.failing] == [True, False]
     assert bench.arbiter.state is LineState.OFFLINE
     assert {type(t.error) for t in asked} == {LineDown}
     assert type(fresh.error) is BusClosed
