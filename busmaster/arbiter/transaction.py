@@ -29,16 +29,20 @@ URGENT, COMMAND, POLL, BACKGROUND = Priority
 
 
 class Phase(enum.Enum):
-    """Where a transaction is. A write is PARKED while an earlier write to its node is not over (R7)."""
+    """Where a transaction is. A write is PARKED while an earlier write to its node is not over (R7).
+
+    What is FAILING waited for a line that can no longer be used: it ends next, and is never sent (R13).
+    """
 
     IDLE = "idle"
     QUEUED = "queued"
     PARKED = "parked"
     ON_WIRE = "on wire"
+    FAILING = "failing"
     ENDED = "ended"
 
 
-IDLE, QUEUED, PARKED, ON_WIRE, ENDED = Phase
+IDLE, QUEUED, PARKED, ON_WIRE, FAILING, ENDED = Phase
 
 
 class Timeline(NamedTuple):

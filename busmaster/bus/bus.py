@@ -330,9 +330,8 @@ class Bus:
             polls=1 + max(polled - low, backlog.waiting(Priority.POLL)),
             background=probed + max(low, backlog.waiting(Priority.BACKGROUND)),
         )
-        parked = sum(
-            write.phase is Phase.PARKED for writes in self._arbiter.dispatcher.writes.values() for write in writes
-        )
+        queues = self._arbiter.dispatcher.writes.queues.values()
+        parked = sum(write.phase is Phase.PARKED for queue in queues for write in queue)
         longest = max((poll.patience for poll in polls if poll.results), default=1.0)
         return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 

@@ -324,7 +324,7 @@ class Judge:
         if open_transactions:
             self.totals.lost += open_transactions
             self.problem(f"R8: {open_transactions} transactions never ended")
-        if len(dispatcher.backlog) or any(dispatcher.writes.values()):
+        if len(dispatcher.backlog) or any(dispatcher.writes.queues.values()):
             self.problem("R8: something is left in the backlog")
 
     def sum_up(self, seconds: float) -> None:
