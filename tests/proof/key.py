@@ -64,7 +64,7 @@ class View:
 def transactions(world: World) -> list[Transaction]:
     arbiter = world.arbiter
     every = [t for queue in arbiter.dispatcher.backlog.queues for t in queue]
-    every += [t for node in world.nodes for t in arbiter.dispatcher.writes[node]]
+    every += [t for node in world.nodes for t in arbiter.dispatcher.writes.queues[node]]
     return every if arbiter._wire.transaction is None else [arbiter._wire.transaction, *every]
 
 
@@ -217,7 +217,8 @@ def past_waiting(view: View) -> None:
     world = view.world
     arbiter, dispatcher = world.arbiter, world.arbiter.dispatcher
     arbiter._cause = ""
-    dispatcher.writes = defaultdict(deque, {node: dispatcher.writes[node] for node in world.nodes})
+    queues = dispatcher.writes.queues
+    dispatcher.writes.queues = defaultdict(deque, {node: queues[node] for node in world.nodes})
     if arbiter.noisy:
         dispatcher.fault = noisy
     urgent, command, *by_deadline = dispatcher.backlog.queues

@@ -172,7 +172,7 @@ class World:
         """R8 and progress: nobody is forgotten, and the line's state has an end."""
         arbiter = self.arbiter
         wire = arbiter._wire
-        held = [w for node in self.nodes for w in arbiter.dispatcher.writes[node] if w.phase is PARKED]
+        held = [w for node in self.nodes for w in arbiter.dispatcher.writes.queues[node] if w.phase is PARKED]
         held += [transaction for queue in arbiter.dispatcher.backlog.queues for transaction in queue]
         held += [wire.transaction] if wire.transaction is not None else []
         if len(self.live) > sum(transaction.wanted and transaction.tag is not None for transaction in held):
