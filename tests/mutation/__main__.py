@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.mutation.places import ROOMS, Mutant, drawn
-from tests.mutation.trial import Verdict, copied, tried
+from tests.mutation.trial import Copy, Verdict
 
 ROOT = Path(__file__).parents[2]
 EQUIVALENT = Path(__file__).with_name("equivalent.json")
@@ -63,18 +63,19 @@ def try_all(mutants: list[Mutant], session: Path, options: argparse.Namespace) -
             say(f"{number}/{len(mutants)} {verdict.outcome:8} {verdict.seconds:6.0f} s  {mutant.module}:{mutant.line}")
 
 
-COPY: list[tuple[Path, bool]] = []
+COPY: list[tuple[Copy, bool]] = []
 """The copy of this process, and whether only the nearest tests are run in it."""
 
 
 def start_in_a_copy(folder: Path, near: bool) -> None:
     """Make a process its copy."""
-    COPY.append((copied(ROOT, folder / multiprocessing.current_process().name), near))
+    COPY.append((Copy(ROOT, folder / multiprocessing.current_process().name), near))
 
 
 def judged(mutant: Mutant) -> tuple[Mutant, Verdict]:
     """Try it in this process's copy."""
-    return mutant, tried(mutant, *COPY[0])
+    copy, near = COPY[0]
+    return mutant, copy.tried(mutant, near)
 
 
 def read(session: Path) -> list[dict[str, Any]]:

@@ -1,0 +1,59 @@
+"""Runs pytest for one mutant after the other, in children that find the libraries imported and the project not.
+
+Each line on standard input is a JSON list, the seconds that a run may take and pytest's arguments; each is answered by
+one line, the exit status of that run. A child that takes longer is killed: by then it hangs.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import signal
+import sys
+import time
+
+LIBRARIES = ("anyio", "click", "hypothesis", "msgspec", "pytest", "pytest_asyncio", "pytest_timeout", "rich", "serial")
+LOOKS = 0.05
+"""Seconds between two looks at a child."""
+
+
+def main() -> None:
+    """Import what every run needs, then answer lines until there are no more."""
+    for name in LIBRARIES:
+        importlib.import_module(name)
+    sys.dont_write_bytecode = True  # of a mutant it would be taken for the original's
+    for line in sys.stdin:
+        limit, *arguments = json.loads(line)
+        sys.stdout.write(f"{status_of(arguments, limit)}\n")
+        sys.stdout.flush()
+
+
+def status_of(arguments: list[str], limit: float) -> int:
+    """Run pytest in a child with a session of its own, and return how it ended; below 0 for a signal."""
+    child = os.fork()
+    if child == 0:
+        run(arguments)
+    deadline = time.monotonic() + limit
+    while time.monotonic() < deadline:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(LOOKS)
+    os.killpg(child, signal.SIGKILL)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def run(arguments: list[str]) -> None:
+    """Become a run of pytest that is seen and heard by nobody."""
+    os.setsid()
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nothing, stream)
+    import pytest
+
+    os._exit(pytest.main(arguments))
+
+
+if __name__ == "__main__":
+    main()
