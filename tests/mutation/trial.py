@@ -94,19 +94,19 @@ class Copy:
         """Return the seconds that a stage takes without a mutant. Raises RuntimeError if it fails: it could not judge."""
         if stage not in self._usual:
             start = time.monotonic()
-            if not self.passes(stage, LONGEST):
+            if not self.passes(stage, LONGEST, keeps=True):
                 raise RuntimeError(f"the tests fail without a mutant: {' '.join(stage)}")
             self._usual[stage] = time.monotonic() - start
         return self._usual[stage]
 
-    def passes(self, stage: tuple[str, ...], usual: float) -> bool:
-        """Run tests, and return whether all passed in time."""
+    def passes(self, stage: tuple[str, ...], usual: float, keeps: bool = False) -> bool:
+        """Run tests, and return whether all passed in time; `keeps` what is compiled for the next run."""
         request: IO[str] | None = self._process.stdin
         answer: IO[str] | None = self._process.stdout
         assert request is not None
         assert answer is not None
         limit = SHORTEST + PATIENCE * usual
-        request.write(json.dumps([limit, "-q", "-x", "-p", "no:cacheprovider", *stage]) + "\n")
+        request.write(json.dumps([limit, keeps, "-q", "-x", "-p", "no:cacheprovider", *stage]) + "\n")
         request.flush()
         return int(answer.readline()) == 0
 

@@ -1,7 +1,8 @@
 """Runs pytest for one mutant after the other, in children that find the libraries imported and the project not.
 
-Each line on standard input is a JSON list, the seconds that a run may take and pytest's arguments; each is answered by
-one line, the exit status of that run. A child that takes longer is killed: by then it hangs.
+Each line on standard input is a JSON list: the seconds that a run may take, whether it keeps what it compiles, and
+pytest's arguments. Each is answered by one line, the exit status of that run. A child that takes longer is killed: by
+then it hangs.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ def main() -> None:
     """Import what every run needs, then answer lines until there are no more."""
     for name in LIBRARIES:
         importlib.import_module(name)
-    sys.dont_write_bytecode = True  # of a mutant it would be taken for the original's
     for line in sys.stdin:
-        limit, *arguments = json.loads(line)
+        limit, keeps, *arguments = json.loads(line)
+        sys.dont_write_bytecode = not keeps  # what is compiled of a mutant would be taken for the original's
         sys.stdout.write(f"{status_of(arguments, limit)}\n")
         sys.stdout.flush()
 
@@ -52,7 +53,7 @@ def run(arguments: list[str]) -> None:
         os.dup2(nothing, stream)
     import pytest
 
-    os._exit(pytest.main(arguments))
+    os._exit(pytest.main([*arguments, "-W", "ignore::pytest.PytestAssertRewriteWarning"]))  # of plugins imported here
 
 
 if __name__ == "__main__":
