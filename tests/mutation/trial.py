@@ -59,9 +59,10 @@ class Copy:
     def __init__(self, root: Path, folder: Path) -> None:
         subprocess.run(["git", "clone", "--quiet", "--shared", str(root), str(folder)], check=True)
         self.folder = folder
+        self._said = folder.with_name(f"{folder.name}.txt")
         self._usual: dict[tuple[str, ...], float] = {}
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.mutation.warm"],
+            [sys.executable, "-m", "tests.mutation.warm", str(self._said)],
             cwd=folder,
             env=os.environ | {"PYTHONPATH": str(folder), "CI": "true"},
             stdin=subprocess.PIPE,
@@ -95,7 +96,7 @@ class Copy:
         if stage not in self._usual:
             start = time.monotonic()
             if not self.passes(stage, LONGEST, keeps=True):
-                raise RuntimeError(f"the tests fail without a mutant: {' '.join(stage)}")
+                raise RuntimeError(f"the tests fail without a mutant:\n{self._said.read_text()[-2000:]}")
             self._usual[stage] = time.monotonic() - start
         return self._usual[stage]
 

@@ -46,11 +46,12 @@ def status_of(arguments: list[str], limit: float) -> int:
 
 
 def run(arguments: list[str]) -> None:
-    """Become a run of pytest that is seen and heard by nobody."""
+    """Become a run of pytest that hears nothing, and speaks into the file that the command line names."""
     os.setsid()
-    nothing = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):
-        os.dup2(nothing, stream)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    said = os.open(sys.argv[1], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    for stream in (1, 2):
+        os.dup2(said, stream)
     import pytest
 
     os._exit(pytest.main([*arguments, "-W", "ignore::pytest.PytestAssertRewriteWarning"]))  # of plugins imported here
