@@ -19,23 +19,8 @@ from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator
 
 from tests.mutation.places import Mutant
+from tests.mutation.stages import stages_of
 
-NEAR: dict[str, tuple[str, ...]] = {
-    "arbiter": ("tests/arbiter",),
-    "contract": ("tests/contract", "tests/protocols", "tests/testing", "tests/test_mistyped_arguments.py"),
-    "wire": ("tests/wire", "tests/protocols"),
-    "codecs": ("tests/contract", "tests/protocols", "tests/test_mistyped_arguments.py"),
-    "pump": ("tests/transport", "tests/bus"),
-}
-"""The tests of a room: `--near` asks no others."""
-FURTHER: dict[str, tuple[str, ...]] = {
-    "arbiter": ("tests/bus", "tests/campaigns", "tests/planning", "tests/transport"),
-    "contract": ("tests/arbiter", "tests/config", "tests/planning"),
-    "wire": ("tests/emulator",),
-    "codecs": ("tests/handles", "tests/capture", "tests/emulator"),
-    "pump": ("tests/real_wire", "tests/doctor"),
-}
-"""Where a room's mutants are likeliest to be noticed next; the rest of the tests comes behind."""
 PATIENCE = 5.0
 """Times the usual run, after which a trial is over: a mutant that makes the tests hang is noticed."""
 LONGEST = 1800.0
@@ -72,7 +57,7 @@ class Copy:
 
     def tried(self, mutant: Mutant, near: bool) -> Verdict:
         """Change the copy, run its tests (`near`: only the room's) to the first failure, and change it back."""
-        stages = stages_of(mutant, near, self.folder)
+        stages = stages_of(mutant.room, mutant.module, near, self.folder)
         for stage in stages[:2]:
             self.usual(stage)
         start = time.monotonic()
@@ -92,7 +77,7 @@ class Copy:
         return Verdict("survived" if passes else "killed", round(time.monotonic() - start, 1), "\n".join(diff))
 
     def usual(self, stage: tuple[str, ...]) -> float:
-        """Return the seconds that a stage takes without a mutant. Raises RuntimeError if it fails: it could not judge."""
+        """Return the seconds that a stage takes without a mutant. Raises RuntimeError if it fails then already."""
         if stage not in self._usual:
             start = time.monotonic()
             if not self.passes(stage, LONGEST, keeps=True):
@@ -110,32 +95,3 @@ class Copy:
         request.write(json.dumps([limit, keeps, "-q", "-x", "-p", "no:cacheprovider", *stage]) + "\n")
         request.flush()
         return int(answer.readline()) == 0
-
-
-def stages_of(mutant: Mutant, near: bool, root: Path) -> list[tuple[str, ...]]:
-    """The tests in the order in which they are asked: those named after the module, the room's, and all others."""
-    own = [path for path in NEAR[mutant.room] if (root / path).exists()]
-    named = [
-        str(path.relative_to(root))
-        for folder in own
-        for path in sorted((root / folder).glob("test_*.py"))
-        if set(path.stem.split("_")) & words_of(mutant.module)
-    ]
-    stages = [tuple(named), tuple(own)]
-    if not near:
-        further = [path for path in FURTHER[mutant.room] if (root / path).exists()]
-        tests = [str(path.relative_to(root)) for path in sorted((root / "tests").iterdir()) if holds_tests(path)]
-        stages += [tuple(further), tuple(path for path in tests if path not in own + further)]
-    return [stage for stage in stages if stage]
-
-
-def words_of(module: str) -> set[str]:
-    """What the tests of a module may be named after: the module itself, or the protocol whose codec it is."""
-    path = Path(module)
-    name = path.parent.name.removeprefix("_") if path.parts[1] == "protocols" else path.stem
-    return {name, name.removesuffix("s"), *name.split("_")} | ({"hcp", "hcp2"} if name == "comms" else set())
-
-
-def holds_tests(path: Path) -> bool:
-    """Whether pytest finds anything there."""
-    return path.name.startswith("test_") if path.is_file() else any(path.rglob("test_*.py"))
