@@ -8,7 +8,7 @@ NEAR: dict[str, tuple[str, ...]] = {
     "arbiter": ("tests/arbiter",),
     "contract": ("tests/contract", "tests/protocols", "tests/testing", "tests/test_mistyped_arguments.py"),
     "wire": ("tests/wire", "tests/protocols"),
-    "codecs": ("tests/contract", "tests/protocols", "tests/test_mistyped_arguments.py"),
+    "codecs": ("tests/contract", "tests/protocols", "tests/handles", "tests/test_mistyped_arguments.py"),
     "pump": ("tests/transport", "tests/bus"),
 }
 """The tests of a room: `--near` asks no others."""
@@ -16,7 +16,7 @@ FURTHER: dict[str, tuple[str, ...]] = {
     "arbiter": ("tests/bus", "tests/campaigns", "tests/planning", "tests/transport"),
     "contract": ("tests/arbiter", "tests/config", "tests/planning"),
     "wire": ("tests/emulator",),
-    "codecs": ("tests/handles", "tests/capture", "tests/emulator"),
+    "codecs": ("tests/capture", "tests/emulator"),
     "pump": ("tests/real_wire", "tests/doctor"),
 }
 """Where a room's mutants are likeliest to be noticed next; the rest of the tests comes behind."""

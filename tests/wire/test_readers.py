@@ -126,6 +126,8 @@ def test_a_reader_says_what_it_heard_in_place_of_its_reply() -> None:
         with pytest.raises(FrameError) as failure:
             reader().feed(heard)
         assert failure.value.heard == heard
+    with pytest.raises(FrameError, match="cannot begin with 78"):
+        reader().feed(b"x1")
     with pytest.raises(FrameError) as failure:
         AcknowledgeReader(b"", TIMING).feed(b"x1")
     assert failure.value.heard == b"x1"
