@@ -26,7 +26,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
 }
 """The rooms whose mutants count, by patterns of their files."""
 IDLE = {"core/ReplaceComparisonOperator_Is_Eq", "core/ReplaceComparisonOperator_IsNot_NotEq"}
-"""Operators that change nothing here: what is compared by `is` are None, members of enums and objects without equals."""
+"""Operators that change nothing here: `is` compares None, members of enums, and objects that equal only themselves."""
 
 Span: TypeAlias = tuple[tuple[int, int], tuple[int, int]]
 """From the first (line, column) to behind the last."""
