@@ -58,7 +58,7 @@ class Copy:
     def tried(self, mutant: Mutant, near: bool) -> Verdict:
         """Change the copy, run its tests (`near`: only the room's) to the first failure, and change it back."""
         stages = stages_of(mutant.room, mutant.module, near, self.folder)
-        for stage in stages[:2]:
+        for stage in stages_of(mutant.room, mutant.module, True, self.folder):
             self.usual(stage)
         start = time.monotonic()
         path = self.folder / mutant.module
