@@ -178,3 +178,23 @@ class BusClosed(BusError):
     """The bus was closed."""
 
     hint = "use the bus inside `async with`"
+
+
+__all__ = [
+    "Addressed",
+    "BacklogFull",
+    "BusClosed",
+    "BusError",
+    "GarbledReply",
+    "InvalidCommand",
+    "LineDown",
+    "LineNoisy",
+    "NoReply",
+    "NoSuchParameter",
+    "NodeDown",
+    "NotStarted",
+    "Refused",
+    "Superseded",
+    "VerifyFailed",
+    "WriteUnconfirmed",
+]

@@ -119,3 +119,12 @@ def item_text(item: str) -> str:
 def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
     """Return the error for an item that does not exist: it says what would do, and the nearest name."""
     return InvalidCommand(f"no such item {item!r}: use {form}{guess(str(item), known)}")
+
+
+__all__ = [
+    "Handle",
+    "Send",
+    "encoder",
+    "item_text",
+    "unknown_item",
+]
