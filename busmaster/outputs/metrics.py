@@ -200,13 +200,15 @@ class MetricsOutput(Output):
         written = CounterMetricFamily("busmaster_output_written", "Values and events written", labels=["output"])
         dropped = CounterMetricFamily("busmaster_output_dropped", "Values and events dropped", labels=["output"])
         waiting = GaugeMetricFamily("busmaster_output_waiting", "Values and events that wait", labels=["output"])
+        spilled = GaugeMetricFamily("busmaster_output_spilled", "Of those, on disk", labels=["output"])
         up = GaugeMetricFamily("busmaster_output_up", "1 while the output works", labels=["output"])
         for counts in self._others():
             written.add_metric([counts.kind], counts.written)
             dropped.add_metric([counts.kind], counts.dropped)
             waiting.add_metric([counts.kind], counts.waiting)
+            spilled.add_metric([counts.kind], counts.spilled)
             up.add_metric([counts.kind], float(not counts.error))
-        yield from (written, dropped, waiting, up)
+        yield from (written, dropped, waiting, spilled, up)
 
 
 def read_node(node: Node) -> tuple[NodeStatistics, list[tuple[float, int]], float]:
