@@ -131,7 +131,7 @@ class MqttOutput(Output):
 
     async def _hurry(self, scope: anyio.CancelScope) -> None:
         """A broker that does not answer when all is to end is not waited for to the last moment."""
-        while not self._stop.is_set():
+        while not self._stop.is_set():  # noqa: ASYNC110  # another thread sets it
             await anyio.sleep(TICK)
         await anyio.sleep(HURRY)
         scope.cancel()

@@ -63,8 +63,8 @@ class SqliteSettings(Settings):
 class MqttSettings(Settings):
     """`messages`: one for each "point", or one for each "cycle". `qos` 0 may lose values unseen, 1 does not.
 
-    `spill` is a file for what waits while the broker is away, which then survives a restart; `spill_values` of them at
-    most. `allow_commands` names the points ("winder/1") that commands may write; without any, no command is listened to.
+    `allow_commands` names the points ("winder/1") that commands may write; without any, no command is listened to.
+    `spill` is a file for what waits while the broker is away, which then survives a restart: `spill_values` at most.
     """
 
     host: str = "127.0.0.1"
@@ -84,7 +84,7 @@ class MqttSettings(Settings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MetricsSettings(Settings):
-    """Where it is served: only there."""
+    """Where it is served: only there. The values of `groups` are served too; without any, only counts are."""
 
     host: str = "127.0.0.1"
     port: Annotated[int, Between(0, 65535)] = 9464

@@ -81,13 +81,13 @@ class Spool:
 
     def _forget(self, values: int) -> int:
         """Remove the oldest messages that hold at least so many values, or a PIECE of them."""
-        gone, last = 0, 0
+        gone, up_to = 0, 0
         query = "select id, count from waiting order by id limit ?"
-        for last, count in self._database.execute(query, (PIECE,)).fetchall():
-            gone += count
+        for number, count in self._database.execute(query, (PIECE,)).fetchall():
+            gone, up_to = gone + count, number
             if gone >= values:
                 break
-        self._database.execute("delete from waiting where id <= ?", (last,))
+        self._database.execute("delete from waiting where id <= ?", (up_to,))
         return gone
 
 

@@ -105,7 +105,7 @@ async def test_what_a_broker_that_is_away_misses_is_sent_in_order_when_it_is_bac
     for number in range(1, 501):
         output.offer(cycle(number, number))
         if number % 25 == 0:
-            await asyncio.to_thread(until, lambda sent=number: output.spilled == sent)
+            await asyncio.to_thread(until, lambda: output.spilled == output.offered)
     counts = output.statistics()
     assert (counts.dropped, counts.waiting, counts.spilled) == (0, 500, 500)
     async with asyncio.timeout(20):
@@ -173,19 +173,22 @@ asyncio.run(publish())
 """
 
 
+def killed(folder: Path) -> int:
+    """How many values it had on disk, by its own account, before it was."""
+    command = [sys.executable, "-c", PUBLISH, str(free_port()), str(folder)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        spilled = 0
+        while spilled < 300:
+            spilled = int(process.stdout.readline())
+        process.send_signal(signal.SIGKILL)
+    return spilled
+
+
 @needs_mosquitto
 @pytest.mark.asyncio
 async def test_a_process_that_is_killed_loses_nothing_that_it_had_put_on_disk(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-c", PUBLISH, str(free_port()), str(tmp_path)], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    spilled = 0
-    while spilled < 300:
-        spilled = int(process.stdout.readline())
-    process.send_signal(signal.SIGKILL)
-    process.wait(10)
-    process.stdout.close()
+    spilled = await asyncio.to_thread(killed, tmp_path)
     broker = Broker(tmp_path)
     await asyncio.to_thread(broker.start)
     try:
