@@ -15,6 +15,7 @@ from typing import Any, TextIO
 import click
 
 from busmaster.cli.ending import Ending
+from busmaster.cli.terminal import note, printable
 from busmaster.contract.arguments import meant
 from busmaster.errors import BusError, InvalidCommand, NoReply
 
@@ -131,7 +132,7 @@ def show_warning(
     line: str | None = None,
 ) -> None:
     if issubclass(category, UserWarning):
-        print(f"busmaster: warning: {message}", file=file or sys.stderr, flush=True)
+        print(f"busmaster: warning: {printable(str(message))}", file=file or sys.stderr, flush=True)
 
 
 def usage_text(error: click.UsageError) -> str:
@@ -142,7 +143,7 @@ def usage_text(error: click.UsageError) -> str:
 
 
 def complain(text: str, status: int) -> int:
-    print("busmaster: " + " ".join(text.split()), file=sys.stderr, flush=True)
+    note(" ".join(text.split()))
     return status
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Container, Iterable, Iterator, Sequence
 
+from busmaster.cli.terminal import note, printable
 from busmaster.outputs.values import json_line, json_value, number_text, value_text, word_text
 
 __all__ = ["columns", "emit", "emit_all", "json_line", "json_value", "note", "number_text", "value_text", "word_text"]
@@ -16,7 +17,7 @@ def emit(*lines: str) -> None:
 
 
 def emit_all(lines: Iterable[str]) -> None:
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
     sys.stdout.flush()
 
 
@@ -29,8 +30,3 @@ def columns(rows: Sequence[Sequence[str]], right: Container[int] = ()) -> Iterat
             for number, (cell, width) in enumerate(zip(cells, widths, strict=True))
         )
         yield "  ".join(padded).rstrip()
-
-
-def note(line: str) -> None:
-    """A line for the person, on standard error."""
-    print(f"busmaster: {line}", file=sys.stderr, flush=True)

@@ -62,4 +62,6 @@ async def run(line: ConfiguredLine, view: View) -> int:
 
 def output_text(counts: OutputStatistics) -> str:
     text = f"{counts.kind}: {counts.written} {counts.what}, {counts.dropped} dropped"
+    if counts.spilled:
+        text += f", {counts.spilled} kept on disk for the next time"
     return f"{text}, down: {counts.error}" if counts.error else text

@@ -87,6 +87,10 @@ class ConfiguredLine:
             raise InvalidCommand(f"no such point {name!r}: use NODE/ITEM with one of {', '.join(self.nodes)}")
         return self._point(node, item)
 
+    def members(self, group: str) -> tuple[Point[Any], ...]:
+        """Return the points of a poll group of the file."""
+        return self._wanted[group]
+
     def plan(self) -> Plan:
         """Whether the file's poll groups fit its line. Pure arithmetic: nothing is opened."""
         planned = (

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine, Iterable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import anyio
 
 from busmaster.arbiter.events import LatenessRaised, NodeChanged
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
-from busmaster.bus.polling import PollGroup, Snapshot, Stream
+from busmaster.bus.polling import Snapshot, Stream
 from busmaster.outputs.base import Happening, Output, OutputStatistics
 from busmaster.outputs.files import CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings, MetricsSettings, MqttSettings, Settings, SqliteSettings
@@ -22,6 +22,18 @@ WAITING = 256
 """Cycles of a group that may wait for a loop that is busy with other things."""
 FAREWELL = 5.0
 """Seconds in which the outputs write what they still hold, when the line is closed."""
+
+
+class Source(Protocol):
+    """Where cycles come from: a poll group, or what is heard of one."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def points(self) -> tuple[Point[Any], ...]: ...
+
+    def subscribe(self, buffer: int, /) -> Stream[Snapshot]: ...
 
 
 class Distributor:
@@ -38,7 +50,7 @@ class Distributor:
         """One more. `commands`: the points that it lets others write. Raises InvalidCommand if an extra is missing."""
         self._outputs.append(self._make(kind, settings, commands or {}))
 
-    def start(self, groups: Iterable[PollGroup]) -> None:
+    def start(self, groups: Iterable[Source]) -> None:
         """From now on, until `close`."""
         self._loop = asyncio.get_running_loop()
         if not self._outputs:
@@ -68,7 +80,7 @@ class Distributor:
         """Tasks of their own: a task group would tie entering and leaving the line to one task."""
         self._tasks.append(asyncio.ensure_future(work))
 
-    async def _feed(self, cycles: Stream[Snapshot], group: PollGroup, takers: list[Output]) -> None:
+    async def _feed(self, cycles: Stream[Snapshot], group: Source, takers: list[Output]) -> None:
         lost = 0
         async for snapshot in cycles:
             for output in takers:
