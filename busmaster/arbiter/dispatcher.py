@@ -24,7 +24,17 @@ from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.schedule import Poll, Schedule
 from busmaster.arbiter.state import SETTLING
 from busmaster.arbiter.tap import Attempt
-from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
+from busmaster.arbiter.transaction import (
+    BACKGROUND,
+    ENDED,
+    IDLE,
+    ON_WIRE,
+    PARKED,
+    QUEUED,
+    URGENT,
+    Priority,
+    Transaction,
+)
 from busmaster.contract.exchange import Command
 from busmaster.errors import (
     BacklogFull,
@@ -42,6 +52,7 @@ REFUSED_POLL_PAUSE = 10.0
 RETRY_PATIENCE = 1.0
 """Seconds after which a request in POLL or BACKGROUND wants to be answered; the period, for a poll."""
 SUSPENDED = "suspended for maintenance"
+LEFT = "the line is being left: only its safe state is still written"
 NOT_DONE = (Refused, Superseded)
 """Errors that say of a write that it was not carried out, unless an attempt before them may have been."""
 
@@ -82,7 +93,7 @@ class Dispatcher:
             self._end(transaction, now, name_error(self.fault(), transaction))
             return False
         if transaction.writes and transaction.priority is URGENT:
-            self._supersede(node, now)
+            self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
         waiting = self.backlog.queues[transaction.priority].live
         if transaction.writes:
             waiting = max(waiting, len(node.writes))
@@ -258,6 +269,11 @@ class Dispatcher:
 
     # everything at once
 
+    def supersede_writes(self, now: float) -> None:
+        """End every write that waits, of whatever class, as Superseded."""
+        for node in self.nodes:
+            self._supersede(node, LEFT, now)
+
     def fail_all(self, now: float) -> None:
         """End whatever waits, with the current fault."""
         fault = self.fault
@@ -432,15 +448,18 @@ class Dispatcher:
         if first.priority > write.priority and first.phase is QUEUED:
             self.backlog.promote(first, write.priority)
 
-    def _supersede(self, node: NodeRecord, now: float) -> None:
-        """An urgent write overtakes: what it overtakes is never sent after it, nor if it cannot be sent itself (R7)."""
+    def _supersede(self, node: NodeRecord, why: str, now: float, above: Priority | None = None) -> None:
+        """What is overtaken is never sent after what overtakes it, nor if that cannot be sent itself (R7).
+
+        `above`: only what is of a lower class than this one.
+        """
         for write in list(node.writes):
             if write.phase is ON_WIRE:
                 write.superseded = True
-            elif write.priority > URGENT:
+            elif above is None or write.priority > above:
                 if write.phase is QUEUED:
                     self.backlog.discard(write, PARKED)
-                self._end(write, now, make_error(Superseded, "overtaken by an urgent write to the same node", write))
+                self._end(write, now, make_error(Superseded, why, write))
 
     def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:
         """Exactly once (R8). A write that was on the wire before something else ended it may have been carried out."""

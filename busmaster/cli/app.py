@@ -15,6 +15,7 @@ from typing import Any, TextIO
 import click
 
 from busmaster.cli.ending import Ending
+from busmaster.cli.output import Level, note
 from busmaster.contract.arguments import meant
 from busmaster.errors import BusError, InvalidCommand, NoReply
 
@@ -27,6 +28,7 @@ COMMANDS = (
     "scan",
     "emulate",
     "run",
+    "safe",
     "plan",
     "monitor",
     "doctor",
@@ -142,7 +144,7 @@ def usage_text(error: click.UsageError) -> str:
 
 
 def complain(text: str, status: int) -> int:
-    print("busmaster: " + " ".join(text.split()), file=sys.stderr, flush=True)
+    note(" ".join(text.split()), Level.ERROR)
     return status
 
 
