@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import pty
 import signal
@@ -10,11 +11,16 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from termios import tcgetattr
 
 import pytest
 
+from busmaster.bus.requester import Priority
+from busmaster.config import open_line
 from busmaster.emulator.serve import TcpServer
+from busmaster.errors import Superseded, WriteUnconfirmed
 from tests.cli.conftest import ENVIRONMENT, ROOT, Command, serve, started
+from tests.cli.test_processes import Terminal
 
 PATIENCE = 30.0
 TEXT = """
@@ -220,3 +226,42 @@ def test_a_terminal_that_is_closed_does_not_end_a_run(busmaster: Command, path: 
     os.kill(pid, signal.SIGTERM)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
     assert force(busmaster, winder) == "10 15"
+
+
+@pytest.mark.slow
+def test_a_drawing_process_that_is_killed_does_not_end_a_run(busmaster: Command, path: Path, winder: TcpServer) -> None:
+    terminal = Terminal("run", str(path))
+    try:
+        terminal.until(lambda drawn: b"\x1b[?1049h" in drawn and b"force" in drawn.partition(b"\x1b[?1049h")[2])
+        process = terminal.process.pid
+        [screen] = [
+            pid for found in Path(f"/proc/{process}/task").glob("*/children") for pid in found.read_text().split()
+        ]
+        os.kill(int(screen), signal.SIGKILL)
+        terminal.until(lambda drawn: b"polling goes on without it" in drawn)
+        terminal.process.terminate()
+        assert terminal.process.wait(PATIENCE) == 0
+        assert tcgetattr(terminal.slave) == terminal.before
+    finally:
+        terminal.close()
+    assert force(busmaster, winder) == "10 15"
+
+
+@pytest.mark.asyncio
+async def test_from_the_safe_state_on_no_other_write_is_accepted_and_waiting_ones_are_superseded(
+    path: Path, winder: TcpServer
+) -> None:
+    async with open_line(path) as line:
+        winder.call(lambda line, now: line.cut(now, line.device(1)))
+        drive = line.nodes["winder"]
+        waiting = [asyncio.ensure_future(drive.write(10 + number, 1.0)) for number in range(3)]
+        await asyncio.sleep(0)
+        leaving = asyncio.ensure_future(line.safe_state.enter(line.bus))
+        await asyncio.sleep(0)
+        with pytest.raises(Superseded):
+            await drive.write(20, 1.0, priority=Priority.URGENT)
+        winder.call(lambda line, now: line.restore(now))
+        assert await leaving == {"winder/force": None}
+        ended = await asyncio.gather(*waiting, return_exceptions=True)
+    assert all(isinstance(error, Superseded | WriteUnconfirmed) for error in ended)
+    assert sum(isinstance(error, Superseded) for error in ended) >= 2
