@@ -141,7 +141,7 @@ class VerifyFailed(BusError):
 class Superseded(BusError):
     """A queued write was dropped because an urgent write to the same node overtook it."""
 
-    hint = "decide again after the urgent command"
+    hint = "decide again after what overtook it"
 
 
 class NodeDown(BusError):

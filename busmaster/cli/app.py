@@ -15,7 +15,8 @@ from typing import Any, TextIO
 import click
 
 from busmaster.cli.ending import Ending
-from busmaster.cli.terminal import note, printable
+from busmaster.cli.output import Level, note
+from busmaster.cli.terminal import printable
 from busmaster.contract.arguments import meant
 from busmaster.errors import BusError, InvalidCommand, NoReply
 
@@ -28,6 +29,7 @@ COMMANDS = (
     "scan",
     "emulate",
     "run",
+    "safe",
     "plan",
     "monitor",
     "doctor",
@@ -143,7 +145,7 @@ def usage_text(error: click.UsageError) -> str:
 
 
 def complain(text: str, status: int) -> int:
-    note(" ".join(text.split()))
+    note(" ".join(text.split()), Level.ERROR)
     return status
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import unicodedata
 
 
@@ -15,8 +14,3 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else json.dumps(c)[1:-1] for c in text)
-
-
-def note(line: str) -> None:
-    """Print a line for the person, on standard error."""
-    print(f"busmaster: {printable(line)}", file=sys.stderr, flush=True)

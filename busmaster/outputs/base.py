@@ -124,6 +124,7 @@ class Output(ABC):
         self._say = say
         self._waiting: deque[Item] = deque()
         self._stop = threading.Event()
+        self._reopen = threading.Event()
         self._retry = FIRST_RETRY
         self._thread = threading.Thread(target=self._run, name=f"busmaster {kind}", daemon=True)
 
@@ -147,6 +148,16 @@ class Output(ABC):
         """So many were lost before they could be offered."""
         self.offered += values
         self.dropped += values
+
+    def reopen(self) -> None:
+        """Have it let go of the file that is open, if there is one, and open it anew: it may have been moved away."""
+        self._reopen.set()
+
+    def succeed(self, before: Output) -> None:
+        """Count on from the one that it replaces, which is closed. Called before it is started."""
+        self.offered += before.offered
+        self.dropped += before.dropped
+        self.written += before.written
 
     def statistics(self) -> OutputStatistics:
         dropped = self.dropped + self.lost
@@ -240,6 +251,9 @@ class BatchOutput(Output, Generic[Formatted]):
             stopped = False
             while not stopped:
                 stopped = self._stop.wait(TICK)
+                if self._reopen.is_set():
+                    self._reopen.clear()
+                    self.shut()
                 while self._fill():
                     self.commit(self._batch)
                     self._batch = []
