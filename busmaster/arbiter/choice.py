@@ -46,7 +46,8 @@ class Choice:
         while (transaction := dispatcher.next(now)) is not None:
             node = transaction.node
             try:
-                exchange = transaction.command.open(node.address, node.timings)
+                timings = node.timings if node.learning is None else node.timings_for(transaction)
+                exchange = transaction.command.open(node.address, timings)
                 answers = exchange.answers  # a protocol may lack it: found out here, it fails this one alone
             except Exception as bug:
                 dispatcher.unsendable(transaction, bug, now)
@@ -79,6 +80,8 @@ class Choice:
 
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
+        elif not exchange.answered and now < in_step.awaited_until():
+            chosen = in_step.awaited_until()  # what may still come would spoil what nobody acknowledges
         elif transaction.probe and in_step.clashes(answers, now, transaction.node):
             chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
         elif in_step.clashes(answers, now):
@@ -107,11 +110,15 @@ class Choice:
     def _instead_of(self, first: Chosen, now: float) -> Chosen | float:
         """What goes in place of one whose answer could be one that is owed."""
         in_step, answers = self._in_step, first[1].answers
-        if self._gone_before >= MOST_BEFORE:
-            return first
 
         def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
             return in_step.clashes(answers, now, node)
+
+        awaited = in_step.awaited_until(answers)
+        if now < awaited:
+            return self._while_awaited(first, now, clashes) or awaited
+        if self._gone_before >= MOST_BEFORE:
+            return first
 
         def proves_nothing(answers: Sequence[bytes], node: NodeRecord) -> bool:
             return in_step.clashes(answers, now)
@@ -138,6 +145,16 @@ class Choice:
         if other is None:
             return first
         self._gone_before += 1
+        return other
+
+    def _while_awaited(self, first: Chosen, now: float, clashes: Unfit) -> Chosen | None:
+        """What goes while an answer that is owed may still be on time: a check of the node that owes it shows that it
+        is not, else others have to wait. None once two were in vain."""
+        if self._gone_before >= MOST_BEFORE - 1:
+            return None
+        owing = dict.fromkeys(self._in_step.owing(first[1].answers, now))
+        other = self._ask_check(owing, now, clashes) or self._another(first, now, clashes)
+        self._gone_before += other is not None
         return other
 
     def _ask_itself(self, first: Chosen, now: float) -> Chosen | None:
@@ -184,7 +201,10 @@ class Choice:
     def _ask_check(self, nodes: Iterable[NodeRecord], now: float, unfit: Unfit) -> Chosen | None:
         """A read of the first of these nodes that has one whose answer is fit to prove something."""
         for node, command, exchange in _fit_checks(nodes, unfit):
-            return self._dispatcher.check(node, command, now), exchange
+            check = self._dispatcher.check(node, command, now)
+            if node.learning is not None:
+                exchange = command.open(node.address, node.timings_for(check))
+            return check, exchange
         return None
 
     def _whom_to_ask(self, now: float) -> tuple[list[NodeRecord], list[NodeRecord]]:
@@ -219,6 +239,6 @@ def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:
 def _opened(transaction: Transaction) -> Exchange[Any] | None:
     """None where its protocol cannot encode it: that is told when its turn has come."""
     try:
-        return transaction.command.open(transaction.node.address, transaction.node.timings)
+        return transaction.command.open(transaction.node.address, transaction.node.timings_for(transaction))
     except Exception:
         return None

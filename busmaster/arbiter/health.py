@@ -9,6 +9,7 @@ from math import inf
 from typing import Any
 
 from busmaster.arbiter.counters import NodeCounters
+from busmaster.arbiter.learned import Learning
 from busmaster.arbiter.transaction import Transaction
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
@@ -72,6 +73,7 @@ class NodeRecord:
         "holds",
         "label",
         "last_reply",
+        "learning",
         "lateness_until",
         "line",
         "probe_at",
@@ -99,6 +101,8 @@ class NodeRecord:
         self.label = profile.label(address)
         self.timings = timings
         self.retries = retries
+        self.learning: Learning | None = None
+        """What is learned of its reply times, where that is wished for."""
         self.health = UNKNOWN
         self.failures = 0
         """Transactions in a row that failed without a valid reply."""
@@ -132,6 +136,15 @@ class NodeRecord:
         self.lateness_until = inf
         """When a lateness that was raised comes down again, if all replies are prompt until then."""
         self._before_raised: Timings | None = None
+
+    def timings_for(self, transaction: Transaction) -> Timings:
+        """Return the times of the next attempt: learned ones only for a read that will be repeated if they are over."""
+        learning = self.learning
+        if learning is None:
+            return self.timings
+        again = transaction.check or (transaction.retried < transaction.retries and not transaction.probe)
+        hurried = again and not self.failures and self.health in (UP, SUSPECT) and not transaction.writes
+        return learning.timings(transaction.command, self.timings, min(transaction.retried, 2) if hurried else 2)
 
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
         """It has answered rightly, after so many seconds."""

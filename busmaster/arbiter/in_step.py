@@ -38,6 +38,8 @@ DOUBT_PERIOD = 30.0
 """Seconds after something was said twice in which answers like those heard lately are doubted."""
 SAID_MEMORY = 0.5
 """Seconds for which what was said may be said again."""
+MOST_UNHEARD = 4
+"""Learned windows in a row that may bring nothing before a node is taken to be silent."""
 MOST_DEBTS = 400
 """More unheard replies than fit into LAPSE at any window that is in use; the oldest goes."""
 
@@ -53,6 +55,10 @@ class Debt:
     """From then on, it is later than its node's lateness allows."""
     until: float = inf
     """From then on, only its own node's answers can be it: a right answer of another node was heard."""
+    awaited: bool = False
+    """The line went on before it was over: it may still come, and meet with what is said."""
+    in_part: bool = False
+    """Something came when it was due, which may have been a part of it."""
 
     def of(self, node: NodeRecord | None, now: float) -> bool:
         """It could be the answer of this node (None: of any) to a request that is made now."""
@@ -79,9 +85,17 @@ class InStep:
 
     # what is owed
 
-    def owe(self, keys: Iterable[bytes], node: NodeRecord | None, asked: float, over: float) -> None:
-        """Replies that begin with these keys were not heard."""
-        self.debts += [Debt(key, node, asked, over) for key in keys]
+    def owe(
+        self,
+        keys: Iterable[bytes],
+        node: NodeRecord | None,
+        asked: float,
+        over: float,
+        awaited: bool = False,
+        in_part: bool = False,
+    ) -> None:
+        """Replies that begin with these keys were not heard, see `Debt`."""
+        self.debts += [Debt(key, node, asked, over, inf, awaited, in_part) for key in keys]
         del self.debts[:-MOST_DEBTS]
         self.alert = True
 
@@ -99,11 +113,17 @@ class InStep:
         """When all that is owed and could look so is later than its node's lateness allows."""
         return max((debt.over for debt in self.debts if _could_be(debt, answers)), default=-inf)
 
+    def awaited_until(self, answers: Sequence[bytes] | None = None) -> float:
+        """Until when something may come (that could look so), though the line went on."""
+        awaited = (debt for debt in self.debts if debt.awaited and (answers is None or _could_be(debt, answers)))
+        return max((debt.over for debt in awaited), default=-inf)
+
     def owing(self, answers: Sequence[bytes], now: float) -> Iterator[NodeRecord]:
         """The nodes that owe what could look so, and answer, as far as is known."""
         for debt in self.debts:
-            if debt.node is not None and now < debt.until and not _is_silent(debt) and _could_be(debt, answers):
-                yield debt.node
+            if debt.node is not None and now < debt.until and _could_be(debt, answers):
+                if not _is_silent(debt) or (debt.awaited and now < debt.over and debt.node.unheard <= MOST_UNHEARD):
+                    yield debt.node
 
     def ends(self, answers: Sequence[bytes], now: float) -> float:
         """When what is owed and could look so can be no other node's any more; inf if that is not known."""
@@ -133,8 +153,8 @@ class InStep:
                 debt.until = now + (0.0 if debt.node is None else debt.node.latest(patience))
                 self._doubted.append((debt.key, debt.until + DOUBTED_LATENESSES * (debt.over - debt.asked)))
 
-    def heard(self, run: bytes, now: float) -> NodeRecord | None:
-        """Take all that came up to a silence, unasked or in place of a reply. Returns who owed it, if that is known.
+    def heard(self, run: bytes, now: float) -> Debt | None:
+        """Take all that came up to a silence, unasked or in place of a reply. Returns what it paid, if anything.
 
         What nobody owed, though it is like the last answers, was said twice. Of what is no lone answer, a part may
         be still to come: a byte of any kind.
@@ -152,14 +172,14 @@ class InStep:
                 self._pay(debt)
                 rest = rest[:place] + rest[place + len(debt.key) :]
         if payers and not rest:
-            return payers[0].node
+            return payers[0]
         if not payers and any(until > now and _is(run, key) for key, until in self._doubted):
             self._doubted = [entry for entry in self._doubted if not _is(run, entry[0])]
         elif not payers and any(_is(run, key) for key in (*self.last, *self.before)):
             self.said_twice(now)
         else:
             self.owe((ANY_BYTE,), None, now, now)
-        return payers[0].node if payers else None
+        return payers[0] if payers else None
 
     def _owed_byte(self, run: bytes) -> Debt | None:
         """The debt that the first byte pays: one that is alone, or before more of its kind, or before an owed reply."""

@@ -251,6 +251,7 @@ class LineMachine:
             data = kept
         leg.begun = True
         leg.begun_at = now
+        leg.first_bytes = data
         if transaction.first_byte == -inf:
             transaction.first_byte = now
         if now > leg.end + leg.timing.nominal + leg.latency:
@@ -298,6 +299,8 @@ class LineMachine:
                     self._deadlines.line = verdict
                     return
             transaction.node.note_reply(exchange.answers, transaction.command, begun_at - leg.end)
+            if transaction.node.learning is not None:
+                wire.learn(now)
         if step.send:
             wire.say(step.send, now)
         wire.transaction = wire.exchange = self._trust.held = None
@@ -406,7 +409,8 @@ class LineMachine:
         self._echo.forget()
         last = max(self._strays.last_byte, self._leg.out)  # ours, too: who speaks on two wires does not hear
         silent = max(last + self._leg.quiet(), self._quarantine, now)
-        self._silent_at = silent if begun else max(silent, self._leg.past())
+        learned = self._leg.timing.silence is not None  # then what may still come is owed (R15)
+        self._silent_at = silent if begun or learned else max(silent, self._leg.past())
         self._deadlines.line = self._strays.look_before(self._silent_at, now)
 
     def _free(self, now: float) -> None:
@@ -443,7 +447,7 @@ class LineMachine:
 
     def _hear_out(self, run: bytes, now: float) -> None:
         """The line is silent, and this came before: whoever said it, and owed it, is alive (R11, R15)."""
-        node = self._in_step.heard(run, now) if run else None
+        node = self._trust.hear(self._wire, run, self._strays, now) if run else None
         if node is not None and node.health is DOWN:
             self.dispatcher.probes.alive(node, now)
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from busmaster.arbiter.events import Mark
+from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.in_step import ANY_BYTE, InStep
 from busmaster.arbiter.on_wire import OnWire
+from busmaster.arbiter.strays import Strays
 from busmaster.contract.exchange import Done
 
 TWO_ANSWERS = "two answers came where one was due"
@@ -64,8 +66,20 @@ class Trust:
         assert transaction is not None
         assert exchange is not None
         keys = () if whole else tuple(exchange.owed)
-        if heard:
+        over, awaited = wire.leg.past(), wire.leg.timing.silence is not None
+        if awaited:  # what comes of it may meet with what is said then, and only a part of it be heard
+            over += sum(leg.timing.lateness for leg in exchange.later if not leg.sent)
+        if heard or (awaited and keys):
             keys += (ANY_BYTE,)
         if exchange.answered:
             transaction.node.unheard += not heard
-            self._in_step.owe(keys, transaction.node, wire.leg.end, wire.leg.past())
+            self._in_step.owe(keys, transaction.node, wire.leg.end, over, awaited, heard)
+
+    def hear(self, wire: OnWire, run: bytes, strays: Strays, now: float) -> NodeRecord | None:
+        """The line is silent, and this came before. Returns who owed it, if that is known."""
+        paid = self._in_step.heard(run, now)
+        node = None if paid is None else paid.node
+        if paid is not None and node is not None and node.learning is not None and paid.awaited and not paid.in_part:
+            node.learning.doubt()
+            strays.blame_for(node, paid.asked, strays.last_byte - (len(run) - 1) * wire.leg.byte_time)
+        return node
