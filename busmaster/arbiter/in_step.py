@@ -55,10 +55,8 @@ class Debt:
     """From then on, it is later than its node's lateness allows."""
     until: float = inf
     """From then on, only its own node's answers can be it: a right answer of another node was heard."""
-    awaited: bool = False
-    """The line went on before it was over: it may still come, and meet with what is said."""
-    in_part: bool = False
-    """Something came when it was due, which may have been a part of it."""
+    window: float | None = None
+    """The learned window, in seconds, after which the line went on: it may still come, and meet with what is said."""
 
     def of(self, node: NodeRecord | None, now: float) -> bool:
         """It could be the answer of this node (None: of any) to a request that is made now."""
@@ -91,11 +89,10 @@ class InStep:
         node: NodeRecord | None,
         asked: float,
         over: float,
-        awaited: bool = False,
-        in_part: bool = False,
+        window: float | None = None,
     ) -> None:
         """Replies that begin with these keys were not heard, see `Debt`."""
-        self.debts += [Debt(key, node, asked, over, inf, awaited, in_part) for key in keys]
+        self.debts += [Debt(key, node, asked, over, inf, window) for key in keys]
         del self.debts[:-MOST_DEBTS]
         self.alert = True
 
@@ -115,14 +112,14 @@ class InStep:
 
     def awaited_until(self, answers: Sequence[bytes] | None = None) -> float:
         """Until when something may come (that could look so), though the line went on."""
-        awaited = (debt for debt in self.debts if debt.awaited and (answers is None or _could_be(debt, answers)))
-        return max((debt.over for debt in awaited), default=-inf)
+        awaited = (debt for debt in self.debts if debt.window is not None)
+        return max((debt.over for debt in awaited if answers is None or _could_be(debt, answers)), default=-inf)
 
     def owing(self, answers: Sequence[bytes], now: float) -> Iterator[NodeRecord]:
         """The nodes that owe what could look so, and answer, as far as is known."""
         for debt in self.debts:
             if debt.node is not None and now < debt.until and _could_be(debt, answers):
-                if not _is_silent(debt) or (debt.awaited and now < debt.over and debt.node.unheard <= MOST_UNHEARD):
+                if not _is_silent(debt) or (debt.window and now < debt.over and debt.node.unheard <= MOST_UNHEARD):
                     yield debt.node
 
     def ends(self, answers: Sequence[bytes], now: float) -> float:

@@ -7,6 +7,7 @@ from typing import Any
 from busmaster.arbiter.events import Mark
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.in_step import ANY_BYTE, InStep
+from busmaster.arbiter.learned import LATE_SHARE
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.strays import Strays
 from busmaster.contract.exchange import Done
@@ -66,20 +67,23 @@ class Trust:
         assert transaction is not None
         assert exchange is not None
         keys = () if whole else tuple(exchange.owed)
-        over, awaited = wire.leg.past(), wire.leg.timing.silence is not None
-        if awaited:  # what comes of it may meet with what is said then, and only a part of it be heard
+        over, timing = wire.leg.past(), wire.leg.timing
+        window = None if timing.silence is None else timing.window
+        if window is not None:  # what comes of it may meet with what is said then, and only a part of it be heard
             over += sum(leg.timing.lateness for leg in exchange.later if not leg.sent)
-        if heard or (awaited and keys):
+        if heard or (window is not None and keys):
             keys += (ANY_BYTE,)
         if exchange.answered:
             transaction.node.unheard += not heard
-            self._in_step.owe(keys, transaction.node, wire.leg.end, over, awaited, heard)
+            self._in_step.owe(keys, transaction.node, wire.leg.end, over, window)
 
     def hear(self, wire: OnWire, run: bytes, strays: Strays, now: float) -> NodeRecord | None:
         """The line is silent, and this came before. Returns who owed it, if that is known."""
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
-        if paid is not None and node is not None and node.learning is not None and paid.awaited and not paid.in_part:
-            node.learning.doubt()
-            strays.blame_for(node, paid.asked, strays.last_byte - (len(run) - 1) * wire.leg.byte_time)
+        if paid is not None and node is not None and node.learning is not None and paid.window is not None:
+            first_byte = strays.last_byte - (len(run) - 1) * wire.leg.byte_time - wire.leg.latency
+            if first_byte - paid.asked > LATE_SHARE * paid.window:
+                node.learning.doubt()
+                strays.blame_for(node, paid.asked, first_byte)
         return node
