@@ -7,7 +7,7 @@ line is in step. An urgent write is never held back; its answer may then be doub
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from math import inf
 from typing import Any, TypeAlias
 
@@ -80,8 +80,8 @@ class Choice:
 
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
-        elif not exchange.answered and now < in_step.awaited_until():
-            chosen = in_step.awaited_until()  # what may still come would spoil what nobody acknowledges
+        elif _is_decisive(first) and now < in_step.awaited_until():
+            chosen = self._while_awaited(first, now) or in_step.awaited_until()
         elif transaction.probe and in_step.clashes(answers, now, transaction.node):
             chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
         elif in_step.clashes(answers, now):
@@ -116,7 +116,7 @@ class Choice:
 
         awaited = in_step.awaited_until(answers)
         if now < awaited:
-            return self._while_awaited(first, now, clashes) or awaited
+            return self._while_awaited(first, now, answers) or awaited
         if self._gone_before >= MOST_BEFORE:
             return first
 
@@ -147,15 +147,40 @@ class Choice:
         self._gone_before += 1
         return other
 
-    def _while_awaited(self, first: Chosen, now: float, clashes: Unfit) -> Chosen | None:
-        """What goes while an answer that is owed may still be on time: a check of the node that owes it shows that it
-        is not, else others have to wait. None once two were in vain."""
+    def _while_awaited(self, first: Chosen, now: float, answers: Sequence[bytes] | None = None) -> Chosen | None:
+        """What goes while an owed answer (that could look so) may still be on time, though the line went on: a check
+        of the node that owes it, which shows that it is not to come; else another. None once two were in vain."""
         if self._gone_before >= MOST_BEFORE - 1:
             return None
-        owing = dict.fromkeys(self._in_step.owing(first[1].answers, now))
-        other = self._ask_check(owing, now, clashes) or self._another(first, now, clashes)
+
+        def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
+            return self._in_step.clashes(answers, now, node)
+
+        owing = dict.fromkeys(self._in_step.owing(answers, now))
+        other = (
+            self._of_these(owing, now, clashes)
+            or self._ask_check(owing, now, clashes)
+            or self._another(first, now, clashes)
+        )
         self._gone_before += other is not None
         return other
+
+    def _of_these(self, nodes: Container[NodeRecord], now: float, unfit: Unfit) -> Chosen | None:
+        """A read of one of these nodes that waits anyway, of whatever class: it costs nothing, as a check does."""
+        opened: list[Exchange[Any]] = []
+
+        def suits(other: Transaction) -> bool:
+            node = other.node
+            if other.writes or node not in nodes or node.writes or not self._dispatcher.may_go(other, now):
+                return False
+            exchange = _opened(other)
+            if exchange is None or unfit(exchange.answers, node):
+                return False
+            opened.append(exchange)
+            return True
+
+        transaction = self._dispatcher.backlog.take(suits)
+        return None if transaction is None else (transaction, opened[0])
 
     def _ask_itself(self, first: Chosen, now: float) -> Chosen | None:
         """A check of a node that owes what it is to be asked for: its answer would not be believed. None for one that
@@ -226,6 +251,13 @@ def _fit_checks(nodes: Iterable[NodeRecord], unfit: Unfit) -> Iterator[tuple[Nod
             exchange = command.open(node.address, node.timings)
             if not unfit(exchange.answers, node):
                 yield node, command, exchange
+
+
+def _is_decisive(chosen: Chosen) -> bool:
+    """It is a write, or the last attempt of a read: nothing that could have been waited for may spoil it."""
+    transaction, exchange = chosen
+    last = transaction.retried >= transaction.retries and not transaction.probe
+    return transaction.writes or not exchange.answered or last
 
 
 def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:

@@ -9,7 +9,7 @@ from math import inf
 from typing import Any
 
 from busmaster.arbiter.counters import NodeCounters
-from busmaster.arbiter.learned import Learning
+from busmaster.arbiter.learned import AGAIN, AT_FIRST, AT_LAST, NEVER, Learning
 from busmaster.arbiter.transaction import Transaction
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
@@ -138,13 +138,15 @@ class NodeRecord:
         self._before_raised: Timings | None = None
 
     def timings_for(self, transaction: Transaction) -> Timings:
-        """Return the times of the next attempt: learned ones only for a read that will be repeated if they are over."""
-        learning = self.learning
-        if learning is None:
+        """Return the times of the next attempt: a learned window only for a read that is repeated if it is over."""
+        if self.learning is None:
             return self.timings
-        again = transaction.check or (transaction.retried < transaction.retries and not transaction.probe)
-        hurried = again and not self.failures and self.health in (UP, SUSPECT) and not transaction.writes
-        return learning.timings(transaction.command, self.timings, min(transaction.retried, 2) if hurried else 2)
+        retried, hurry = transaction.retried, AT_LAST
+        if self.failures or self.health is UNKNOWN or self.health is DOWN or (transaction.probe != transaction.check):
+            hurry = NEVER
+        elif transaction.check or (retried < transaction.retries and not transaction.writes and retried < 2):
+            hurry = AGAIN if retried else AT_FIRST
+        return self.learning.timings(transaction.command, self.timings, hurry)
 
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
         """It has answered rightly, after so many seconds."""

@@ -115,10 +115,10 @@ class InStep:
         awaited = (debt for debt in self.debts if debt.window is not None)
         return max((debt.over for debt in awaited if answers is None or _could_be(debt, answers)), default=-inf)
 
-    def owing(self, answers: Sequence[bytes], now: float) -> Iterator[NodeRecord]:
-        """The nodes that owe what could look so, and answer, as far as is known."""
+    def owing(self, answers: Sequence[bytes] | None, now: float) -> Iterator[NodeRecord]:
+        """The nodes that owe what could look so (None: anything), and answer, as far as is known."""
         for debt in self.debts:
-            if debt.node is not None and now < debt.until and _could_be(debt, answers):
+            if debt.node is not None and now < debt.until and (answers is None or _could_be(debt, answers)):
                 if not _is_silent(debt) or (debt.window and now < debt.over and debt.node.unheard <= MOST_UNHEARD):
                     yield debt.node
 

@@ -6,10 +6,11 @@ as long as this node has needed of late, with a good margin; then the line goes 
 
 What makes that safe is R15, not the window: the reply is *owed* from then on, for as long as the document's lateness
 and beyond it, and nothing that it could counterfeit is believed, no write and no broadcast is sent, until the node has
-answered something else. Nothing that is told to a caller rests on a learned time, either: writes, probes, the last
-attempt of a read, and all that is asked of a node that is not UP have the document's times.
+answered something else. Nothing that is told to a caller rests on a learned time, either: writes and the last attempt
+of a read have the document's window, and go only when nothing is awaited any more; probes and all that is asked of a
+node that has failed, and not answered since, have the document's times altogether.
 
-The rule, for each kind of read (its command's type) and each of the node's two legs (the answer; MSC's packet after its
+The rule, for each kind of command (its type) and each of the node's two legs (the answer; MSC's packet after its
 ACK) on its own: the window is twice the largest reply time of the last 500 to 1000 replies, or the largest until the
 first bytes were handed over if that is more (an adapter may hand over a whole reply at once), plus 2 ms; at least 5 ms,
 at most the document's. It is trusted after 200 replies.
@@ -43,8 +44,9 @@ SLOWER = 2
 """How many times its slowest reply is awaited of a node."""
 LEAST = 0.005
 """The shortest window, in seconds: less than a process is held up for."""
-PATIENCE = 4
-"""How many times longer the second attempt of a read is awaited than the first."""
+AT_FIRST, AGAIN, AT_LAST, NEVER = 1, 4, 10**9, 0
+"""How many times the learned window an attempt is awaited, but no longer than the document says. AT_LAST is the attempt
+on which an outcome rests: the document's window. NEVER: neither its window nor its silence is learned."""
 LATE_SHARE = 0.75
 """The share of a learned window after which a reply says that the node has become slower."""
 LEAST_SILENCE = 17
@@ -53,7 +55,7 @@ LEAST_SILENCE = 17
 
 @dataclass(frozen=True, slots=True)
 class LearnedTimes:
-    """What is known of the replies of one node to one kind of read; in seconds.
+    """What is known of the replies of one node to one kind of command; in seconds.
 
     `slowest` is the largest reply time of the last 500 to 1000 replies, to the first byte; `heard` the largest until
     the first bytes were handed over; `pause` the longest within a reply. `window` is what is awaited, once `trusted`.
@@ -85,7 +87,7 @@ class _Largest:
 
 
 class LegTimes:
-    """The reply times of one leg of one kind of read."""
+    """The reply times of one leg of one kind of command."""
 
     __slots__ = ("_left", "doubts", "heard", "pause", "slowest")
 
@@ -127,16 +129,16 @@ class LegTimes:
         return max(LEAST, max(SLOWER * self.slowest.value, self.heard.value) + MARGIN)
 
     def timing(self, document: ReplyTiming, byte_time: float, patience: int) -> ReplyTiming:
-        """Return what is awaited: the document's while too little is known, or where that is no longer."""
-        window = patience * self.window
-        if self.doubts or window >= document.window:
+        """Return what is awaited: the document's while too little is known."""
+        window = min(patience * self.window, document.window)
+        if self.doubts:
             return document
         gap = min(document.byte_gap, max(LEAST_SILENCE * byte_time, 2 * self.pause.value))
         return replace(document, nominal=min(document.nominal, window), window=window, byte_gap=gap, silence=gap)
 
 
 class Kind:
-    """One kind of read of one node, and the times that its next exchange is opened with."""
+    """One kind of command of one node, and the times that its next exchange is opened with."""
 
     __slots__ = ("_byte_time", "_document", "_given", "first", "packet")
 
@@ -145,15 +147,16 @@ class Kind:
         self.packet = LegTimes()
         self._byte_time = 0.0
         self._document: Timings | None = None
-        self._given: tuple[Timings, Timings, Timings] | None = None
+        self._given: dict[int, Timings] | None = None
 
-    def timings(self, document: Timings, attempt: int) -> Timings:
-        """Return those of a first attempt (0), a second one (1), or one that has the document's times (2)."""
+    def timings(self, document: Timings, hurry: int) -> Timings:
+        """Return what an exchange is to be opened with: AT_FIRST, AGAIN, AT_LAST or NEVER."""
         if self._given is None or document is not self._document:
             self._document = document
             own = replace(document, packet=replace(document.packet))  # so that a packet's leg can be told by its timing
-            self._given = (self._learned(own, 1), self._learned(own, PATIENCE), own)
-        return self._given[attempt]
+            self._given = {patience: self._learned(own, patience) for patience in (AT_FIRST, AGAIN, AT_LAST)}
+            self._given[NEVER] = own
+        return self._given[hurry]
 
     def note(self, packet: bool, begun: float, heard: float, pause: float, byte_time: float) -> None:
         """Note the reply to one of its legs."""
@@ -169,7 +172,8 @@ class Kind:
 
     def _learned(self, own: Timings, patience: int) -> Timings:
         first = self.first.timing(own.read, self._byte_time, patience)
-        return replace(own, read=first, packet=self.packet.timing(own.packet, self._byte_time, patience))
+        write = self.first.timing(own.write, self._byte_time, AT_LAST)
+        return Timings(first, write, self.packet.timing(own.packet, self._byte_time, patience))
 
 
 class Learning:
@@ -183,12 +187,12 @@ class Learning:
         self.returns = 0
         """How often the document's times were gone back to."""
 
-    def timings(self, command: object, document: Timings, attempt: int) -> Timings:
+    def timings(self, command: object, document: Timings, hurry: int) -> Timings:
         """Return the times with which `command` is to be opened, see `Kind.timings`."""
         kind = self.kinds.get(type(command))
         if kind is None:
             kind = self.kinds[type(command)] = self._begin(type(command).__name__)
-        return kind.timings(document, attempt)
+        return kind.timings(document, hurry)
 
     def note(self, command: object, packet: bool, begun: float, heard: float, pause: float, byte_time: float) -> None:
         """A reply came: begun after so many seconds, its first bytes handed over after `heard`, with that `pause`."""

@@ -51,7 +51,7 @@ class OnWire:
         assert transaction is not None
         assert exchange is not None
         learning = transaction.node.learning
-        if learning is None or transaction.writes or not leg.begun:
+        if learning is None or not leg.begun:
             return
         heard = max(0.0, leg.begun_at - leg.end - leg.latency)
         begun = max(0.0, heard - (len(leg.first_bytes) - 1) * leg.byte_time)
