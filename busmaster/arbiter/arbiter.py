@@ -20,7 +20,7 @@ from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import EXCHANGE, READY
 from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import Transaction
-from busmaster.contract.learning import Learned
+from busmaster.contract.learning import Learned, documented
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed
@@ -62,11 +62,10 @@ class Arbiter(LineMachine):
     ) -> NodeRecord:
         """Raises InvalidCommand for an address that the protocol does not have."""
         profile.check_address(address)
-        document = timings.document if isinstance(timings, Learned) else timings
         node = NodeRecord(
             profile,
             address,
-            document or profile.timings,
+            documented(timings) or profile.timings,
             profile.retries if retries is None else retries,
             self.name,
         )

@@ -118,9 +118,10 @@ class InStep:
     def owing(self, answers: Sequence[bytes] | None, now: float) -> Iterator[NodeRecord]:
         """The nodes that owe what could look so (None: anything), and answer, as far as is known."""
         for debt in self.debts:
-            if debt.node is not None and now < debt.until and (answers is None or _could_be(debt, answers)):
-                if not _is_silent(debt) or (debt.window and now < debt.over and debt.node.unheard <= MOST_UNHEARD):
-                    yield debt.node
+            if debt.node is None or now >= debt.until or not (answers is None or _could_be(debt, answers)):
+                continue
+            if not _is_silent(debt) or (debt.window and now < debt.over and debt.node.unheard <= MOST_UNHEARD):
+                yield debt.node
 
     def ends(self, answers: Sequence[bytes], now: float) -> float:
         """When what is owed and could look so can be no other node's any more; inf if that is not known."""

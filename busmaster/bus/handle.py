@@ -10,6 +10,7 @@ from typing import Any, ClassVar, TypeAlias, Unpack
 from busmaster.bus.points import Point
 from busmaster.bus.requester import NodeSource, ReadOptions, WriteOptions
 from busmaster.contract.exchange import Command
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
@@ -34,7 +35,7 @@ class Handle(ABC):
         bus: NodeSource,
         address: int,
         *,
-        timings: Timings | None = None,
+        timings: Timings | Learned | None = None,
         retries: int | None = None,
         profile: Profile | None = None,
     ) -> None:

@@ -1,4 +1,4 @@
-"""The wish to have reply times learned from the nodes, instead of always awaiting replies for as long as documents say."""
+"""The wish to have reply times learned from the nodes, instead of awaiting each reply for as long as documents say."""
 
 from __future__ import annotations
 
@@ -16,6 +16,15 @@ class Learned:
     """
 
     document: Timings | None = None
+
+    def of(self, document: Timings) -> Learned:
+        """Return the same for nodes of a protocol with these times."""
+        return self if self.document is not None else Learned(document)
+
+
+def documented(timings: Timings | Learned | None) -> Timings | None:
+    """Return the times that hold where nothing is learned; None for those of the protocol."""
+    return timings.document if isinstance(timings, Learned) else timings
 
 
 LEARNED = Learned()

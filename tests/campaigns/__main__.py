@@ -48,7 +48,8 @@ def main() -> int:
                 done += totals.transactions
                 if totals.problems:
                     _say(f"{protocol}/{mix}/{seed}: {totals.problems[0]}")
-                    options = f"--each {arguments.each}{' --strict' * arguments.strict}{' --learned' * arguments.learned}"
+                    options = f"--each {arguments.each}{' --strict' * arguments.strict}"
+                    options += " --learned" * arguments.learned
                     _say(f"  python -m tests.campaigns --replay '{protocol}/{mix}/{seed}' {options}")
             sys.stderr.write(f"seed {seed}: {done:,} transactions, {time.perf_counter() - begun:.0f} s\n")
             if seed - arguments.seed + 1 == arguments.seeds or (not arguments.seeds and done >= arguments.transactions):

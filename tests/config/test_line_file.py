@@ -11,6 +11,7 @@ from busmaster.bus.node import Node
 from busmaster.config import ConfiguredLine, FileError, LineFile, emulated_line, load
 from busmaster.config.sections import read
 from busmaster.config.source import Source
+from busmaster.contract.learning import documented
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.outputs.settings import FileSettings, MqttSettings, SqliteSettings
@@ -101,7 +102,7 @@ def test_a_node_overrides_its_protocol_and_the_protocol_its_document() -> None:
         "timing = { nominal = 0.08, write = { window = 0.3, lateness = 0.4 } }\n"
     )
     nodes = parse(text).nodes
-    first, second = nodes["winder"].timings, nodes["other"].timings
+    first, second = documented(nodes["winder"].timings), documented(nodes["other"].timings)
     assert first is not None
     assert second is not None
     assert (nodes["winder"].retries, nodes["other"].retries) == (1, 0)

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Unpack
 from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
 from busmaster.bus.points import Point
 from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
@@ -38,7 +39,7 @@ class CtAnsiDrive(Handle):
         address: int,
         *,
         decimals: Mapping[str, int] | None = None,
-        timings: Timings | None = None,
+        timings: Timings | Learned | None = None,
         retries: int | None = None,
     ) -> None:
         super().__init__(bus, address, timings=timings, retries=retries)
