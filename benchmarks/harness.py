@@ -32,7 +32,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Claim:
-    """What the design promises of a figure, and whether this run shows it."""
+    """What is claimed of a figure, and whether this run shows it."""
 
     text: str
     measured: float

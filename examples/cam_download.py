@@ -23,7 +23,7 @@ def show(done: int, total: int) -> None:
 
 async def main(port: Endpoint) -> None:
     async with Bus(port) as bus:
-        # The address step is not in the documents: 4 where addresses count bytes. `find_address_step` finds it.
+        # The address step is not in the manual: 4 where addresses count bytes. `find_address_step` finds it.
         press = MscController(bus, 3, symbols={"cam": 3000}, address_step=4)
         await press.load_cam("cam", TABLE, progress=show)  # what was written and what was verified both count
         print("the first values are", await press.read_block("cam", 8))

@@ -1,12 +1,12 @@
-"""The command handshake of the HCP document: data in Comms(2) to (4), then the command in Comms(1), then wait for zero.
+"""The command handshake of AN00110: data in Comms(2) to (4), then the command in Comms(1), then wait for zero.
 
     python examples/hcp_handshake.py [PORT]    such as /dev/ttyUSB0; without one, emulated
 
-The document's Mint program clears Comms(1) whether it has seen a command or not: one that is written between its look
+That note's Mint program clears Comms(1) whether it has seen a command or not: one that is written between its look
 and its clearing is lost, although the host sees zero. So the effect is checked, and the command is given again: one
 that may be repeated, a move to an absolute position.
 
-With a PORT it MOVES axis 1 of node 2, if that runs the document's program and keeps POS(1) in Comms(10).
+With a PORT it MOVES axis 1 of node 2, if that runs that program and keeps POS(1) in Comms(10).
 """
 
 import sys
@@ -53,7 +53,7 @@ async def main(port: Endpoint) -> None:
 
 
 def program(mint: EmulatedMint) -> Generator[int, None, None]:
-    """The document's, with one more line: Comms(10) = POS(1)."""
+    """The note's, with one more line: Comms(10) = POS(1)."""
     for line in command_handshake(mint):
         mint.comms[10] = mint.axes[1].position(mint.now)
         yield line

@@ -56,6 +56,8 @@ class Alike:
             self.count = 0
             return False
         self.count += 1
+        if not leg.paced:  # where bytes leave when they like, times show nothing
+            return self.count >= LONGEST_ALIKE
         untimely = self._was_untimely(last_byte - leg.end, len(exchange.request) * leg.byte_time)
         if self.count == 1:  # the one before it was unlike: whatever its time, it was its own
             self._untimely = False
@@ -67,7 +69,7 @@ class Alike:
         """Whether times fail to show that the last answer was its own. It came `took` seconds after its request, which
         needed `asking` on the wire."""
         node = self.node
-        if not self._wire.leg.paced or node is None or took < 0:  # below 0: there was none
+        if node is None or took < 0:  # below 0: there was none
             return True
         usual = node.usual
         if usual is None:

@@ -144,7 +144,7 @@ class Arbiter(LineMachine):
     def poll_event(self) -> Event | None:
         if self.dispatcher.unnoted is not None:
             self.dispatcher.note_success()
-        return self._events.popleft() if self._events else None
+        return self.events.popleft() if self.events else None
 
     def poll_timeout(self) -> float:
         deadlines = self._deadlines

@@ -60,6 +60,9 @@ class _Fifo:
         return found
 
     def discard(self) -> None:
+        # A caller that gives up must be free at once, however long the queue is, so its place is only given up, and
+        # swept later. Without the sweep, callers that always give up would fill the memory of a line that never gets
+        # to them.
         self.live -= 1
         if len(self._entries) > 2 * self.live + SLACK:
             self._entries = deque(self)
@@ -91,6 +94,8 @@ class _EarliestDeadlineFirst:
         self.live += 1
 
     def push_front(self, transaction: Transaction) -> None:
+        # The first of all whatever its deadline, or a write would go behind what it had its turn before. The negative
+        # number puts it before the one that has the same deadline, and the last one put back before the others.
         transaction.deadline = self._entries[0][0] if self._entries else transaction.deadline
         heapq.heappush(self._entries, (transaction.deadline, -next(self._order), transaction))
         self.live += 1
@@ -201,10 +206,12 @@ class Backlog:
         self._streak_before = self._streak
         self._rotated_before = self._rotated
         if urgent.live:
+            # Not counted as a higher class that had its turn: a stop waits for nobody's fairness. R9's bounds of the
+            # lower classes therefore hold below sustained urgent traffic only.
             return urgent.pop()
         if command.live:
             if not poll.live and not background.live:
-                self._streak = 0
+                self._streak = 0  # nobody was kept waiting, so nobody is owed a slot
             elif self._streak >= SHARE:
                 return self._lower_slot()
             else:

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 from busmaster.arbiter.alike import Alike
 from busmaster.arbiter.dispatcher import Dispatcher
-from busmaster.arbiter.health import SILENT, UP, NodeRecord
+from busmaster.arbiter.health import UP, NodeRecord
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.transaction import URGENT, Transaction
@@ -96,7 +96,7 @@ class Choice:
             chosen = self._another(first, now, alike) or first
         if chosen is first:
             self._gone_before = 0
-        if isinstance(chosen, float):
+        if not isinstance(chosen, tuple):
             self._dispatcher.backlog.restore(transaction)
         else:
             if chosen[0] is not transaction:
@@ -186,7 +186,7 @@ class Choice:
         """A check of a node that owes what it is to be asked for: its answer would not be believed. None for one that
         is likely to be dead."""
         node = first[0].node
-        if node.unheard > SILENT or self._gone_before >= MOST_BEFORE:
+        if node.silent or self._gone_before >= MOST_BEFORE:
             return None
         self._gone_before += 1
         return self._ask_check([node], now, lambda answers, node: self._in_step.clashes(answers, now, node))
@@ -240,7 +240,8 @@ class Choice:
             if node.address != node.profile.broadcast and node.suspended_until <= now
         ]
         alive = [node for node in nodes if not node.silent]
-        alive.sort(key=lambda node: (node.health is not UP, -node.last_reply))
+        alive.sort(key=lambda node: node.last_reply, reverse=True)
+        alive.sort(key=lambda node: node.health is not UP)
         return alive, [node for node in nodes if node.silent]
 
 

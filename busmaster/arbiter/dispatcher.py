@@ -74,9 +74,10 @@ class Dispatcher:
 
     def submit(self, transaction: Transaction, now: float) -> bool:
         """Queue it, or end it at once with the reason why not: then False."""
-        node = transaction.node
+        node, counters = transaction.node, self.counters
         transaction.queued = now
-        self._waits(transaction)
+        transaction.exchanges_ahead = counters.exchanges  # as _waits does: this is done for every request
+        transaction.settling_ahead = counters.spent[SETTLING]
         if self.fault is not None:
             self._end(transaction, now, name_error(self.fault(), transaction))
             return False

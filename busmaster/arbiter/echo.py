@@ -24,6 +24,8 @@ class Echo:
         owed = self.owed
         length = min(len(owed), len(data))
         if data[:length] != owed[:length]:
+            # Nothing after this can be told from echo: who else was talking changed, ate or added bytes. Looking for
+            # where the echo goes on would be searching, and might find it in somebody's reply.
             self.owed = b""
             return None
         self.owed = owed[length:]

@@ -151,6 +151,8 @@ class NodeRecord:
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
         """It has answered rightly, after so many seconds."""
         self.unheard = 0
+        # Up at once, down slowly: it decides which answers are believed (R15), and one slow reply among many fast ones
+        # is what it must not forget.
         slowest = self.slowest
         self.slowest = took if took > slowest else slowest - SLOWEST_DECAY * (slowest - took)
         if len(self.answered) < MOST_ANSWERED and answers not in self.answered and not command.writes:
@@ -215,6 +217,7 @@ class ProbeBudget:
         before, probe = self._pause, self.probe
         pause = before + seconds
         if pause > probe and self.tokens < BUDGET_CAPACITY:
+            # only what is longer than a probe, and only what was not counted when the same pause was looked at before
             earned = BUDGET_IDLE_SHARE * (pause - max(probe, before))
             self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)
         self._pause = 0.0 if over else pause
@@ -280,9 +283,13 @@ def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> N
         if now >= node.probe_at:
             _probe_later(node, min(2 * node.probe_delay, LONGEST_PROBE_DELAY), now, jitter)
         return
+    # One failure is enough of a node that was never heard: nothing says that it is there, and a
+    # line that starts with thirty absent nodes would else wait for each of them three times.
     never_heard = node.health is UNKNOWN
     silent = now - node.last_reply >= DOWN_AFTER_SILENCE
     if never_heard or (node.failures >= DOWN_AFTER_FAILURES and silent):
+        # One that has just come back and is gone again goes on with its longer delays, or flapping would cost as much
+        # line time as dying for the first time, each time.
         again = min(2 * node.probe_delay, LONGEST_PROBE_DELAY)
         node.health = DOWN
         _probe_later(node, again if flaps(node, now) else FIRST_PROBE_DELAY, now, jitter)
@@ -293,4 +300,5 @@ def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> N
 def _probe_later(node: NodeRecord, delay: float, now: float, jitter: Callable[[], float]) -> None:
     node.probe_delay = delay
     node.probed_at = now
+    # Nodes that died together (one fuse, one cable) would else be probed together ever after.
     node.probe_at = now + delay * (1 + PROBE_JITTER * (2 * jitter() - 1))

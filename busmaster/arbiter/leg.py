@@ -9,7 +9,7 @@ what was said last               when the last byte that it caused can have been
 a request, one leg               a silence of `quiet()` that ends at or after `end + lateness + latency + byte time`
 a request whose ACK was heard    likewise from the end of that ACK, with the packet's lateness (MSC)
 a request whose ACK was not      likewise; the packet's lateness counts from the request's end, and anew from
-heard (MSC: it may be lost)      each stray, which may be the missing ACK
+heard (MSC: it may be lost)      each stray, and what came in its place: either may be the ACK, damaged
 a request on an echoing port     likewise, `end` being the last byte of its echo
 a closing ACK                    when it is out; nothing answers it
 a broadcast                      when it is out, and `turnaround` later
@@ -29,6 +29,8 @@ from busmaster.arbiter.strays import QUIET
 from busmaster.contract.exchange import Leg as LaterLeg
 from busmaster.contract.timing import ReplyTiming
 
+UNKNOWN_LATENESS = 0.150
+"""Assumed of an earlier master's nodes while none is known."""
 TAINT_SHARE = 0.9
 """A reply cannot begin before this share of its request's own wire time (R4)."""
 
@@ -134,6 +136,11 @@ class Leg:
         self._follows = later[0].timing if later and not later[0].sent else None
         if self._follows is not None:
             self._follows_until = self._past(self.end, self._follows)
+
+    def answered(self) -> None:
+        """What was answered has left, whatever the baud rate says: not every port keeps to it."""
+        if self.end > self.begun_at:
+            self.end = self.out = self.begun_at
 
     def strayed(self, now: float) -> None:
         """Something came: perhaps the reply that was given up, and its next leg begins here. Or it was noise, and the

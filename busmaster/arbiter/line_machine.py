@@ -40,7 +40,7 @@ from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import LineChange, LineChanged, Mark, Strayed
 from busmaster.arbiter.health import DOWN
 from busmaster.arbiter.in_step import InStep
-from busmaster.arbiter.leg import Leg
+from busmaster.arbiter.leg import UNKNOWN_LATENESS, Leg
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
 from busmaster.arbiter.strays import LOOK_SLACK, QUIET, Strays
@@ -49,9 +49,6 @@ from busmaster.arbiter.trust import COLLIDED, TOO_EARLY, TWO_ANSWERS, Trust, dam
 from busmaster.contract.exchange import NO_REPLY, Done, Expect, FrameError
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import BusError, LineDown, LineNoisy, Refused
-
-UNKNOWN_LATENESS = 0.150
-"""Assumed of an earlier master's nodes while none is known."""
 
 
 class LineMachine:
@@ -76,7 +73,7 @@ class LineMachine:
         self._counters = LineCounters(now)
         self.dispatcher = make_dispatcher(tapped, self._deadlines, self._counters, now, capacity, jitter)
         self.dispatcher.fault = self._offline
-        self._events = self.dispatcher.events
+        self.events = self.dispatcher.events
         self._cause = "not open yet"
         self._closed = False
         # the exchange on the wire
@@ -86,7 +83,7 @@ class LineMachine:
         self._choice = Choice(self.dispatcher, self._in_step, self._wire)
         self._trust = Trust(self._in_step)
         # the line
-        self._strays = Strays(self._events, self._counters)
+        self._strays = Strays(self.events, self._counters)
         self._up_at = -inf
         self._quarantine = -inf
         self._silent_at = -inf
@@ -102,7 +99,7 @@ class LineMachine:
             return
         self._leg.paced = paced and not self._echo.declared
         self.dispatcher.fault = None
-        self._events.append(LineChanged(LineChange.UP))
+        self.events.append(LineChanged(LineChange.UP))
         lateness = max((node.lateness for node in self.dispatcher.nodes), default=UNKNOWN_LATENESS)
         self._up_at = now
         self._quarantine = now + lateness + self._leg.latency + self._leg.byte_time
@@ -114,7 +111,7 @@ class LineMachine:
             return
         self._counters.losses += 1
         self._cause = cause
-        self._events.append(LineChanged(LineChange.DOWN, cause))
+        self.events.append(LineChanged(LineChange.DOWN, cause))
         if not self._closed:
             self.dispatcher.fault = self._offline
         self._go_offline(now)
@@ -287,9 +284,6 @@ class LineMachine:
         assert exchange is not None
         answered = exchange.answered
         if answered:
-            begun_at = leg.begun_at
-            if leg.end > begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
-                leg.end = leg.out = begun_at
             if self._in_step.alert or step.rest:
                 verdict = self._trust.weigh(wire, step, now)
                 if isinstance(verdict, str):
@@ -298,7 +292,9 @@ class LineMachine:
                 if verdict is not None:
                     self._deadlines.line = verdict
                     return
-            transaction.node.note_reply(exchange.answers, transaction.command, begun_at - leg.end)
+            if leg.end > leg.begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
+                leg.end = leg.out = leg.begun_at
+            transaction.node.note_reply(exchange.answers, transaction.command, leg.begun_at - leg.end)
             if transaction.node.learning is not None:
                 wire.learn(now)
         if step.send:
@@ -371,6 +367,7 @@ class LineMachine:
         self._end_exchange()
         self.dispatcher.refused(transaction, refusal, certain, now)
         if transaction.writes and certain:
+            self._leg.answered()
             self._release(self._leg.timing.turnaround, now)
         else:
             self._settle(now, begun=confirmed and certain)
@@ -379,6 +376,7 @@ class LineMachine:
         wire = self._wire
         if failed and wire.exchange is not None:
             self._leg.give_up(wire.exchange.later)
+            self._leg.strayed(self._strays.last_byte)  # what came in place of the reply may have been it, damaged
         wire.transaction = wire.exchange = self._trust.held = None
         self._counters.exchanges += 1
 
@@ -389,8 +387,7 @@ class LineMachine:
         if self._closed:
             self._go_offline(now)
         elif hold or not self._advance(now):
-            out = self._leg.out
-            free = (out if out > now else now) + hold
+            free = max(self._leg.out, now) + hold
             held = free > now
             self._enter(HOLDOFF if held else READY, now)
             self._deadlines.line = free if held else inf
@@ -409,8 +406,8 @@ class LineMachine:
         self._echo.forget()
         last = max(self._strays.last_byte, self._leg.out)  # ours, too: who speaks on two wires does not hear
         silent = max(last + self._leg.quiet(), self._quarantine, now)
-        learned = self._leg.timing.silence is not None  # then what may still come is owed (R15)
-        self._silent_at = silent if begun or learned else max(silent, self._leg.past())
+        goes_on = begun or self._leg.timing.silence is not None  # learned: what may still come is owed (R15)
+        self._silent_at = silent if goes_on else max(silent, self._leg.past())
         self._deadlines.line = self._strays.look_before(self._silent_at, now)
 
     def _free(self, now: float) -> None:
@@ -423,7 +420,7 @@ class LineMachine:
             if self.noisy:
                 self.noisy = False
                 self.dispatcher.fault = None
-                self._events.append(LineChanged(LineChange.QUIET))
+                self.events.append(LineChanged(LineChange.QUIET))
         self._enter(READY, now)
         self._deadlines.line = self._strays.look_before(inf, now)
         self._advance(now)
@@ -441,7 +438,7 @@ class LineMachine:
         if strays.babbling(now) and not self.noisy:
             self.noisy = True
             self._counters.noisy += 1
-            self._events.append(LineChanged(LineChange.NOISY))
+            self.events.append(LineChanged(LineChange.NOISY))
             self.dispatcher.fault = lambda: LineNoisy("the line has not been silent for a second")
             self.dispatcher.fail_all(now)
 
@@ -463,10 +460,11 @@ class LineMachine:
     def _strip_echo(self, data: bytes, now: float) -> bytes:
         """Take the echo of what was sent off the front, byte for byte; a mismatch is a collision."""
         rest = self._echo.strip(data)
+        self._strays.last_byte = now  # where the echo is lost, this may be another's byte that looks like it
         if rest is None:
             self._counters.collisions += 1
-            self._events.append(Strayed(data, collision=True))
-            self._strays.last_byte = now
+            self.events.append(Strayed(data, collision=True))
+            self._strays.collided = True
             if self.state is EXCHANGE:
                 self._attempt_failed(FrameError(COLLIDED), now)
             else:

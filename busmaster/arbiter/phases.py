@@ -40,6 +40,8 @@ def quietest_offset(
     their offset modulo the common divisor of their periods, made of straight pieces; the least sum of all of them lies
     at one of the kinks. Among equals the earliest wins. The search ends early where there would be too many kinks.
     """
+    # Stretched over the time that there is: cycles that just fit one behind the other would meet as soon as one of them
+    # takes longer than it was reckoned.
     own = min(poll.cost * stretch, poll.period)
     pairs: list[Pair] = []
     divisors: dict[float, float] = {}

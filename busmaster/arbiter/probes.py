@@ -29,6 +29,8 @@ class Probes:
             self._deadlines.health = inf
             return
         down = [node for node in self.nodes if node.health is DOWN]
+        # A probe of a dead node is expected to fail, and a failed attempt costs the lateness: that, not the window, is
+        # what it takes of the line.
         self.budget.probe = max((node.lateness for node in down), default=0.0)
         due = min((max(node.probe_at, node.suspended_until) for node in down), default=inf)
         free = min((max(self._free_at, node.suspended_until) for node in down), default=inf)
@@ -40,6 +42,7 @@ class Probes:
         if self._running is not None or not down or not usable:
             self._put_off(now)
             return None
+        # Of those that are due the one that has waited longest, so that none is forgotten when the budget is short.
         node = min(down, key=lambda node: (node.probe_at > now, node.probed_at))
         cost = node.lateness
         if self._is_free(node, now, idle):
@@ -55,6 +58,8 @@ class Probes:
 
     def spare(self, cost: float, now: float) -> bool:
         """Pay for a caller's request to a dead node, if the budget holds that beside the probe that is due."""
+        # The probe that is due keeps its share: else a caller that asks a dead node again and again would spend all
+        # there is, and the other dead ones would never be found to be back.
         due = max((n.lateness for n in self.nodes if n.health is DOWN and n.probe_at <= now), default=0.0)
         if self.budget.tokens < min(cost + due, BUDGET_CAPACITY):
             return False

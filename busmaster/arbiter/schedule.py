@@ -225,9 +225,10 @@ class Schedule:
 
     def _starts(self, poll: Poll, now: float) -> bool:
         """The first of the heap is due: put it back where it is due next."""
+        # From the number of the period, never by adding periods up: sums of floats drift, and a grid must not (R10).
         behind = floor((now - poll.base) / poll.period) - poll.number
         if poll.base + (poll.number + max(behind, 0) + 1) * poll.period <= now:
-            behind = max(behind, 0) + 1  # rounding
+            behind = max(behind, 0) + 1  # the quotient was rounded down across a cycle that the clock already stands on
         if behind > 0:
             poll.number += behind
             poll.missed += 0 if poll.paused else behind
@@ -236,7 +237,7 @@ class Schedule:
         heapq.heapreplace(self._heap, (poll.next_due(), next(self._order), poll))
         if poll.paused:
             return False
-        if poll.remaining:
+        if poll.remaining:  # its last cycle still runs: a second one beside it would only make both late
             poll.missed += 1
             return False
         poll.due = due

@@ -34,6 +34,8 @@ class Strays:
         self.last_byte = -inf
         self.run = bytearray()
         """What came since the line was last silent, or in place of a reply."""
+        self.collided = False
+        """Some of it is an echo that did not match: what is like a request is like a reply, too."""
         self._looked = -inf
         self._look_at = inf
         self.listener: Listener | None = None
@@ -98,6 +100,8 @@ class Strays:
         stalled = first_byte > self._look_at + LOOK_SLACK  # it may have lain unread for as long
         age = (self._looked if stalled else first_byte) - asked
         raised = min(STRAGGLER_MARGIN * age, LONGEST_LATENESS)
+        # Before its lateness is exceeded, not after: by then it can be taken for somebody's answer. What comes later
+        # than the memory is nobody's straggler any more, but noise, or owed (R15).
         if STRAGGLER_SHARE * lateness < age <= STRAGGLER_MEMORY and raised > lateness:
             node.raise_lateness(raised, first_byte)
             self._events.append(LatenessRaised(node, age, raised))

@@ -114,7 +114,7 @@ class Transaction:
         self.writes = command.writes
         self.idempotent = command.idempotent if idempotent is None else idempotent
         if probe or (self.writes and not self.idempotent):
-            self.retries = 0
+            self.retries = 0  # whatever number was given: that alone does not make a write repeatable
         else:
             self.retries = node.retries if retries is None else retries
         self.start_by = start_by

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any
 
 from busmaster.arbiter.events import Mark
@@ -79,6 +80,10 @@ class Trust:
 
     def hear(self, wire: OnWire, run: bytes, strays: Strays, now: float) -> NodeRecord | None:
         """The line is silent, and this came before. Returns who owed it, if that is known."""
+        echoed, strays.collided = strays.collided, False
+        if echoed and self._in_step.awaited_until() > -inf:  # our own request is no reply
+            self._in_step.owe((ANY_BYTE,), None, now, now)
+            return None
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
         if paid is not None and node is not None and node.learning is not None and paid.window is not None:

@@ -24,7 +24,7 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup, Sample, Stream
 from busmaster.bus.requester import checked_priority, checked_retries
-from busmaster.bus.shared_line import SharedLine
+from busmaster.bus.shared_line import SharedLine, running_loop
 from busmaster.bus.suitability import check_company, check_settings
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.contract.learning import Learned
@@ -107,7 +107,13 @@ class Bus:
         self._check_not_closed()
         if self.running:
             raise InvalidCommand(f"the bus on {self.endpoint.name} is open already: enter it once, and share it")
-        self._line.bind(asyncio.get_running_loop())
+        loop = running_loop()
+        if loop is None:  # awaited, and not by asyncio
+            raise InvalidCommand(
+                f"the bus on {self.endpoint.name} needs asyncio's event loop, which does not run here: "
+                "run the program by asyncio.run, or by anyio.run with its asyncio backend, not by trio"
+            )
+        self._line.bind(loop)
         self._arbiter.reset_statistics(self.now())
         connection = Connection(self.endpoint, self.pump, on_failed=self._on_failed, jitter=self._random)
         self._connection = connection
@@ -167,7 +173,7 @@ class Bus:
     def node(
         self, profile: Profile, address: int, *, timings: Timings | Learned | None = None, retries: int | None = None
     ) -> Node:
-        """The node at this address: a protocol and an address are one node, however often it is asked for.
+        """Return the node at this address: a protocol and an address are one node, however often it is asked for.
 
         Raises InvalidCommand for an address that the protocol does not have; for a protocol that cannot share the line
         with those that are on it; and for another profile, timings or retries than the node was first asked with. What
@@ -241,13 +247,13 @@ class Bus:
         return group
 
     def latest(self, point: Point[T]) -> Sample[T] | None:
-        """The youngest good sample of this point in any group, unless a write has made it stale."""
+        """Return the youngest good sample of this point in any group, unless a write has made it stale."""
         return self._line.latest(point)
 
     # looking
 
     def now(self) -> float:
-        """The bus's clock, in seconds: all its times are of this clock."""
+        """Return the time of the bus's clock, in seconds: all its times are of this clock."""
         return self.pump.clock()
 
     def wall_time(self) -> float:
@@ -261,7 +267,7 @@ class Bus:
 
     @property
     def byte_time(self) -> float:
-        """tau: seconds per byte of this line."""
+        """Return tau, the seconds per byte of this line."""
         return self._arbiter.byte_time
 
     @property
@@ -269,7 +275,7 @@ class Bus:
         return self._arbiter.state
 
     def statistics(self) -> LineStatistics:
-        """An immutable snapshot of the line's counts since it was opened or reset."""
+        """Return an immutable snapshot of the line's counts since it was opened or reset."""
         self.check_loop()
         return replace(self._arbiter.statistics(self.now()), driver=self.pump.driver_errors())
 
@@ -282,7 +288,7 @@ class Bus:
             group.reset_statistics()
 
     def plan(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-        """What becomes of the groups that run, and of `more`, by the reply times measured so far.
+        """Reckon what becomes of the groups that run, and of `more`, by the reply times measured so far.
 
         It is reckoned at once: with hundreds of points that takes some ten milliseconds, in which no line of this
         loop goes on. While a line runs, await `plan_in_steps`.
@@ -291,7 +297,7 @@ class Bus:
         return at_once(self._planning(more, could_merge))
 
     async def plan_in_steps(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
-        """Like `plan`, in steps of less than a millisecond between which exchanges go on."""
+        """Do what `plan` does, in steps of less than a millisecond between which exchanges go on."""
         self.check_loop()
         steps = self._planning(more, could_merge)
         done = 0
@@ -306,7 +312,7 @@ class Bus:
                 await asyncio.sleep(0)
 
     def worst_case_wait(self, priority: Priority = Priority.COMMAND) -> float:
-        """How long, in seconds, a request of this class, made now, waits at the most until it is sent (R9).
+        """Return how long, in seconds, a request of this class, made now, waits at most until it is sent (R9).
 
         It reckons with what is polled, what waits already, every node's probe, and each kind of command that was
         asked or polled so far; with nodes that are dead, late or trickling; not with a line that is never silent.
@@ -330,7 +336,7 @@ class Bus:
         return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 
     def events(self) -> Stream[Event]:
-        """What happens to the line and its nodes, from now on (NodeChanged, LineChanged, PortFailed, ...)."""
+        """Return a stream of what happens to line and nodes from now on (NodeChanged, LineChanged, PortFailed, ...)."""
         self.check_loop()
         self._check_not_closed()
         return Stream(self._streams, EVENT_BUFFER)

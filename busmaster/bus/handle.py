@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, TypeAlias, Unpack
 
 from busmaster.bus.points import Point
 from busmaster.bus.requester import NodeSource, ReadOptions, WriteOptions
+from busmaster.contract.arguments import guess, is_decimal
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
@@ -44,7 +44,7 @@ class Handle(ABC):
 
     @abstractmethod
     def point(self, item: str) -> Point[Any]:
-        """The point that ITEM names on the command line. Raises InvalidCommand for one that does not exist."""
+        """Return the point that ITEM names on the command line. Raises InvalidCommand for one that does not exist."""
 
     @abstractmethod
     async def read(self, item: Any, /, **options: Unpack[ReadOptions]) -> Any:
@@ -57,7 +57,7 @@ class Handle(ABC):
     @classmethod
     @abstractmethod
     def items(cls) -> tuple[str, ...]:
-        """The names (not the numbers) that `point` knows."""
+        """Return the names (not the numbers) that `point` knows."""
 
     @classmethod
     def names_of_items(cls) -> Mapping[str, str]:
@@ -110,20 +110,13 @@ def encoder(point: Point[Any]) -> Callable[[Any], Command[None]]:
     return point.encode
 
 
-def is_decimal(text: str) -> bool:
-    """Return whether a text is a whole number without a sign, in digits as the command line takes them."""
-    return text.isascii() and text.isdigit()
-
-
 def item_text(item: str) -> str:
-    """The item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
+    """Return the item. Raises InvalidCommand for a number: 1.10 would be 1.1, and 7 may be meant as `element(7)`."""
     if not isinstance(item, str):
         raise InvalidCommand(f"an item is text, such as {str(item)!r}, not {item!r}")
     return item
 
 
 def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
-    """The error for an item that does not exist: what would do, and the nearest name."""
-    near = difflib.get_close_matches(str(item), list(known), n=1)
-    guess = f"; did you mean {near[0]!r}?" if near else ""
-    return InvalidCommand(f"no such item {item!r}: use {form}{guess}")
+    """Return the error for an item that does not exist: it says what would do, and the nearest name."""
+    return InvalidCommand(f"no such item {item!r}: use {form}{guess(str(item), known)}")

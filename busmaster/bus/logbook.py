@@ -59,11 +59,11 @@ class Logbook:
             self._write(Strayed, logging.WARNING, text, now)
 
     def failed_hook(self, label: str, error: Exception) -> None:
-        """A user's on_return hook raised."""
+        """Write that a user's on_return hook raised."""
         logger.error("%s: the on_return hook of %s failed", self._name, label, exc_info=error)
 
     def failed_choice(self, group: str, error: Exception) -> None:
-        """A merge raised, or a protocol could not say what an exchange costs."""
+        """Write that a merge raised, or that a protocol could not say what an exchange costs."""
         logger.error("%s: the exchanges of poll group %r could not be chosen", self._name, group, exc_info=error)
 
     def _write(self, key: Hashable, level: int, text: str, now: float, bug: BaseException | None = None) -> None:

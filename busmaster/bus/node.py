@@ -68,7 +68,7 @@ class Node:
 
     @property
     def line(self) -> str:
-        """The name of its line's port."""
+        """Return the name of its line's port."""
         return self.record.line
 
     @property
@@ -81,7 +81,7 @@ class Node:
 
     @property
     def label(self) -> str:
-        """ "node 5", as messages call it."""
+        """Return how messages call it: "node 5"."""
         return self.record.label
 
     def rename(self, label: str) -> None:
@@ -90,7 +90,7 @@ class Node:
 
     @property
     def stops(self) -> int:
-        """How often it was told to stop, by whatever handle."""
+        """Return how often it was told to stop, by whatever handle."""
         return self.record.stops
 
     def note_stop(self) -> None:
@@ -98,20 +98,20 @@ class Node:
         self.shared.arbiter.note_stop(self.record)
 
     def now(self) -> float:
-        """The bus's clock, in seconds."""
+        """Return the time of the bus's clock, in seconds."""
         return self.shared.now()
 
     def latest(self, point: Any, /) -> Sample[Any] | None:
-        """The youngest good sample of a point in any poll group, unless a write has made it stale."""
+        """Return the youngest good sample of a point in any poll group, unless a write has made it stale."""
         return self.shared.latest(point)
 
     def planned(self) -> PlannedNode:
-        """The node as the planner sees it, with its reply time as measured so far."""
+        """Return the node as the planner sees it, with its reply time as measured so far."""
         record = self.record
         return PlannedNode(record.profile, record.address, record.timings, self.reply_time)
 
     def note_wait(self, wait: float) -> None:
-        """It took so many seconds to reply: the mean of the last replies is what planning goes by."""
+        """Note that it took so many seconds to reply: the mean of the last replies is what planning goes by."""
         self._measured = min(self._measured + 1, REPLIES_REMEMBERED)
         known = wait if self.reply_time is None else self.reply_time
         self.reply_time = known + (wait - known) / self._measured
@@ -125,9 +125,10 @@ class Node:
 
     @property
     def on_return(self) -> Callable[[Node], Awaitable[None]] | None:
-        """Awaited when the node comes back from DOWN, before its polls resume: re-send its parameters here.
+        """Return the hook that is awaited when the node is back from DOWN, before its polls resume.
 
-        By default nothing is done: a master that enables a drive or repeats a reference by itself is a danger.
+        Parameters are re-sent in it. By default nothing is done: a master that enables a drive or repeats a reference
+        by itself is a danger.
         """
         return self._on_return
 
@@ -188,7 +189,7 @@ class Node:
         return value
 
     async def timed_request(self, command: Command[T], **options: Unpack[CommandOptions]) -> tuple[T, Timeline]:
-        """Like `request`, with the timeline that says why it took as long as it did."""
+        """Do what `request` does, and return beside the value the timeline that says why it took so long."""
         transaction, future = self._start(command, self._options(options))
         try:
             return await future, transaction.timeline()
@@ -242,12 +243,13 @@ class Node:
         """Nobody waits for it any more. A write that is on the wire now is over before anything else can be read."""
         line = self.shared
         line.pump.cancel(transaction)
+        # Its end is told to nobody, but what it may have changed is: samples that were read before it are stale now.
         if transaction.writes and transaction.attempts:
             line.touched(transaction, line.now())
 
     async def probe(self) -> bool:
-        """Ask the node's cheapest read now, once; True if it answered (a refusal is an answer), False if not, or if
-        it could not be asked."""
+        """Ask the node's cheapest read now, once. Return True if it answered (a refusal is an answer), False if not, or
+        if it could not be asked."""
         transaction, future = self._start(self.profile.probe, PROBE, probe=True)
         try:
             await future
@@ -261,7 +263,7 @@ class Node:
         return True
 
     def suspend(self, for_: float) -> None:
-        """For maintenance: its polls rest and its requests fail with NodeDown for so many seconds, 0 to end it now."""
+        """Let it rest for maintenance: no polls, and NodeDown for requests, for so many seconds; 0 ends that now."""
         self.shared.suspend(self.record, seconds(for_, f"{self.label}: a suspension"))
 
     @property
@@ -269,7 +271,7 @@ class Node:
         return self.shared.now() < self.record.suspended_until
 
     def statistics(self) -> NodeStatistics:
-        """Counts and latencies since the bus was opened or its statistics were reset."""
+        """Return counts and latencies since the bus was opened or its statistics were reset."""
         self.shared.check_loop()
         record = self.record
         learning = record.learning

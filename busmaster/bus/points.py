@@ -34,16 +34,16 @@ class Point(Generic[T]):
 
     @property
     def key(self) -> str:
-        """ "5/axis0.position": node and item, as JSON output names a sample."""
+        """Return node and item, as JSON output names a sample: "5/axis0.position"."""
         return f"{self.node.address}/{self.item}"
 
     @property
     def quantity(self) -> tuple[Requester, Command[Any]]:
-        """What it reads, by whatever name: a write to one point makes every point of its quantity stale."""
+        """Return what it reads, by whatever name: a write to one point makes every point of its quantity stale."""
         return self.node, self.command
 
     def value_of(self, raw: Any) -> T:
-        """The value that stands for what its command returned. Raises GarbledReply for what means nothing."""
+        """Return the value that stands for what its command returned. Raises GarbledReply for what means nothing."""
         if self.decode is None:
             value: T = raw
             return value
@@ -59,13 +59,14 @@ class Point(Generic[T]):
         return self.encode is not None
 
     async def read(self, *, max_age: float | None = None, **options: Unpack[ReadOptions]) -> T:
-        """Its value now, or, with `max_age` in seconds, a poll group's latest sample if that is young enough.
+        """Return its value now, or, with `max_age` in seconds, a poll group's latest sample if that is young enough.
 
         `RequestOptions` says what the other options are.
         """
         if max_age is not None:
             if max_age != inf:
                 max_age = seconds(max_age, f"{self.node.label}: max_age")
+            # whichever group has it: two groups may read one quantity, and a write makes both of their samples stale
             sample = self.node.latest(self)
             if sample is not None and sample.error is None and sample.age(self.node.now()) <= max_age:
                 value: T = sample.value
@@ -73,7 +74,7 @@ class Point(Generic[T]):
         return self.value_of(await self.node.request(self.command, **options))
 
     async def write(self, value: T, **options: Unpack[CommandOptions]) -> None:
-        """Raises InvalidCommand, before anything is sent, if it is read-only or the value cannot be sent."""
+        """Write a value. Raises InvalidCommand, before anything is sent, if it is read-only or cannot be sent."""
         if self.encode is None:
             raise InvalidCommand(f"{self.node.label}: {self.item} is read-only")
         await self.node.request(self.encode(value), touches=self.command, **options)

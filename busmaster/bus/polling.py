@@ -47,7 +47,7 @@ class _Read(NamedTuple):
 
     @property
     def line_time(self) -> float:
-        """Seconds of the line that it takes, by the node's reply time as measured so far."""
+        """Return the seconds of the line that it takes, by the node's reply time as measured so far."""
         wait = self.node.reply_time
         return self.guess if wait is None else self.unwaited + self.legs * wait
 
@@ -99,7 +99,7 @@ class PollGroup:
 
     @property
     def poll(self) -> Poll:
-        """The arbiter's side of the group."""
+        """Return the arbiter's side of the group."""
         return self._poll
 
     @property
@@ -135,11 +135,11 @@ class PollGroup:
         self._choose()
 
     def pause(self) -> None:
-        """No cycle starts, and none is counted missed, until `resume`."""
+        """Start no cycle, and count none missed, until `resume`."""
         self._poll.paused = True
 
     def resume(self) -> None:
-        """Back on the grid."""
+        """Go back on the grid."""
         self._poll.paused = False
 
     def demand(self) -> None:
@@ -157,7 +157,7 @@ class PollGroup:
             consumer.close()
 
     def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
-        """A consumer with a buffer of so many snapshots. Close it when it is not read any more."""
+        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
         self._line.check_loop()
         if not self._poll.active:
             raise BusClosed(f"poll group {self.name!r} is closed")
@@ -172,7 +172,7 @@ class PollGroup:
             consumer.close()
 
     def statistics(self) -> GroupStatistics:
-        """An immutable snapshot of its counts."""
+        """Return an immutable snapshot of its counts."""
         self._line.check_loop()
         return self._tally.statistics(self._poll)
 
@@ -182,7 +182,7 @@ class PollGroup:
         self._tally = Tally(self._poll)
 
     def planned(self) -> PlannedGroup:
-        """The group as the planner sees it, with reply times as measured so far."""
+        """Return the group as the planner sees it, with reply times as measured so far."""
         nodes = {node: node.planned() for node in set(self._points.values())}
         for node, plan in nodes.items():
             if self._refused and plan.profile.merge is not None:
@@ -192,7 +192,7 @@ class PollGroup:
         return PlannedGroup(self.name, self._poll.period, reads, self._poll.phase, self._priority, merges)
 
     def sampled(self, transaction: Transaction) -> None:
-        """One exchange of the cycle is over: make its samples. Runs in the pump: no user code but decoders."""
+        """Make the samples of an exchange that is over. Runs in the pump: no user code but decoders."""
         read: _Read = transaction.waiter
         if self._cycle != self._poll.cycles:
             self._cycle = self._poll.cycles
@@ -212,7 +212,7 @@ class PollGroup:
             self._qualities[sample.quality] += 1
 
     def cycle_finished(self) -> None:
-        """All exchanges of a cycle are over: hand its snapshot round. Runs in the pump: no user code."""
+        """Hand the snapshot of a cycle round whose exchanges are over. Runs in the pump: no user code."""
         poll = self._poll
         if poll.fresh is None:
             poll.cost = self._line_time
@@ -227,6 +227,7 @@ class PollGroup:
         self.latest = self._line.latest_of[self.name] = snapshot
         for consumer in self._consumers:
             consumer.put(snapshot)
+        # Once: choosing anew whenever a mean moves would make the cycles differ for ever.
         if poll.cycles == WEIGHED_AGAIN:
             self._choose()
 
@@ -271,7 +272,7 @@ class PollGroup:
 
     def _choosing(self) -> Iterator[int]:
         """Give the poll its transactions and its cost, if they are other ones than it has."""
-        for merged in (True, False):
+        for merged in (True, False):  # a merge that fails costs its savings, not the group
             try:
                 reads = yield from self._reads(merged)
                 break
@@ -345,5 +346,5 @@ class PollGroup:
 
 def _measure(transaction: Transaction, read: _Read) -> None:
     """The mean of what the node takes to reply, over the last of its replies."""
-    if transaction.attempts == 1:
+    if transaction.attempts == 1:  # of a repeated one, the time includes what the failed attempts cost
         read.node.note_wait((transaction.last_byte - transaction.started - read.bytes_time) / read.legs)

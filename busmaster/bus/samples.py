@@ -37,5 +37,5 @@ class Sample(NamedTuple, Generic[T]):
     wall: float
 
     def age(self, now: float) -> float:
-        """Seconds since the value was asked for."""
+        """Return the seconds since the value was asked for."""
         return now - (self.finished if self.started is None else self.started)

@@ -63,7 +63,7 @@ class SharedLine:
     # time
 
     def now(self) -> float:
-        """The bus's clock, in seconds: all its times are of this clock."""
+        """Return the time of the bus's clock, in seconds: all its times are of this clock."""
         return self.pump.clock()
 
     def wall_offset(self) -> float:
@@ -84,7 +84,7 @@ class SharedLine:
         self.pump.turn()
 
     def demand(self, poll: Poll) -> None:
-        """What `PollGroup.demand` does."""
+        """Do what `PollGroup.demand` does."""
         self.check_loop()
         self.arbiter.demand(poll, self.now())
         self.pump.turn()
@@ -95,7 +95,7 @@ class SharedLine:
         self.pump.turn()
 
     def latest(self, point: Point[Any]) -> Sample[Any] | None:
-        """The youngest good sample of this point in any group, unless a write has made it stale."""
+        """Return the youngest good sample of this point in any group, unless a write has made it stale."""
         youngest = None
         for snapshot in self.latest_of.values():
             sample = snapshot.samples.get(point)
@@ -108,23 +108,23 @@ class SharedLine:
     # nodes
 
     def suspend(self, record: NodeRecord, seconds: float) -> None:
-        """What `Node.suspend` does."""
+        """Do what `Node.suspend` does."""
         self.check_loop()
         self.arbiter.dispatcher.suspend(record, self.now() + seconds)
         self.pump.turn()
 
     def touched(self, write: Transaction, when: float) -> None:
-        """A write is over: what was asked before is not newer than what it changed."""
+        """Note that a write is over: what was asked before is not newer than what it changed."""
         self._touched[write.touches] = self._written[write.node] = self.last_touched = when
         if write.node.address == write.node.profile.broadcast:
             self._all_touched = when
 
     def written_since(self, node: NodeRecord, started: float) -> bool:
-        """Whether a write to this node, or to a point of it, has ended since then."""
+        """Return whether a write to this node, or to a point of it, has ended since then."""
         return max(self._written.get(node, -inf), self._all_touched) > started
 
     def is_stale(self, point: Point[Any], started: float) -> bool:
-        """Whether a write to the point's quantity, or to all of its node, has ended since its read was started."""
+        """Return whether a write to the point's quantity, or to all of its node, has ended since its read began."""
         touched = self._touched
         return max(touched.get(point.quantity, -inf), touched.get(point.node, -inf), self._all_touched) > started
 
@@ -137,7 +137,7 @@ class SharedLine:
 
     def _check_elsewhere(self) -> None:
         """Its loop does not run here: right only in its own thread, between two runs of the loop."""
-        if get_ident() != self.thread or is_any_loop_running():
+        if get_ident() != self.thread or running_loop() is not None:
             raise InvalidCommand(
                 f"the bus on {self.name} was used from thread {current_thread().name!r} outside the "
                 "event loop that opened it: hand the call to that loop, with portal.call (anyio.from_thread) or "
@@ -155,10 +155,9 @@ class SharedLine:
         return error
 
 
-def is_any_loop_running() -> bool:
-    """Return whether an event loop runs in this thread."""
+def running_loop() -> asyncio.AbstractEventLoop | None:
+    """Return the event loop of asyncio that runs in this thread, or None."""
     try:
-        asyncio.get_running_loop()
+        return asyncio.get_running_loop()
     except RuntimeError:
-        return False
-    return True
+        return None

@@ -94,7 +94,7 @@ class Tally:
         self.samples = NO_SAMPLES.copy()
 
     def note(self, poll: Poll, qualities: Mapping[Quality, int]) -> None:
-        """A cycle is over, with so many samples of each quality.
+        """Count a cycle that is over, with so many samples of each quality.
 
         What its first exchange waited for is what the cycle waited for.
         """
@@ -147,13 +147,15 @@ class Stream(Generic[T]):
         while not self._items:
             if self._closed:
                 raise StopAsyncIteration
+            # A new event only when the old one was used, and shared until then: of two tasks that wait on one stream,
+            # one would else wait on an event that nobody knows any more.
             if self._arrived.is_set():
                 self._arrived = anyio.Event()
             await self._arrived.wait()
         return self._items.popleft()
 
     def close(self) -> None:
-        """It gets nothing more; what it holds can still be read."""
+        """Give it nothing more; what it holds can still be read."""
         self._closed = True
         if self in self._listeners:
             self._listeners.remove(self)

@@ -120,18 +120,16 @@ class Assembler:
         if sender is not self._sender or sender is Direction.HOST:
             self._rest()
         self._now, self._told, self._sender, self._asked = now, True, sender, attempt
-        begins = attempt is not None and attempt is not self._exchange.attempt
-        if sender is Direction.HOST:
-            if self._echo:
-                self._echo_owed += data
-                self._sent = data
-            if begins and attempt is not None:
-                closing = data.removesuffix(attempt.request)  # behind what closes the exchange before
-                self._decode(now, closing if closing != data else b"", sender)
-                data = data[len(closing) :] or data
+        if sender is Direction.HOST and self._echo:
+            self._echo_owed += data
+            self._sent = data
         elif self._echo_owed:
             data = self._strip_echo(data)
-        if begins and attempt is not None:
+        if attempt is not None and attempt is not self._exchange.attempt:
+            request = attempt.request
+            if sender is Direction.HOST and data.endswith(request):
+                self._decode(now, data[: -len(request)], sender)  # what closes the exchange before
+                data = request
             self._begin(attempt)
         self._decode(now, data, sender)
 

@@ -1,7 +1,7 @@
 """A passive decoder: what passes on a line, cut into frames and put into words.
 
 It hears both directions, mixed, and mostly does not know who speaks; so it is not the master's reader. Frames are cut
-by position, as PROTOCOLS 1.1 demands. Silence ends a frame only to give it up.
+by position: any byte may be a check. Silence ends a frame only to give it up.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The operator's tools: what CLI.md says, word for word. `main` is the console script."""
+"""The command line: one module for each command, and what they share. `main` is the console script."""
 
 from __future__ import annotations
 

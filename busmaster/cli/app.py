@@ -10,12 +10,12 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from difflib import get_close_matches
 from typing import Any, TextIO
 
 import click
 
 from busmaster.cli.ending import Ending
+from busmaster.contract.arguments import meant
 from busmaster.errors import BusError, InvalidCommand, NoReply
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
@@ -52,9 +52,7 @@ class Commands(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         known = self.list_commands(ctx)
         if args and not args[0].startswith("-") and args[0] not in known:
-            near = get_close_matches(args[0], known, n=1)
-            guess = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
-            raise click.UsageError(f"no such command {args[0]!r}: {guess}", ctx)
+            raise click.UsageError(f"no such command {args[0]!r}; {meant(args[0], known)}", ctx)
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:

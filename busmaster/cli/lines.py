@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import click
 
-from busmaster.config import LineFile, load
+from busmaster.config import LineFile, line_settings, load
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -29,8 +29,8 @@ port_option = click.option("--port", metavar="PORT", help="Use this port in plac
 
 
 def other_port(file: LineFile, port: str | None) -> SerialPort | TcpPort | None:
-    """That of --port; what it leaves open of a serial line is as in the file. Raises InvalidCommand."""
-    return None if port is None else endpoint(port, defaults=file.port.settings)
+    """Return that of --port; what it leaves open of a serial line is as the file's line is. Raises InvalidCommand."""
+    return None if port is None else endpoint(port, defaults=line_settings(file))
 
 
 __all__ = ["file_argument", "load", "other_port", "port_option"]

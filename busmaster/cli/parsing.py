@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import click
 
-from busmaster.bus.handle import is_decimal
+from busmaster.contract.arguments import is_decimal
 from busmaster.contract.learning import LEARNED, Learned
 from busmaster.errors import InvalidCommand
 from busmaster.registry import kinds

@@ -1,20 +1,29 @@
-"""The line of a file, emulated: every node that it names, with the reply delays and faults of its `[emulator]`."""
+"""The line of a file, emulated: every node that it names, as the node and the file's `[emulator]` say."""
 
 from __future__ import annotations
 
 import random
 from dataclasses import replace
 
-from busmaster.config.sections import LineFile
+from busmaster.config.line import decimals_of
+from busmaster.config.names import expanded
+from busmaster.config.points import Scale
+from busmaster.config.sections import LineFile, NodeSection, PointSection
+from busmaster.contract.arguments import guess
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Echo, Line
+from busmaster.errors import InvalidCommand
 from busmaster.registry import make_device
 from busmaster.transport.serial_port import SerialPort
 
 
 def emulated_line(file: LineFile, *, paced: bool | None = None, seed: int | None = None) -> Line:
-    """Not yet served: `serve_pty`, `serve_tcp` or a MemoryPort puts it to use. `paced` and `seed` go before its own."""
+    """Make the line, not yet served: `serve_pty`, `serve_tcp` or a MemoryPort puts it to use.
+
+    `paced` and `seed` go before the file's own. Raises FileError, naming line and key, for an option or a value that
+    an emulated device cannot have.
+    """
     emulator = file.emulator
     return Line(
         line_settings(file),
@@ -34,7 +43,39 @@ def line_settings(file: LineFile) -> LineSettings:
 
 
 def _device(file: LineFile, name: str) -> Device:
-    node, emulator = file.nodes[name], file.emulator
-    device = make_device(node.protocol, node.address, delay=emulator.delays[name], lively=emulator.lively)
-    device.faults = emulator.faults[name]
+    node, section = file.nodes[name], file.emulator.nodes[name]
+    emulated = {option.name for option in node.kind.emulated}
+    options = {key: value for key, value in node.options.items() if key in emulated} | dict(section.options)
+    with (section.table or node.table).at():
+        device = make_device(node.protocol, node.address, delay=section.delay, lively=section.lively, **options)
+    device.faults = section.faults
+    for key, (table, values) in section.values.items():
+        with table.at(key):
+            _hold(device, node, key, values)
     return device
+
+
+def _hold(device: Device, node: NodeSection, key: str, values: tuple[float, ...]) -> None:
+    """Have the device hold values of what the file calls so, as `busmaster run` will show them."""
+    named = {name: number for number, name in node.kind.handle.names_of_items().items()}
+    named |= {name: str(address) for name, address in node.options.get("symbols", {}).items()}
+    known = {*node.points, *named}
+    for name in expanded(key, known):
+        point = node.points.get(name)
+        item = name if point is None else point.item
+        base, colon, rest = item.partition(":")
+        try:
+            sent = map(_scale(node, point, item).write, values)
+            device.preset(f"{named.get(base, base)}{colon}{rest}", *sent)
+        except InvalidCommand as error:
+            raise InvalidCommand(f"{error}{'' if name in known else guess(name, known)}") from None
+
+
+def _scale(node: NodeSection, point: PointSection | None, item: str) -> Scale:
+    """What a number on the line means to the file."""
+    whole = node.kind.whole_numbers(item)
+    decimals = 0 if point is None else point.decimals
+    if node.kind.takes_decimals:
+        decimals = decimals_of(node).get(item.partition(":")[0], node.kind.decimals(item)) if whole else 0
+    factor, offset = (1.0, 0.0) if point is None else (point.factor, point.offset)
+    return Scale.of(factor, offset, decimals, whole)

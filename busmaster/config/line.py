@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
@@ -17,7 +16,7 @@ from busmaster.bus.polling import PollGroup
 from busmaster.config.names import expanded, listed
 from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
-from busmaster.contract.arguments import meant
+from busmaster.contract.arguments import guess, is_decimal, meant
 from busmaster.errors import InvalidCommand
 from busmaster.outputs.fan import Fan
 from busmaster.outputs.settings import MqttSettings
@@ -108,14 +107,14 @@ class ConfiguredLine:
     def _handle(self, node: NodeSection) -> Handle:
         options = dict(node.options)
         if node.kind.takes_decimals:
-            options["decimals"] = _decimals(node)
+            options["decimals"] = decimals_of(node)
         with node.table.at():
             make: Callable[..., Handle] = node.kind.handle
             handle = make(self.bus, node.address, timings=node.timings, retries=node.retries, **options)
             own = Node.of(handle)
             if node.reply_time is not None:
                 own.reply_time = node.reply_time  # until it is measured
-            if not node.name.isdigit():
+            if not is_decimal(node.name):
                 own.rename(node.name)  # what messages and the screen call it
         for point in node.points.values():
             with point.table.at(*(["item"] if "item" in point.table else [])):
@@ -167,11 +166,11 @@ class ConfiguredLine:
             table = self.file.table.table("outputs").table(kind)
             writable: dict[str, Point[Any]] = {}
             if isinstance(settings, MqttSettings):
-                for number, text in enumerate(settings.allow):
+                for number, text in enumerate(settings.allow_commands):
                     with table.at("allow_commands", number):
                         writable |= {point.key: point for point in map(self._writable, self._names(text))}
             with table.at():
-                self.outputs.add(kind, settings, title=self.file.title, commands=writable)
+                self.outputs.add(kind, settings, commands=writable)
 
     def _writable(self, name: tuple[str, str]) -> Point[Any]:
         point = self._point(*name)
@@ -184,14 +183,16 @@ def _known(handle: Handle, item: str, points: Iterable[str]) -> Point[Any]:
     try:
         return handle.point(item)
     except InvalidCommand:
-        near = difflib.get_close_matches(item, list(points), n=1)
-        if near:
-            raise InvalidCommand(f"no such item {item!r}: did you mean {near[0]!r}?") from None
+        if near := guess(item, points):
+            raise InvalidCommand(f"no such item {item!r}{near}") from None
         raise
 
 
-def _decimals(node: NodeSection) -> dict[str, int]:
-    """Of each quantity the digits, where the handle rounds by them. What is behind a colon only says how it is sent."""
+def decimals_of(node: NodeSection) -> dict[str, int]:
+    """Return the digits of each quantity whose points have decimals, for a handle that scales or rounds by them.
+
+    What is behind a colon only says how it is sent.
+    """
     decimals: dict[str, int] = {}
     for point in node.points.values():
         parameter = point.item.partition(":")[0]

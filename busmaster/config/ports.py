@@ -2,29 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict
 
 from busmaster.config.table import Table
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
-
-SERIAL: Mapping[str, str] = {
-    "baudrate": "whole",
-    "bytesize": "whole",
-    "parity": "text",
-    "stopbits": "number",
-    "rtscts": "flag",
-    "rs485": "flag",
-    "echo": "flag",
-    "low_latency": "flag",
-    "receive_latency": "seconds",
-    "exclusive": "flag",
-    "paced": "flag",
-}
-TCP: Mapping[str, str] = {"baudrate": "whole", "receive_latency": "seconds", "echo": "flag", "paced": "flag"}
 
 
 def read_port(top: Table, profiles: Sequence[Profile]) -> SerialPort | TcpPort:
@@ -36,35 +21,18 @@ def read_port(top: Table, profiles: Sequence[Profile]) -> SerialPort | TcpPort:
         raise top.error("'port' is missing: a device path, socket://HOST:PORT, or a table: [port]")
     table = top.table("port")
     if "host" in table:
-        table.only("host", "port", *TCP)
-        host, port = table.text("host"), table.whole("port", least=1, most=65535)
-        options = _options(table, TCP)
+        said = table.typed(TcpPort)
         with table.at():
-            return TcpPort(host, port, **options)
-    table.only("path", *SERIAL)
-    path = table.text("path")
-    options = _options(table, SERIAL)
-    defaults = _agreed(profiles)
-    if defaults is not None:
-        options = {name: getattr(defaults, name) for name in ("baudrate", "bytesize", "parity", "stopbits")} | options
-    if "baudrate" not in options:
+            return TcpPort(**said)
+    agreed = _agreed(profiles)
+    said = table.typed(SerialPort, optional=("baudrate",))
+    if "baudrate" not in said and agreed is None:
         raise table.error("'baudrate' is missing: the nodes' protocols are meant for different lines")
     with table.at():
-        return SerialPort(path, **options)
+        return SerialPort(**({} if agreed is None else asdict(agreed)) | said)
 
 
 def _agreed(profiles: Sequence[Profile]) -> LineSettings | None:
     """The line that all the protocols are meant for, if there is one."""
     lines = {profile.line for profile in profiles}
     return lines.pop() if len(lines) == 1 else None
-
-
-def _options(table: Table, kinds: Mapping[str, str]) -> dict[str, Any]:
-    readers: dict[str, Callable[[str], Any]] = {
-        "whole": table.whole,
-        "text": table.text,
-        "number": table.number,
-        "seconds": table.seconds,
-        "flag": lambda name: table.flag(name, False),
-    }
-    return {name: readers[kind](name) for name, kind in kinds.items() if name in table}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
-from typing import Any, Literal, TypeAlias, get_args
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from functools import partial
+from typing import TypeAlias
 
-from busmaster.config.table import Table
+from busmaster.config.table import Readers, Table
 from busmaster.contract.arguments import meant
 from busmaster.outputs.settings import (
-    BUFFER,
     FileSettings,
     MetricsSettings,
     MqttSettings,
@@ -16,96 +16,71 @@ from busmaster.outputs.settings import (
     SqliteSettings,
 )
 
-Kind: TypeAlias = Literal["csv", "jsonl", "sqlite", "mqtt", "metrics"]
 Outputs: TypeAlias = dict[str, Settings]
 """Those that are enabled, by their kind."""
 
 
 def read_outputs(table: Table, groups: Iterable[str]) -> Outputs:
     """Raises FileError, naming line and key: also in one that is not enabled."""
-    table.only(*get_args(Kind))
+    table.only(*KINDS)
     return dict(_enabled(table, tuple(groups)))
 
 
-def _enabled(outer: Table, groups: tuple[str, ...]) -> Iterator[tuple[str, Settings]]:
+def _enabled(outer: Table, groups: Collection[str]) -> Iterator[tuple[str, Settings]]:
     for table in outer.each():
-        settings = READERS[table.name](table, _common(table, groups))
+        kind = KINDS[table.name]
+        readers: Readers = {**READERS, "groups": partial(_groups, known=groups)}
+        said = table.typed(kind, "enabled", readers=readers, without=WITHOUT.get(table.name, ()))
+        with table.at():
+            settings = kind(**said)
         if table.flag("enabled", True):
             yield table.name, settings
 
 
-def _common(table: Table, groups: Collection[str]) -> dict[str, Any]:
-    chosen = table.texts("groups", ())
+def _groups(table: Table, key: str, known: Collection[str]) -> tuple[str, ...]:
+    chosen = table.texts(key, ())
     for number, name in enumerate(chosen):
-        if name not in groups:
-            raise table.error(f"no such group {name!r}; {meant(name, groups)}", "groups", number)
-    return {"groups": chosen, "buffer": table.whole("buffer", BUFFER, least=1)}
+        if name not in known:
+            raise table.error(f"no such group {name!r}; {meant(name, known)}", key, number)
+    return chosen
 
 
-def _file(table: Table, common: dict[str, Any]) -> Settings:
-    table.only("enabled", "groups", "buffer", "path", "mode", "sync_every")
-    return FileSettings(
-        path=table.text("path"), mode=_mode(table), sync_every=table.seconds("sync_every", 10.0), **common
-    )
-
-
-def _mode(table: Table) -> int:
+def _mode(table: Table, key: str) -> int:
     """Who may read and write a new file, as chmod takes it in octal."""
-    text = table.text("mode", "0640")
+    text = table.text(key)
     if len(text) not in (3, 4) or not set(text) <= set("01234567") or int(text, 8) > 0o777:
-        raise table.error('a mode is octal, as chmod takes it: mode = "0640"', "mode")
+        raise table.error('a mode is octal, as chmod takes it: mode = "0640"', key)
     return int(text, 8)
 
 
-def _sqlite(table: Table, common: dict[str, Any]) -> Settings:
-    table.only("enabled", "groups", "buffer", "path", "mode", "keep_days", "keep_mb")
-    return SqliteSettings(
-        path=table.text("path"),
-        mode=_mode(table),
-        keep_days=_limit(table, "keep_days"),
-        keep_mb=_limit(table, "keep_mb"),
-        **common,
-    )
-
-
-def _limit(table: Table, key: str) -> float | None:
-    """How much is kept; None where everything is."""
-    limit = table.number(key, None)
-    if limit is not None and limit <= 0:
+def _limit(table: Table, key: str) -> float:
+    """How much is kept, where not everything is."""
+    limit = table.number(key)
+    if limit <= 0:
         raise table.error(f"must be more than 0, not {limit}; leave it out to keep all", key)
     return limit
 
 
-def _mqtt(table: Table, common: dict[str, Any]) -> Settings:
-    table.only(
-        *("enabled", "groups", "buffer", "host", "port", "prefix", "messages", "qos", "retain"),
-        *("username", "password_file", "tls", "ca_file", "allow_commands"),
-    )
-    prefix = table.text("prefix", "busmaster")
-    if not prefix or set(prefix) & set("+#") or prefix.startswith("/") or prefix.endswith("/"):
-        raise table.error("a topic has neither + nor #, nor a slash at an end", "prefix")
-    messages = table.choice("messages", ("point", "cycle"), "point")
-    return MqttSettings(
-        host=table.text("host", "127.0.0.1"),
-        port=table.whole("port", 1883, least=1, most=65535),
-        prefix=prefix,
-        messages="cycle" if messages == "cycle" else "point",
-        qos=table.whole("qos", 1, most=1),
-        retain=table.flag("retain", True),
-        username=table.text("username", None),
-        password_file=table.text("password_file", None),
-        tls=table.flag("tls", False),
-        ca_file=table.text("ca_file", None),
-        allow=table.texts("allow_commands", ()),
-        **common,
-    )
+def _topic(table: Table, key: str) -> str:
+    topic = table.text(key)
+    if not topic or set(topic) & set("+#") or topic.startswith("/") or topic.endswith("/"):
+        raise table.error("a topic has neither + nor #, nor a slash at an end", key)
+    return topic
 
 
-def _metrics(table: Table, common: dict[str, Any]) -> Settings:
-    table.only("enabled", "host", "port")
-    return MetricsSettings(
-        host=table.text("host", "127.0.0.1"), port=table.whole("port", 9464, least=0, most=65535), **common
-    )
-
-
-READERS = {"csv": _file, "jsonl": _file, "sqlite": _sqlite, "mqtt": _mqtt, "metrics": _metrics}
+KINDS: Mapping[str, type[Settings]] = {
+    "csv": FileSettings,
+    "jsonl": FileSettings,
+    "sqlite": SqliteSettings,
+    "mqtt": MqttSettings,
+    "metrics": MetricsSettings,
+}
+READERS: Readers = {
+    "mode": _mode,
+    "keep_days": _limit,
+    "keep_mb": _limit,
+    "prefix": _topic,
+}
+"""What is more than its type."""
+WITHOUT = {"metrics": ("groups", "buffer")}
+"""What an output that is asked for its values cannot be told."""

@@ -9,23 +9,25 @@ from typing import Any
 
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.suitability import check_company
+from busmaster.config.emulator import EmulatorSection, read_emulator
 from busmaster.config.names import NODE_NAME, POINT_NAME, expanded
+from busmaster.config.options import check_keys, read_options
 from busmaster.config.ports import read_port
 from busmaster.config.recording import Outputs, read_outputs
 from busmaster.config.source import Source
 from busmaster.config.table import Table
 from busmaster.config.timing import LEARNED_WORD, read_timings, reads_learned
-from busmaster.contract.arguments import meant
+from busmaster.contract.arguments import is_decimal
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
-from busmaster.emulator.device import Delay
-from busmaster.emulator.faults import NAMES, Faults
 from busmaster.errors import InvalidCommand
-from busmaster.registry import NodeKind, Option, find, kinds
+from busmaster.registry import NodeKind, find, kinds
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
+NODE_KEYS = ("protocol", "address", "timing", "retries", "reply_time", "points")
+"""What every node's table may say; its kind's options come to it."""
 PRIORITIES = {"poll": Priority.POLL, "background": Priority.BACKGROUND}
 
 
@@ -79,17 +81,6 @@ class GroupSection:
 
 
 @dataclass(frozen=True, slots=True)
-class EmulatorSection:
-    """The line's emulation. Node by node: reply delays and faults."""
-
-    paced: bool
-    seed: int
-    lively: bool
-    delays: Mapping[str, Delay]
-    faults: Mapping[str, Faults]
-
-
-@dataclass(frozen=True, slots=True)
 class LineFile:
     """All that one file says. `table` is the whole of it, for messages."""
 
@@ -123,7 +114,7 @@ def read(source: Source) -> LineFile:
         nodes=nodes,
         groups=groups,
         outputs=read_outputs(top.table("outputs"), groups),
-        emulator=_emulator(top.table("emulator"), nodes),
+        emulator=read_emulator(top.table("emulator"), {node.name: node.kind for node in nodes.values()}),
         table=top,
     )
     if not nodes:
@@ -167,7 +158,7 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
     """The nodes of one table: several where its name is a range. `learned`: the line's reply times are."""
     protocol = table.choice("protocol", kinds())
     own = find(protocol).options
-    _check_own(table, protocol)
+    check_keys(table, find(protocol), NODE_KEYS, lambda kind: kind.options)
     with table.at():
         names = list(expanded(table.name))
     profile = find(protocol).profile
@@ -181,7 +172,7 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
     timings = Learned(document) if is_learned else None if document == profile.timings else document
     retries = table.whole("retries", default.whole("retries", None, most=100), most=100)
     reply_time = table.seconds("reply_time", default.seconds("reply_time", None))
-    options = {**_options(default, own), **_options(table, own)}
+    options = {**read_options(default, own), **read_options(table, own)}
     points = {point.name: _point(point) for point in table.tables("points")}
     for name, address in zip(names, addresses, strict=True):
         if not NODE_NAME.fullmatch(name):
@@ -199,16 +190,6 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
         )
 
 
-def _check_own(table: Table, protocol: str) -> None:
-    """Raises FileError for a key that nodes of this kind do not have."""
-    names = {kind.name: [option.name for option in kind.options] for kind in kinds().values()}
-    for key in table.data:
-        holders = [name for name, options in names.items() if key in options]
-        if holders and protocol not in holders:
-            raise table.error(f"only nodes of {' and '.join(holders)} have this, not those of {protocol}", key)
-    table.only("protocol", "address", "timing", "retries", "reply_time", "points", *names[protocol])
-
-
 def _addresses(table: Table, profile: Profile) -> Sequence[int]:
     """`address = 5`, or `address = "4-8"`."""
     if not profile.addressed:
@@ -220,7 +201,7 @@ def _addresses(table: Table, profile: Profile) -> Sequence[int]:
     else:
         text = table.text("address")
         with table.at("address"):
-            addresses = [int(part) if part.isdigit() else _no_address(text) for part in expanded(text.strip())]
+            addresses = [int(part) if is_decimal(part) else _no_address(text) for part in expanded(text.strip())]
     with table.at("address"):
         for address in addresses:
             profile.check_address(address)
@@ -231,24 +212,6 @@ def _addresses(table: Table, profile: Profile) -> Sequence[int]:
 
 def _no_address(text: str) -> int:
     raise InvalidCommand(f'an address is a number, or a range such as "4-8", not {text!r}')
-
-
-def _options(table: Table, known: Sequence[Option]) -> dict[str, Any]:
-    """Those of them that the table has."""
-    return {option.name: _option(table, option) for option in known if option.name in table}
-
-
-def _option(table: Table, option: Option) -> Any:
-    match option.kind:
-        case "addresses":
-            named = table.table(option.name)
-            return {name: named.whole(name, most=0xFFFF_FFFF) for name in named.data}
-        case "flag":
-            return table.flag(option.name, False)
-        case "text":
-            return table.text(option.name)
-        case "whole":
-            return table.whole(option.name, least=1)
 
 
 def _point(table: Table) -> PointSection:
@@ -269,7 +232,7 @@ def _point(table: Table) -> PointSection:
     )
 
 
-# groups and the emulator
+# groups
 
 
 def _group(table: Table) -> GroupSection:
@@ -282,49 +245,3 @@ def _group(table: Table) -> GroupSection:
         points=table.texts("points"),
         table=table,
     )
-
-
-def _emulator(table: Table, nodes: Mapping[str, NodeSection]) -> EmulatorSection:
-    table.only("paced", "seed", "lively", "reply_delay", "faults", "nodes")
-    delays = dict.fromkeys(nodes, _delay(table, Delay()))
-    shared = table.table("faults")
-    shared.only(*NAMES)
-    faults = {name: _faults(shared, {}) for name in nodes}
-    for one in table.tables("nodes"):
-        one.only("reply_delay", "faults")
-        with one.at():
-            names = list(expanded(one.name, nodes))
-        for name in names:
-            if name not in nodes:
-                raise one.error(f"no such node {name!r}; {meant(name, nodes)}")
-            delays[name] = _delay(one, delays[name])
-            faults[name] = _faults(one.table("faults"), shared.data)
-    return EmulatorSection(
-        paced=table.flag("paced", True),
-        seed=table.whole("seed", 1),
-        lively=table.flag("lively", True),
-        delays=delays,
-        faults=faults,
-    )
-
-
-def _delay(table: Table, default: Delay) -> Delay:
-    """`reply_delay = 0.002`, or `reply_delay = [0.001, 0.004]`."""
-    value = table.data.get("reply_delay")
-    if value is None:
-        return default
-    bounds = value if isinstance(value, list) else [value]
-    if len(bounds) not in (1, 2) or not all(type(bound) in (int, float) for bound in bounds):
-        raise table.error("must be a number of seconds, or two of them: [0.001, 0.004]", "reply_delay")
-    with table.at("reply_delay"):
-        return Delay(*bounds)
-
-
-def _faults(table: Table, base: Mapping[str, Any]) -> Faults:
-    """Those of the table over `base`."""
-    table.only(*NAMES)
-    faults = Faults()
-    for name, rate in {**base, **{name: table.number(name) for name in table.data}}.items():
-        with table.at(name):
-            setattr(faults, name, rate)
-    return faults

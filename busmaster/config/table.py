@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Final, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
 
 from busmaster.config.source import FileError, Key, Source
 from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
 
 T = TypeVar("T")
+Readers: TypeAlias = Mapping[str, "Callable[[Table, str], Any]"]
+"""How keys are read, by name, whose values are more than their type."""
 
 
 class _Required:
@@ -85,6 +88,20 @@ class Table:
             raise self.error(f"must be a number of seconds, 0 or more, not {value}", key)
         return value
 
+    def positive(self, key: str) -> float:
+        """Above 0."""
+        value = self.number(key)
+        if value <= 0:
+            raise self.error(f"must be above 0, not {value}", key)
+        return value
+
+    def share(self, key: str) -> float:
+        """0 to 1."""
+        value = self.number(key)
+        if not 0 <= value <= 1:
+            raise self.error(f"must be 0 to 1, not {value}", key)
+        return value
+
     def choice(self, key: str, known: Iterable[str], default: T | _Required = REQUIRED) -> str | T:
         known = tuple(known)
         value = self.text(key, default)
@@ -103,6 +120,64 @@ class Table:
             if not isinstance(value, str):
                 raise self.error(f"must be a text in quotes, not {value!r}", key, number)
         return tuple(values)
+
+    def wholes(self, key: str, *, most: int = MILLION) -> tuple[int, ...]:
+        """Whole numbers, 0 to `most`, in a list."""
+        values = self._take(key, list, REQUIRED, "a list of whole numbers")
+        for number, value in enumerate(values):
+            if type(value) is not int or not 0 <= value <= most:
+                raise self.error(f"must be a whole number, 0 to {most}, not {shown(value)}", key, number)
+        return tuple(values)
+
+    def numbers(self, key: str) -> tuple[float, ...]:
+        """One finite number, or true or false, or several of them."""
+        given = self.data[key]
+        values = given if isinstance(given, list) else [given]
+        for number, value in enumerate(values):
+            if not isinstance(value, int | float) or not math.isfinite(value):
+                way = (key, number) if isinstance(given, list) else (key,)
+                raise self.error(f"must be a number, true or false, or a list of them, not {shown(value)}", *way)
+        return tuple(values)
+
+    def typed(
+        self,
+        kind: type,
+        *others: str,
+        readers: Readers | None = None,
+        without: Container[str] = (),
+        optional: Container[str] = (),
+    ) -> dict[str, Any]:
+        """Return what the table says of a dataclass's fields, each read as its type wants it, or by its reader.
+
+        The fields `without` cannot be said; those that are `optional` may be missing though they have no default.
+        Raises FileError for a key that is neither a field nor one of `others`, and for a field that is missing.
+        """
+        hints = get_type_hints(kind, include_extras=True)
+        parts = [part for part in dataclasses.fields(kind) if part.name not in without]
+        self.only(*others, *(part.name for part in parts))
+        said: dict[str, Any] = {}
+        for part in parts:
+            if part.name not in self and (part.default is not dataclasses.MISSING or part.name in optional):
+                continue
+            own = (readers or {}).get(part.name)
+            said[part.name] = own(self, part.name) if own else self._typed(part.name, hints[part.name])
+        return said
+
+    def _typed(self, key: str, hint: Any) -> Any:
+        if get_origin(hint) is Annotated:
+            bare, bounds = get_args(hint)
+            value = self._typed(key, bare)
+            if not bounds.least <= value <= bounds.most:
+                most = " or more" if bounds.most == math.inf else f" to {bounds.most}"
+                raise self.error(f"must be {bounds.least}{most}, not {value}", key)
+            return value
+        if get_origin(hint) is Literal:
+            return self.choice(key, get_args(hint))
+        kinds = get_args(hint) or (hint,)  # of a union the one that a file can say
+        for kind, read in ((bool, lambda name: self.flag(name, False)), (int, self.whole), (float, self.number)):
+            if kind in kinds:
+                return read(key)
+        return self.texts(key) if get_origin(hint) is tuple else self.text(key)
 
     # tables
 

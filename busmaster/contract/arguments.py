@@ -10,9 +10,16 @@ import operator
 from collections.abc import Iterable
 from math import inf, nan
 from numbers import Real
-from typing import SupportsIndex
+from typing import NamedTuple, SupportsIndex
 
 from busmaster.errors import InvalidCommand
+
+
+class Between(NamedTuple):
+    """The least and the most that a number may be, bounds included: beside its type, in `Annotated`."""
+
+    least: float
+    most: float = inf
 
 
 def whole_number(value: SupportsIndex, lowest: int, highest: int, what: str) -> int:

@@ -100,45 +100,46 @@ class Exchange(Protocol[T_co]):
 
     @property
     def timing(self) -> ReplyTiming:
-        """Of the first leg."""
+        """Return the reply times of the first leg."""
         ...
 
     @property
     def sizes(self) -> Sizes:
-        """Of the first reply leg."""
+        """Return the bytes of the first reply leg."""
         ...
 
     @property
     def later(self) -> Sequence[Leg]:
-        """The legs after the first, when nothing goes wrong. Empty for most protocols."""
+        """Return the legs after the first, when nothing goes wrong. Empty for most protocols."""
         ...
 
     @property
     def closing(self) -> int:
-        """Bytes of the host's closing ACK. 0 for most protocols."""
+        """Return how many bytes the host's closing ACK has. 0 for most protocols."""
         ...
 
     @property
     def starts(self) -> bytes:
-        """The legal first bytes of the first reply leg; anything else is a FrameError."""
+        """Return the legal first bytes of the first reply leg; anything else is a FrameError."""
         ...
 
     @property
     def answers(self) -> tuple[bytes, ...]:
-        """What its good replies begin with, or are where they are one byte: one for each reply that decides.
+        """Return what its good replies begin with, or are where they are one byte: one for each reply that decides.
 
-        Two exchanges that share one could be taken for each other (R15). Empty for a broadcast.
+        Two exchanges that share one could be taken for each other (R15); they are compared whole, so one that only
+        begins like another is another. Empty for a broadcast.
         """
         ...
 
     @property
     def owed(self) -> tuple[bytes, ...]:
-        """What its node may still say if the attempt ends now, unheard: of the same kind as `answers` (R15)."""
+        """Return what its node may still say if the attempt ends now, unheard: of the same kind as `answers` (R15)."""
         ...
 
     @property
     def answered(self) -> bool:
-        """False for a broadcast: no reply will come, and `expired(False)` is called when the line is free again."""
+        """Return False for a broadcast: no reply will come, and `expired(False)` is called when the line is free."""
         ...
 
     def feed(self, data: bytes, /) -> Step[T_co]:
@@ -146,7 +147,7 @@ class Exchange(Protocol[T_co]):
         ...
 
     def expired(self, started: bool, /) -> Expect | Done[T_co]:
-        """The window (`started` False) or a byte gap (True) ran out.
+        """Say what becomes of a window (`started` False) or a byte gap (True) that ran out.
 
         Raises FrameError to fail the attempt, or returns Expect (NAK a cut packet) or Done (a broadcast).
         """
@@ -158,7 +159,7 @@ class Abandonable(Protocol):
     `exchange_limit` (R9)."""
 
     def abandon(self) -> FrameError | Refused:
-        """What to fail the attempt with in place of the last Expect's `send`, which is then not sent.
+        """Return what to fail the attempt with in place of the last Expect's `send`, which is then not sent.
 
         A FrameError's own `send` leaves the node with nothing unacknowledged.
         """
@@ -173,12 +174,12 @@ class Command(Protocol[T_co]):
 
     @property
     def writes(self) -> bool:
-        """True if it changes the node: then it is never retried unasked, and never overtakes another write."""
+        """Return True if it changes the node: then it is never retried unasked, and never overtakes a write."""
         ...
 
     @property
     def idempotent(self) -> bool:
-        """It may be repeated without asking the caller: reads yes; Comms writes no; levels (a reference) yes."""
+        """Return True if it may be repeated without asking the caller: a read, or a level such as a reference."""
         ...
 
     def open(self, address: int, timings: Timings, /) -> Exchange[T_co]: ...
@@ -188,11 +189,11 @@ class Listener(Protocol):
     """A reader for what arrives while nothing is asked (MSC: a stale packet is ACKed and dropped)."""
 
     def feed(self, data: bytes, /) -> Need | Done[None]:
-        """Raises FrameError for what cannot be a stale packet; its `send` is honoured too."""
+        """Take the next bytes. Raises FrameError for what cannot be a stale packet; its `send` is honoured too."""
         ...
 
     def expired(self) -> Done[None]:
-        """A byte gap ran out in mid-frame."""
+        """Say what becomes of a byte gap that ran out in mid-frame."""
         ...
 
 
@@ -200,7 +201,7 @@ NO_REPLY = "no reply"
 
 
 def no_reply() -> FrameError:
-    """The one failure that every exchange shares: the window ran out before a byte came."""
+    """Return the one failure that every exchange shares: the window ran out before a byte came."""
     return FrameError(NO_REPLY)
 
 

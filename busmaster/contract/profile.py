@@ -33,7 +33,7 @@ class LineSettings:
 
     @property
     def byte_time(self) -> float:
-        """tau: seconds per byte on the wire."""
+        """Return tau, the seconds per byte on the wire."""
         bits = START_BIT + self.bytesize + (self.parity != "N") + self.stopbits
         return bits / self.baudrate
 
@@ -85,7 +85,7 @@ class Profile:
     merge: Callable[[Sequence[Command[Any]]], Sequence[Batch]] | None = field(default=None, compare=False)
 
     def label(self, address: int) -> str:
-        """How messages name a node: "node 5", or "the drive" where the protocol has no address."""
+        """Return how messages name a node: "node 5", or "the drive" where the protocol has no address."""
         return f"node {address}" if self.addressed else "the drive"
 
     def may_share_with(self, other: Profile) -> bool:
@@ -99,7 +99,7 @@ class Profile:
         return f"{self.title} devices speak at {self.line.baudrate} baud alone, not at {baudrate}"
 
     def check_address(self, address: int) -> None:
-        """Raises InvalidCommand unless `address` is a node's, or the broadcast, address."""
+        """Raise InvalidCommand unless `address` is a node's, or the broadcast, address."""
         if isinstance(address, bool) or not isinstance(address, int):
             raise InvalidCommand(f"{self.name}: an address is a whole number, not {address!r}")
         if address in self.addresses or address == self.broadcast:

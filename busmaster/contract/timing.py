@@ -43,11 +43,11 @@ class ReplyTiming:
             raise InvalidCommand("a reply's byte_gap is above 0 s")
 
     def with_window(self, window: float) -> ReplyTiming:
-        """The same with another reply window; nominal and lateness move only as far as they must."""
+        """Return the same with another reply window; nominal and lateness move only as far as they must."""
         return replace(self, nominal=min(self.nominal, window), window=window, lateness=max(self.lateness, window))
 
     def with_lateness(self, lateness: float) -> ReplyTiming:
-        """The same with at least this lateness."""
+        """Return the same with at least this lateness."""
         return self if lateness <= self.lateness else replace(self, lateness=lateness)
 
 
@@ -64,7 +64,7 @@ class Timings:
         return cls(timing, timing, timing)
 
     def with_window(self, window: float) -> Timings:
-        """Another reply window for every first leg; a packet's window is only ever lengthened."""
+        """Return the same with another window for every first leg; a packet's is only ever lengthened."""
         packet = self.packet.with_window(max(window, self.packet.window))
         return Timings(self.read.with_window(window), self.write.with_window(window), packet)
 

@@ -18,6 +18,7 @@ import anyio
 
 from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import Mark
+from busmaster.arbiter.strays import QUIET
 from busmaster.arbiter.tap import Attempt, Tap, Verdict
 from busmaster.contract.driver import Driver
 from busmaster.contract.exchange import Command, Exchange, FrameError
@@ -29,8 +30,6 @@ from busmaster.transport.clock import clock_of
 from busmaster.transport.endpoints import Endpoint, is_paced
 from busmaster.transport.kernel import OpenPort, open_port
 
-QUIET = 0.02
-"""Seconds of silence, at least, after which nothing more is expected."""
 BABBLE = 1.0
 """Seconds after which a line that does not fall silent is left alone."""
 MUCH = 16384

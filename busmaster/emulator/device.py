@@ -72,6 +72,13 @@ class Delay:
         return self.low if self.high is None else chance.uniform(self.low, self.high)
 
 
+def held(value: float, low: int, high: int, what: str) -> int:
+    """Return a value as the whole number that a device can hold. Raises InvalidCommand, naming it `what`."""
+    if not low <= value <= high or value != int(value):
+        raise InvalidCommand(f"{what} holds a whole number, {low} to {high}, not {value:g}")
+    return int(value)
+
+
 class Device(ABC):
     """One slave on the line. A kind of device writes `hear_byte`, its `routes`, and `take` for speed.
 
@@ -103,6 +110,16 @@ class Device(ABC):
         """Added to every delay: how a fault makes one reply late."""
         self.away_until = 0.0
         """A fault took it off the line until then."""
+
+    # Before it joins a line
+
+    def preset(self, item: str, *values: float) -> None:
+        """Hold `values` from the start: in `item`, written as on the command line, and in those after it.
+
+        A value is the number that the line carries. A kind of device whose values can be set writes this. Raises
+        InvalidCommand for an item that it does not have, or that cannot hold the value.
+        """
+        raise InvalidCommand(f"{type(self).__name__} takes no initial values")
 
     # What the line calls
 

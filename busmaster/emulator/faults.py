@@ -13,12 +13,12 @@ it and answers NAK, to a request that went to somebody else.
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+from busmaster.contract.arguments import guess
 from busmaster.errors import InvalidCommand
 
 FORGED = b"\x06\x15\x04"
@@ -111,9 +111,7 @@ class Faults:
         for setting in settings:
             name, _, text = (part.strip() for part in setting.partition("="))
             if name not in NAMES:
-                near = difflib.get_close_matches(name, NAMES, n=1)
-                guess = f"; did you mean {near[0]}?" if near else ""
-                raise InvalidCommand(f"no such fault {name!r}: use {' '.join(NAMES)}{guess}")
+                raise InvalidCommand(f"no such fault {name!r}: use {' '.join(NAMES)}{guess(name, NAMES)}")
             try:
                 value = float(text)
             except ValueError:

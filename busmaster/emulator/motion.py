@@ -44,7 +44,7 @@ class Ramp:
 
 
 class Motion(enum.IntEnum):
-    """An axis's mode of motion. The numbers of AXISMODE are not in the documents: these are ours."""
+    """An axis's mode of motion. The numbers of AXISMODE are in Mint's help, not in AN00129: these are ours."""
 
     IDLE = 0
     JOG = 1
@@ -80,6 +80,11 @@ class Axis:
         self._arrives = NEVER
         self._ramp.speed = self._ramp.target = 0.0
         self.motion = Motion.IDLE
+
+    def place(self, position: float, now: float) -> None:
+        """Be idle at a position."""
+        self.stop(now)
+        self._ramp.position = position
 
     def move(self, target: float, now: float, motion: Motion = Motion.MOVE) -> None:
         """Go to `target` at `speed`, then be idle: MOVEA and GO (HOME likewise, to 0)."""

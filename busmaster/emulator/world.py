@@ -146,13 +146,8 @@ class World:
 
     def _step(self, now: float, due_at: float) -> None:
         data = self.line.receive(now)
-        if data and self.plugged:
-            if self._record is not None:
-                self._record(f"{now:.6f} < {data.hex(' ')}")
-            if self.tap is not None:
-                self.tap.received(now, data, self.arbiter.attempt)
-            self.arbiter.data_received(data, now)
-            self._pump()
+        if data:
+            self._hear(data)
         if due_at <= now:
             self.arbiter.handle_timeout(now)
             self._pump()
@@ -161,18 +156,32 @@ class World:
             heapq.heappop(actions)[2]()
             self._pump()
 
+    def _hear(self, data: bytes) -> None:
+        """Hand the arbiter what came off the line."""
+        if self.plugged:
+            if self._record is not None:
+                self._record(f"{self.now:.6f} < {data.hex(' ')}")
+            if self.tap is not None:
+                self.tap.received(self.now, data, self.arbiter.attempt)
+            self.arbiter.data_received(data, self.now)
+            self._pump()
+
+    def _say(self, data: bytes) -> None:
+        """Put on the line what the arbiter says."""
+        if self._record is not None:
+            self._record(f"{self.now:.6f} > {data.hex(' ')}")
+        if self.plugged:
+            self.line.send(data, self.now)
+            if self.tap is not None:
+                self.tap.transmitted(self.now, data, self.arbiter.attempt)
+
     def _pump(self) -> None:
         """What the arbiter says goes on the line, and its events to whom they concern."""
         arbiter = self.arbiter
         while True:
             data = arbiter.poll_transmit()
             if data is not None:
-                if self._record is not None:
-                    self._record(f"{self.now:.6f} > {data.hex(' ')}")
-                if self.plugged:
-                    self.line.send(data, self.now)
-                    if self.tap is not None:
-                        self.tap.transmitted(self.now, data, arbiter.attempt)
+                self._say(data)
             event = arbiter.poll_event()
             if event is None:
                 if data is None:

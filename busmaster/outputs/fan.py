@@ -34,11 +34,9 @@ class Fan:
         self._tasks: list[asyncio.Task[None]] = []
         self._loop: asyncio.AbstractEventLoop | None = None
 
-    def add(
-        self, kind: str, settings: Settings, *, title: str = "", commands: Mapping[str, Point[Any]] | None = None
-    ) -> None:
+    def add(self, kind: str, settings: Settings, *, commands: Mapping[str, Point[Any]] | None = None) -> None:
         """One more. `commands`: the points that it lets others write. Raises InvalidCommand if an extra is missing."""
-        self._outputs.append(self._make(kind, settings, title, commands or {}))
+        self._outputs.append(self._make(kind, settings, commands or {}))
 
     def start(self, groups: Iterable[PollGroup]) -> None:
         """From now on, until `close`."""
@@ -94,7 +92,7 @@ class Fan:
             except RuntimeError:
                 pass
 
-    def _make(self, kind: str, settings: Settings, title: str, commands: Mapping[str, Point[Any]]) -> Output:
+    def _make(self, kind: str, settings: Settings, commands: Mapping[str, Point[Any]]) -> Output:
         match settings:
             case FileSettings():
                 return (CsvOutput if kind == "csv" else JsonlOutput)(kind, settings, self._say)
@@ -103,7 +101,7 @@ class Fan:
             case MqttSettings():
                 from busmaster.outputs.mqtt import MqttOutput
 
-                return MqttOutput(kind, settings, self._bus, self._say, title=title, commands=commands)
+                return MqttOutput(kind, settings, self._bus, self._say, commands=commands)
             case MetricsSettings():
                 from busmaster.outputs.metrics import MetricsOutput
 

@@ -69,7 +69,6 @@ class MqttOutput(Output):
         bus: Bus,
         say: Callable[[str], None] = lambda _: None,
         *,
-        title: str = "",
         commands: Mapping[str, Point[Any]] | None = None,
     ) -> None:
         check_extra("aiomqtt", "mqtt")
@@ -77,7 +76,6 @@ class MqttOutput(Output):
         self._settings = settings
         self._secrets = secrets(settings)
         self._bus = bus
-        self._title = title
         self._commands = {topic_part(key): point for key, point in (commands or {}).items()}
         self._owner: asyncio.AbstractEventLoop | None = None
         self._held: list[Item] = []

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
-from typing import Literal
+from typing import Annotated, Literal
 
+from busmaster.contract.arguments import Between
 from busmaster.errors import InvalidCommand
 
 BUFFER = 50_000
 """Values that may wait, some 500 bytes each: ten minutes of 80 a second."""
+MOST_BUFFERED = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -17,7 +19,7 @@ class Settings:
     """`groups`: the poll groups whose values it gets, all if there are none. `buffer`: values that may wait for it."""
 
     groups: tuple[str, ...] = ()
-    buffer: int = BUFFER
+    buffer: Annotated[int, Between(1, MOST_BUFFERED)] = BUFFER
 
     def __post_init__(self) -> None:
         if self.buffer < 1:
@@ -34,7 +36,7 @@ class FileSettings(Settings):
 
     path: str
     mode: int = 0o640
-    sync_every: float = 10.0
+    sync_every: Annotated[float, Between(0)] = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,20 +62,20 @@ class SqliteSettings(Settings):
 class MqttSettings(Settings):
     """`messages`: one for each "point", or one for each "cycle". `qos` 0 may lose values unseen, 1 does not.
 
-    `allow` names the points ("winder/1") that commands may write; without any, no command is listened to.
+    `allow_commands` names the points ("winder/1") that commands may write; without any, no command is listened to.
     """
 
     host: str = "127.0.0.1"
-    port: int = 1883
+    port: Annotated[int, Between(1, 65535)] = 1883
     prefix: str = "busmaster"
     messages: Literal["point", "cycle"] = "point"
-    qos: int = 1
+    qos: Annotated[int, Between(0, 1)] = 1
     retain: bool = True
     username: str | None = None
     password_file: str | None = None
     tls: bool = False
     ca_file: str | None = None
-    allow: tuple[str, ...] = ()
+    allow_commands: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,4 +83,4 @@ class MetricsSettings(Settings):
     """Where it is served: only there."""
 
     host: str = "127.0.0.1"
-    port: int = 9464
+    port: Annotated[int, Between(0, 65535)] = 9464

@@ -2,9 +2,6 @@
 
 from busmaster.planning.fit import BAUDRATES, GroupPlan, MergedReads, Plan, PlannedGroup, plan, plan_steps
 from busmaster.planning.worst_case import (
-    NOISY_AFTER,
-    QUIET,
-    SHARE,
     Bounds,
     PlannedNode,
     Read,
@@ -15,9 +12,6 @@ from busmaster.planning.worst_case import (
 
 __all__ = [
     "BAUDRATES",
-    "NOISY_AFTER",
-    "QUIET",
-    "SHARE",
     "Bounds",
     "GroupPlan",
     "MergedReads",

@@ -15,11 +15,12 @@ from itertools import count
 from math import ceil, floor, inf, log10
 from typing import Any
 
+from busmaster.arbiter.backlog import SHARE
 from busmaster.arbiter.schedule import SLICE, Poll, Priority, Schedule, line_time
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import LineSettings
 from busmaster.planning.merging import WEIGHING, Merge, Served, at_once, cheapest
-from busmaster.planning.worst_case import SHARE, Bounds, PlannedNode, Read, bound_steps, unanswered
+from busmaster.planning.worst_case import Bounds, PlannedNode, Read, bound_steps, unanswered
 
 COMFORT = 0.9
 """The share of the line that a schedule may take: the rest is for commands, retries and probes."""
@@ -84,7 +85,7 @@ class GroupPlan:
 
     @property
     def utilisation(self) -> float:
-        """The share of the line that it asks for."""
+        """Return the share of the line that it asks for."""
         return self.line_time / self.period
 
 
@@ -108,12 +109,12 @@ class Plan:
 
     @property
     def fits(self) -> bool:
-        """As long as nothing goes wrong, no cycle is missed."""
+        """Return whether no cycle is missed as long as nothing goes wrong."""
         return self.utilisation <= 1 and not any(group.missed for group in self.groups)
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """What does not fit and what would, a sentence each; empty where the schedule fits comfortably."""
+        """Say what does not fit and what would, a sentence each; empty where the schedule fits comfortably."""
         return tuple(_advice(self))
 
 
@@ -125,7 +126,7 @@ def plan(
     others: Iterable[Read] = (),
     could_merge: Sequence[Merge] = (),
 ) -> Plan:
-    """What becomes of these poll groups on this line.
+    """Reckon what becomes of these poll groups on this line.
 
     `others` may be asked beside them: the worst case reckons with those, and with every node's probe. `could_merge`
     are merges to be weighed that no group opts in to. Raises InvalidCommand for a period or phase that cannot be.

@@ -12,20 +12,14 @@ from dataclasses import dataclass
 from math import ceil
 from typing import Any, TypeAlias
 
+from busmaster.arbiter.backlog import SHARE
+from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.schedule import Priority, line_time
+from busmaster.arbiter.strays import NOISY_AFTER, QUIET
 from busmaster.contract.exchange import Command, Exchange
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.planning.merging import WEIGHING, at_once
-
-SHARE = 7
-"""Exchanges of higher classes after which a lower class that waits gets a slot (R9)."""
-QUIET = 0.020
-"""The least silence that ends a settle (R3)."""
-MOST_BEFORE = 3
-"""Exchanges that may go before one whose answer could be taken for another's (R15)."""
-NOISY_AFTER = 1.0
-"""Without such a silence for so long, the line is NOISY and whoever waits fails (R3)."""
 
 
 @dataclass(frozen=True, slots=True)

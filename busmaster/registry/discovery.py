@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
@@ -68,11 +68,16 @@ def make_device(
     delay: Delay | None = None,
     oracle: Oracle | None = None,
     lively: bool = False,
+    **options: Any,
 ) -> Device:
-    """Make an emulated device of a kind. Raises InvalidCommand for a kind that does not exist, see `DeviceMaker`."""
+    """Make an emulated device of a kind; `options` are those of `NodeKind.emulated`.
+
+    Raises InvalidCommand for a kind that does not exist, see `DeviceMaker`.
+    """
     from busmaster.emulator.device import Delay
 
-    return find(name).make_device(address, delay=Delay() if delay is None else delay, oracle=oracle, lively=lively)
+    delay = Delay() if delay is None else delay
+    return find(name).make_device(address, delay=delay, oracle=oracle, lively=lively, **options)
 
 
 def _own() -> Iterator[Protocol]:

@@ -8,7 +8,7 @@ import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from busmaster.contract.items import Item
 from busmaster.errors import InvalidCommand
@@ -18,43 +18,58 @@ if TYPE_CHECKING:  # so that a master alone does not load the emulator
     from busmaster.capture.decode import Dialect
     from busmaster.contract.exchange import Command
     from busmaster.contract.profile import Profile
-    from busmaster.emulator.device import Delay, Device
-    from busmaster.emulator.oracle import Oracle
+    from busmaster.emulator.device import Device
 
 NAME = re.compile(r"[a-z][a-z0-9_-]*")
 HIGHEST_CAPTURE_ID = 255
 
+OptionKind: TypeAlias = Literal[
+    "flag", "whole", "number", "positive", "share", "delay", "text", "numbers", "addresses", "tables"
+]
+"""What an option can be in LINE.toml, and as what the argument comes.
+
+A "whole" number is 1 or more; "positive" is any number above 0, "share" one from 0 to 1. A "delay" is a number of
+seconds or two bounds, and comes as a `Delay`. "numbers" is a list of whole numbers, and comes as a frozenset;
+"addresses" a table of names and the address that each stands for; "tables" are tables by name, of `fields`.
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """Describe one thing that can be said of nodes of one kind alone: an argument of that name, of their handle.
+    """Describe one thing that can be said of nodes of one kind alone: an argument of that name.
 
-    `help` is what the command line says of it; without one it can be said in LINE.toml alone. `common`: it may also be
-    said once for all nodes of the kind, in [protocols.NAME].
+    It is an argument of their handle, of reading an item, or of making their emulated device. `help` is what the
+    command line says of it; without one it can be said in LINE.toml alone. `common`: it may also be said once for all
+    nodes of the kind, in [protocols.NAME].
     """
 
     name: str
-    kind: Literal["flag", "whole", "text", "addresses"]
-    """A whole number is 1 or more. "addresses" is a table of names and the address that each stands for."""
+    kind: OptionKind
     help: str = ""
     common: bool = True
+    choices: tuple[str, ...] = ()
+    """All texts that it can be; () if it can be any."""
+    fields: tuple[Option, ...] = ()
+    """What each of its tables may say."""
 
 
 class DeviceMaker(typing.Protocol):
     """Makes an emulated device.
 
-    `oracle`: every value is the oracle's, whose modulus must be one that the protocol can carry. `lively`: something
-    moves on it from the start. Raises InvalidCommand for an address that the device cannot have.
+    It is called with an address, `delay`, `oracle`, `lively`, and those of `NodeKind.emulated` that were said. `delay`
+    is a Delay. `oracle` is None or an Oracle whose every value the device holds; its modulus must be one that the
+    protocol can carry. `lively` is True if something is to move on it from the start. Raises InvalidCommand for an
+    address or an option that the device cannot have.
     """
 
-    def __call__(self, address: int, /, *, delay: Delay, oracle: Oracle | None, lively: bool) -> Device: ...
+    def __call__(self, address: int, /, *args: Any, **options: Any) -> Device: ...
 
 
 def device_of(module: str) -> DeviceMaker:
     """Return the `make_device` of a module that is not imported before the first device is made."""
 
-    def make_device(address: int, /, *, delay: Delay, oracle: Oracle | None, lively: bool) -> Device:
-        device: Device = import_module(module).make_device(address, delay=delay, oracle=oracle, lively=lively)
+    def make_device(address: int, /, **options: Any) -> Device:
+        device: Device = import_module(module).make_device(address, **options)
         return device
 
     return make_device
@@ -88,6 +103,9 @@ class NodeKind:
     """Arguments of its handle."""
     read_options: tuple[Option, ...] = ()
     """Arguments of its handle's `read_item`, for the command line."""
+    emulated: tuple[Option, ...] = ()
+    """Arguments of `make_device`, said in [emulator.nodes.NAME]. One that is among `options` too is as the node says,
+    unless it is said there."""
     whole_numbers: Callable[[str], bool] = nowhere
     """Whether the line carries whole numbers for an item: a value scaled by LINE.toml is then rounded to one."""
     takes_decimals: bool = False

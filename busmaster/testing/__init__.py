@@ -1,12 +1,13 @@
 """For those who test with busmaster, or add to it: shipped, documented, and used by its own tests.
 
-`check_protocol` is the conformance kit of a protocol; `run_in_virtual_time` runs an application on a loop whose time
-jumps; `busmaster.testing.fixtures` has pytest fixtures.
+`check_protocol` and `check_dialect` are the conformance kit of a protocol; `run_in_virtual_time` runs an application
+on a loop whose time jumps; `busmaster.testing.fixtures` has pytest fixtures.
 """
 
 from __future__ import annotations
 
 from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen, answers_of
+from busmaster.testing.dialect import check_dialect
 from busmaster.testing.protocol import check_protocol
 from busmaster.testing.virtual_time import DeadlockError, VirtualTimeLoop, run_in_virtual_time
 
@@ -20,6 +21,7 @@ __all__ = [
     "Unseen",
     "VirtualTimeLoop",
     "answers_of",
+    "check_dialect",
     "check_protocol",
     "run_in_virtual_time",
 ]

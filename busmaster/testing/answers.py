@@ -31,7 +31,10 @@ def check_exchangeable(asked: Exchange[Any], other: Exchange[Any]) -> str:
     may_come = {*other.answers, *other.owed}
     if may_come & set(asked.answers):
         return ""
-    return f"has the answers {_hex(asked.answers)}, and none that is owed by another: {_hex(sorted(may_come))}"
+    what = f"has the answers {_hex(asked.answers)}, and none that is owed by another: {_hex(sorted(may_come))}"
+    if any(one.startswith(key) or key.startswith(one) for one in may_come for key in asked.answers):
+        what += " (one that only begins like another is another: give both the same)"
+    return what
 
 
 def _begins(leg: bytes, keys: Sequence[bytes]) -> bool:

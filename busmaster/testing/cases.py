@@ -78,7 +78,7 @@ Tally = Counter[str]
 
 
 def answers_of(device: Device) -> Callable[[bytes], bytes]:
-    """An emulated device, alone on a line on which nothing takes time, as what `round_trips` ask."""
+    """Return an emulated device, alone on a line on which nothing takes time, as what `round_trips` ask."""
 
     def answer(heard: bytes) -> bytes:
         device.hear(heard, 0.0)

@@ -21,7 +21,7 @@ OTHER_TIMINGS = Timings(
 
 
 def check_command(command: Command[Any], address: int, timings: Timings) -> Iterator[str]:
-    """What does not hold, one sentence each."""
+    """Say what does not hold of a command, one sentence each."""
     if not str(command) or str(command) == object.__repr__(command):
         yield f"{command!r} has no text: write __str__, as in 'read element 100'"
     twin = copy.deepcopy(command)
@@ -87,7 +87,7 @@ def _check_keys(command: Command[Any], exchange: Exchange[Any]) -> Iterator[str]
 
 
 def check_invalid(builders: Iterable[Callable[[], object]]) -> Iterator[str]:
-    """Each of `builders` must raise InvalidCommand."""
+    """Say which of `builders` does not raise InvalidCommand."""
     for number, build in enumerate(builders):
         try:
             built = build()
@@ -100,7 +100,7 @@ def check_invalid(builders: Iterable[Callable[[], object]]) -> Iterator[str]:
 
 
 def check_checks(profile: Profile) -> Iterator[str]:
-    """Reads of which no two answers could be taken for each other."""
+    """Say which of the checks write, or have answers that could be taken for each other."""
     seen: dict[bytes, Command[Any]] = {}
     for check in profile.checks:
         if check.writes:
@@ -113,7 +113,7 @@ def check_checks(profile: Profile) -> Iterator[str]:
 
 
 def check_addresses(profile: Profile) -> Iterator[str]:
-    """Every address has its own request; the probe is a read."""
+    """Say which addresses are sent the same request, and whether the probe writes."""
     probe = profile.probe
     if probe.writes:
         yield f"the probe {probe!r} writes"

@@ -39,13 +39,13 @@ class LineFactory(Protocol):
 
 @pytest.fixture
 def virtual_time() -> Callable[[Coroutine[Any, Any, Any]], Any]:
-    """Runs a coroutine to its end in virtual time and returns its result: `virtual_time(main())`."""
+    """Run a coroutine to its end in virtual time and return its result: `virtual_time(main())`."""
     return run_in_virtual_time
 
 
 @pytest.fixture
 def emulated_line() -> LineFactory:
-    """Makes emulated lines: `emulated_line("hcp2", range(1, 9))`. Further options are those of `Line`."""
+    """Make emulated lines: `emulated_line("hcp2", range(1, 9))`. Further options are those of `Line`."""
 
     def make(
         protocol: str,

@@ -12,7 +12,7 @@
             invalid=[lambda: ReadRegister(70000)],
         )
 
-A few cases say what the document says: a command, the node, what that node answers, and the value. From them the kit
+A few cases say what the manual says: a command, the node, what that node answers, and the value. From them the kit
 derives what the arbiter relies on (`busmaster.contract.exchange`), and raises `NotConformant` with all that does not
 hold:
 
@@ -65,7 +65,7 @@ def check_protocol(
     garbage: int = 100,
     seed: int = 0,
 ) -> Tally:
-    """Raises NotConformant unless the protocol keeps the contract for all of `cases`, see the module's text.
+    """Raise NotConformant unless the protocol keeps the contract for all of `cases`, see the module's text.
 
     `names(command, address)` is what a reply to it names: where it is equal for two cases, the reply to one may be
     taken for the other's. `device` is told what the host says, and returns what the device says at once (see
@@ -230,7 +230,7 @@ class _Kit:
             if byte not in starts:
                 ending = self.hear(case, bytes((byte,)), *case.legs).run_out()
                 if ending.delivered or isinstance(ending.error, Refused) or ending.is_bug:
-                    yield f"{case}: {byte:02x} and then the reply gives {ending}"
+                    yield f"{case}: {byte:02x}, which is not in starts, and then the reply gives {ending}"
 
     def check_garbage(self, case: Case, count: int) -> Iterator[str]:
         for _ in range(count):

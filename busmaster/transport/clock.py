@@ -11,10 +11,10 @@ VIRTUAL = 1.0
 
 
 def is_virtual(loop: asyncio.AbstractEventLoop) -> bool:
-    """Whether the loop keeps a time of its own."""
+    """Return whether the loop keeps a time of its own."""
     return abs(loop.time() - time.monotonic()) > VIRTUAL
 
 
 def clock_of(loop: asyncio.AbstractEventLoop) -> Callable[[], float]:
-    """The loop's own clock if its time is virtual; else the machine's, which is finer than some loops'."""
+    """Return the loop's own clock if its time is virtual; else the machine's, which is finer than some loops'."""
     return loop.time if is_virtual(loop) else time.monotonic

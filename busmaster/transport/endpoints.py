@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import difflib
 import re
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Protocol
 from urllib.parse import parse_qsl, urlsplit
 
+from busmaster.contract.arguments import meant
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
 from busmaster.transport.identity import USB, Identity
@@ -23,31 +23,31 @@ class Endpoint(Protocol):
 
     @property
     def name(self) -> str:
-        """How messages call it: the path, or "host:port"."""
+        """Return how messages call it: the path, or "host:port"."""
         ...
 
     @property
     def settings(self) -> LineSettings | None:
-        """Where tau comes from. None where nobody said: a TCP port without `baudrate`."""
+        """Return where tau comes from; None where nobody said: a TCP port without `baudrate`."""
         ...
 
     @property
     def echo(self) -> bool:
-        """What is sent comes back as received (two-wire adapters)."""
+        """Return whether what is sent comes back as received (two-wire adapters)."""
         ...
 
     @property
     def receive_latency(self) -> float:
-        """Seconds that received bytes may lie in an adapter or a server before they get here."""
+        """Return the seconds that received bytes may lie in an adapter or a server before they get here."""
         ...
 
     @property
     def paced(self) -> bool | None:
-        """Bytes leave at the baud rate. None: not known before it is open (see `is_paced`)."""
+        """Return whether bytes leave at the baud rate; None: not known before it is open (see `is_paced`)."""
         ...
 
     def presence(self) -> Hashable | None:
-        """What is seen of the device without opening it: it changes when one comes. None: nothing is there or seen.
+        """Return what is seen of the device without opening it: it changes when one comes. None: nothing is seen.
 
         It is asked several times a second while the line is down, on the loop, and returns at once.
         """
@@ -69,12 +69,12 @@ class Endpoint(Protocol):
 
 
 def is_paced(endpoint: Endpoint, transport: asyncio.BaseTransport) -> bool:
-    """Whether bytes leave `transport` at the line's baud rate, so that an earlier reply cannot be one (R4)."""
+    """Return whether bytes leave `transport` at the baud rate, so that an earlier reply cannot be one (R4)."""
     return bool(transport.get_extra_info("paced", False) if endpoint.paced is None else endpoint.paced)
 
 
 def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | TcpPort:
-    """The endpoint that `url` names: "/dev/ttyUSB0", "usb:A500ABC?baudrate=9600&parity=E", "socket://host:port".
+    """Return the endpoint that `url` names: "/dev/ttyUSB0", "usb:A500ABC?baudrate=9600&parity=E", "socket://host:port".
 
     `defaults` fills the line settings that a serial port's URL leaves open; behind a TCP port they are the server's.
     Raises InvalidCommand, naming the nearest option, for anything that it does not understand.
@@ -123,9 +123,7 @@ def _options(query: str, known: Mapping[str, Callable[[str], object]]) -> dict[s
     options: dict[str, Any] = {}
     for key, text in parse_qsl(query, keep_blank_values=True):
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            guess = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(known)}"
-            raise InvalidCommand(f"no such port option {key!r}: {guess}")
+            raise InvalidCommand(f"no such port option {key!r}; {meant(key, known)}")
         try:
             options[key] = known[key](text)
         except (ValueError, KeyError):

@@ -40,7 +40,7 @@ class OpenPort:
         self._buffered = _buffer_of(transport)
 
     def unread(self) -> bool:
-        """Whether bytes have come that were not handed over yet, as far as can be seen.
+        """Return whether bytes have come that were not handed over yet, as far as can be seen.
 
         A loop that was blocked may run a timer before it reads: a late reply would lie there, and the silence that R3
         waits for would be a mistake.
@@ -48,14 +48,14 @@ class OpenPort:
         return False
 
     def unsent(self, waited: float) -> int | None:
-        """Bytes that have not left, `waited` seconds after the last write; None if that cannot be told."""
+        """Return how many bytes have not left, `waited` seconds after the last write; None if that cannot be told."""
         return None if self._buffered is None else self._buffered()
 
     def discard_unsent(self) -> None:
         """See to it that what has not left never leaves when the transport is aborted."""
 
     def errors(self) -> DriverErrors | None:
-        """What its driver has counted since it was opened or reset; None where there is none that counts."""
+        """Return what its driver has counted since it was opened or reset; None where there is none that counts."""
         return None
 
     def reset(self) -> None:
@@ -148,7 +148,7 @@ class Socket(_Descriptor):
 
 
 def open_port(transport: asyncio.Transport) -> OpenPort:
-    """What can be asked of the port behind this transport."""
+    """Return what can be asked of the port behind this transport."""
     device = transport.get_extra_info("serial")
     if device is not None:
         return Tty(transport, device.fileno())

@@ -103,9 +103,18 @@ class Pump(asyncio.Protocol):
                 self.tap.transmitted(now, data, arbiter.attempt)
             if self._paused:
                 self._check_output(now)
-        while (event := arbiter.poll_event()) is not None:
+        event = arbiter.poll_event()
+        while event is not None:
             if type(event) is Transaction:
-                self._resolve(event)
+                if event.writes and event.attempts:
+                    self._on_written(event, event.ended_at)
+                future = event.waiter
+                if future is None or future.done():
+                    pass  # nobody waits for it any more
+                elif event.error is None:
+                    future.set_result(event.value)
+                else:
+                    future.set_exception(event.error)
             elif type(event) is Sampled:
                 self._on_sample(event.poll, event.transaction)
             elif type(event) is Polled:
@@ -117,6 +126,7 @@ class Pump(asyncio.Protocol):
                     self.tap.attempted(event)
             else:
                 self._on_event(event)
+            event = arbiter.poll_event() if arbiter.events else None
         due = arbiter.poll_timeout()
         if due < self._armed:
             self._arm(due)
@@ -192,17 +202,6 @@ class Pump(asyncio.Protocol):
         self.turn()
 
     # inside
-
-    def _resolve(self, transaction: Transaction) -> None:
-        if transaction.writes and transaction.attempts:
-            self._on_written(transaction, transaction.ended_at)
-        future = transaction.waiter
-        if future is None or future.done():
-            return
-        if transaction.error is None:
-            future.set_result(transaction.value)
-        else:
-            future.set_exception(transaction.error)
 
     def _give_up_on(self, late: Overdue) -> None:
         """Its caller goes, the exchange stays: a write that is on the wire is over before anything else can be read."""

@@ -55,15 +55,12 @@ class Connection:
         self._told: dict[str, str] = {}
         self._closing = asyncio.Event()
 
-    @property
-    def connected(self) -> bool:
-        return self._link is not None and not self._link.lost.is_set()
-
     async def open(self) -> None:
         """Open it once, now. Raises LineDown."""
         self._came_back()
         link = _Link(self.endpoint.name, self._protocol, self._closing)
         transport = await self.endpoint.open(lambda: link, self._device)
+        # of this opening: the same device may have come back at another place, and is known from there on
         self._device = transport.get_extra_info("identity")
         self._link = link
         self._told.clear()
@@ -121,6 +118,7 @@ class Connection:
     async def _wait(self, delay: float) -> bool:
         """Wait that long, spread by the jitter. True, and earlier, if the device is seen to come back."""
         loop = asyncio.get_running_loop()
+        # spread, or all lines of a server that went away would come back to it at the same moments
         until = loop.time() + delay * self._jitter.uniform(0.75, 1.25)
         while (left := until - loop.time()) > 0:
             try:

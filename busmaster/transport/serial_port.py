@@ -1,11 +1,11 @@
 """A serial port, on pyserial and pyserial-asyncio with the latter's traps mended.
 
-Inherited from pyserial is how a port is opened and configured, and from pyserial-asyncio the reader and writer on the
-loop, pausing and resuming, and the write buffer. Mended is all that costs time or hides something: a write leaves at
-once instead of a turn of the loop later; reading asks no select(), which fails above descriptor 1023; every loss is
-reported, once, and never from within a write; bytes with parity or framing errors come marked (pyserial switches the
-check off); and nothing that can block (opening, configuring, draining, closing) runs on the loop's thread: a driver may
-take seconds, or for ever. Why stands at each method of `PortTransport`.
+pyserial opens and configures the port. Inherited from pyserial-asyncio is little: how reader and writer are registered
+with the loop and removed, pausing and resuming of reading, the limits of the write buffer and the pausing of the
+protocol by them. Mended is all that costs time or hides something: a write leaves at once instead of a turn of the loop
+later; reading asks no select(), which fails above descriptor 1023; every loss is reported, once, and never from within
+a write; bytes with parity or framing errors come marked; and nothing that can block (opening, configuring, draining,
+closing) runs on the loop's thread. Why stands at each method of `PortTransport`.
 """
 
 from __future__ import annotations

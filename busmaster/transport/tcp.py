@@ -81,7 +81,7 @@ class TcpPort:
         except OSError as error:
             raise self._refusal(error) from None
         _find_out_a_dead_server(transport.get_extra_info("socket"))
-        transport.set_write_buffer_limits(high=0)
+        transport.set_write_buffer_limits(high=0)  # any byte that is still here pauses the pump: it has not left (R2)
         return transport
 
     def _refusal(self, error: OSError) -> LineDown:

@@ -39,7 +39,7 @@ def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes]
     become such a telegram; `whole` only if nothing but the checksum is wrong, and nothing follows.
     """
     start = len(header)
-    if buffer[:start] != header:
+    if not buffer.startswith(header):
         if header.startswith(buffer):
             return 0
         raise FrameError(f"wrong echo: {buffer[:start].hex(' ')} in place of {header.hex(' ')}", heard=buffer)

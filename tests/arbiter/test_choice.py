@@ -17,7 +17,6 @@ REQUEST = 8 * TAU
 URGENT, COMMAND, POLL, BACKGROUND = Priority
 MOST_ALIKE = 32
 WRITE_0 = "07 30 31 02 30 31 30 03 31"
-WRITE_5_OF_2 = "07 30 32 02 30 31 35 03 37"
 
 
 def write(value: int = 5, *, idempotent: bool = False) -> hcp2.Write:
@@ -297,7 +296,7 @@ def test_r15_a_node_that_owes_what_it_is_to_be_asked_for_is_asked_something_else
     bench = Bench()
     node, other = up(bench), up(bench, 2)
     lost(bench, node)
-    node.unheard = SILENT
+    node.unheard = SILENT - 1
     bench.served(bench.ask(other, hcp2.Read(3)))
     bench.wait(0.010)
     read = bench.ask(node)
@@ -312,7 +311,7 @@ def test_r15_a_node_that_is_likely_to_be_dead_is_not_asked_something_else_first(
     bench = Bench()
     node, other = up(bench), up(bench, 2)
     lost(bench, node)
-    node.unheard = SILENT + 1
+    node.unheard = SILENT
     bench.served(bench.ask(other, hcp2.Read(3)))
     bench.wait(0.010)
     bench.ask(node)

@@ -7,12 +7,13 @@ from dataclasses import replace
 import pytest
 
 from busmaster.arbiter.state import LineState
+from busmaster.arbiter.transaction import Priority
 from busmaster.contract.timing import ReplyTiming, Timings
-from busmaster.errors import NoReply
+from busmaster.errors import NoReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import ACK, FIVE, LATENESS, QUIET, SEVEN, TAU, WRITE_5, Bench, up
+from tests.arbiter.bench import ACK, FIVE, LATENESS, NAK, QUIET, SEVEN, TAU, WRITE_5, Bench, up
 
 REQUEST = 8 * TAU
 JUST = 1e-6
@@ -73,6 +74,35 @@ def checksum(telegram: str) -> int:
     for byte in bytes.fromhex(telegram)[1:]:
         check ^= byte
     return check + 0x20 if check < 0x20 else check
+
+
+def test_what_was_refused_has_left_whatever_the_baud_rate_says() -> None:
+    """On an unpaced port, requests that are refused at once do not add up."""
+    bench = Bench()
+    node = up(bench)
+    for _ in range(5):
+        refused = bench.ask(node, hcp2.Write(1, (5.0,)))
+        while refused.error is None:
+            bench.sent()
+            bench.hear(NAK, after=JUST)
+    asked = bench.now
+    bench.ask(node, retries=0)
+    assert bench.arbiter.poll_timeout() - asked == pytest.approx(REQUEST + 0.100)
+
+
+def test_r3_an_answer_that_is_not_believed_proves_not_that_its_request_has_left() -> None:
+    """On an unpaced port a reply may come before the baud rate says; an earlier one, held up, too."""
+    bench = Bench()
+    node = up(bench)
+    bench.ask(node, hcp2.Write(1, (5.0,)))
+    bench.sent()
+    bench.wait(1.0)
+    disabled = bench.ask(node, hcp2.Write(1, (5.0,)), priority=Priority.URGENT)
+    said = len(bytes.fromhex(bench.sent())) * TAU
+    bench.hear(ACK, after=TAU)
+    assert isinstance(disabled.error, WriteUnconfirmed)
+    bench.ask(node)
+    assert bench.until_sent() == pytest.approx(said - TAU + LATENESS)
 
 
 # the silence
@@ -215,6 +245,21 @@ def test_r3_a_stray_byte_may_have_been_the_lost_ack_and_its_packet_is_waited_for
     bench.sent()
     bench.hear("00", after=MSC_REQUEST + 0.8)
     assert bench.until_sent() == pytest.approx(1.0 + MSC_TAU)
+
+
+def test_r3_a_damaged_byte_in_place_of_the_ack_may_have_been_it_and_its_packet_is_waited_for_anew() -> None:
+    bench, timings = msc_line()
+    node = bench.node(1, msc.PROFILE, timings)
+    bench.wait(2.0)
+    bench.ask(node, msc.DataRead(2008), retries=0)
+    bench.ask(node, msc.DataRead(2012))
+    bench.sent()
+    bench.hear("07", after=MSC_REQUEST + 0.4)
+    heard = bench.now
+    bench.until_sent()
+    assert bench.sent() == ACK, "what was said in its place may be a packet"
+    bench.until_sent()
+    assert bench.now - heard == pytest.approx(1.0 + MSC_TAU)
 
 
 def test_r3_noise_does_not_use_up_the_knowledge_that_a_packet_follows_its_ack() -> None:

@@ -1,4 +1,4 @@
-"""MSC's packets: two legs, a closing ACK, stale packets, and a limit on one exchange (PROTOCOLS 5, R9)."""
+"""MSC's packets: two legs, a closing ACK, stale packets, and a limit on one exchange (docs/protocols/msc.md, R9)."""
 
 from __future__ import annotations
 

@@ -214,3 +214,28 @@ def test_another_loop_of_the_same_thread_is_told_so_and_a_loop_that_pauses_is_no
     first.run_until_complete(bus.__aexit__(None, None, None))
     first.close()
     second.close()
+
+
+def test_a_bus_that_is_entered_under_another_library_than_asyncio_says_what_it_needs_and_opens_nothing() -> None:
+    """Trio awaits as this does: it sends into the coroutine, and no loop of asyncio runs."""
+    bus = slow_bus()
+    with pytest.raises(InvalidCommand, match=r"needs asyncio's event loop.* not by trio"):
+        bus.__aenter__().send(None)
+    assert not bus.running
+
+
+def test_anyios_cancel_scopes_and_task_groups_work_around_a_bus() -> None:
+    async def story() -> list[float]:
+        read: list[float] = []
+        async with slow_bus() as bus, anyio.create_task_group() as tasks:
+            axis = Hcp2Controller(bus, 1)
+            with anyio.move_on_after(0.01) as scope:
+                await axis.read(1)
+            assert scope.cancelled_caught
+            tasks.start_soon(lambda: collect(axis, read))
+        return read
+
+    async def collect(axis: Hcp2Controller, read: list[float]) -> None:
+        read.append(await axis.read(1))
+
+    assert anyio.run(story) == [0.0]

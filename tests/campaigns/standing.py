@@ -11,8 +11,7 @@ from math import inf
 from random import Random
 from typing import Any
 
-from busmaster.arbiter.tap import Attempt
-from busmaster.emulator.world import World, told
+from busmaster.emulator.world import World
 from tests.campaigns.edges import EdgeLine
 from tests.campaigns.mixes import Standstill
 
@@ -133,20 +132,11 @@ class StandingWorld(World):
         if due_at <= self.now and self._own.random() < 0.5:
             self._time_out()
         if self._unread:
-            self._hand_over()
+            data, self._unread = self._unread, b""
+            self._hear(data)
         if due_at <= self.now:
             self._time_out()
         super()._step(self.now, inf)
-
-    def _hand_over(self) -> None:
-        data, self._unread = self._unread, b""
-        if self.plugged:
-            if self._record is not None:
-                self._record(f"{self.now:.6f} < {data.hex(' ')}")
-            if self.tap is not None:
-                self.tap.received(self.now, data, self.arbiter.attempt)
-            self.arbiter.data_received(data, self.now)
-            self._pump()
 
     def _time_out(self) -> None:
         arbiter = self.arbiter
@@ -165,30 +155,10 @@ class StandingWorld(World):
             self._unread += self.line.receive(self.now)
         self.now = end
 
-    def _pump(self) -> None:
-        arbiter = self.arbiter
-        while True:
-            data = arbiter.poll_transmit()
-            if data is not None:
-                if self._own.random() < self._stands.process:
-                    self._stand_still()
-                if self._record is not None:
-                    self._record(f"{self.now:.6f} > {data.hex(' ')}")
-                if self.plugged:
-                    self.line.send(data, self.now)
-                    arbiter.transmitted(self.now)
-                    if self.tap is not None:
-                        self.tap.transmitted(self.now, data, arbiter.attempt)
-            event = arbiter.poll_event()
-            if event is None:
-                if data is None:
-                    return
-                continue
-            if type(event) is Attempt:
-                if self.tap is not None:
-                    self.tap.attempted(event)
-                continue
-            if self._record is not None:
-                self._record(f"{self.now:.6f} {told(event)}")
-            if self._on_event is not None:
-                self._on_event(event)
+    def _say(self, data: bytes) -> None:
+        """The driver takes it, late perhaps, and says when it has."""
+        if self._own.random() < self._stands.process:
+            self._stand_still()
+        super()._say(data)
+        if self.plugged:
+            self.arbiter.transmitted(self.now)

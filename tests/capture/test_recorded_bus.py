@@ -116,7 +116,7 @@ def test_polls_retries_refusals_cancellations_and_probes_each_have_their_verdict
                 await two.write(100, 3)
             with anyio.move_on_after(0.0001):
                 await one.read(3)
-            await bus.nodes[0].probe()
+            await bus.node(one.profile, 1).probe()
 
     path = tmp_path / "line.pcapng"
     with Recorder(path) as tap:

@@ -1,4 +1,4 @@
-"""read, write, poll and scan, as CLI.md has them, against an emulated line on a TCP port."""
+"""read, write, poll and scan, as a person types them, against an emulated line on a TCP port."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_a_bad_assignment_is_status_2_and_nothing_is_sent(busmaster: Command, as
         (("poll", "PORT", *HCP2, "--nodes", "1", "--items", "1", "--period", "-1"), "a time is above 0"),
         (("emulate", *HCP2, "--tcp", "5020"), "HOST:PORT"),
         (("emulate", *HCP2, "--pty", "--tcp", "127.0.0.1:0"), "not both"),
-        (("emulate", *HCP2, "--fault", "losst=1"), "did you mean lost?"),
+        (("emulate", *HCP2, "--fault", "losst=1"), "did you mean 'lost'?"),
         (("emulate", *HCP2, "--reply-delay", "5-x"), "as 2 or 50-100"),
         (("emulate", "--protocol", "mentor", "--nodes", "0-3"), "means all of them"),
     ],

@@ -1,4 +1,4 @@
-"""The items of each protocol, as CLI.md lists them, written to and read from an emulated drive."""
+"""The items of each protocol, written to and read from an emulated drive."""
 
 from __future__ import annotations
 

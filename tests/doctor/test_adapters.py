@@ -160,13 +160,6 @@ def test_a_pty_has_no_low_latency_flag_and_a_driver_tells_its_own(
 # -- a name that lasts -----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def usb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UsbTree:
-    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
-    monkeypatch.setattr(identity, "LINKS", tmp_path / "serial")
-    return UsbTree(tmp_path / "sys")
-
-
 def name_of(port: str) -> Finding:
     (finding,) = [finding for finding in inspect(port) if finding.topic == "name"]
     assert finding.ok
@@ -186,7 +179,7 @@ def test_the_name_to_use_for_an_adapter_is_said_unless_it_is_used(usb: UsbTree, 
 def test_an_adapter_without_a_serial_number_goes_by_its_place(usb: UsbTree, far_end: FarEnd, tmp_path: Path) -> None:
     usb.plug(far_end.path, place="1-1.2")
     assert name_of(far_end.path).advice == "it has no serial number: leave it in this USB port"
-    link = tmp_path / "serial/by-path/pci-0000:00:14.0-usb-0:1.2:1.0-port0"
+    link = tmp_path / "links/by-path/pci-0000:00:14.0-usb-0:1.2:1.0-port0"
     link.parent.mkdir(parents=True)
     link.symlink_to(far_end.path)
     assert name_of(far_end.path).advice.startswith(f"name it {link}: ")

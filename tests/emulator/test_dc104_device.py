@@ -73,7 +73,7 @@ def test_a_write_is_acknowledged_when_it_is_completed() -> None:
 
 
 def test_what_it_has_not_is_refused_or_by_option_met_with_silence() -> None:
-    drive = EmulatedDc104(last_parameter=10, read_only=frozenset({3}))
+    drive = EmulatedDc104(maximum=10, read_only=frozenset({3}))
     line = line_of(drive)
     drive.registers[3] = 33
     assert ask(line, read(11), 0.0) == NAK
@@ -119,7 +119,7 @@ def test_the_oracle_answers_and_counts_writes() -> None:
 def test_what_no_dc104_is_cannot_be_made() -> None:
     for bad in (0, 256):
         with pytest.raises(InvalidCommand):
-            EmulatedDc104(last_parameter=bad)
+            EmulatedDc104(maximum=bad)
     with pytest.raises(InvalidCommand, match=r"2\*\*16 oracle values"):
         EmulatedDc104(oracle=Oracle(0))
 

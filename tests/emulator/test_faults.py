@@ -56,7 +56,7 @@ def test_faults_are_read_from_text() -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("lots=0.1", "no such fault 'lots'.*did you mean lost"),
+        ("lots=0.1", "no such fault 'lots'.*did you mean 'lost'"),
         ("lost", "fault lost: '' is no number; write for example lost=0.1"),
         ("lost=often", "'often' is no number"),
         ("lost=1.5", "fault lost is a probability from 0 to 1, not 1.5"),

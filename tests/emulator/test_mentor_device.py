@@ -1,4 +1,4 @@
-"""A Mentor II drive, as its user guide and PROTOCOLS section 4 describe it."""
+"""A Mentor II drive, as its user guide and docs/protocols/mentor.md describe it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def backwards(drive: int, *, short_after_write: bool = False) -> tuple[EmulatedM
     return device, line_of(device)
 
 
-# The frames of the guide, and what PROTOCOLS 4.2 computes from its rules
+# The frames of the guide, and those that follow from its rules
 
 
 @pytest.mark.parametrize("bytewise", [False, True])
@@ -160,7 +160,7 @@ def test_a_broadcast_is_taken_by_all_and_answered_by_none() -> None:
 
 
 def test_next_previous_and_same_again_after_a_read() -> None:
-    """The transcript of PROTOCOLS 4.2 with an independent node of the same protocol, in Mentor II's five characters."""
+    """A transcript with an independent node of the same protocol, in Mentor II's five characters."""
     _, line = backwards(12)
     asked = ["04 31 31 32 32 30 31 31 37 05", ACK, BS, NAK, "04 31 31 32 32 31 37 32 33 05", NAK]
     heard = [ask(line, text, number) for number, text in enumerate(asked)]

@@ -33,7 +33,7 @@ def value(reply: str) -> str:
     return bytes.fromhex(reply)[3:-2].decode()
 
 
-# Frames of the documents
+# Frames as AN00110 and AN00129 describe them
 
 
 @pytest.mark.parametrize(

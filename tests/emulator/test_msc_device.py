@@ -16,7 +16,7 @@ from busmaster.protocols.msc.device import COUNT, RUN_FLAG, EmulatedMsc, packet
 from tests.emulator.lines import arrivals, ask, ask_bytewise, hexed, line_of
 
 ACK, NAK, SILENCE = "06", "15", ""
-DWRITE = "02 01 00 0D 00 00 44 57 52 49 54 45 2C 07 D8 00 00 04 D2 03 BE"  # the document's example packet
+DWRITE = "02 01 00 0D 00 00 44 57 52 49 54 45 2C 07 D8 00 00 04 D2 03 BE"  # the example of IB-11A002
 DREAD = "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74"
 REPLY = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"
 PAUSE = 10.0
@@ -35,7 +35,7 @@ def answer(line: Line, text: str, now: float, *, bytewise: bool = False) -> str:
     return heard
 
 
-# The document's packets, and what PROTOCOLS computes from its rules
+# The packet that IB-11A002 prints, and those that follow from its rules
 
 
 STATUS = "02 01 00 0F 00 00 52 51 53 54 41 54 2C 00 41 00 00 00 00 00 00 02 5C"  # 65: running, auto start

@@ -30,10 +30,8 @@ from busmaster.protocols.mentor.device import EmulatedMentor
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.protocols.msc.status import ProgramStatus
-from busmaster.registry import make_device
+from busmaster.registry import find, make_device
 
-PROFILES = {"hcp": hcp.PROFILE, "hcp2": hcp2.PROFILE, "msc": msc.PROFILE, "mentor": mentor.PROFILE}
-PROFILES |= {"microflex": hcp2.PROFILE, "dc104": dc104.PROFILE}
 BLOCK = tuple(range(-16, 16))
 Step = tuple[Command[Any], Any]
 """A command, and what comes of it: a value, None for a write, or the error."""
@@ -162,7 +160,7 @@ ALL = pytest.mark.parametrize(
 
 @ALL
 def test_every_command_is_understood_on_both_sides(protocol: str, address: int, steps: list[Step]) -> None:
-    Master(PROFILES[protocol], make_device(protocol, address)).tries(steps)
+    Master(find(protocol).profile, make_device(protocol, address)).tries(steps)
 
 
 @ALL
@@ -170,15 +168,15 @@ def test_every_command_is_understood_on_both_sides(protocol: str, address: int, 
 def test_likewise_in_single_bytes_without_pacing_and_behind_a_slow_adapter(
     protocol: str, address: int, steps: list[Step], options: dict[str, Any]
 ) -> None:
-    Master(PROFILES[protocol], make_device(protocol, address), **options).tries(steps)
+    Master(find(protocol).profile, make_device(protocol, address), **options).tries(steps)
 
 
 @ALL
 def test_a_device_does_not_hear_what_another_is_asked(protocol: str, address: int, steps: list[Step]) -> None:
-    if not PROFILES[protocol].addressed:
+    if not find(protocol).profile.addressed:
         return
     others = [make_device(protocol, other) for other in (2, 3, 12)]
-    master = Master(PROFILES[protocol], make_device(protocol, address), *others)
+    master = Master(find(protocol).profile, make_device(protocol, address), *others)
     master.tries(steps)
     assert master.line.collisions == 0
     untouched: dict[str, Command[Any]] = {
@@ -216,7 +214,7 @@ def test_a_broadcast_reaches_all_and_the_line_goes_on() -> None:
     assert [master.asks(mentor.Read(1, 17), drive.address) for drive in drives] == [250, 250]
 
 
-# HCP and HCP2 on one line (PROTOCOLS 1.4)
+# HCP and HCP2 on one line
 
 
 def test_hcp_and_hcp2_controllers_share_a_line() -> None:
@@ -278,7 +276,7 @@ def test_msc_never_takes_a_packet_whose_ack_was_lost_for_the_answer() -> None:
 
 
 def test_a_packet_that_was_never_acknowledged_does_not_come_again_into_other_exchanges() -> None:
-    """The host's closing ACK is lost; one second later the controller sends its packet again (S16)."""
+    """The host's closing ACK is lost; one second later the controller sends its packet again."""
     first, second = EmulatedMsc(3), EmulatedMsc(4)
     second.set_value(2008, 44)
     master = Master(msc.PROFILE, first, second)
@@ -310,7 +308,7 @@ def test_a_dc104_write_is_awaited_until_its_eeprom_is_written() -> None:
 
 def test_a_node_that_is_not_there_does_not_answer() -> None:
     for protocol, command in (("msc", msc.ReadStatus()), ("mentor", mentor.Read(1, 17))):
-        master = Master(PROFILES[protocol], make_device(protocol, 1))
-        master.knows(PROFILES[protocol], 2)
+        master = Master(find(protocol).profile, make_device(protocol, 1))
+        master.knows(find(protocol).profile, 2)
         with pytest.raises(NoReply):
             master.asks(command, 2)

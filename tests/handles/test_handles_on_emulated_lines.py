@@ -232,7 +232,7 @@ async def test_neighbouring_parameters_are_polled_as_runs_where_that_is_allowed(
 
 @in_virtual_time
 async def test_dc104_parameters() -> None:
-    device = dc104.EmulatedDc104(last_parameter=100)
+    device = dc104.EmulatedDc104(maximum=100)
     async with line_of(Dc104Drive, device) as bus:
         drive = Dc104Drive(bus)
         await drive.write(12, 1500, verify=True)

@@ -312,9 +312,9 @@ async def test_by_number_too_since_every_drive_has_the_same_map(drive: MicroFlex
             await drive.point(str(element)).write(1)
         assert not drive.element(element).writable
     assert line.asked == []
-    await drive.write(118, 5, idempotent=True)
-    await drive.write(50, 5, idempotent=True)  # not in the map: the drive's to refuse
-    assert line.asked == ["write element 118 = 5", "write element 50 = 5"]
+    for element in (118, 50):  # 50 is not in the map: the drive's to refuse
+        assert drive.element(element).writable
+        assert [str(command) for command in drive.writes(element, (5,))] == [f"write element {element} = 5"]
 
 
 @pytest.mark.asyncio

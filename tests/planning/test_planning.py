@@ -11,13 +11,12 @@ import pytest
 from hypothesis import given, settings
 
 from busmaster import planning
-from busmaster.arbiter import backlog, choice, strays
 from busmaster.arbiter.transaction import Priority
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import LineSettings
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
-from busmaster.planning import Bounds, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan, worst_case
+from busmaster.planning import Bounds, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -38,12 +37,6 @@ def group(name: str, period: float, count: int, *, node: PlannedNode = NODE, **o
 
 def planned(*groups: PlannedGroup, **options: Any) -> Plan:
     return plan(groups, line=LINE, **options)
-
-
-def test_the_planner_reckons_with_what_the_arbiter_does() -> None:
-    """It may not import them, so it repeats them."""
-    assert (planning.SHARE, planning.QUIET, planning.NOISY_AFTER) == (backlog.SHARE, strays.QUIET, strays.NOISY_AFTER)
-    assert worst_case.MOST_BEFORE == choice.MOST_BEFORE
 
 
 # how busy

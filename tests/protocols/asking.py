@@ -1,4 +1,4 @@
-"""Ask an exchange as the arbiter does, and take the documents' frames from the vectors."""
+"""Ask an exchange as the arbiter does, and take the manuals' frames from the vectors."""
 
 from __future__ import annotations
 

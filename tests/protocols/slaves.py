@@ -1,6 +1,6 @@
 """The least slaves that keep what is written to them: what the host says in, what they answer out.
 
-Written from the documents alone, so that what is misread on one side is not misread alike on the other.
+Written from the manuals alone, so that what is misread on one side is not misread alike on the other.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class MscSlave:
         return ACK + self.packet
 
     def obey(self, name: bytes, which: int, values: bytes) -> bytes | None:
-        """The reply's values, or None where the document says "Packet returned by the MSC: None"."""
+        """The reply's values, or None where IB-11A002 says "Packet returned by the MSC: None"."""
         match name:
             case b"DWRITE," | b"BWRITE,":
                 for i in range(len(values) // 4):

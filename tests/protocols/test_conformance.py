@@ -1,4 +1,4 @@
-"""Five protocols through the conformance kit: what each document says, and what its checks cannot see."""
+"""Five protocols through the conformance kit: what each manual says, and what its checks cannot see."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""DC104: every byte of the document, and what is no reply."""
+"""DC104: every byte of its manual, and what is no reply."""
 
 from __future__ import annotations
 

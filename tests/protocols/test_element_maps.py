@@ -15,12 +15,12 @@ from busmaster.protocols.hcp2.microflex import CommandWord, StatusWord
     ("name", "number"),
     [
         ("axis0.position", 100),
-        ("axis0.encoder", 105),  # the document's own example
+        ("axis0.encoder", 105),  # AN00129's own example
         ("axis0.following_error", 107),
         ("axis1.position", 115),
         ("axis7.following_error", 212),
         ("inputs", 220),
-        ("outputs", 222),  # the document's own example
+        ("outputs", 222),  # AN00129's own example
         ("adc0", 224),
         ("adc7", 231),
         ("error", 232),

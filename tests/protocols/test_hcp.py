@@ -1,4 +1,4 @@
-"""HCP as AN00110 describes it; frames of the vectors and of PROTOCOLS 2."""
+"""HCP as AN00110 describes it; frames of the vectors and of docs/protocols/hcp.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""HCP2 as AN00129 describes it; frames of the vectors and of PROTOCOLS 3."""
+"""HCP2 as AN00129 describes it; frames of the vectors and of docs/protocols/hcp2.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mentor II as its guide describes it; frames of the vectors and of PROTOCOLS 4."""
+"""Mentor II as its guide describes it; frames of the vectors and of docs/protocols/mentor.md."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def says(step: object) -> bytes:
     return step.send
 
 
-# as the document has it
+# as IB-11A002 has it
 
 
 def test_a_read_is_an_ack_and_a_packet_that_the_host_acks() -> None:

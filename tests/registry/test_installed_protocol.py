@@ -155,6 +155,18 @@ def test_a_line_file_has_nodes_of_it_with_its_options(tally: None) -> None:
     assert run_in_virtual_time(poll()) == (3, 1.5)
 
 
+def test_its_emulated_device_is_as_the_file_says(tally: None) -> None:
+    file = read(Source("line.toml", f"{FILE}[emulator.nodes.west]\nvalues = {{ people = 21, c = 5 }}\n"))
+
+    async def ask() -> Any:
+        async with ConfiguredLine(file, port=MemoryPort(line_of_file(file))) as line:
+            return [await line.point(f"west/{point}").read() for point in ("people", "b", "c", "a")]
+
+    assert run_in_virtual_time(ask()) == [21, 42, 5, 0]
+    with pytest.raises(FileError, match=r"line\.toml:13: emulator\.nodes\.west\.values\.C: a turnstile has no counter"):
+        line_of_file(read(Source("line.toml", f"{FILE}[emulator.nodes.west]\nvalues.C = 5\n")))
+
+
 def test_a_wrong_key_in_a_line_file_says_whose_it_is(tally: None) -> None:
     with pytest.raises(FileError, match="only nodes of tally have this, not those of hcp2"):
         read(Source("line.toml", FILE.replace('protocol = "tally"', 'protocol = "hcp2"\ngate = 1')))

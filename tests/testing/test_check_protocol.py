@@ -176,7 +176,7 @@ class NumberingItsRequests(Asking):
         (Crashing, "KeyError"),
         (AskingForEver, "Endless"),
         (TurningForEver, "Endless"),
-        (SearchingForItsUnit, "00 and then the reply gives the value 555"),
+        (SearchingForItsUnit, "00, which is not in starts, and then the reply gives the value 555"),
         (BeginningElsewhere, "its reply begins with 11, which is not in starts"),
         (SmallerThanItSays, "a leg of 7 bytes is longer than the 5 announced"),
         (SizedBackwards, "typically 9 and at most 8 bytes"),

@@ -19,13 +19,6 @@ CH340 = "1a86:7523"
 
 
 @pytest.fixture
-def usb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UsbTree:
-    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
-    monkeypatch.setattr(identity, "LINKS", tmp_path / "links")
-    return UsbTree(tmp_path / "sys")
-
-
-@pytest.fixture
 def one() -> Iterator[FarEnd]:
     with plugged() as end:
         yield end

@@ -20,7 +20,7 @@ import serial
 from busmaster.arbiter.events import LineChange, LineChanged, PortFailed
 from busmaster.bus.bus import Bus
 from busmaster.errors import LineDown
-from busmaster.transport import identity, serial_port
+from busmaster.transport import serial_port
 from busmaster.transport.identity import identify
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
@@ -78,13 +78,6 @@ async def kept(port: SerialPort) -> AsyncIterator[tuple[Connection, Recorder, Ca
         await connection.close()
         async with asyncio.timeout(1):
             await running
-
-
-@pytest.fixture
-def usb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UsbTree:
-    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
-    monkeypatch.setattr(identity, "LINKS", tmp_path / "links")
-    return UsbTree(tmp_path / "sys")
 
 
 @pytest.fixture

@@ -5,6 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import pytest
+
+from busmaster.transport import identity
+
 
 class UsbTree:
     """What the kernel describes. `root` stands for /sys."""
@@ -51,3 +55,11 @@ class UsbTree:
     def unplug(self, path: str) -> None:
         for entry in self._entries.pop(path):
             entry.unlink()
+
+
+@pytest.fixture
+def usb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UsbTree:
+    """Adapters that are looked for in this tree, with no links to them by name."""
+    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
+    monkeypatch.setattr(identity, "LINKS", tmp_path / "links")
+    return UsbTree(tmp_path / "sys")

@@ -13,7 +13,7 @@ def test_an_hcp_checksum_is_the_xor_of_everything_after_stx_through_etx() -> Non
 
 
 def test_an_hcp_checksum_may_be_any_control_character() -> None:
-    values = ("11", "10", "17", "16", "15", "14", "10.8")  # PROTOCOLS 2
+    values = ("11", "10", "17", "16", "15", "14", "10.8")  # docs/protocols/hcp.md
     assert [xor(b"01" + v.encode() + b"\x03") for v in values] == [0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x15]
 
 

@@ -41,8 +41,14 @@ class ReadElement:
     def __str__(self) -> str:
         return f"read element {self.element}"
 
-    def open(self, address: int, timings: Timings) -> Reading:
+    @staticmethod
+    def encode(address: int, element: int) -> tuple[bytes, bytes]:
+        """Return the request, and the element as its reply echoes it."""
         raise NotImplementedError
+
+    def open(self, address: int, timings: Timings) -> Reading:
+        request, echo = self.encode(address, self.element)
+        return Reading(request, echo, timings.read)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +83,14 @@ class WriteElements:
         which = f"elements {self.element}-{self.element + many}" if many else f"element {self.element}"
         return f"write {which} = {self.text}"
 
-    def open(self, address: int, timings: Timings) -> Writing | WritingMany:
+    @staticmethod
+    def encode(address: int, element: int, text: bytes) -> bytes:
+        """Return the request that writes the numbers of a text."""
         raise NotImplementedError
+
+    def open(self, address: int, timings: Timings) -> Writing | WritingMany:
+        exchange = Writing if len(self.values) == 1 else WritingMany
+        return exchange(self.encode(address, self.element, self.text.encode()), timings.write)
 
 
 class Reading(TelegramReader[float]):
@@ -89,8 +101,7 @@ class Reading(TelegramReader[float]):
     longest = LONGEST_NUMBER
     sizes: ClassVar[Sizes] = telegram_sizes(echo=2, typical=7, longest=LONGEST_NUMBER)
 
-    def parse(self, field: bytes) -> float:
-        return parse_number(field)
+    parse = staticmethod(parse_number)
 
 
 class Writing(AcknowledgeReader):

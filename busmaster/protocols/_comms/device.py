@@ -14,12 +14,15 @@ from functools import lru_cache
 from busmaster.emulator.chance import Chance
 from busmaster.emulator.device import NAK, Delay, Device
 from busmaster.emulator.oracle import Oracle
+from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import xor
 
 STX, ETX, EOT, ENQ, ACK, BEL = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
 FIRST_PRINTABLE = 0x20
 LONGEST_WRITE = 60
 LONGEST_REPLY = 20
+GREATEST = 1e9
+"""What a value may be that is there from the start."""
 DECIMALS = Decimal("0.0001")
 ROUNDING = Context(prec=LONGEST_WRITE + 20, rounding=ROUND_HALF_UP)
 ELEMENT_AT = 4
@@ -56,6 +59,13 @@ class Framing:
 
 HCP = Framing("hcp", EOT, 10, b"0123456789", 99, ELEMENT_AT, False)
 HCP2 = Framing("hcp2", BEL, 16, b"0123456789ABCDEF", 255, 1, True)
+
+
+def sendable(value: float, element: int) -> float:
+    """Return a value that a reply can carry. Raises InvalidCommand for any other."""
+    if not abs(value) <= GREATEST:
+        raise InvalidCommand(f"element {element} holds {-GREATEST:g} to {GREATEST:g}, not {value:g}")
+    return value
 
 
 class HostCommsDevice(Device):

@@ -6,9 +6,10 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Generic, TypeVar, Unpack, overload
 
-from busmaster.bus.handle import Handle, Send, is_decimal, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, item_text, unknown_item
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
+from busmaster.contract.arguments import is_decimal
 from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols._comms.codec import ReadElement, WriteElements, is_read_back, telegrams

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Generator, Sequence
+from typing import Any
 
-from busmaster.emulator.device import NEVER, Delay
+from busmaster.contract.arguments import is_decimal
+from busmaster.emulator.device import NEVER, Delay, held
 from busmaster.emulator.motion import Axis, Motion
 from busmaster.emulator.oracle import Oracle
-from busmaster.protocols._comms.device import HCP2, Framing, HostCommsDevice
+from busmaster.errors import InvalidCommand
+from busmaster.protocols._comms.device import HCP2, Framing, HostCommsDevice, sendable
 
 LAST_COMMS = 99
 FIRST_AXIS = 100
@@ -17,7 +20,10 @@ AXES = 8
 FIRST_IO = FIRST_AXIS + AXES * AXIS_SIZE
 OUTPUTS = 222
 FIRST_ADC, LAST_ADC = 224, 231
+IO = {220: "inputs", OUTPUTS: "outputs", 239: "firmware"}
 LAST_EVENT = 5
+REPORTED = range(11, 11 + AXES)
+"""Where `report_positions` writes."""
 COUNTS = 1000.0
 """Encoder counts per unit of position."""
 FULL_SPEED = 100.0
@@ -83,6 +89,36 @@ class EmulatedMint(HostCommsDevice):
         self.program = program
         self._run: Generator[int, None, None] | None = None
         self.start_program()
+
+    def preset(self, item: str, *values: float) -> None:
+        """Hold values in an element and those after it: of the comms array, a position, an axis error, or I/O.
+
+        An axis whose position is given stands still, and nothing reports positions over elements that are given.
+        """
+        first = int(item) if is_decimal(item) else 0
+        for element, value in enumerate(values, first):
+            if not 1 <= element <= self.framing.last_element or not self._hold(element, value):
+                raise InvalidCommand(f"an emulated controller's element {element if first else item!r} cannot be given")
+
+    def _hold(self, element: int, value: float) -> bool:
+        value = sendable(value, element)
+        number, offset = divmod(element - FIRST_AXIS, AXIS_SIZE)
+        if element <= LAST_COMMS:
+            self.comms[element] = single(value) if self.single_precision else value
+            if self.program is report_positions and element in REPORTED:
+                self.program = self._run = None
+        elif element < FIRST_IO and number < len(self.axes) and offset in (0, 3):
+            if offset == 0:
+                self.axes[number].place(value, 0.0)
+            else:
+                self.axes[number].error = held(value, 0, 0xFFFF_FFFF, "an axis error")
+        elif FIRST_ADC <= element <= LAST_ADC:
+            self.adc[element - FIRST_ADC] = value
+        elif element in IO:
+            setattr(self, IO[element], held(value, 0, 0xFFFF_FFFF, IO[element]))
+        else:
+            return False
+        return True
 
     # The program
 
@@ -247,7 +283,7 @@ def report_positions(mint: EmulatedMint) -> Generator[int, None, None]:
     """Not in the documents: keeps Comms(11) to Comms(18) at the positions of the axes, for a host that speaks HCP."""
     while True:
         for number, axis in enumerate(mint.axes):
-            mint.comms[11 + number] = axis.position(mint.now)
+            mint.comms[REPORTED[number]] = axis.position(mint.now)
         yield 1
 
 
@@ -257,13 +293,45 @@ def jog_on_comms1(mint: EmulatedMint, element: int, now: float) -> None:
         mint.axes[0].jog(mint.comms[1], now)
 
 
-def make_mint(framing: Framing, address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedMint:
-    """Make a controller; if it is lively, its axes swing, and its program reports their positions in its elements."""
-    controller = EmulatedMint(address, framing, delay=delay, oracle=oracle)
-    if lively:
-        controller.program = report_positions
-        controller.statement = 0.05
-        controller.start_program()
+PROGRAMS = {program.__name__: program for program in (winding, command_handshake, report_positions)}
+
+AXES_NEEDED: dict[str | None, int] = {command_handshake.__name__: 2}
+SHORTEST_STATEMENT = 0.0001
+"""Seconds: a program is caught up with statement by statement."""
+
+
+def make_mint(
+    framing: Framing,
+    address: int,
+    *,
+    lively: bool,
+    program: str | None = None,
+    axes: int = AXES,
+    jogs_on_comms1: bool = False,
+    statement: float | None = None,
+    **options: Any,
+) -> EmulatedMint:
+    """Make a controller that runs a program of the documents.
+
+    If it is lively and no program is given, its axes swing, and a program reports their positions in its elements.
+    """
+    if not AXES_NEEDED.get(program, 1) <= axes <= AXES:
+        raise InvalidCommand(
+            f"a controller has {AXES_NEEDED.get(program, 1)} to {AXES} axes for what it runs, not {axes}"
+        )
+    if statement is not None and statement < SHORTEST_STATEMENT:
+        raise InvalidCommand(f"a statement takes {SHORTEST_STATEMENT} s at least, not {statement:g} s")
+    swings = lively and program is None
+    controller = EmulatedMint(
+        address,
+        framing,
+        axes=axes,
+        program=report_positions if swings else PROGRAMS[program] if program else None,
+        events=(jog_on_comms1,) if jogs_on_comms1 else (),
+        statement=statement or (0.05 if swings else 0.001),
+        **options,
+    )
+    if swings:
         for number, axis in enumerate(controller.axes):
             axis.swing(100.0, 8.0 + number, address / 7 + number / 3, 0.0)
     return controller

@@ -5,9 +5,9 @@ from __future__ import annotations
 from busmaster.protocols.ct_ansi.capture import CtAnsiDialect
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
-from busmaster.protocols.mentor import CHAIN
+from busmaster.protocols.mentor import CHAIN, EMULATED
 from busmaster.protocols.mentor.parameters import ANY
-from busmaster.registry import NodeKind, Protocol, device_of
+from busmaster.registry import NodeKind, Option, Protocol, device_of
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -20,6 +20,7 @@ PROTOCOL = Protocol(
             documented=(ANY,),
             read_options=(CHAIN,),
             takes_decimals=True,
+            emulated=(*EMULATED, Option("plus", "flag"), Option("width", "whole")),
             capture_id=8,
         ),
     ),

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from decimal import Decimal
+from functools import partial
+from typing import Any
 
-from busmaster.emulator.device import Delay
-from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
-from busmaster.protocols.mentor.device import FINE, SPEED_FEEDBACK, SPEED_REFERENCE, EmulatedMentor, Parameter
+from busmaster.protocols.mentor.device import FINE, SPEED_FEEDBACK, EmulatedMentor, Parameter
+from busmaster.protocols.mentor.device import make_device as make_mentor
 from busmaster.wire.checks import bcc
 
 VALUE = re.compile(rb" *[+-]?(\d+\.?\d*|\.\d+)", re.ASCII)
@@ -18,7 +19,8 @@ LONGEST_VALUE = 12
 class EmulatedCtAnsi(EmulatedMentor):
     """Addresses 11 to 99 without the tens. Menus are Mentor II's; references and feedback have one decimal, in %.
 
-    `plus`: a value that is not negative is sent with a sign. `width`: how many characters zeros fill a value up to.
+    Other options are those of a Mentor II. `plus`: a value that is not negative is sent with a sign. `width`: how many
+    characters zeros fill a value up to.
     """
 
     def __init__(
@@ -27,19 +29,23 @@ class EmulatedCtAnsi(EmulatedMentor):
         *,
         plus: bool = False,
         width: int = 0,
-        ripple: float = 0.0,
-        delay: Delay | None = None,
-        oracle: Oracle | None = None,
+        **options: Any,
     ) -> None:
         if address % 10 == 0 or address < 11:
             raise InvalidCommand(f"a drive has an address from 11 to 99 without the tens, not {address}")
-        super().__init__(address, ripple=ripple, delay=delay, oracle=oracle)
+        if width > LONGEST_VALUE:
+            raise InvalidCommand(f"a value has {LONGEST_VALUE} characters at most, not {width}")
+        super().__init__(address, **options)
         self.plus = plus
         self.width = width
 
     def has_decimal(self, parameter: int) -> bool:
         """Whether the parameter has a decimal: 117 is 01.17."""
         return self.parameters[parameter].fine or parameter == SPEED_FEEDBACK
+
+    def steps(self, parameter: int, value: float) -> float:
+        """Tenths of those that have a decimal."""
+        return round(value * FINE, 6) if self.has_decimal(parameter) else value
 
     def _telegram(self, parameter: int, now: float) -> bytes:
         number = self.value(parameter, now)
@@ -59,10 +65,4 @@ class EmulatedCtAnsi(EmulatedMentor):
         return int(steps) * FINE if steps == int(steps) else None
 
 
-def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedCtAnsi:
-    """Make a drive; if it is lively, it runs."""
-    drive = EmulatedCtAnsi(address, delay=delay, oracle=oracle)
-    if lively:
-        drive.ripple = 0.01
-        drive.set_value(SPEED_REFERENCE, 313 + 50 * (address % 8), 0.0)
-    return drive
+make_device = partial(make_mentor, device=EmulatedCtAnsi)

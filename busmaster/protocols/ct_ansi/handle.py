@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from decimal import ROUND_HALF_UP, Decimal
 from typing import Any, ClassVar, Unpack
 
-from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
 from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
+from busmaster.contract.arguments import is_decimal
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings

@@ -8,6 +8,9 @@ from busmaster.protocols.dc104.codec import PROFILE, Read, Write
 from busmaster.protocols.dc104.handle import Dc104Drive
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
+MAXIMUM = Option("maximum", "whole")
+ALLOW_ZERO = Option("allow_zero", "flag")
+
 PROTOCOL = Protocol(
     profile=PROFILE,
     kinds=(
@@ -17,7 +20,14 @@ PROTOCOL = Protocol(
             device_of("busmaster.protocols.dc104.device"),
             items="a parameter, 1 to 255",
             documented=(Item("1-255", "1-255", "a parameter, 0 to 65535", access="read/write"),),
-            options=(Option("maximum", "whole"), Option("allow_zero", "flag")),
+            options=(MAXIMUM, ALLOW_ZERO),
+            emulated=(
+                MAXIMUM,
+                ALLOW_ZERO,
+                Option("read_only", "numbers"),
+                Option("eeprom", "delay"),
+                Option("silent", "flag"),
+            ),
             whole_numbers=everywhere,
             capture_id=6,
         ),

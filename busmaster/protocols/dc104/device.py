@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 
+from busmaster.contract.arguments import is_decimal
 from busmaster.emulator.chance import Chance
-from busmaster.emulator.device import NAK, Delay, Device
+from busmaster.emulator.device import NAK, Delay, Device, held
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import sum8
@@ -28,7 +29,7 @@ SWING, TURN = 10_000, 10.0
 
 
 class EmulatedDc104(Device):
-    """The drive of a line. Parameters 1 to `last_parameter`; `allow_zero`: 0 too. `read_only` ones refuse writes.
+    """The drive of a line. Parameters 1 to `maximum`; `allow_zero`: 0 too. `read_only` ones refuse writes.
 
     `eeprom` is the time that storing takes. `silent`: a read of what is not there gets no answer, in place of NAK,
     since the document names none. `lively`: parameter 1 moves. With an `oracle` every value is the oracle's.
@@ -38,7 +39,7 @@ class EmulatedDc104(Device):
         self,
         address: int = 0,
         *,
-        last_parameter: int = LAST_PARAMETER,
+        maximum: int = LAST_PARAMETER,
         allow_zero: bool = False,
         read_only: frozenset[int] = frozenset(),
         eeprom: Delay | None = None,
@@ -48,12 +49,12 @@ class EmulatedDc104(Device):
         oracle: Oracle | None = None,
     ) -> None:
         super().__init__(address, delay=delay)
-        if not 1 <= last_parameter <= LAST_PARAMETER:
-            raise InvalidCommand(f"the last parameter is from 1 to {LAST_PARAMETER}, not {last_parameter}")
+        if not 1 <= maximum <= LAST_PARAMETER:
+            raise InvalidCommand(f"the last parameter is from 1 to {LAST_PARAMETER}, not {maximum}")
         if oracle is not None and oracle.modulus > 2**16:
             raise InvalidCommand(f"a DC104 carries 2**16 oracle values, not {oracle.modulus}")
         self.registers = [0] * (LAST_PARAMETER + 1)
-        self.parameters = range(0 if allow_zero else 1, last_parameter + 1)
+        self.parameters = range(0 if allow_zero else 1, maximum + 1)
         self.read_only = read_only
         self.eeprom = Delay(0.01) if eeprom is None else eeprom
         self.silent = silent
@@ -62,6 +63,17 @@ class EmulatedDc104(Device):
         self.routes = (bytes((STX, READ)), bytes((STX, WRITE)))
         self._frame = bytearray()
         self._heard_at = 0.0
+
+    def preset(self, item: str, *values: float) -> None:
+        """Hold values from a parameter on. One that is given does not move."""
+        if not is_decimal(item) or not {int(item), int(item) + len(values) - 1} <= set(self.parameters):
+            last = self.parameters.stop - 1
+            raise InvalidCommand(
+                f"an emulated DC104 cannot hold what is given at {item!r}: its last parameter is {last}"
+            )
+        for parameter, value in enumerate(values, int(item)):
+            self.registers[parameter] = held(value, 0, 0xFFFF, f"parameter {parameter}")
+            self.lively &= parameter != LIVE
 
     def restart(self, now: float) -> None:
         """Its parameters are in the EEPROM."""
@@ -132,6 +144,4 @@ def packet(parameter: int, value: int) -> bytes:
     return bytes((STX,)) + summed + bytes((sum8(summed),))
 
 
-def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedDc104:
-    """Make a drive; if it is lively, its parameter 1 moves."""
-    return EmulatedDc104(address, delay=delay, oracle=oracle, lively=lively)
+make_device = EmulatedDc104

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from busmaster.protocols._comms import EMULATED
 from busmaster.protocols._comms.elements import COMMS
 from busmaster.protocols.hcp.capture import HcpDialect
 from busmaster.protocols.hcp.codec import PROFILE, Read, Write
@@ -17,6 +18,7 @@ PROTOCOL = Protocol(
             device_of("busmaster.protocols.hcp.device"),
             items="a comms element, 1 to 99",
             documented=COMMS,
+            emulated=EMULATED,
             capture_id=1,
         ),
     ),

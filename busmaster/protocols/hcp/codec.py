@@ -13,17 +13,7 @@ from functools import lru_cache
 from typing import ClassVar
 
 from busmaster.contract.profile import Profile
-from busmaster.contract.timing import Timings
-from busmaster.protocols._comms.codec import (
-    CHECKED,
-    LINE,
-    TIMINGS,
-    ReadElement,
-    Reading,
-    WriteElements,
-    Writing,
-    WritingMany,
-)
+from busmaster.protocols._comms.codec import CHECKED, LINE, TIMINGS, ReadElement, WriteElements
 from busmaster.wire.checks import xor
 from busmaster.wire.readers import ENQ, EOT, ETX, STX
 
@@ -36,9 +26,11 @@ class Read(ReadElement):
 
     last: ClassVar[int] = LAST_ELEMENT
 
-    def open(self, address: int, timings: Timings) -> Reading:
-        request, echo = _read_request(address, self.element)
-        return Reading(request, echo, timings.read)
+    @staticmethod
+    @lru_cache(maxsize=4096)
+    def encode(address: int, element: int) -> tuple[bytes, bytes]:
+        echo = b"%02d" % element
+        return _reset(address) + STX + echo + ENQ, echo
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,16 +39,10 @@ class Write(WriteElements):
 
     last: ClassVar[int] = LAST_ELEMENT
 
-    def open(self, address: int, timings: Timings) -> Writing | WritingMany:
-        body = b"%02d%b" % (self.element, self.text.encode()) + ETX
-        exchange = Writing if len(self.values) == 1 else WritingMany
-        return exchange(_reset(address) + STX + body + bytes((xor(body),)), timings.write)
-
-
-@lru_cache(maxsize=4096)
-def _read_request(address: int, element: int) -> tuple[bytes, bytes]:
-    echo = b"%02d" % element
-    return _reset(address) + STX + echo + ENQ, echo
+    @staticmethod
+    def encode(address: int, element: int, text: bytes) -> bytes:
+        body = b"%02d%b" % (element, text) + ETX
+        return _reset(address) + STX + body + bytes((xor(body),))
 
 
 def _reset(address: int) -> bytes:

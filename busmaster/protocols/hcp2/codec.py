@@ -13,17 +13,7 @@ from functools import lru_cache
 from typing import ClassVar
 
 from busmaster.contract.profile import Profile
-from busmaster.contract.timing import Timings
-from busmaster.protocols._comms.codec import (
-    CHECKED,
-    LINE,
-    TIMINGS,
-    ReadElement,
-    Reading,
-    WriteElements,
-    Writing,
-    WritingMany,
-)
+from busmaster.protocols._comms.codec import CHECKED, LINE, TIMINGS, ReadElement, WriteElements
 from busmaster.wire.checks import xor
 from busmaster.wire.readers import BEL, ENQ, ETX
 
@@ -36,9 +26,12 @@ class Read(ReadElement):
 
     last: ClassVar[int] = LAST_ELEMENT
 
-    def open(self, address: int, timings: Timings) -> Reading:
-        request, echo = _read_request(address, self.element)
-        return Reading(request, echo, timings.read)
+    @staticmethod
+    @lru_cache(maxsize=4096)
+    def encode(address: int, element: int) -> tuple[bytes, bytes]:
+        echo = b"%02X" % element
+        body = b"%02X\x02%b" % (address, echo) + ENQ
+        return BEL + body + bytes((xor(body),)), echo
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,17 +40,10 @@ class Write(WriteElements):
 
     last: ClassVar[int] = LAST_ELEMENT
 
-    def open(self, address: int, timings: Timings) -> Writing | WritingMany:
-        body = b"%02X\x02%02X%b" % (address, self.element, self.text.encode()) + ETX
-        exchange = Writing if len(self.values) == 1 else WritingMany
-        return exchange(BEL + body + bytes((xor(body),)), timings.write)
-
-
-@lru_cache(maxsize=4096)
-def _read_request(address: int, element: int) -> tuple[bytes, bytes]:
-    echo = b"%02X" % element
-    body = b"%02X\x02%b" % (address, echo) + ENQ
-    return BEL + body + bytes((xor(body),)), echo
+    @staticmethod
+    def encode(address: int, element: int, text: bytes) -> bytes:
+        body = b"%02X\x02%02X%b" % (address, element, text) + ETX
+        return BEL + body + bytes((xor(body),))
 
 
 PROFILE = Profile(

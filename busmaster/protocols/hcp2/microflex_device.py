@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
-from busmaster.emulator.device import Delay
+from busmaster.contract.arguments import is_decimal
+from busmaster.emulator.device import NEVER, Delay, held
 from busmaster.emulator.motion import Ramp
 from busmaster.emulator.oracle import Oracle
-from busmaster.protocols._comms.device import HCP2, HostCommsDevice
+from busmaster.errors import InvalidCommand
+from busmaster.protocols._comms.device import HCP2, HostCommsDevice, sendable
 
 COMMAND_WORD, TORQUE_REFERENCE, SPEED_REFERENCE = 108, 116, 118
 
@@ -36,6 +40,16 @@ ACCELERATING = 50.0
 """Torque in % while the speed ramps."""
 LAG = 0.001
 """Seconds by which the position stays behind its demand."""
+
+
+@dataclass(slots=True)
+class Trip:
+    """Errors to come: `delay` seconds after `since`, which is when the drive is first asked."""
+
+    delay: float
+    errors: int
+    drive_errors: int
+    since: float = NEVER
 
 
 class EmulatedMicroFlex(HostCommsDevice):
@@ -80,10 +94,48 @@ class EmulatedMicroFlex(HostCommsDevice):
         self.torque_reference = 0.0
         self.enabled = False
         self._motor = Ramp(acceleration)
+        self._trip: Trip | None = None
         self._temperature = AMBIENT
         self._updated = -math.inf
 
     # What happens to it
+
+    def preset(self, item: str, *values: float) -> None:
+        """Hold values in an element and those after it: position, errors, command word, references, I/O, firmware."""
+        first = int(item) if is_decimal(item) else 0
+        for element, value in enumerate(values, first):
+            if not self._hold(element, value):
+                raise InvalidCommand(f"an emulated drive's element {element if first else item!r} cannot be given")
+
+    def _hold(self, element: int, value: float) -> bool:
+        value = sendable(value, element)
+        match element:
+            case 100 | 131:
+                self._motor.position = value / FULL_SPEED * 100
+            case 103:
+                self.trip(held(value, 0, 0xFFFF_FFFF, "axis_error"), 0.0)
+            case 108:
+                self.command(held(value, 0, COMMAND_BITS, "command_word"), 0.0)
+            case 110:
+                self.trip(0, 0.0, held(value, 0, 0xFFFF_FFFF, "drive_error"))
+            case 116:
+                self.torque_reference = value
+            case 118:
+                self.speed_reference = value
+            case 220:
+                self.inputs = held(value, 0, 0xFFFF, "inputs")
+            case 224:
+                self.analog_input = value
+            case 239:
+                self.firmware = held(value, 0, 0xFFFF_FFFF, "firmware")
+            case _:
+                return False
+        self._apply(0.0)
+        return True
+
+    def trip_after(self, delay: float, errors: int, drive_errors: int = 0) -> None:
+        """Trip so many seconds after it is first asked."""
+        self._trip = Trip(delay, errors, drive_errors)
 
     def trip(self, errors: int, now: float, drive_errors: int = 0) -> None:
         """An error occurs. It latches and disables the drive, unless the cancel bit was left high."""
@@ -249,6 +301,16 @@ class EmulatedMicroFlex(HostCommsDevice):
             final = AMBIENT + HEATING * abs(self._torque) / 100
             self._temperature += (final - self._temperature) * -math.expm1((self._updated - now) / THERMAL_TIME)
             self._updated = now
+        self._trip_if_due(now)
+
+    def _trip_if_due(self, now: float) -> None:
+        trip = self._trip
+        if trip is None:
+            return
+        trip.since = min(trip.since, now)
+        if now >= trip.since + trip.delay:
+            self._trip = None
+            self.trip(trip.errors, now, trip.drive_errors)
 
     def _apply(self, now: float) -> None:
         """Whether the drive runs, and at what speed it aims. After the cancel bit, motion waits until it is cleared."""
@@ -259,11 +321,30 @@ class EmulatedMicroFlex(HostCommsDevice):
         self._motor.target = reference if runs else 0.0
 
 
-def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedMicroFlex:
-    """Make a drive; if it is lively, it runs."""
-    drive = EmulatedMicroFlex(address, delay=delay, oracle=oracle)
+def make_device(
+    address: int,
+    *,
+    lively: bool,
+    ripple: float | None = None,
+    hardware_enable: bool = True,
+    stop_input: bool = False,
+    axis_error: int = 0,
+    drive_error: int = 0,
+    trips_after: float | None = None,
+    **options: Any,
+) -> EmulatedMicroFlex:
+    """Make a drive; if it is lively, it runs.
+
+    With errors given it has tripped, or trips `trips_after` seconds after it is first asked.
+    """
+    drive = EmulatedMicroFlex(address, ripple=(0.01 if lively else 0.0) if ripple is None else ripple, **options)
+    drive.hardware_enable = hardware_enable
+    drive.stop_input = stop_input
     if lively:
-        drive.ripple = 0.01
-        drive.speed_reference = 20.0 + 5 * (address % 8)
+        drive.speed_reference = drive.torque_reference = 20.0 + 5 * (address % 8)
         drive.command(ENABLE, 0.0)
+    if trips_after is not None:
+        drive.trip_after(trips_after, axis_error, drive_error)
+    elif axis_error or drive_error:
+        drive.trip(axis_error, 0.0, drive_error)
     return drive

@@ -10,6 +10,25 @@ from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
 CHAIN = Option("chain", "flag", "read a run in one exchange, where no other drive can mistake it")
 
+EMULATED = (
+    Option("acceleration", "positive"),
+    Option("ripple", "share"),
+    Option("short_after_write", "flag"),
+    Option("refuse_malformed", "flag"),
+    Option(
+        "parameters",
+        "tables",
+        fields=(
+            Option("low", "number"),
+            Option("high", "number"),
+            Option("read_only", "flag"),
+            Option("wide", "flag"),
+            Option("fine", "flag"),
+        ),
+    ),
+)
+"""What can be said of an emulated drive. `fine`: it may be written in high resolution."""
+
 PROTOCOL = Protocol(
     profile=PROFILE,
     kinds=(
@@ -24,6 +43,7 @@ PROTOCOL = Protocol(
             read_options=(CHAIN,),
             whole_numbers=everywhere,
             takes_decimals=True,
+            emulated=EMULATED,
             capture_id=5,
         ),
     ),

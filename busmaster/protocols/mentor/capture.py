@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from busmaster.capture.frames import UNASKED, Direction, Frame, Kind
 from busmaster.capture.telegrams import (
@@ -35,10 +35,12 @@ class MentorDialect:
     """CT-ANSI: EOT a a a a m m p p ENQ, EOT a a a a STX m m p p ..., and NAK, ACK, BS for again, next, previous.
 
     Bit 7 is parity, or nothing: it is not looked at. ACK and NAK are the drive's while something is asked, and the
-    host's short commands after a read that was answered (PROTOCOLS 4.1).
+    host's short commands after a read that was answered.
     """
 
     starts = bytes((EOT, STX))
+    read: ClassVar[type[Read]] = Read
+    read_run: ClassVar[type[ReadRun]] = ReadRun
 
     def __init__(self) -> None:
         self._asked: Frame | None = None
@@ -148,12 +150,15 @@ class MentorDialect:
 
     def command(self, request: Frame, continued: Sequence[Frame], /) -> Command[Any]:
         menu, number = parse_parameter(request.item)
-        if request.kind is Kind.READ:
-            steps = [STEPS[short.command] for short in continued]
-            if not steps or len(set(steps)) > 1:
-                return Read(menu, number)
-            return ReadRun(menu, number, 1 + len(steps), steps[0])
-        text = request.value
+        if request.kind is not Kind.READ:
+            return self.write(menu, number, request.value)
+        steps = [STEPS[short.command] for short in continued]
+        if not steps or len(set(steps)) > 1:
+            return self.read(menu, number)
+        return self.read_run(menu, number, 1 + len(steps), steps[0])
+
+    def write(self, menu: int, number: int, text: str) -> Command[None]:
+        """Return the command that writes what a listener has read from the line."""
         signed = text[:1] in ("+", "-")
         value = bool(int(text)) if len(text) == 1 else int(text)
         return Write(menu, number, value, wide=not signed and len(text) == 5, high_resolution=len(text) == 6)

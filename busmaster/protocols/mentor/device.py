@@ -11,11 +11,13 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 from busmaster.emulator.chance import Chance
-from busmaster.emulator.device import NAK, Delay, Device
+from busmaster.emulator.device import NAK, Delay, Device, held
 from busmaster.emulator.motion import Ramp
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
@@ -36,6 +38,7 @@ READ_SIZE = 10
 SHORTEST_WRITE = 12
 KEPT = 32
 """Bytes of a frame that are kept: whatever is longer is refused anyway."""
+ITEM = re.compile(r"(\d{1,2})\.(\d{1,2})(?::wide|:\d+)?", re.ASCII)
 VALUE = re.compile(rb"[+-]?\d{1,5}", re.ASCII)
 LONGEST_VALUE = 5
 HIGH_RESOLUTION = re.compile(rb"[+-]\d{5}", re.ASCII)
@@ -60,6 +63,7 @@ class Parameter:
     fine: bool = False
 
 
+PLAIN = Parameter(-9999, 9999)
 REFERENCE = Parameter(-FULL_SPEED, FULL_SPEED, fine=True)
 PARAMETERS = {
     **dict.fromkeys(range(SPEED_REFERENCE, 137), REFERENCE),
@@ -115,6 +119,24 @@ class EmulatedMentor(Device):
         self._known_reads: dict[bytes, int] = {}
 
     # What is in it
+
+    def preset(self, item: str, *values: float) -> None:
+        """Hold values in a parameter ("1.17") and those after it; what is not there is added, as a plain integer."""
+        match = ITEM.fullmatch(item)
+        if match is None:
+            raise InvalidCommand(f"an emulated drive has no {item!r}: use a parameter such as 1.17")
+        for name, value in enumerate(values, int(match[1]) * 100 + int(match[2])):
+            parameter = self.parameters.setdefault(name, PLAIN)
+            if name == SERIAL_ADDRESS:
+                raise InvalidCommand(f"{item} is the drive's address: it cannot be given")
+            number = held(self.steps(name, value), parameter.low, parameter.high, f"{item}, without its decimals,")
+            self.set_value(name, number, 0.0)
+            if name == SPEED_FEEDBACK:
+                self._motor.speed = number
+
+    def steps(self, parameter: int, value: float) -> float:
+        """Return the whole number that a value on the line is."""
+        return value
 
     def value(self, parameter: int, now: float) -> int:
         """Of menu x 100 + number. Raises KeyError for one that does not exist."""
@@ -320,10 +342,37 @@ def telegram(parameter: int, value: int, wide: bool = False) -> bytes:
     return b"\x02" + summed + bytes((bcc(summed),))
 
 
-def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedMentor:
-    """Make a drive; if it is lively, it runs."""
-    drive = EmulatedMentor(address, delay=delay, oracle=oracle)
+def make_device(
+    address: int,
+    *,
+    lively: bool,
+    ripple: float | None = None,
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+    device: type[EmulatedMentor] = EmulatedMentor,
+    **options: Any,
+) -> EmulatedMentor:
+    """Make a drive with further parameters; if it is lively, it runs."""
+    drive = device(address, ripple=(0.01 if lively else 0.0) if ripple is None else ripple, **options)
+    for item, said in (parameters or {}).items():
+        match = ITEM.fullmatch(item)
+        if match is None:
+            raise InvalidCommand(f"{item!r} is no parameter: write 7.05")
+        drive.parameters[int(match[1]) * 100 + int(match[2])] = parameter_of(**said)
     if lively:
-        drive.ripple = 0.01
         drive.set_value(SPEED_REFERENCE, 313 + 50 * (address % 8), 0.0)
     return drive
+
+
+def parameter_of(
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    read_only: bool = False,
+    wide: bool = False,
+    fine: bool = False,
+) -> Parameter:
+    """Return a parameter with these limits; without them, those that its form can carry."""
+    least, most = (0, 65535) if wide else (PLAIN.low, PLAIN.high)
+    low = least if low is None else held(low, least, most, "a lower limit")
+    high = most if high is None else held(high, low, most, "an upper limit")
+    return Parameter(low, high, writable=not read_only, wide=wide, fine=fine)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
 from typing import Any, ClassVar, NamedTuple, TypeVar, Unpack
 
-from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions, NodeSource, ReadOptions, SeveralRequests, WriteOptions
-from busmaster.contract.arguments import whole_number
+from busmaster.contract.arguments import is_decimal, whole_number
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile

@@ -6,11 +6,13 @@ A request is told by its length where the function is known; of one that is not,
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from busmaster.emulator.chance import Chance
-from busmaster.emulator.device import NEVER, Delay, Device
+from busmaster.emulator.device import NEVER, Delay, Device, held
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
 
@@ -25,10 +27,17 @@ COUNTED = frozenset({WRITE_COILS, WRITE_REGISTERS})
 MOST = {READ_COILS: 2000, READ_DISCRETES: 2000, READ_HOLDING: 125, READ_INPUTS: 125}
 EXCEPTION = 0x80
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
-SHORTEST, LONGEST = 4, 256
+SHORTEST = 4
 PAUSE_CHARACTERS, SHORTEST_PAUSE = 3.5, 0.00175
 SIZE = 1000
 """Of each table, where nothing else is said."""
+FORMS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
+TABLES = {"holding": "registers", "input": "inputs", "coil": "coils", "discrete": "discretes"}
+ITEM = re.compile(
+    rf"(?P<table>{'|'.join(TABLES)}):(?P<first>\d+)(:\d+|:(?P<form>{'|'.join(FORMS)})(?P<swapped>:swapped)?)?",
+    re.ASCII,
+)
+FORM = "holding:100, input:100, coil:5 or discrete:5, with a kind of number behind it where it is one"
 LIVE = 0
 """The register, in both tables, that moves on a lively unit: a sine about the middle of its range."""
 SWING, TURN = 10_000, 10.0
@@ -64,6 +73,10 @@ class EmulatedModbus(Device):
             raise InvalidCommand(f"a Modbus unit has an address from 1 to 247, not {address}")
         if oracle is not None and oracle.modulus > 2**16:
             raise InvalidCommand(f"a register carries 2**16 oracle values, not {oracle.modulus}")
+        if not functions <= FIXED | COUNTED:
+            raise InvalidCommand(
+                f"an emulated unit knows the functions {sorted(FIXED | COUNTED)}, not {sorted(functions)}"
+            )
         self.registers = list(registers)
         self.inputs = list(inputs)
         self.coils = list(coils)
@@ -75,6 +88,25 @@ class EmulatedModbus(Device):
         self.routes = (bytes((address,)), bytes((BROADCAST,)))
         self._frame = b""
         self._heard_until = 0.0
+
+    def preset(self, item: str, *values: float) -> None:
+        """Hold values in a table from an address on: "holding:100", "input:40:float32:swapped", "coil:5".
+
+        A register that is given does not move. A count behind the address says nothing more.
+        """
+        match = ITEM.fullmatch(item)
+        if match is None:
+            raise InvalidCommand(f"an emulated unit has no {item!r}: use {FORM}")
+        table, first = getattr(self, TABLES[match["table"]]), int(match["first"])
+        if match["table"] in ("coil", "discrete"):
+            held_there: list[int] = [bool(held(value, 0, 1, item)) for value in values]
+        else:
+            form = match["form"] or "uint16"
+            held_there = [word for value in values for word in words_of(value, form, match["swapped"], item)]
+            self.lively &= first > LIVE
+        if first + len(held_there) > len(table):
+            raise InvalidCommand(f"{item} is beyond the {len(table)} addresses of its table: give size")
+        table[first : first + len(held_there)] = held_there
 
     def restart(self, now: float) -> None:
         super().restart(now)
@@ -216,6 +248,22 @@ class EmulatedModbus(Device):
         return body + crc(body)
 
 
+def words_of(value: float, form: str, swapped: str | None, item: str) -> tuple[int, ...]:
+    """Return the registers that hold a number, in the order of their addresses. Raises InvalidCommand."""
+    try:
+        data = struct.pack(f">{FORMS[form]}", value if form.startswith("float") else _whole(value))
+    except (struct.error, OverflowError, ValueError):
+        raise InvalidCommand(f"{item} cannot hold {value:g}: it is a register of {form}") from None
+    words: tuple[int, ...] = struct.unpack(f">{len(data) // 2}H", data)
+    return words[::-1] if swapped else words
+
+
+def _whole(value: float) -> int:
+    if value != int(value):
+        raise ValueError(value)
+    return int(value)
+
+
 def _check(table: Sequence[object], first: int, count: int) -> None:
     if first + count > len(table):
         raise Illegal(ILLEGAL_ADDRESS)
@@ -238,6 +286,7 @@ def crc(data: bytes) -> bytes:
     return check.to_bytes(2, "little")
 
 
-def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedModbus:
-    """Make a unit; if it is lively, its register 0 moves."""
-    return EmulatedModbus(address, delay=delay, oracle=oracle, lively=lively)
+def make_device(address: int, *, size: int = SIZE, **options: Any) -> EmulatedModbus:
+    """Make a unit whose tables have `size` addresses; if it is lively, its register 0 moves."""
+    zeros, off = (0,) * size, (False,) * size
+    return EmulatedModbus(address, zeros, inputs=zeros, coils=off, discretes=off, **options)

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Unpack
 
-from busmaster.bus.handle import Handle, Send, is_decimal, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, item_text, unknown_item
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ReadOptions, SeveralRequests, WriteOptions
+from busmaster.contract.arguments import is_decimal
 from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand, VerifyFailed
 from busmaster.protocols.modbus.codec import (

@@ -9,6 +9,9 @@ from busmaster.protocols.msc.handle import MscController
 from busmaster.protocols.msc.items import ITEMS
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
+ADDRESS_STEP = Option("address_step", "whole", "addresses from one value to the next")
+MODEL = Option("model", "text", choices=("MSC-250", "MSC-850", "MSC-850/32"))
+
 PROTOCOL = Protocol(
     profile=PROFILE,
     kinds=(
@@ -20,8 +23,17 @@ PROTOCOL = Protocol(
             documented=ITEMS,
             options=(
                 Option("symbols", "addresses", common=False),
-                Option("address_step", "whole", "addresses from one value to the next"),
-                Option("model", "text"),
+                ADDRESS_STEP,
+                MODEL,
+            ),
+            emulated=(
+                ADDRESS_STEP,
+                MODEL,
+                Option("addresses", "whole"),
+                Option("read_only_flags", "numbers"),
+                Option("battery", "flag"),
+                Option("period", "positive"),
+                Option("packet_delay", "delay"),
             ),
             whole_numbers=everywhere,
             capture_id=4,

@@ -8,8 +8,11 @@ its ACK, and is sent again until the host ACKs it, five times at most ("Data tra
 
 from __future__ import annotations
 
+from typing import Any
+
+from busmaster.contract.arguments import is_decimal
 from busmaster.emulator.chance import Chance
-from busmaster.emulator.device import NAK, NEVER, Delay, Device
+from busmaster.emulator.device import NAK, NEVER, Delay, Device, held
 from busmaster.emulator.oracle import Oracle
 from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import sum16
@@ -48,6 +51,8 @@ REPLIES = {b"DREAD,": VALUE, b"BREAD,": VALUE * BLOCK, b"RFLAGS,": FLAGS // 8, b
 RUNNING, RAM_NOT_RELIABLE, SYSTEM_RESET, AUTO_START = 1, 4, 8, 64
 RUN_FLAG = 200
 """The user flag that lets the program count. Ours, like the address: the document has no program."""
+SHORTEST_PERIOD = 0.001
+FORM = "a data address that there is, flag:5, flags (the numbers of those that are on), or status"
 COUNT = 2000
 """The data address at which it counts."""
 
@@ -87,6 +92,8 @@ class EmulatedMsc(Device):
                 f"no MSC is unit {address}, an {model!r} or has addresses {address_step} apart: use units 1 to 15, "
                 f"{', '.join(MODELS)}, and steps of 1, 2 or 4"
             )
+        if period < SHORTEST_PERIOD:
+            raise InvalidCommand(f"its program counts every {SHORTEST_PERIOD} s at most, not every {period:g} s")
         if oracle is not None and oracle.modulus > 2**31:
             raise InvalidCommand(f"an MSC carries 2**31 oracle values, not {oracle.modulus}")
         self.model = model
@@ -116,6 +123,24 @@ class EmulatedMsc(Device):
         self._retransmit_at = NEVER
 
     # What is in it
+
+    def preset(self, item: str, *values: float) -> None:
+        """Hold values from a data address on ("2008"), in "flag:5" and those after it 0 or 1, in "status" the word.
+
+        "flags" are given as the numbers of those that are on.
+        """
+        name, _, number = item.partition(":")
+        if item == "flags":
+            self.flags = {held(value, 0, FLAGS - 1, "a flag") for value in values}
+        elif item == "status" and len(values) == 1:
+            self.status = held(values[0], 0, 0xFFFF, item)
+        elif name == "flag" and is_decimal(number) and int(number) + len(values) <= FLAGS:
+            for flag, on in enumerate(values, int(number)):
+                (self.flags.add if held(on, 0, 1, "a flag") else self.flags.discard)(flag)
+        elif is_decimal(name) and int(name) * self._width + len(values) * VALUE <= len(self._memory):
+            self.set_value(int(name), *(held(value, -(2**31), 2**31 - 1, "a data address") for value in values))
+        else:
+            raise InvalidCommand(f"an emulated MSC cannot hold what is given at {item!r}: use {FORM}")
 
     @property
     def unacknowledged(self) -> bool:
@@ -329,9 +354,9 @@ def packet(unit: int, body: bytes) -> bytes:
     return bytes((STX,)) + summed + sum16(summed).to_bytes(2, "big")
 
 
-def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool) -> EmulatedMsc:
+def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool, **options: Any) -> EmulatedMsc:
     """Make a unit; if it is lively, its program counts."""
-    controller = EmulatedMsc(address, delay=delay, oracle=oracle)
+    controller = EmulatedMsc(address, delay=delay, oracle=oracle, **options)
     if lively:
         controller.flags.add(RUN_FLAG)
     return controller

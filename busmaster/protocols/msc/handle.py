@@ -6,9 +6,10 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NoReturn, Unpack
 
-from busmaster.bus.handle import Handle, Send, encoder, is_decimal, item_text, unknown_item
+from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions, NodeSource, Priority, ReadOptions, SeveralRequests, WriteOptions
+from busmaster.contract.arguments import is_decimal
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
@@ -68,7 +69,7 @@ class MscController(Handle):
         self.symbols = dict(symbols or {})
         for name, symbol in self.symbols.items():
             DataRead(symbol)
-            if not name or name in self.items() or name.isdigit() or set(name) & set(":=, "):
+            if not name or name in self.items() or is_decimal(name) or set(name) & set(":=, "):
                 raise InvalidCommand(f"{name!r} cannot be the name of a symbol")
         known = Merging(address_step, model in MODELS_WITH_RFLAGS)
         profile = self.profile if known == Merging() else replace(self.profile, merge=known)

@@ -22,7 +22,7 @@ from busmaster.contract.exchange import MORE, Command, Done, FrameError, Need, S
 from busmaster.contract.items import Item
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
-from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.device import Delay, Device, held
 from busmaster.emulator.oracle import Oracle
 from busmaster.registry import NodeKind, Option, Protocol, everywhere
 from busmaster.wire.readers import SingleLeg
@@ -135,11 +135,18 @@ class Turnstile(Handle):
 class EmulatedTurnstile(Device):
     """Counts in memory."""
 
-    def __init__(self, address: int, *, delay: Delay) -> None:
+    def __init__(self, address: int, *, delay: Delay, gate: int) -> None:
         super().__init__(address, delay=delay)
+        self.gate = string.ascii_lowercase[gate - 1]
         self.routes = (b"?%d" % address, b"!%d" % address)
         self.counts = dict.fromkeys(string.ascii_lowercase, 0)
         self._frame = b""
+
+    def preset(self, item: str, *values: float) -> None:
+        counter = self.gate if item == "gate" else item
+        if counter not in self.counts or len(values) != 1:
+            raise InvalidCommand(f"a turnstile has no counter {item!r}")
+        self.counts[counter] = held(values[0], 0, 0xFFFF, f"counter {counter}")
 
     def hear_byte(self, byte: int, now: float) -> None:
         self._frame = bytes((byte,)) if byte in b"?!" else self._frame + bytes((byte,))
@@ -188,10 +195,13 @@ class TallyDialect:
         return Count(request.item) if request.kind is Kind.READ else Preset(request.item, int(request.value))
 
 
-def make_device(address: int, /, *, delay: Delay, oracle: Oracle | None, lively: bool) -> Device:
+def make_device(address: int, /, *, delay: Delay, oracle: Oracle | None, lively: bool, gate: int = 1) -> Device:
     if oracle is not None:
         raise InvalidCommand("a turnstile has no oracle")
-    return EmulatedTurnstile(address, delay=delay)
+    return EmulatedTurnstile(address, delay=delay, gate=gate)
+
+
+GATE = Option("gate", "whole", "which counter the gate has, 1 for a")
 
 
 PROTOCOL = Protocol(
@@ -209,7 +219,8 @@ PROTOCOL = Protocol(
                 ),
                 Item("gate", "", "the counter that the gate has", access="read/write"),
             ),
-            options=(Option("gate", "whole", "which counter the gate has, 1 for a"),),
+            options=(GATE,),
+            emulated=(GATE,),
             whole_numbers=everywhere,
         ),
     ),

@@ -1,0 +1,71 @@
+"""The options of a kind of node, as its protocol declares them, read off a table of the file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from busmaster.config.names import expanded
+from busmaster.config.table import Table
+from busmaster.emulator.device import Delay
+from busmaster.registry import NodeKind, Option, kinds
+
+HIGHEST_ADDRESS = 0xFFFF_FFFF
+
+
+def check_keys(
+    table: Table, kind: NodeKind, common: Sequence[str], options_of: Callable[[NodeKind], Sequence[Option]]
+) -> None:
+    """Raise FileError for a key that is neither `common` to all nodes nor an option of this kind of node."""
+    for key in table.data:
+        holders = [other.name for other in kinds().values() if any(key == option.name for option in options_of(other))]
+        if holders and kind.name not in holders:
+            raise table.error(f"only nodes of {' and '.join(holders)} have this, not those of {kind.name}", key)
+    table.only(*common, *(option.name for option in options_of(kind)))
+
+
+def read_options(table: Table, known: Sequence[Option]) -> dict[str, Any]:
+    """Return those of the options that the table says, each as the argument that it is."""
+    return {option.name: _option(table, option) for option in known if option.name in table}
+
+
+def _option(table: Table, option: Option) -> Any:
+    name = option.name
+    match option.kind:
+        case "flag":
+            return table.flag(name, False)
+        case "whole":
+            return table.whole(name, least=1)
+        case "number":
+            return table.number(name)
+        case "positive":
+            return table.positive(name)
+        case "share":
+            return table.share(name)
+        case "delay":
+            return read_delay(table, name)
+        case "text":
+            return table.choice(name, option.choices) if option.choices else table.text(name)
+        case "numbers":
+            return frozenset(table.wholes(name, most=HIGHEST_ADDRESS))
+        case "addresses":
+            named = table.table(name)
+            return {key: named.whole(key, most=HIGHEST_ADDRESS) for key in named.data}
+        case "tables":
+            tables = ((one, _fields(one, option.fields)) for one in table.tables(name))
+            return {each: fields for one, fields in tables for each in expanded(one.name)}
+
+
+def _fields(table: Table, fields: Sequence[Option]) -> dict[str, Any]:
+    table.only(*(field.name for field in fields))
+    return read_options(table, fields)
+
+
+def read_delay(table: Table, key: str) -> Delay:
+    """Return `reply_delay = 0.002`, or `reply_delay = [0.001, 0.004]`, as the delay that it is."""
+    value = table.data[key]
+    bounds = value if isinstance(value, list) else [value]
+    if len(bounds) not in (1, 2) or not all(type(bound) in (int, float) for bound in bounds):
+        raise table.error("must be a number of seconds, or two of them: [0.001, 0.004]", key)
+    with table.at(key):
+        return Delay(*bounds)

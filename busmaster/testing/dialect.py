@@ -1,0 +1,126 @@
+"""The conformance kit for a protocol's listener: whether it reads off the line what was said on it.
+
+    def test_the_dialect_reads_what_is_said():
+        check_dialect(PROTOCOL, CASES)
+
+It takes the cases of `check_protocol`. Of each it derives, and raises `NotConformant` with all that does not hold:
+
+- what the host and the node say is cut into the same frames in one chunk, one byte at a time, and with noise before it;
+- the request is a read or a write of that node without a fault, and speaks the command that sent it: what the dialect
+  makes of it sends the same bytes;
+- what decides is an answer: a value, or an acknowledgement; a refusal where the case raises one;
+- the command can be written down as JSON and read back.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+from busmaster.capture.decode import Decoder
+from busmaster.capture.frames import Direction, Frame, Kind
+from busmaster.contract.driver import Driver
+from busmaster.contract.exchange import Command
+from busmaster.errors import InvalidCommand
+from busmaster.registry import Protocol
+from busmaster.testing.cases import Case, NotConformant
+from busmaster.testing.damage import bytewise
+
+Said = tuple[Direction, bytes]
+APART = 0.5
+"""Seconds between noise and what follows it: longer than a listener waits for the rest of a frame."""
+NOISE = b"\xff\xff"
+
+
+def check_dialect(protocol: Protocol, cases: Iterable[Case]) -> None:
+    """Raise NotConformant, with all that does not hold of the protocol's dialect and of its written commands."""
+    findings = [f"{case}: {finding}" for case in cases for finding in _check(protocol, case)]
+    if findings:
+        raise NotConformant(protocol.name, findings)
+
+
+def _check(protocol: Protocol, case: Case) -> Iterator[str]:
+    said = list(_conversation(protocol, case))
+    frames = _hear(protocol, said)
+    pieces = [(sender, byte) for sender, data in said for byte in bytewise(data)]
+    if (found := _hear(protocol, pieces)) != frames:
+        yield f"one byte at a time it is {_told(found)} in place of {_told(frames)}"
+    if (found := _hear(protocol, said, NOISE)) != frames:
+        yield f"behind noise it is {_told(found)} in place of {_told(frames)}"
+    yield from _check_request(protocol, case, frames)
+    if case.legs:
+        yield from _check_answer(case, frames)
+    yield from _check_written(protocol, case.command)
+
+
+def _conversation(protocol: Protocol, case: Case) -> Iterator[Said]:
+    """What both sides say, the host's closing word too."""
+    driver = Driver(case.command.open(case.address, protocol.profile.timings))
+    yield Direction.HOST, driver.exchange.request
+    heard = 0
+    for leg in case.legs:
+        yield Direction.NODE, leg
+        driver.feed(leg)
+        yield from ((Direction.HOST, word) for word in driver.said[heard:])
+        heard = len(driver.said)
+    ending = driver.ending
+    if ending is not None and ending.send:
+        yield Direction.HOST, ending.send
+
+
+def _hear(protocol: Protocol, said: Iterable[Said], noise: bytes = b"") -> list[Frame]:
+    """Return the frames without their times; noise before them is left out."""
+    decoder = Decoder(protocol.dialect())
+    frames = decoder.feed(noise, 0.0) if noise else []
+    for sender, data in said:
+        frames += decoder.feed(data, APART, sender)
+    frames = [frame for frame in frames + decoder.quiet() if not (noise and frame.raw == noise)]
+    for frame in frames:
+        frame.time, frame.delay = 0.0, None
+    return frames
+
+
+def _check_request(protocol: Protocol, case: Case, frames: Sequence[Frame]) -> Iterator[str]:
+    profile = protocol.profile
+    asked = case.command.open(case.address, profile.timings).request
+    request = frames[0]
+    wanted = Kind.WRITE if case.command.writes else Kind.READ
+    if request.raw != asked or request.kind is not wanted or request.sender is not Direction.HOST or request.fault:
+        yield f"its request {asked.hex(' ')} is {_told(frames[:1])}, no {wanted.value} of the host's"
+        return
+    if profile.addressed and request.node != case.address:
+        yield f"its request is one to {request.node}"
+    continued = [frame for frame in frames[1:] if frame.sender is Direction.HOST and frame.continues]
+    try:
+        command = protocol.dialect().command(request, continued)
+        again = command.open(case.address, profile.timings).request
+    except (InvalidCommand, ValueError, KeyError) as error:
+        yield f"no command speaks its request {_told(frames[:1])}: {error}"
+        return
+    if again != asked or (continued and str(command) != str(case.command)):
+        yield f"its request is read as {command}, which sends {again.hex(' ')} in place of {asked.hex(' ')}"
+
+
+def _check_answer(case: Case, frames: Sequence[Frame]) -> Iterator[str]:
+    answers = [frame for frame in frames if frame.sender is Direction.NODE]
+    if not answers or not answers[-1].answers or answers[-1].fault:
+        yield f"its reply is {_told(answers[-1:])}, no answer to it"
+        return
+    refused = answers[-1].kind in (Kind.NAK, Kind.EOT)
+    if refused is not (case.raises is not None):
+        yield f"its reply is {_told(answers[-1:])}, {'a refusal' if refused else 'no refusal'}"
+
+
+def _check_written(protocol: Protocol, command: Command[Any]) -> Iterator[str]:
+    try:
+        back = protocol.read_back(json.loads(json.dumps(protocol.write_down(command))))
+    except (InvalidCommand, TypeError, ValueError) as error:
+        yield f"it cannot be written down and read back: {error}"
+        return
+    if back != command:
+        yield f"it is written down, and read back as {back!r}"
+
+
+def _told(frames: Sequence[Frame]) -> str:
+    return "; ".join(f"{f.kind.value} {f.text!r}" + (f" [{f.fault}]" if f.fault else "") for f in frames) or "nothing"
