@@ -36,6 +36,7 @@ class Choice:
         self._in_step = in_step
         self._alike = Alike(wire)
         self._gone_before = 0
+        self._last_byte = -inf
 
     def next(self, now: float, last_byte: float) -> Chosen | float | None:
         """The transaction to be sent now, with its exchange. None if none waits; a time if none may go before it.
@@ -43,6 +44,7 @@ class Choice:
         `last_byte`: when the last one came.
         """
         dispatcher, in_step, alike = self._dispatcher, self._in_step, self._alike
+        self._last_byte = last_byte
         while (transaction := dispatcher.next(now)) is not None:
             node = transaction.node
             try:
@@ -80,8 +82,8 @@ class Choice:
 
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
-        elif _is_decisive(first) and now < in_step.awaited_until():
-            chosen = self._while_awaited(first, now) or in_step.awaited_until()
+        elif _is_decisive(first) and now < in_step.awaited_until(self._last_byte):
+            chosen = self._while_awaited(first, now) or in_step.awaited_until(self._last_byte)
         elif transaction.probe and in_step.clashes(answers, now, transaction.node):
             chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
         elif in_step.clashes(answers, now):
@@ -114,7 +116,7 @@ class Choice:
         def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
             return in_step.clashes(answers, now, node)
 
-        awaited = in_step.awaited_until(answers)
+        awaited = in_step.awaited_until(self._last_byte, answers)
         if now < awaited:
             return self._while_awaited(first, now, answers) or awaited
         if self._gone_before >= MOST_BEFORE:
@@ -174,7 +176,7 @@ class Choice:
             if other.writes or node not in nodes or node.writes or not self._dispatcher.may_go(other, now):
                 return False
             exchange = _opened(other)
-            if exchange is None or unfit(exchange.answers, node):
+            if exchange is None or _is_decisive((other, exchange)) or unfit(exchange.answers, node):
                 return False
             opened.append(exchange)
             return True
@@ -207,14 +209,18 @@ class Choice:
         opened: list[Exchange[Any]] = []
         passed = {first[0].node}
         written = {first[0].node} if first[0].writes else set()
+        in_step = self._in_step
+        awaited = now < in_step.awaited_until(self._last_byte)
 
         def suits(other: Transaction) -> bool:
             in_order = other.node not in (passed if other.writes else written)
             if in_order and of in (None, other.node) and self._dispatcher.may_go(other, now):
                 exchange = _opened(other)
                 if exchange is not None and exchange.answered and not unfit(exchange.answers, other.node):
-                    opened.append(exchange)
-                    return True
+                    spoilt = awaited and (_is_decisive((other, exchange)) or in_step.clashes(exchange.answers, now))
+                    if not spoilt:
+                        opened.append(exchange)
+                        return True
             passed.add(other.node)
             if other.writes:
                 written.add(other.node)

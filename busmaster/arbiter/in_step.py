@@ -7,7 +7,8 @@ A *debt* is one such reply: what it would begin with (its key), whose it is, and
 came in place of a whole reply leaves one with the key ANY_BYTE: its tail, a lone byte, could look like an ACK.
 
 A debt is paid
-- by its own reply, heard while nothing was asked or in place of another;
+- by its own reply, heard while nothing was asked or in place of another (unless a learned window was over before:
+  then talkers may have met on the line, and what is left of two can look like anything);
 - by a right answer of the same node to something else: a node answers in the order in which it was asked;
 - once its lateness is over, and where its node has been silent since, by a right answer of any node to something else:
   a channel keeps the order. It stays for as long as its node could still take: what was held up together is let go
@@ -57,6 +58,8 @@ class Debt:
     """From then on, only its own node's answers can be it: a right answer of another node was heard."""
     window: float | None = None
     """The learned window, in seconds, after which the line went on: it may still come, and meet with what is said."""
+    silence: float = 0.0
+    """Then, the silence after which it is over, as the document says."""
 
     def of(self, node: NodeRecord | None, now: float) -> bool:
         """It could be the answer of this node (None: of any) to a request that is made now."""
@@ -90,9 +93,10 @@ class InStep:
         asked: float,
         over: float,
         window: float | None = None,
+        silence: float = 0.0,
     ) -> None:
         """Replies that begin with these keys were not heard, see `Debt`."""
-        self.debts += [Debt(key, node, asked, over, inf, window) for key in keys]
+        self.debts += [Debt(key, node, asked, over, inf, window, silence) for key in keys]
         del self.debts[:-MOST_DEBTS]
         self.alert = True
 
@@ -110,10 +114,14 @@ class InStep:
         """When all that is owed and could look so is later than its node's lateness allows."""
         return max((debt.over for debt in self.debts if _could_be(debt, answers)), default=-inf)
 
-    def awaited_until(self, answers: Sequence[bytes] | None = None) -> float:
-        """Until when something may come (that could look so), though the line went on."""
-        awaited = (debt for debt in self.debts if debt.window is not None)
-        return max((debt.over for debt in awaited if answers is None or _could_be(debt, answers)), default=-inf)
+    def awaited_until(self, last_byte: float, answers: Sequence[bytes] | None = None) -> float:
+        """Until when something may come (that could look so), though the line went on. `last_byte`: when one came."""
+        until = -inf
+        for debt in self.debts:
+            if debt.window is not None and (answers is None or _could_be(debt, answers)):
+                over = debt.over
+                until = max(until, over, last_byte + debt.silence if last_byte < over else over)
+        return until
 
     def owing(self, answers: Sequence[bytes] | None, now: float) -> Iterator[NodeRecord]:
         """The nodes that owe what could look so (None: anything), and answer, as far as is known."""
@@ -136,7 +144,7 @@ class InStep:
     def doubtful_answer(self, answers: Sequence[bytes]) -> None:
         """An answer came that was the oldest debt of its kind, or the answer: one of the two is still owed."""
         for place, debt in enumerate(self.debts):
-            if _could_be(debt, answers):
+            if debt.window is None and _could_be(debt, answers):
                 del self.debts[place]
                 return
 
@@ -152,11 +160,15 @@ class InStep:
                 self._doubted.append((debt.key, debt.until + DOUBTED_LATENESSES * (debt.over - debt.asked)))
 
     def heard(self, run: bytes, now: float) -> Debt | None:
-        """Take all that came up to a silence, unasked or in place of a reply. Returns what it paid, if anything.
+        """Take all that came up to a silence, unasked or in place of a reply. Returns whose it is, as far as is known.
 
         What nobody owed, though it is like the last answers, was said twice. Of what is no lone answer, a part may
         be still to come: a byte of any kind.
         """
+        awaited = [debt for debt in self.debts if debt.window is not None]
+        if awaited:  # talkers may have met: what is left of two looks like anything
+            self.owe((ANY_BYTE,), None, now, now)
+            return next((debt for debt in awaited if len(debt.key) > 1 and debt.key in run), None)
         payers: list[Debt] = []
         rest = run
         while (debt := self._owed_byte(rest)) is not None:

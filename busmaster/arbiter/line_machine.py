@@ -3,8 +3,9 @@
 Theory of operation
 -------------------
 One half-duplex line, many nodes, anonymous replies: at most one exchange is on the line (R1), and no byte of an earlier
-one can come when the next begins (R3). It is told the time with every call and sends nothing itself: its owner pumps
-`poll_transmit`, then `poll_event`, then arms a timer for `poll_timeout`. Early or repeated calls change nothing.
+one can come when the next begins (R3), but for one that a learned window did not wait for, which is owed (R15). It is
+told the time with every call and sends nothing itself: its owner pumps `poll_transmit`, then `poll_event`, then arms a
+timer for `poll_timeout`. Early or repeated calls change nothing.
 
 The line is in one of five states; `_line_due` is when the state ends by itself.
 
@@ -393,10 +394,7 @@ class LineMachine:
             self._deadlines.line = free if held else inf
 
     def _settle(self, now: float, begun: bool = False) -> None:
-        """Discard until it has been silent long enough, and nothing can come any more (R3).
-
-        `begun`: the reply to the last request is known to have begun, so that silence is enough.
-        """
+        """Discard until it has been silent long enough, and nothing can come any more (R3) unless it has `begun`."""
         if self._closed:
             self._go_offline(now)
             return
@@ -464,7 +462,6 @@ class LineMachine:
         if rest is None:
             self._counters.collisions += 1
             self.events.append(Strayed(data, collision=True))
-            self._strays.collided = True
             if self.state is EXCHANGE:
                 self._attempt_failed(FrameError(COLLIDED), now)
             else:

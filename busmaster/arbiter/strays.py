@@ -34,8 +34,6 @@ class Strays:
         self.last_byte = -inf
         self.run = bytearray()
         """What came since the line was last silent, or in place of a reply."""
-        self.collided = False
-        """Some of it is an echo that did not match: what is like a request is like a reply, too."""
         self._looked = -inf
         self._look_at = inf
         self.listener: Listener | None = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import inf
 from typing import Any
 
 from busmaster.arbiter.events import Mark
@@ -10,7 +9,7 @@ from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.in_step import ANY_BYTE, InStep
 from busmaster.arbiter.learned import LATE_SHARE
 from busmaster.arbiter.on_wire import OnWire
-from busmaster.arbiter.strays import Strays
+from busmaster.arbiter.strays import QUIET, Strays
 from busmaster.contract.exchange import Done
 
 TWO_ANSWERS = "two answers came where one was due"
@@ -70,20 +69,17 @@ class Trust:
         keys = () if whole else tuple(exchange.owed)
         over, timing = wire.leg.past(), wire.leg.timing
         window = None if timing.silence is None else timing.window
+        silence = max(QUIET, transaction.node.timings.read.byte_gap) + wire.leg.latency + wire.leg.byte_time
         if window is not None:  # what comes of it may meet with what is said then, and only a part of it be heard
             over += sum(leg.timing.lateness for leg in exchange.later if not leg.sent)
         if heard or (window is not None and keys):
             keys += (ANY_BYTE,)
         if exchange.answered:
             transaction.node.unheard += not heard
-            self._in_step.owe(keys, transaction.node, wire.leg.end, over, window)
+            self._in_step.owe(keys, transaction.node, wire.leg.end, over, window, silence)
 
     def hear(self, wire: OnWire, run: bytes, strays: Strays, now: float) -> NodeRecord | None:
         """The line is silent, and this came before. Returns who owed it, if that is known."""
-        echoed, strays.collided = strays.collided, False
-        if echoed and self._in_step.awaited_until() > -inf:  # our own request is no reply
-            self._in_step.owe((ANY_BYTE,), None, now, now)
-            return None
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
         if paid is not None and node is not None and node.learning is not None and paid.window is not None:

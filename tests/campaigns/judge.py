@@ -148,7 +148,7 @@ class Judge:
 
     def _goes_on(self, last: Frame, now: float) -> bool:
         """Whether a learned window was over, and so the line need not wait (R15): but a write has to."""
-        awaited = self.arbiter._in_step.awaited_until() > -inf
+        awaited = self.arbiter._in_step.awaited_until(-inf) > -inf
         asked = self.arbiter._wire.transaction
         still_comes = last.end > now + ROUNDING and not self.ledger.damaged(last.start, now)
         if awaited and still_comes and asked is not None and asked.writes and asked.priority is not Priority.URGENT:
