@@ -6,7 +6,7 @@ from typing import Any
 
 from busmaster.arbiter.events import Mark
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.in_step import ANY_BYTE, InStep
+from busmaster.arbiter.in_step import ANY_BYTE, Awaited, InStep
 from busmaster.arbiter.learned import LATE_SHARE
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.strays import QUIET, Strays
@@ -67,24 +67,25 @@ class Trust:
         assert transaction is not None
         assert exchange is not None
         keys = () if whole else tuple(exchange.owed)
-        over, timing = wire.leg.past(), wire.leg.timing
-        window = None if timing.silence is None else timing.window
-        silence = max(QUIET, transaction.node.timings.read.byte_gap) + wire.leg.latency + wire.leg.byte_time
-        if window is not None:  # what comes of it may meet with what is said then, and only a part of it be heard
-            over += sum(leg.timing.lateness for leg in exchange.later if not leg.sent)
-        if heard or (window is not None and keys):
+        leg, awaited = wire.leg, None
+        over = leg.past()
+        if leg.timing.silence is not None:  # it may meet with what is said then, and only a part of it be heard
+            over += sum(later.timing.lateness for later in exchange.later if not later.sent)
+            silence = max(QUIET, transaction.node.timings.read.byte_gap) + leg.latency + leg.byte_time
+            awaited = Awaited(transaction.command, leg.timing.window, silence)
+        if heard or (awaited is not None and keys):
             keys += (ANY_BYTE,)
         if exchange.answered:
             transaction.node.unheard += not heard
-            self._in_step.owe(keys, transaction.node, wire.leg.end, over, window, silence)
+            self._in_step.owe(keys, transaction.node, leg.end, over, awaited)
 
     def hear(self, wire: OnWire, run: bytes, strays: Strays, now: float) -> NodeRecord | None:
         """The line is silent, and this came before. Returns who owed it, if that is known."""
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
-        if paid is not None and node is not None and node.learning is not None and paid.window is not None:
+        if paid is not None and node is not None and node.learning is not None and paid.awaited is not None:
             first_byte = strays.last_byte - (len(run) - 1) * wire.leg.byte_time - wire.leg.latency
-            if first_byte - paid.asked > LATE_SHARE * paid.window:
+            if first_byte - paid.asked > LATE_SHARE * paid.awaited.window:
                 node.learning.doubt()
                 strays.blame_for(node, paid.asked, first_byte)
         return node
