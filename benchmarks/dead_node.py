@@ -11,9 +11,9 @@ import asyncio
 import time
 from collections import Counter
 
-from benchmarks.far_end import FarEnd, value_of
 from benchmarks.harness import Claim, Options, Outcome, Table
 from benchmarks.modbus_masters import Busmaster, Failed, ModbusMaster, masters, notes
+from benchmarks.served_line import ServedLine, value_of
 
 UNITS = 8
 DEAD = 8
@@ -32,13 +32,13 @@ def run(options: Options) -> Outcome:
     table = Table(f"{UNITS} units, then one of them dead", COLUMNS, notes=notes(options))
     for maker in masters(options):
         master = maker()
-        with FarEnd(UNITS, delay=DELAY) as line:
+        with ServedLine(UNITS, delay=DELAY) as line:
             asyncio.run(_measure(master, line, options, table, outcome))
     outcome.tables.append(table)
     return outcome
 
 
-async def _measure(master: ModbusMaster, line: FarEnd, options: Options, table: Table, outcome: Outcome) -> None:
+async def _measure(master: ModbusMaster, line: ServedLine, options: Options, table: Table, outcome: Outcome) -> None:
     counts: Counter[str] = Counter()
     await master.open(line.path)
     pollers = [asyncio.create_task(_poll(master, unit, counts)) for unit in range(1, UNITS + 1)]

@@ -14,9 +14,9 @@ import time
 from math import inf, nan
 from statistics import median
 
-from benchmarks.far_end import FarEnd, value_of
 from benchmarks.harness import Options, Outcome, Table, quantile
 from benchmarks.modbus_masters import PROFILE, RETRIES, TIMINGS, Busmaster, Failed, ModbusMaster, masters, notes
+from benchmarks.served_line import ServedLine, value_of
 from busmaster.protocols.modbus.handle import ModbusUnit
 
 UNITS = 8
@@ -42,11 +42,11 @@ def run(options: Options) -> Outcome:
     outcome = Outcome()
     title = f"{UNITS} units polled every {PERIOD * 1000:g} ms, ten commands a second"
     table = Table(title, COLUMNS, notes=notes(options))
-    table.notes.append("not in time: of the values that the grid asks for, those after the next was due, or never")
+    table.notes.append("not in time: of the values that the grid questions for, those after the next was due, or never")
     cycles = options.pick(100, 5)
     for maker in masters(options):
         master = maker()
-        with FarEnd(UNITS, delay=DELAY) as line:
+        with ServedLine(UNITS, delay=DELAY) as line:
             alive, dead, wrong = asyncio.run(_measure(master, line, cycles))
         figures = [*_figures(alive, cycles), *_figures({u: dead[u] for u in dead if u != DEAD}, cycles)]
         table.row(master.name, wrong, *figures)
@@ -69,7 +69,7 @@ def _jitter(delays: Delays) -> list[float]:
     return [abs(delay - middle) for values in inside if values and (middle := median(values)) for delay in values]
 
 
-async def _measure(master: ModbusMaster, line: FarEnd, cycles: int) -> tuple[Delays, Delays, int]:
+async def _measure(master: ModbusMaster, line: ServedLine, cycles: int) -> tuple[Delays, Delays, int]:
     await master.open(line.path)
     await asyncio.sleep(0.2)
     commands = asyncio.create_task(_command(master))
@@ -88,7 +88,7 @@ async def _measure(master: ModbusMaster, line: FarEnd, cycles: int) -> tuple[Del
     return alive, dead, wrong
 
 
-async def _poll_group(master: Busmaster, line: FarEnd, cycles: int, alive: Delays, dead: Delays) -> int:
+async def _poll_group(master: Busmaster, line: ServedLine, cycles: int, alive: Delays, dead: Delays) -> int:
     """The group goes on while the unit dies: so it does in earnest."""
     bus = master.bus
     assert bus is not None

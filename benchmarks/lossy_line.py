@@ -15,9 +15,9 @@ from collections.abc import Callable
 from functools import partial
 from random import Random
 
-from benchmarks.far_end import FarEnd, value_of
 from benchmarks.harness import Claim, Options, Outcome, Table
 from benchmarks.modbus_masters import Busmaster, Failed, ModbusMaster, masters, notes
+from benchmarks.served_line import ServedLine, value_of
 from busmaster.arbiter.events import Event
 from busmaster.arbiter.learned import TRUSTED_AFTER
 from busmaster.arbiter.transaction import Transaction
@@ -135,12 +135,12 @@ def _compared(options: Options, outcome: Outcome) -> Table:
     makers: list[Callable[[], ModbusMaster]] = [*masters(options), partial(Busmaster, learned=True)]
     for maker in makers:
         master = maker()
-        with FarEnd(UNITS, delay=DELAY) as line:
+        with ServedLine(UNITS, delay=DELAY) as line:
             asyncio.run(_measure(master, line, options, table, outcome))
     return table
 
 
-async def _measure(master: ModbusMaster, line: FarEnd, options: Options, table: Table, outcome: Outcome) -> None:
+async def _measure(master: ModbusMaster, line: ServedLine, options: Options, table: Table, outcome: Outcome) -> None:
     counts: Counter[str] = Counter()
     await master.open(line.path)
     callers = [asyncio.create_task(_call(master, number, counts)) for number in range(CALLERS)]

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from statistics import mean, pstdev
 
-from benchmarks.asks import hcp2_asks, wire_time
 from benchmarks.harness import Claim, Options, Outcome, Table, quantile
 from benchmarks.lines import Lines
-from benchmarks.masters import Ask
+from benchmarks.masters import Question
+from benchmarks.questions import hcp2_questions, wire_time
 from busmaster.bus.bus import Bus
 from busmaster.contract.profile import LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -57,14 +57,14 @@ class Tally:
 
 def run(options: Options) -> Outcome:
     outcome = Outcome()
-    asks = hcp2_asks()
+    questions = hcp2_questions()
     table = Table(f"Lines of {SETTINGS.baudrate} baud, HCP2, reply time {DELAY * 1000:g} ms, one process", COLUMNS)
-    limit = 1 / mean(wire_time(ask, SETTINGS, DELAY) for ask in asks)
+    limit = 1 / mean(wire_time(ask, SETTINGS, DELAY) for ask in questions)
     seconds = options.pick(4.0, 0.5)
-    _, unpaced_cpu = asyncio.run(_measure(1, asks, None, seconds))
+    _, unpaced_cpu = asyncio.run(_measure(1, questions, None, seconds))
     alone = 0.0
     for count in options.pick(COUNTS, (1, 64)):
-        tallies, cpu = asyncio.run(_measure(count, asks, SETTINGS, seconds))
+        tallies, cpu = asyncio.run(_measure(count, questions, SETTINGS, seconds))
         rates = [tally.rate for tally in tallies]
         alone = alone or rates[0]
         worst = 100 * min(rates) / alone
@@ -87,15 +87,15 @@ def run(options: Options) -> Outcome:
 
 
 async def _measure(
-    count: int, asks: Sequence[Ask], settings: LineSettings | None, seconds: float
+    count: int, questions: Sequence[Question], settings: LineSettings | None, seconds: float
 ) -> tuple[list[Tally], float]:
     """What each line did, and seconds of CPU a transaction."""
-    replies = {ask.request: ask.reply for ask in asks}
+    replies = {ask.request: ask.reply for ask in questions}
     delay = DELAY if settings is not None else 0.0
     with Lines(count, replies, settings=settings, delay=delay, spin=0.0 if count > 1 else 500e-6) as lines:
         tallies = [Tally() for _ in range(count)]
         stop = asyncio.Event()
-        work = [asyncio.create_task(_line(p, asks, t, stop)) for p, t in zip(lines.ports, tallies, strict=True)]
+        work = [asyncio.create_task(_line(p, questions, t, stop)) for p, t in zip(lines.ports, tallies, strict=True)]
         await asyncio.sleep(SETTLED + count * 0.005)
         for tally in tallies:
             tally.ends.clear()
@@ -108,13 +108,15 @@ async def _measure(
     return tallies, cpu / transactions
 
 
-async def _line(port: Endpoint, asks: Sequence[Ask], tally: Tally, stop: asyncio.Event) -> None:
+async def _line(port: Endpoint, questions: Sequence[Question], tally: Tally, stop: asyncio.Event) -> None:
     async with Bus(port) as bus:
-        await asyncio.gather(*(_call(bus, [*asks[number:], *asks[:number]], tally, stop) for number in range(CALLERS)))
+        await asyncio.gather(
+            *(_call(bus, [*questions[number:], *questions[:number]], tally, stop) for number in range(CALLERS))
+        )
 
 
-async def _call(bus: Bus, asks: Sequence[Ask], tally: Tally, stop: asyncio.Event) -> None:
-    nodes = [(bus.node(hcp2.PROFILE, ask.address), ask.command, ask.value) for ask in asks]
+async def _call(bus: Bus, questions: Sequence[Question], tally: Tally, stop: asyncio.Event) -> None:
+    nodes = [(bus.node(hcp2.PROFILE, ask.address), ask.command, ask.value) for ask in questions]
     clock = time.perf_counter
     while not stop.is_set():
         for node, command, value in nodes:

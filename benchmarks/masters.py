@@ -32,7 +32,7 @@ PATIENCE = 50
 
 
 @dataclass(frozen=True)
-class Ask:
+class Question:
     """One question: our command, the node, its bytes on the wire both ways, and the value that is right."""
 
     command: Command[Any]
@@ -56,10 +56,10 @@ class Master(Protocol):
 class Ours:
     """A bus, with `callers` tasks that each ask one thing after another: the backlog is never empty from two up."""
 
-    def __init__(self, profile: Profile, asks: Sequence[Ask], callers: int = 4) -> None:
+    def __init__(self, profile: Profile, questions: Sequence[Question], callers: int = 4) -> None:
         self.name = "busmaster" if callers > 1 else "busmaster, one caller"
         self._profile = profile
-        self._asks = asks
+        self._asks = questions
         self._callers = callers
         self.bus: Bus | None = None
 
@@ -75,11 +75,11 @@ class Ours:
 
     async def _call(self, number: int, transactions: int) -> int:
         assert self.bus is not None
-        asks = [(self.bus.node(self._profile, ask.address), ask.command, ask.value) for ask in self._asks]
-        asks = asks[number % len(asks) :] + asks[: number % len(asks)]
+        questions = [(self.bus.node(self._profile, ask.address), ask.command, ask.value) for ask in self._asks]
+        questions = questions[number % len(questions) :] + questions[: number % len(questions)]
         wrong = 0
         for n in range(transactions):
-            node, command, value = asks[n % len(asks)]
+            node, command, value = questions[n % len(questions)]
             wrong += await node.request(command) != value
         return wrong
 
@@ -93,10 +93,10 @@ class Bare(asyncio.Protocol):
 
     name = "bare asyncio.Protocol"
 
-    def __init__(self, asks: Sequence[Ask]) -> None:
-        self._sends = [ask.request for ask in asks]
-        self._replies = [b"".join(ask.reply) for ask in asks]
-        self._closings = [ask.closing for ask in asks]
+    def __init__(self, questions: Sequence[Question]) -> None:
+        self._sends = [ask.request for ask in questions]
+        self._replies = [b"".join(ask.reply) for ask in questions]
+        self._closings = [ask.closing for ask in questions]
         self._buffer = b""
         self._left = 0
         self._next = 0
@@ -142,9 +142,9 @@ class Bare(asyncio.Protocol):
 class Streams:
     """A lock, a StreamReader and a StreamWriter, `callers` tasks at it."""
 
-    def __init__(self, asks: Sequence[Ask], callers: int = 4) -> None:
+    def __init__(self, questions: Sequence[Question], callers: int = 4) -> None:
         self.name = "lock and streams" if callers > 1 else "lock and streams, one caller"
-        self._asks = asks
+        self._asks = questions
         self._callers = callers
         self._lock = asyncio.Lock()
         self._reader: asyncio.StreamReader | None = None
@@ -171,7 +171,7 @@ class Streams:
             wrong += await self._ask(ask) != ask.value
         return wrong
 
-    async def _ask(self, ask: Ask) -> float:
+    async def _ask(self, ask: Question) -> float:
         assert self._reader is not None
         assert self._writer is not None
         async with self._lock:
@@ -192,8 +192,8 @@ class Blocking:
 
     name = "blocking pyserial"
 
-    def __init__(self, asks: Sequence[Ask]) -> None:
-        self._asks = asks
+    def __init__(self, questions: Sequence[Question]) -> None:
+        self._asks = questions
         self._write: Callable[[bytes], Any] | None = None
         self._read: Callable[[], bytes] | None = None
         self._port: serial.Serial | socket.socket | None = None

@@ -15,8 +15,8 @@ from dataclasses import replace
 from importlib import import_module, metadata
 from typing import Any, Protocol, TypeVar
 
-from benchmarks.far_end import SETTINGS
 from benchmarks.harness import Options, installed
+from benchmarks.served_line import SETTINGS
 from busmaster import Bus, BusError, Node, Priority, ReplyTiming, SerialPort, Timings
 from busmaster.contract.learning import Learned
 from busmaster.planning import longest_hold

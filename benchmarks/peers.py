@@ -11,11 +11,11 @@ from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
-from benchmarks.far_end import SETTINGS, value_of
 from benchmarks.harness import Options, Outcome, Table, alternate
 from benchmarks.lines import Lines
-from benchmarks.masters import Ask, Bare
+from benchmarks.masters import Bare, Question
 from benchmarks.modbus_masters import PROFILE, TIMINGS, Busmaster, Failed, Minimalmodbus, ModbusMaster, masters, notes
+from benchmarks.served_line import SETTINGS, value_of
 from busmaster import SerialPort, Timings
 from busmaster.contract.profile import LineSettings
 from busmaster.protocols.modbus.codec import ReadRegisters, with_crc
@@ -33,17 +33,17 @@ def run(options: Options) -> Outcome:
     outcome.tables.append(asyncio.run(_measure(paced, SETTINGS, options, outcome)))
     outcome.tables.append(asyncio.run(_measure("Not paced; ours without a silence", None, options, outcome)))
     outcome.tables[0].notes += notes(options)
-    outcome.tables[0].notes.append("Modbus asks for 1.75 ms of silence between frames; pymodbus does not keep it")
+    outcome.tables[0].notes.append("Modbus questions for 1.75 ms of silence between frames; pymodbus does not keep it")
     return outcome
 
 
-def asks() -> list[Ask]:
+def questions() -> list[Question]:
     found = []
     for unit, register in NAMED:
         command = ReadRegisters(register)
         value = value_of(unit, register)
         reply = with_crc(bytes((unit, 3, 2)) + value.to_bytes(2, "big"))
-        found.append(Ask(command, unit, command.open(unit, PROFILE.timings).request, (reply,), (value,)))
+        found.append(Question(command, unit, command.open(unit, PROFILE.timings).request, (reply,), (value,)))
     return found
 
 
@@ -51,8 +51,8 @@ async def _measure(title: str, settings: LineSettings | None, options: Options, 
     compared: list[ModbusMaster] = [maker() for maker in masters(options)]
     if settings is None:
         compared[0] = Busmaster(NO_GAP)
-    bare = Bare(asks())
-    replies = {ask.request: ask.reply for ask in asks()}
+    bare = Bare(questions())
+    replies = {ask.request: ask.reply for ask in questions()}
     runs: dict[str, Callable[[int], Awaitable[int]]] = {}
     failed: Counter[str] = Counter()
     delay = DELAY if settings is not None else 0.0

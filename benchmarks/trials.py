@@ -9,9 +9,9 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from benchmarks.far_end import REGISTERS, SETTINGS, FarEnd, emulated_units, value_of
 from benchmarks.harness import Claim, Options, Outcome, Table
 from benchmarks.modbus_masters import Busmaster, Failed, ModbusMaster, masters, notes
+from benchmarks.served_line import REGISTERS, SETTINGS, ServedLine, emulated_units, value_of
 from busmaster import MemoryPort
 from busmaster.emulator.line import Line
 from busmaster.testing.virtual_time import run_in_virtual_time
@@ -33,7 +33,7 @@ def compare(title: str, what: str, delay: Mapping[str, Any], patience: float | N
     seconds = options.pick(15.0, 0.5)
     for maker in masters(options):
         master = maker()
-        with FarEnd(UNITS, delay=dict(delay)) as line:
+        with ServedLine(UNITS, delay=dict(delay)) as line:
             counts, taken = asyncio.run(_for(seconds, master, line.path, patience))
         _row(table, master.name, counts, counts["right"] / taken)
         outcome.series[master.name] = dict(counts)

@@ -11,10 +11,10 @@ import time
 from collections.abc import Awaitable, Callable
 from statistics import median
 
-from benchmarks.asks import hcp2_asks
 from benchmarks.harness import Claim, Options, Outcome, Table, alternate, loops, quantile, run_on
 from benchmarks.lines import Kind, Lines
 from benchmarks.masters import Bare, Blocking, Master, Ours, Streams
+from benchmarks.questions import hcp2_questions
 from busmaster.protocols.hcp2 import codec as hcp2
 
 WARM_UP = 100
@@ -35,11 +35,11 @@ def run(options: Options) -> Outcome:
 
 
 def _masters(kind: Kind) -> list[Master]:
-    asks = hcp2_asks()
-    masters: list[Master] = [Bare(asks), Ours(hcp2.PROFILE, asks), Ours(hcp2.PROFILE, asks, 1)]
-    masters += [Streams(asks), Streams(asks, 1)]
+    questions = hcp2_questions()
+    masters: list[Master] = [Bare(questions), Ours(hcp2.PROFILE, questions), Ours(hcp2.PROFILE, questions, 1)]
+    masters += [Streams(questions), Streams(questions, 1)]
     if kind is Kind.PTY:
-        masters.append(Blocking(asks))
+        masters.append(Blocking(questions))
     return masters
 
 
@@ -47,7 +47,7 @@ async def _idle(loop: str, kind: Kind, options: Options, outcome: Outcome) -> No
     """On a loop that has nothing else to do."""
     masters = _masters(kind)
     table = Table(f"Turnaround on a {kind.value}, {loop}", COLUMNS)
-    with Lines(len(masters), {ask.request: ask.reply for ask in hcp2_asks()}, kind=kind) as lines:
+    with Lines(len(masters), {ask.request: ask.reply for ask in hcp2_questions()}, kind=kind) as lines:
         for master, port in zip(masters, lines.ports, strict=True):
             await master.open(port)
             await master.run(WARM_UP)
@@ -83,7 +83,7 @@ async def _busy(loop: str, options: Options, outcome: Outcome) -> None:
     masters = [master for master in _masters(Kind.PTY) if not isinstance(master, Blocking)]
     table = Table(f"Turnaround on a pty, {loop}, with {OTHER_WORK * 1e6:g} us of other work an iteration", BUSY_COLUMNS)
     transactions = options.pick(500, 40)
-    with Lines(len(masters), {ask.request: ask.reply for ask in hcp2_asks()}) as lines:
+    with Lines(len(masters), {ask.request: ask.reply for ask in hcp2_questions()}) as lines:
         for master, port in zip(masters, lines.ports, strict=True):
             await master.open(port)
             await master.run(WARM_UP)

@@ -12,9 +12,9 @@ import random
 import time
 from dataclasses import dataclass, field
 
-from benchmarks.far_end import SETTINGS, FarEnd, value_of
 from benchmarks.harness import Claim, Options, Outcome, Table, quantile
 from benchmarks.modbus_masters import Busmaster, Failed, ModbusMaster, masters, notes
+from benchmarks.served_line import SETTINGS, ServedLine, value_of
 from busmaster.protocols.modbus.codec import SILENCE
 
 UNITS = 8
@@ -42,13 +42,13 @@ def run(options: Options) -> Outcome:
     table = Table("From the call of an urgent write to its confirmation", COLUMNS, notes=notes(options))
     for maker in masters(options):
         master = maker()
-        with FarEnd(UNITS, delay={"low": DELAY}) as line:
+        with ServedLine(UNITS, delay={"low": DELAY}) as line:
             asyncio.run(_measure(master, line, options, table, outcome))
     outcome.tables.append(table)
     return outcome
 
 
-async def _measure(master: ModbusMaster, line: FarEnd, options: Options, table: Table, outcome: Outcome) -> None:
+async def _measure(master: ModbusMaster, line: ServedLine, options: Options, table: Table, outcome: Outcome) -> None:
     await master.open(line.path)
     alive, dead = Tally(), Tally()
     pollers = [asyncio.create_task(_poll(master, unit, alive)) for unit in range(1, UNITS + 1)]

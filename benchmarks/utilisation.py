@@ -11,10 +11,10 @@ import asyncio
 from collections.abc import Sequence
 from statistics import mean
 
-from benchmarks.asks import hcp2_asks, msc_asks, wire_time
 from benchmarks.harness import Claim, Options, Outcome, Table, alternate
 from benchmarks.lines import Lines
-from benchmarks.masters import Ask, Bare, Ours
+from benchmarks.masters import Bare, Ours, Question
+from benchmarks.questions import hcp2_questions, msc_questions, wire_time
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
@@ -30,17 +30,17 @@ COLUMNS = ("line", "reply time ms", "wrong", "limit /s", "ours /s", "% of limit"
 def run(options: Options) -> Outcome:
     outcome = Outcome()
     table = Table("Transactions a second against the limit of the wire", COLUMNS)
-    for profile, asks in ((hcp2.PROFILE, hcp2_asks()), (msc.PROFILE, msc_asks())):
+    for profile, questions in ((hcp2.PROFILE, hcp2_questions()), (msc.PROFILE, msc_questions())):
         for baudrate in BAUDRATES:
             for delay in options.pick(REPLY_TIMES, (CLAIMED_REPLY_TIME,)):
-                asyncio.run(_measure(profile, asks, baudrate, delay, options, table, outcome))
+                asyncio.run(_measure(profile, questions, baudrate, delay, options, table, outcome))
     outcome.tables.append(table)
     return outcome
 
 
 async def _measure(
     profile: Profile,
-    asks: Sequence[Ask],
+    questions: Sequence[Question],
     baudrate: int,
     delay: float,
     options: Options,
@@ -48,12 +48,12 @@ async def _measure(
     outcome: Outcome,
 ) -> None:
     settings = LineSettings(baudrate)
-    limit = 1 / mean(wire_time(ask, settings, delay) for ask in asks)
-    ours, bare = Ours(profile, asks), Bare(asks)
+    limit = 1 / mean(wire_time(ask, settings, delay) for ask in questions)
+    ours, bare = Ours(profile, questions), Bare(questions)
     round_length = options.pick(0.5, 0.05)
-    transactions = max(1, round(round_length * limit / len(asks))) * len(asks)
-    replies = {ask.request: ask.reply for ask in asks}
-    with Lines(2, replies, settings=settings, delay=delay, swallow=asks[0].closing) as lines:
+    transactions = max(1, round(round_length * limit / len(questions))) * len(questions)
+    replies = {ask.request: ask.reply for ask in questions}
+    with Lines(2, replies, settings=settings, delay=delay, swallow=questions[0].closing) as lines:
         await ours.open(lines.ports[0])
         await bare.open(lines.ports[1])
         await bare.run(1)

@@ -27,7 +27,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "emulator": {"emulator", "wire"} | BASE,
     "emulator.world": {"emulator", "wire", "arbiter"} | BASE,
     "emulator.memory": {"emulator", "transport"} | BASE,
-    "registry": {"registry", "bus.handle", "emulator.device", "emulator.oracle", "capture.decode"} | BASE,
+    "registry": {"registry", "bus.handle", "emulator.device", "emulator.traceable", "capture.decode"} | BASE,
     "outputs": {"outputs", "bus", "arbiter"} | BASE,
     "capture": {"capture", "wire", "registry", "arbiter.tap"} | BASE,
     "doctor": {"doctor", "registry", "capture", "transport", "arbiter", "outputs.values"} | BASE,

@@ -2,7 +2,7 @@
 
 Where everything that is asked is answered alike, one doubled reply leaves every later answer one exchange behind: it is
 taken for the answer to the next request, whose own is taken for that of the one after it, and so on, with nothing owed
-and no stray byte to be seen. A read whose answer is unlike shows it, and costs an exchange; a pause shows it.
+and no unasked byte to be seen. A read whose answer is unlike shows it, and costs an exchange; a pause shows it.
 
 Times show it too, on a port whose bytes leave at the baud rate. In step, a node has heard its request when it begins to
 think of the answer. One exchange behind, what comes is the answer to the request before, and that node was free to

@@ -72,8 +72,8 @@ class Arbiter(LineMachine):
         if isinstance(timings, Learned):
             node.learning = Learning()
         self.dispatcher.nodes.append(node)
-        if profile.listen is not None and self._strays.listener is None:
-            self._strays.listener = profile.listen()
+        if profile.listen is not None and self._unasked.listener is None:
+            self._unasked.listener = profile.listen()
         self._quarantine = max(self._quarantine, self._up_at + node.lateness + self._leg.latency + self.byte_time)
         return node
 

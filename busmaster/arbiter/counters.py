@@ -72,7 +72,7 @@ class LineStatistics:
     exchanges: int
     completed: int
     cancelled: int
-    stray_bytes: int
+    unasked_bytes: int
     noise_bytes: int
     tainted: int
     collisions: int
@@ -159,8 +159,8 @@ class LineCounters:
         "settles",
         "since",
         "spent",
-        "stray_bytes",
         "tainted",
+        "unasked_bytes",
         "waits",
     )
 
@@ -174,7 +174,7 @@ class LineCounters:
 
     def reset(self, state: LineState, since: float) -> None:
         self.since = since
-        self.completed = self.cancelled = self.stray_bytes = self.noise_bytes = 0
+        self.completed = self.cancelled = self.unasked_bytes = self.noise_bytes = 0
         self.tainted = self.collisions = self.settles = self.noisy = self.losses = 0
         self.checks = self.doubted = self.damaged = self.breaks = 0
         self._before = (self.exchanges, self._times(state, since))
@@ -210,7 +210,7 @@ class LineCounters:
             self.exchanges - exchanges,
             self.completed,
             self.cancelled,
-            self.stray_bytes,
+            self.unasked_bytes,
             self.noise_bytes,
             self.tainted,
             self.collisions,

@@ -102,14 +102,14 @@ class Dispatcher:
 
     def cancel(self, transaction: Transaction, now: float) -> None:
         """Its caller has gone: never sent if still queued, unheard if on the wire (R6)."""
-        if not transaction.heard or transaction.phase in (ENDED, IDLE):
+        if not transaction.wanted or transaction.phase in (ENDED, IDLE):
             return
-        transaction.heard = False
+        transaction.wanted = False
         self.counters.cancelled += 1
         if transaction.phase is QUEUED:
             self.backlog.discard(transaction, PARKED)
         if transaction.phase is PARKED:
-            self.probes.budget.refund(transaction.paid)
+            self.probes.budget.refund(transaction.probe_cost)
             self._end(transaction, now)
 
     def next(self, now: float) -> Transaction | None:
@@ -185,8 +185,8 @@ class Dispatcher:
             self._heard(node, now)
         if node.lateness_until < inf:
             self._lower_lateness(transaction, now)
-        if transaction.paid:
-            self.probes.budget.refund(transaction.paid - (now - transaction.started))
+        if transaction.probe_cost:
+            self.probes.budget.refund(transaction.probe_cost - (now - transaction.started))
         transaction.refused_cycles = 0
         self._end(transaction, now)
 
@@ -276,10 +276,10 @@ class Dispatcher:
         """
         self.note_success()
         for transaction in self._expiries.due(now):
-            if not transaction.heard or (transaction.attempts and transaction.finish_by >= now):
+            if not transaction.wanted or (transaction.attempts and transaction.finish_by >= now):
                 continue
             if transaction.phase is ON_WIRE:
-                transaction.heard = False
+                transaction.wanted = False
                 self.counters.cancelled += 1
                 self.events.append(Overdue(transaction, too_late(transaction, now)))
                 continue
@@ -357,7 +357,7 @@ class Dispatcher:
         self.counters.checks += 1
         check = Transaction(node, command, priority=BACKGROUND, retries=0, probe=True)
         check.check = True
-        check.heard = False
+        check.wanted = False
         check.queued = now
         self._waits(check)
         return check
@@ -370,9 +370,9 @@ class Dispatcher:
             error = self._reason_to_park(transaction, now)
         elif now < node.suspended_until:
             error = make_error(NodeDown, SUSPENDED, transaction)
-        elif node.health is DOWN and not (transaction.paid or transaction.probe):
+        elif node.health is DOWN and not (transaction.probe_cost or transaction.probe):
             if self.probes.spare(node.lateness, now):
-                transaction.paid = node.lateness
+                transaction.probe_cost = node.lateness
                 transaction.retries = 0
             else:
                 error = make_error(NodeDown, "down: no answer for a while", transaction)
@@ -419,7 +419,7 @@ class Dispatcher:
         return not node.failures and node.health is not DOWN
 
     def _wanted(self, transaction: Transaction) -> bool:
-        return transaction.heard and not transaction.superseded and self.fault is None
+        return transaction.wanted and not transaction.superseded and self.fault is None
 
     def _requeue(self, transaction: Transaction, now: float) -> None:
         """At the back of its class; a poll's key becomes failure time + period (R7)."""
@@ -461,17 +461,17 @@ class Dispatcher:
             transaction.node.counters.failed += 1
         if transaction.probe:
             self.probes.over(transaction)
-        if not transaction.heard and not transaction.check:
+        if not transaction.wanted and not transaction.check:
             transaction.node.counters.unheard += transaction.attempts > 0
         poll = transaction.poll
         if poll is not None:
-            if poll.waiter is not None and poll.active:
+            if poll.group is not None and poll.active:
                 self.events.append(Sampled(poll, transaction))
             poll.remaining -= 1
             if not poll.remaining and poll.active:
                 poll.finished = now
                 self.events.append(Polled(poll))
-        elif transaction.heard:
+        elif transaction.wanted:
             self.counters.completed += 1
             self.events.append(transaction)
 

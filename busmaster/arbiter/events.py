@@ -31,7 +31,7 @@ class Overdue:
 
 @dataclass(slots=True)
 class Sampled:
-    """One exchange of a poll's cycle is over; told where the poll has a `waiter`, so that it need not wait for all."""
+    """One exchange of a poll's cycle is over; told where the poll has a `group`, so that it need not wait for all."""
 
     poll: Poll
     transaction: Transaction
@@ -108,7 +108,7 @@ class PortFailed:
 
 
 @dataclass(frozen=True, slots=True)
-class Strayed:
+class CameUnasked:
     """Bytes came that nobody had asked for, or an echo did not match (`collision`)."""
 
     data: bytes
@@ -126,6 +126,6 @@ Event: TypeAlias = (
     | LatenessLowered
     | LineChanged
     | PortFailed
-    | Strayed
+    | CameUnasked
     | Attempt
 )

@@ -9,7 +9,7 @@ what was said last               when the last byte that it caused can have been
 a request, one leg               a silence of `quiet()` that ends at or after `end + lateness + latency + byte time`
 a request whose ACK was heard    likewise from the end of that ACK, with the packet's lateness (MSC)
 a request whose ACK was not      likewise; the packet's lateness counts from the request's end, and anew from
-heard (MSC: it may be lost)      each stray, and what came in its place: either may be the ACK, damaged
+heard (MSC: it may be lost)      each unasked byte, and what came for it: either may be the ACK, damaged
 a request on an echoing port     likewise, `end` being the last byte of its echo
 a closing ACK                    when it is out; nothing answers it
 a broadcast                      when it is out, and `turnaround` later
@@ -25,8 +25,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import inf
 
-from busmaster.arbiter.strays import QUIET
-from busmaster.contract.exchange import Leg as LaterLeg
+from busmaster.arbiter.unasked import QUIET
+from busmaster.contract.exchange import LaterLeg
 from busmaster.contract.timing import ReplyTiming
 
 UNKNOWN_LATENESS = 0.150
@@ -142,7 +142,7 @@ class Leg:
         if self.end > self.begun_at:
             self.end = self.out = self.begun_at
 
-    def strayed(self, now: float) -> None:
+    def came_unasked(self, now: float) -> None:
         """Something came: perhaps the reply that was given up, and its next leg begins here. Or it was noise, and the
         next leg is still to come after that: what is known of it is kept until the line has settled."""
         if self._follows is not None:

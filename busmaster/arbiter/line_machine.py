@@ -13,12 +13,12 @@ The line is in one of five states; `_line_due` is when the state ends by itself.
 state      data received          its deadline             line_up / line_down         submit, poll due
 =========  =====================  =======================  ==========================  ====================
 OFFLINE    counted, dropped       never                    up: SETTLING                fails with LineDown
-READY      stray: SETTLING        never                    down: OFFLINE               EXCHANGE
-HOLDOFF    stray: SETTLING        READY                    down: OFFLINE, all fail     waits
+READY      unasked: SETTLING      never                    down: OFFLINE               EXCHANGE
+HOLDOFF    unasked: SETTLING      READY                    down: OFFLINE, all fail     waits
 EXCHANGE   read: stays, or ends   window or gap is over:   down: OFFLINE, all fail     waits
            in READY, HOLDOFF      failed (SETTLING), next
            or SETTLING            leg, or done (broadcast)
-SETTLING   stray: silence starts  READY                    down: OFFLINE, all fail     waits (NOISY: fails)
+SETTLING   unasked: silence       READY                    down: OFFLINE, all fail     waits (NOISY: fails)
            again; 1 s of it:
            NOISY, all fail
 =========  =====================  =======================  ==========================  ====================
@@ -38,15 +38,15 @@ from busmaster.arbiter.choice import Choice
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.echo import Echo
-from busmaster.arbiter.events import LineChange, LineChanged, Mark, Strayed
+from busmaster.arbiter.events import CameUnasked, LineChange, LineChanged, Mark
 from busmaster.arbiter.health import DOWN
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.leg import UNKNOWN_LATENESS, Leg
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
-from busmaster.arbiter.strays import LOOK_SLACK, QUIET, Strays
 from busmaster.arbiter.tapped import make_dispatcher
 from busmaster.arbiter.trust import COLLIDED, TOO_EARLY, TWO_ANSWERS, Trust, damaged
+from busmaster.arbiter.unasked import LOOK_SLACK, QUIET, UnaskedBytes
 from busmaster.contract.exchange import NO_REPLY, Done, Expect, FrameError
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import BusError, LineDown, LineNoisy, Refused
@@ -84,7 +84,7 @@ class LineMachine:
         self._choice = Choice(self.dispatcher, self._in_step, self._wire)
         self._trust = Trust(self._in_step)
         # the line
-        self._strays = Strays(self.events, self._counters)
+        self._unasked = UnaskedBytes(self.events, self._counters)
         self._up_at = -inf
         self._quarantine = -inf
         self._silent_at = -inf
@@ -124,23 +124,23 @@ class LineMachine:
             if not data:
                 return
         if self.state is not EXCHANGE:
-            self._stray(data, now)
+            self._take_unasked(data, now)
         elif self._trust.held is not None:  # two answers where one is due: neither is believed
             self._disbelieve(TWO_ANSWERS, Done(None, data, self._trust.held.send), now)
         elif self._leg.begun or (data := self._begin_reply(data, now)):
-            self._strays.last_byte = now
+            self._unasked.last_byte = now
             self._take(data, now)
 
     def byte_marked(self, mark: Mark, now: float) -> None:
         """The UART says that a byte came damaged, or a break: whatever it was, it is nobody's answer."""
         self._counters.mark(mark)
-        self._strays.last_byte = now
+        self._unasked.last_byte = now
         self._echo.forget()
         if self.state is EXCHANGE:
             self._leg.begun = True
             self._attempt_failed(FrameError(damaged(mark)), now)
         else:
-            self._stray(b"\0", now)
+            self._take_unasked(b"\0", now)
 
     def transmitted(self, now: float) -> None:
         """The port has taken only now what `poll_transmit` gave: whoever held the process up meanwhile."""
@@ -196,7 +196,7 @@ class LineMachine:
                 else:
                     self._complete(self._trust.held, now)
             elif self.state is SETTLING and now < self._silent_at:
-                deadlines.line = self._strays.look_before(self._silent_at, now)
+                deadlines.line = self._unasked.look_before(self._silent_at, now)
             else:
                 self._free(now)
         elif self.state is READY:
@@ -209,7 +209,7 @@ class LineMachine:
         if now < self._quarantine:
             self._settle(now)
             return True
-        chosen = self._choice.next(now, self._strays.last_byte)
+        chosen = self._choice.next(now, self._unasked.last_byte)
         if chosen is None:
             return False
         if type(chosen) is not tuple:
@@ -221,8 +221,8 @@ class LineMachine:
         if self.state is not EXCHANGE:
             self._enter(EXCHANGE, now)
         self._wire.begin(transaction, exchange, now)
-        if self._strays.unanswered_one is not None:
-            self._strays.looked(now, self._deadlines.line)
+        if self._unasked.unanswered_one is not None:
+            self._unasked.looked(now, self._deadlines.line)
         return True
 
     def _begin_reply(self, data: bytes, now: float) -> bytes:
@@ -233,17 +233,17 @@ class LineMachine:
         assert exchange is not None
         if now < leg.taint_until or wire.output.held:
             self._counters.tainted += 1
-            self._strays.last_byte = now
+            self._unasked.last_byte = now
             self._attempt_failed(FrameError(TOO_EARLY, heard=data), now)
             return b""
         if not exchange.answered:
-            self._strays.note(data, now, leg.quiet())
-            wire.strayed = True
+            self._unasked.note(data, now, leg.quiet())
+            wire.came_unasked = True
             return b""
         if transaction.node.profile.noise_tolerant:
             kept = wire.without_noise(data)
             self._counters.noise_bytes += len(data) - len(kept)
-            self._strays.last_byte = now
+            self._unasked.last_byte = now
             if not kept:
                 return b""
             data = kept
@@ -304,11 +304,11 @@ class LineMachine:
         self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, step.value, now)
         if step.rest:
-            self._strays.note(step.rest, now, leg.quiet())
-        if step.rest or wire.strayed or (self._echo.owed and not answered):
+            self._unasked.note(step.rest, now, leg.quiet())
+        if step.rest or wire.came_unasked or (self._echo.owed and not answered):
             self._settle(now)
             return
-        self._strays.unanswered_one = None
+        self._unasked.unanswered_one = None
         self._release(leg.timing.turnaround if answered else 0.0, now)
 
     def _disbelieve(self, what: str, step: Done[Any], now: float) -> None:
@@ -316,7 +316,7 @@ class LineMachine:
         if self._wire.transaction is not None:
             self._wire.transaction.node.unheard = 0
         if step.rest:
-            self._strays.note(step.rest, now, self._leg.quiet())
+            self._unasked.note(step.rest, now, self._leg.quiet())
         self._attempt_failed(FrameError(what, send=step.send), now, doubted=True)
 
     def _attempt_failed(
@@ -327,18 +327,18 @@ class LineMachine:
         doubted: bool = False,
         bug: Exception | None = None,
     ) -> None:
-        transaction, leg, strays = self._wire.transaction, self._leg, self._strays
+        transaction, leg, unasked = self._wire.transaction, self._leg, self._unasked
         assert transaction is not None
         what = error.what
         if no_reply:
-            strays.unanswered(transaction.node, leg.end, leg.timing.lateness)
+            unasked.unanswered(transaction.node, leg.end, leg.timing.lateness)
             if what == NO_REPLY:
                 what = f"no reply within {leg.timing.window * 1000:g} ms"
             if self._echo.owed:
                 what += ", and no echo of the request: if the adapter has none, leave echo out"
         elif error.heard:
-            strays.blame(now)
-            strays.run[:] = error.heard
+            unasked.blame(now)
+            unasked.run[:] = error.heard
         spared = error.whole and not self._in_step.debts
         both = what is TWO_ANSWERS
         if both:
@@ -377,7 +377,7 @@ class LineMachine:
         wire = self._wire
         if failed and wire.exchange is not None:
             self._leg.give_up(wire.exchange.later)
-            self._leg.strayed(self._strays.last_byte)  # what came in place of the reply may have been it, damaged
+            self._leg.came_unasked(self._unasked.last_byte)  # what came in place of the reply may have been it, damaged
         wire.transaction = wire.exchange = self._trust.held = None
         self._counters.exchanges += 1
 
@@ -402,38 +402,38 @@ class LineMachine:
             self._counters.settles += 1
             self._enter(SETTLING, now)
         self._echo.forget()
-        last = max(self._strays.last_byte, self._leg.out)  # ours, too: who speaks on two wires does not hear
+        last = max(self._unasked.last_byte, self._leg.out)  # ours, too: who speaks on two wires does not hear
         silent = max(last + self._leg.quiet(), self._quarantine, now)
         goes_on = begun or self._leg.timing.silence is not None  # learned: what may still come is owed (R15)
         self._silent_at = silent if goes_on else max(silent, self._leg.past())
-        self._deadlines.line = self._strays.look_before(self._silent_at, now)
+        self._deadlines.line = self._unasked.look_before(self._silent_at, now)
 
     def _free(self, now: float) -> None:
         """A holdoff or a settle is over."""
         if self.state is SETTLING:
             self._leg.settled()
-            self._hear_out(self._strays.silent(), now)
-            if self._answer_stray(self._strays.reply_to_silence(), now):
+            self._hear_out(self._unasked.silent(), now)
+            if self._answer_unasked(self._unasked.reply_to_silence(), now):
                 return
             if self.noisy:
                 self.noisy = False
                 self.dispatcher.fault = None
                 self.events.append(LineChanged(LineChange.QUIET))
         self._enter(READY, now)
-        self._deadlines.line = self._strays.look_before(inf, now)
+        self._deadlines.line = self._unasked.look_before(inf, now)
         self._advance(now)
 
-    def _stray(self, data: bytes, now: float) -> None:
+    def _take_unasked(self, data: bytes, now: float) -> None:
         """Bytes that nobody asked for."""
-        strays = self._strays
-        strays.note(data, now, self._leg.quiet())
-        self._leg.strayed(now)
+        unasked = self._unasked
+        unasked.note(data, now, self._leg.quiet())
+        self._leg.came_unasked(now)
         if self.state is OFFLINE:
             return
         self._settle(now)
         if not self.noisy:
-            self._answer_stray(strays.reply_to(data), now)
-        if strays.babbling(now) and not self.noisy:
+            self._answer_unasked(unasked.reply_to(data), now)
+        if unasked.babbling(now) and not self.noisy:
             self.noisy = True
             self._counters.noisy += 1
             self.events.append(LineChanged(LineChange.NOISY))
@@ -442,11 +442,11 @@ class LineMachine:
 
     def _hear_out(self, run: bytes, now: float) -> None:
         """The line is silent, and this came before: whoever said it, and owed it, is alive (R11, R15)."""
-        node = self._trust.hear(self._wire, run, self._strays, now) if run else None
+        node = self._trust.hear(self._wire, run, self._unasked, now) if run else None
         if node is not None and node.health is DOWN:
             self.dispatcher.probes.alive(node, now)
 
-    def _answer_stray(self, send: bytes, now: float) -> bool:
+    def _answer_unasked(self, send: bytes, now: float) -> bool:
         """True if an answer was owed: then the line settles again, and what was said just now echoes."""
         if send:
             self._wire.say(send, now)
@@ -458,10 +458,10 @@ class LineMachine:
     def _strip_echo(self, data: bytes, now: float) -> bytes:
         """Take the echo of what was sent off the front, byte for byte; a mismatch is a collision."""
         rest = self._echo.strip(data)
-        self._strays.last_byte = now  # where the echo is lost, this may be another's byte that looks like it
+        self._unasked.last_byte = now  # where the echo is lost, this may be another's byte that looks like it
         if rest is None:
             self._counters.collisions += 1
-            self.events.append(Strayed(data, collision=True))
+            self.events.append(CameUnasked(data, collision=True))
             if self.state is EXCHANGE:
                 self._attempt_failed(FrameError(COLLIDED), now)
             else:
@@ -481,8 +481,8 @@ class LineMachine:
         self.noisy = False
         self._deadlines.line = inf
         self._echo.forget()
-        self._strays.answered()
-        self._strays.silent()
+        self._unasked.answered()
+        self._unasked.silent()
         if transaction is not None:
             self._wire.output.discard()
             self._trust.owe(self._wire, heard=True)

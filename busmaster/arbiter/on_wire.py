@@ -18,14 +18,14 @@ from busmaster.contract.exchange import Abandonable, Exchange, Expect, Step
 class OnWire:
     """Of one line. `transaction` and `exchange` are None while nothing is asked; `leg` and `output` outlive them."""
 
-    __slots__ = ("_deadlines", "_echo", "_urgent_waits", "exchange", "leg", "output", "strayed", "transaction")
+    __slots__ = ("_deadlines", "_echo", "_urgent_waits", "came_unasked", "exchange", "leg", "output", "transaction")
 
     def __init__(self, leg: Leg, echo: Echo, deadlines: Deadlines, urgent_waits: Callable[[], bool]) -> None:
         self.transaction: Transaction | None = None
         self.exchange: Exchange[Any] | None = None
         self.leg = leg
         self.output = Output(leg, echo)
-        self.strayed = False
+        self.came_unasked = False
         """Bytes came though no answer was due (a broadcast's)."""
         self._echo = echo
         self._deadlines = deadlines
@@ -35,7 +35,7 @@ class OnWire:
         """Say its request, and set the deadline of its first leg."""
         self.transaction = transaction
         self.exchange = exchange
-        self.strayed = False
+        self.came_unasked = False
         request, timing = exchange.request, exchange.timing
         due = self.leg.begin(timing, len(request), exchange.sizes.longest, now)
         self._deadlines.line = due if exchange.answered else self.leg.end + timing.turnaround
@@ -72,7 +72,7 @@ class OnWire:
         return follow(self.exchange, step, self._next_leg, now)
 
     def say(self, send: bytes, now: float) -> None:
-        """Say what closes an exchange, or answers a stray packet."""
+        """Say what closes an exchange, or answers a packet that nobody asked for."""
         self.output.add(send, now)
         self.leg.say(len(send), now)
 

@@ -85,7 +85,7 @@ class Probes:
 
     def _probe(self, node: NodeRecord, cost: float, now: float) -> Transaction:
         probe = Transaction(node, node.profile.probe, priority=BACKGROUND, retries=0, probe=True)
-        probe.paid = cost
+        probe.probe_cost = cost
         probe.queued = now
         node.counters.probes += 1
         self._running = probe

@@ -65,6 +65,7 @@ class Poll:
         "due",
         "finished",
         "fresh",
+        "group",
         "jitter",
         "missed",
         "name",
@@ -79,7 +80,6 @@ class Poll:
         "remaining",
         "results",
         "started",
-        "waiter",
         "wanted",
     )
 
@@ -97,7 +97,7 @@ class Poll:
         self.results: Sequence[Transaction] = ()
         self.fresh: Sequence[Transaction] | None = None
         self.preparation: Iterator[int] | None = None
-        self.waiter: Any = None
+        self.group: Any = None
         self.base = 0.0
         self.number = 0
         self.due = inf

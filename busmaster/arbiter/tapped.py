@@ -65,7 +65,7 @@ class TappedDispatcher(Dispatcher):
         attempt, self.attempt = self.attempt, None
         assert attempt is not None
         attempt.late = transaction.late
-        attempt.heard = transaction.heard or transaction.check
+        attempt.heard = transaction.wanted or transaction.check
         attempt.end(verdict, result, now)
         self.events.append(attempt)
 

@@ -67,16 +67,15 @@ class Transaction:
         "exchanges_ahead",
         "finish_by",
         "first_byte",
-        "heard",
         "idempotent",
         "last_byte",
         "late",
         "node",
-        "paid",
         "phase",
         "poll",
         "priority",
         "probe",
+        "probe_cost",
         "queued",
         "refusals",
         "refused_cycles",
@@ -87,10 +86,11 @@ class Transaction:
         "start_by",
         "started",
         "superseded",
+        "tag",
         "touches",
         "unsure",
         "value",
-        "waiter",
+        "wanted",
         "writes",
     )
 
@@ -105,7 +105,7 @@ class Transaction:
         probe: bool = False,
         finish_by: float = inf,
         *,
-        waiter: Any = None,
+        tag: Any = None,
         poll: Poll | None = None,
     ) -> None:
         self.node = node
@@ -122,7 +122,7 @@ class Transaction:
         """Its caller waits no longer, and nothing is sent from then on."""
         if finish_by < inf:
             self.start_by = min(start_by, nextafter(finish_by, -inf))
-        self.waiter = waiter
+        self.tag = tag
         self.poll = poll
         self.probe = probe
         self.check = False
@@ -139,8 +139,8 @@ class Transaction:
         self.attempts = 0
         self.retried = 0
         self.refusals = 0
-        self.paid = 0.0
-        self.heard = True
+        self.probe_cost = 0.0
+        self.wanted = True
         self.superseded = False
         self.unsure = False
         """An attempt was sent whose outcome is not known: it may have been carried out (R7)."""

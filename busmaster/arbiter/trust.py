@@ -9,7 +9,7 @@ from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.in_step import ANY_BYTE, Awaited, InStep
 from busmaster.arbiter.learned import LATE_SHARE
 from busmaster.arbiter.on_wire import OnWire
-from busmaster.arbiter.strays import QUIET, Strays
+from busmaster.arbiter.unasked import QUIET, UnaskedBytes
 from busmaster.contract.exchange import Done
 
 TWO_ANSWERS = "two answers came where one was due"
@@ -79,13 +79,13 @@ class Trust:
             transaction.node.unheard += not heard
             self._in_step.owe(keys, transaction.node, leg.end, over, awaited)
 
-    def hear(self, wire: OnWire, run: bytes, strays: Strays, now: float) -> NodeRecord | None:
+    def hear(self, wire: OnWire, run: bytes, unasked: UnaskedBytes, now: float) -> NodeRecord | None:
         """The line is silent, and this came before. Returns who owed it, if that is known."""
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
         if paid is not None and node is not None and node.learning is not None and paid.awaited is not None:
-            first_byte = strays.last_byte - (len(run) - 1) * wire.leg.byte_time - wire.leg.latency
+            first_byte = unasked.last_byte - (len(run) - 1) * wire.leg.byte_time - wire.leg.latency
             if first_byte - paid.asked > LATE_SHARE * paid.awaited.window:
                 node.learning.doubt()
-                strays.blame_for(node, paid.asked, first_byte)
+                unasked.blame_for(node, paid.asked, first_byte)
         return node

@@ -14,7 +14,7 @@ import anyio._backends._asyncio  # now, not when a line runs: it takes 30 ms
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineStatistics
-from busmaster.arbiter.events import Event, NodeChanged, PortFailed, Strayed
+from busmaster.arbiter.events import CameUnasked, Event, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import SLICE
 from busmaster.arbiter.state import LineState
@@ -85,8 +85,8 @@ class Bus:
         self._line = line = SharedLine(endpoint.name, self._arbiter)
         self.pump = line.pump = Pump(
             self._arbiter,
-            on_sample=lambda poll, transaction: poll.waiter.sampled(transaction),
-            on_cycle=lambda poll: poll.waiter.cycle_finished(),
+            on_sample=lambda poll, transaction: poll.group.sampled(transaction),
+            on_cycle=lambda poll: poll.group.cycle_finished(),
             on_event=self._on_event,
             on_written=line.touched,
             paced=lambda transport: is_paced(endpoint, transport),
@@ -359,7 +359,7 @@ class Bus:
         if isinstance(event, NodeChanged) and event.returning:
             self._start(self._run_hook(self._nodes[event.node.profile.name, event.node.address]))
         self._line.logbook.note(event, self.now())
-        if not isinstance(event, Strayed):
+        if not isinstance(event, CameUnasked):
             for stream in self._streams:
                 stream.put(event)
 

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Hashable
 
 from busmaster.arbiter.events import (
+    CameUnasked,
     Event,
     LatenessLowered,
     LatenessRaised,
@@ -13,7 +14,6 @@ from busmaster.arbiter.events import (
     LineChanged,
     NodeChanged,
     PortFailed,
-    Strayed,
 )
 from busmaster.arbiter.health import Health
 
@@ -54,9 +54,9 @@ class Logbook:
         elif isinstance(event, PortFailed):
             text = f"cannot reconnect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
             self._write((PortFailed, event.cause), logging.WARNING, text, now, event.bug)
-        elif isinstance(event, Strayed) and event.collision:
+        elif isinstance(event, CameUnasked) and event.collision:
             text = f"the echo differs from what was sent: a collision ({event.data.hex(' ')})"
-            self._write(Strayed, logging.WARNING, text, now)
+            self._write(CameUnasked, logging.WARNING, text, now)
 
     def failed_hook(self, label: str, error: Exception) -> None:
         """Write that a user's on_return hook raised."""

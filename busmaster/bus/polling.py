@@ -76,7 +76,7 @@ class PollGroup:
         self._merge = tuple(merge)
         self._refused: set[tuple[Node, Command[Any]]] = set()
         self._poll = Poll(name, period, phase=phase)
-        self._poll.waiter = self
+        self._poll.group = self
         self._points: dict[Point[Any], Node] = {}
         self._consumers: list[Stream[Snapshot]] = []
         self._tally = Tally(self._poll)
@@ -193,7 +193,7 @@ class PollGroup:
 
     def sampled(self, transaction: Transaction) -> None:
         """Make the samples of an exchange that is over. Runs in the pump: no user code but decoders."""
-        read: _Read = transaction.waiter
+        read: _Read = transaction.tag
         if self._cycle != self._poll.cycles:
             self._cycle = self._poll.cycles
             self._samples = read.blank.copy()
@@ -255,7 +255,7 @@ class PollGroup:
         for transaction in self._poll.results:
             if not self._line.written_since(transaction.node, transaction.started):
                 continue
-            for point, _ in transaction.waiter.points:
+            for point, _ in transaction.tag.points:
                 sample = self._samples[point]
                 fine = sample.quality in (Quality.GOOD, Quality.LATE)
                 if fine and sample.started is not None and self._line.is_stale(point, sample.started):
@@ -282,11 +282,11 @@ class PollGroup:
             return
         poll = self._poll
         asked = poll.results if poll.fresh is None else poll.fresh
-        if [transaction.waiter.points for transaction in asked] == [read.points for read in reads]:
+        if [transaction.tag.points for transaction in asked] == [read.points for read in reads]:
             return
         fresh = []
         for read in reads:
-            fresh.append(Transaction(read.node.record, read.served.command, waiter=read))
+            fresh.append(Transaction(read.node.record, read.served.command, tag=read))
             read.blank.update((point, None) for point, _ in read.points)
             yield 5
         set_members(poll, fresh, self._priority)

@@ -176,7 +176,7 @@ class Assembler:
         if not (unasked or exchange.released):
             self._mark(packet)
         if unasked or (not from_host and exchange.is_behind(frame)):
-            packet.outcome = Outcome.STRAY
+            packet.outcome = Outcome.UNASKED
             packet.comment = self._straggler()
         elif not from_host:
             exchange.last, exchange.answer = frame, packet

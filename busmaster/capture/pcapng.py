@@ -53,14 +53,14 @@ class CaptureError(ValueError):
 
 
 class Outcome(enum.IntEnum):
-    """How an exchange ended, or that a frame is of none (STRAY). Those from DOUBTED on are a master's alone."""
+    """How an exchange ended, or that a frame is of none (UNASKED). Those from DOUBTED on are a master's alone."""
 
     NONE = 0
     OK = 1
     NO_REPLY = 2
     GARBLED = 3
     REFUSED = 4
-    STRAY = 5
+    UNASKED = 5
     DOUBTED = 6
     """A good answer came and was not believed, since it may have been another request's."""
     SPOILT = 7

@@ -1,7 +1,7 @@
 """A recorded line, run through the master's readers of today: what would they make of the same bytes?
 
-The clock is not replayed, so what a reply's lateness decided is not decided again: strays stay strays, and where
-nothing came nothing comes.
+The clock is not replayed, so what a reply's lateness decided is not decided again: unasked bytes stay
+unasked, and where nothing came nothing comes.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class _Run:
     def note(self, heard: _Heard) -> None:
         """Take the recorded outcome and values."""
         packet = heard.packet
-        if packet.outcome not in (Outcome.NONE, Outcome.STRAY):
+        if packet.outcome not in (Outcome.NONE, Outcome.UNASKED):
             self._recorded = Result(packet.outcome, packet.comment.removesuffix(" (late)"))
         if heard.frame.kind is Kind.VALUE and not heard.frame.fault:
             self._values += numbers_in(heard.frame.value)
@@ -221,7 +221,7 @@ def replay(packets: Iterable[Packet]) -> Iterator[Replayed]:
     for place, one in enumerate(heard):
         of_run = run is not None and one.exchange == run.asked.exchange
         if one.packet.direction is not Direction.HOST:
-            if run is not None and of_run and (any(one.exchange) or one.packet.outcome is not Outcome.STRAY):
+            if run is not None and of_run and (any(one.exchange) or one.packet.outcome is not Outcome.UNASKED):
                 run.node_says(one)
             continue
         if (run is not None and of_run and run.host_says(one)) or not one.is_request or (of_run and any(one.exchange)):
@@ -286,7 +286,7 @@ def recorded_outcome(heard: Sequence[_Heard], place: int) -> Outcome:
     for follower in heard[place + 1 :]:
         if follower.is_request:
             break
-        if follower.packet.outcome is not Outcome.STRAY:
+        if follower.packet.outcome is not Outcome.UNASKED:
             outcome = follower.packet.outcome or outcome
     return outcome
 

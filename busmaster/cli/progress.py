@@ -34,7 +34,7 @@ class Bar:
             self._bar.update(self._task, advance=1, refresh=True)
 
     @contextmanager
-    def aside(self) -> Iterator[None]:
+    def hidden(self) -> Iterator[None]:
         """The bar is gone while a result is printed."""
         self._hide()
         try:

@@ -43,7 +43,7 @@ async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool
                     value, outcome = answer
                     number = connection.node_number(node.address)
                     found = json_line(node=number, value=json_value(value), answer=outcome)
-                    with bar.aside():
+                    with bar.hidden():
                         emit(found if as_json else f"{node.address} {outcome}")
                 bar.advance()
 

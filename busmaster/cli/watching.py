@@ -201,7 +201,7 @@ class Watch:
     def summarise(self) -> None:
         """On standard error: cycles, missed, achieved period, utilisation; a line for each node."""
         counts = self.bus.statistics()
-        if self.bus.state is LineState.SETTLING and not (counts.exchanges or counts.stray_bytes):
+        if self.bus.state is LineState.SETTLING and not (counts.exchanges or counts.unasked_bytes):
             note("nothing was asked: a new line rests until replies to an earlier master are past; let it run longer")
         for group in map(self._group, self.groups):
             text = f"{group.name}: {group.cycles} cycles, {group.missed} missed"

@@ -18,7 +18,7 @@ from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
 from busmaster.contract.arguments import guess, is_decimal, meant
 from busmaster.errors import InvalidCommand
-from busmaster.outputs.fan import Fan
+from busmaster.outputs.distributor import Distributor
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
 from busmaster.transport.endpoints import Endpoint
@@ -48,7 +48,7 @@ class ConfiguredLine:
         self.groups: dict[str, PollGroup] = {}
         self._points: dict[str, NamedPoint] = {}
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
-        self.outputs = Fan(self.bus, tell)
+        self.outputs = Distributor(self.bus, tell)
         if outputs:
             self._add_outputs()
 

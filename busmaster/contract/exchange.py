@@ -30,7 +30,7 @@ class Sizes:
 
 
 @dataclass(frozen=True, slots=True)
-class Leg:
+class LaterLeg:
     """One later leg of an undisturbed exchange, for planning: what the host says first, then what is awaited."""
 
     timing: ReplyTiming
@@ -63,8 +63,8 @@ class Expect:
 class Done(Generic[T_co]):
     """The reply is complete.
 
-    `rest` is what came after the reply: those bytes are strays and the line settles. `send` is the host's closing ACK
-    (MSC): the line is free when it has left.
+    `rest` is what came after the reply: nobody asked for those bytes and the line settles. `send` is the host's closing
+    ACK (MSC): the line is free when it has left.
     """
 
     value: T_co
@@ -109,7 +109,7 @@ class Exchange(Protocol[T_co]):
         ...
 
     @property
-    def later(self) -> Sequence[Leg]:
+    def later(self) -> Sequence[LaterLeg]:
         """Return the legs after the first, when nothing goes wrong. Empty for most protocols."""
         ...
 
@@ -214,7 +214,7 @@ __all__ = [
     "Exchange",
     "Expect",
     "FrameError",
-    "Leg",
+    "LaterLeg",
     "Listener",
     "Need",
     "Refused",

@@ -15,9 +15,9 @@ local HCP, HCP2, MICROFLEX, MSC, MENTOR, DC104, MODBUS, CT_ANSI = 1, 2, 3, 4, 5,
 local TITLES = { [0] = "unknown", "HCP", "HCP2", "MicroFlex", "MSC", "Mentor", "DC104", "Modbus", "CT-ANSI" }
 local DIRECTIONS = { [0] = "unknown", "node to host", "host to node" }
 local OUTCOMES = {
-  [0] = "-", "ok", "no reply", "garbled", "refused", "stray", "not believed", "not read", "cut off",
+  [0] = "-", "ok", "no reply", "garbled", "refused", "unasked", "not believed", "not read", "cut off",
 }
-local NO_REPLY, STRAY, DOUBTED = 2, 5, 6
+local NO_REPLY, UNASKED, DOUBTED = 2, 5, 6
 local SHORT_COMMANDS = { [NAK] = "again", [ACK] = "next", [BS] = "previous" }
 local ACKNOWLEDGEMENTS = { [ACK] = "ACK", [NAK] = "NAK", [EOT] = "EOT" }
 
@@ -59,7 +59,7 @@ local e = {
   missing = ProtoExpert.new("busmaster.eot", "No such parameter (EOT)", expert.group.RESPONSE_CODE, expert.severity.WARN),
   silent = ProtoExpert.new("busmaster.silent", "No reply", expert.group.SEQUENCE, expert.severity.WARN),
   echo = ProtoExpert.new("busmaster.echo", "Not what was asked", expert.group.SEQUENCE, expert.severity.WARN),
-  stray = ProtoExpert.new("busmaster.stray", "Nobody asked for this", expert.group.SEQUENCE, expert.severity.NOTE),
+  unasked = ProtoExpert.new("busmaster.unasked", "Nobody asked for this", expert.group.SEQUENCE, expert.severity.NOTE),
   unused = ProtoExpert.new("busmaster.unused", "Not taken for an answer", expert.group.SEQUENCE, expert.severity.WARN),
 }
 line.experts = e
@@ -507,7 +507,7 @@ end
 local function add_outcome(p, outcome, whole, size)
   if size > 0 and not whole then p.tree:add_proto_expert_info(e.broken) end
   if outcome == NO_REPLY then p.tree:add_proto_expert_info(e.silent) end
-  if outcome == STRAY then p.tree:add_proto_expert_info(e.stray) end
+  if outcome == UNASKED then p.tree:add_proto_expert_info(e.unasked) end
   if outcome >= DOUBTED then
     p.tree:add_proto_expert_info(e.unused, "Not taken for an answer: " .. (OUTCOMES[outcome] or ""))
   end
@@ -546,7 +546,7 @@ function line.dissector(tvb, pinfo, root)
   if not whole then p.kind, p.say = nil, nil end
   local in_frame = p.node
   if not in_frame and tvb(4, 2):uint() ~= NO_NODE then p.node = tvb(4, 2):uint() end
-  local request = outcome ~= STRAY and link(p, pinfo)
+  local request = outcome ~= UNASKED and link(p, pinfo)
   if request then add_link(p, pinfo, request) end
   if p.node and not in_frame then tree:add(f.node, tvb(4, 2), p.node):set_generated() end
   if p.leg then tree:add(f.leg, p.leg):set_generated() end

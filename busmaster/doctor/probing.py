@@ -18,8 +18,8 @@ import anyio
 
 from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import Mark
-from busmaster.arbiter.strays import QUIET
 from busmaster.arbiter.tap import Attempt, Tap, Verdict
+from busmaster.arbiter.unasked import QUIET
 from busmaster.contract.driver import Driver
 from busmaster.contract.exchange import Command, Exchange, FrameError
 from busmaster.contract.profile import Profile

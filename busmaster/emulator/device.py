@@ -159,7 +159,7 @@ class Device(ABC):
     def disguise(self, reply: bytes, chance: Chance) -> bytes:
         """The same reply as if for another element, parameter or unit, with a right checksum. A fault asks for it.
 
-        Unchanged if it carries no such thing (a lone ACK). With an oracle, its value is another node's.
+        Unchanged if it carries no such thing (a lone ACK). With an traceable, its value is another node's.
         """
         return reply
 

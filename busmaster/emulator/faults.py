@@ -66,7 +66,7 @@ class Faults:
     trailing: float = 0.0
     """A few noise bytes glued to its end: never one of `NO_NOISE`."""
     forged: float = 0.0
-    """A stray ACK, NAK or EOT in front of it."""
+    """An unasked ACK, NAK or EOT in front of it."""
     babble: float = 0.0
     """A burst of up to 60 noise bytes at some moment of the next 100 ms."""
     split: float = 0.0

@@ -12,8 +12,8 @@ Time never runs backwards; calls that come early, or twice, do nothing.
 Theory of operation. A *talk* is a run of contiguous bytes by one talker. `_active` is the talk on the wire, or the next
 one to be; `_pending` holds those that start later. A talk that nobody disturbs stays one piece: it is heard as a whole
 when its last byte has ended, and given to the host in part before that if the host asks before. Only a talk that
-starts while another is on the wire is taken apart: both go into a `Wave` of bits, which the devices hear when all of it
-has passed. With `paced` False bytes take no time, and nothing ever overlaps.
+starts while another is on the wire is taken apart: both go into a `Collision` of bits, which the devices hear when all
+of it has passed. With `paced` False bytes take no time, and nothing ever overlaps.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 
 from busmaster.contract.profile import LineSettings
-from busmaster.emulator.audience import Audience
+from busmaster.emulator.attached_devices import AttachedDevices
 from busmaster.emulator.chance import Chance, NoChance
+from busmaster.emulator.collision import Collision
 from busmaster.emulator.device import NEVER, Device
 from busmaster.emulator.disturbance import Said, distort, flipped
 from busmaster.emulator.faults import Faults
-from busmaster.emulator.wave import Wave
 
 PIECE = 0.005
 """Seconds of a frame that a port hands over at once."""
@@ -48,7 +48,7 @@ class Echo:
 class Talk:
     """Contiguous bytes by one talker (None: the host). `given` counts those that the host already has."""
 
-    __slots__ = ("chunk", "clean", "data", "end", "given", "start", "talker", "wave")
+    __slots__ = ("chunk", "clean", "collision", "data", "end", "given", "start", "talker")
 
     def __init__(self, talker: Device | None, start: float, end: float, data: bytes, clean: bool, chunk: int) -> None:
         self.talker = talker
@@ -58,7 +58,7 @@ class Talk:
         self.clean = clean
         self.chunk = chunk
         self.given = 0
-        self.wave: Wave | None = None
+        self.collision: Collision | None = None
 
 
 class Line:
@@ -113,7 +113,7 @@ class Line:
         self._inbox = b""
         self._arrived = 0.0
         self._arrivals: deque[tuple[float, bytes]] = deque()
-        self._audience = Audience(self._say, self.chance, self.tau)
+        self._attached = AttachedDevices(self._say, self.chance, self.tau)
         for device in devices:
             self.add(device)
 
@@ -121,14 +121,14 @@ class Line:
 
     @property
     def devices(self) -> list[Device]:
-        return self._audience.devices
+        return self._attached.devices
 
     def add(self, device: Device) -> None:
         """Two devices may have one address: then both answer, and collide."""
-        self._audience.add(device)
+        self._attached.add(device)
 
     def remove(self, device: Device) -> None:
-        self._audience.remove(device)
+        self._attached.remove(device)
 
     def device(self, address: int) -> Device:
         """The first device with that address. Raises KeyError."""
@@ -140,7 +140,7 @@ class Line:
     def restart(self, device: Device, now: float) -> None:
         """Its power fails and is back at once: what was in its RAM is lost."""
         self._advance(now)
-        self._audience.restart(device, now)
+        self._attached.restart(device, now)
 
     def cut(self, now: float, *devices: Device) -> None:
         """The wire to `devices` (to all of them, by default) breaks: what they say or hear ends there and then."""
@@ -150,10 +150,10 @@ class Line:
         talk = self._active
         if talk is not None and talk.start < now:
             self._give(talk, now)
-            if talk.talker is None and talk.wave is None:
-                self._audience.hear(lost, talk.data[: self._count(talk, now)], talk.start, now)
-        self._audience.cut_off |= frozenset(lost)
-        if talk is not None and (talk.talker in lost or talk.wave is not None):
+            if talk.talker is None and talk.collision is None:
+                self._attached.hear(lost, talk.data[: self._count(talk, now)], talk.start, now)
+        self._attached.cut_off |= frozenset(lost)
+        if talk is not None and (talk.talker in lost or talk.collision is not None):
             self._active = None
         self._pending = [entry for entry in self._pending if entry[2].talker not in lost]
         heapify(self._pending)
@@ -167,7 +167,7 @@ class Line:
         if talk is not None and talk.talker is None and talk.start < now:
             self._mending = talk
         else:
-            self._audience.cut_off = frozenset()
+            self._attached.cut_off = frozenset()
 
     # What the host does
 
@@ -195,15 +195,15 @@ class Line:
         """When something happens next, be it within the line, or has happened unnoticed; NEVER if nothing will."""
         if self._inbox:
             return self._arrived
-        when = self._audience.wakeup
+        when = self._attached.wakeup
         talk = self._active
         if talk is not None:
             end = talk.end
             chunk = talk.chunk or self.chunk
             if self.prompt:
                 chunk = min(chunk or self._piece, self._piece) if talk.given else 1
-            if talk.wave is not None:
-                end = min(end, self._next_byte(talk.wave, talk.given))
+            if talk.collision is not None:
+                end = min(end, self._next_byte(talk.collision, talk.given))
             elif chunk and self._heard_at_once(talk):
                 end = min(end, talk.start + (talk.given + chunk) * self.tau)
             if self._pending and self._pending[0][0] < talk.end - self._rounding:
@@ -229,14 +229,14 @@ class Line:
                 self._join(Talk(talker, begin, begin + len(some) * self.tau, some, clean, chunk))
 
     def _join(self, talk: Talk) -> None:
-        if talk.talker in self._audience.cut_off:
+        if talk.talker in self._attached.cut_off:
             return
         active = self._active
         if active is None:
             self._activate(talk)
             return
         if talk.start < active.start:
-            active.wave = None
+            active.collision = None
             self._activate(talk)
             talk = active
         self._order += 1
@@ -245,13 +245,13 @@ class Line:
     def _activate(self, talk: Talk) -> None:
         self._active = talk
         if talk.start < self._held_until and talk.talker is not self._holder:
-            talk.wave = Wave(self.settings, talk.start, self.chance)
-            talk.wave.add(talk.start, b"", self._holder, self._held_until - talk.start)
-            talk.wave.add(talk.start, talk.data, talk.talker, self._hold(talk))
+            talk.collision = Collision(self.settings, talk.start, self.chance)
+            talk.collision.add(talk.start, b"", self._holder, self._held_until - talk.start)
+            talk.collision.add(talk.start, talk.data, talk.talker, self._hold(talk))
 
     def _advance(self, now: float) -> None:
         """Lets happen, in order, all that happens up to `now`."""
-        audience = self._audience
+        attached = self._attached
         while True:
             talk = self._active
             due = NEVER if talk is None else talk.end
@@ -259,10 +259,10 @@ class Line:
             overlap = bool(pending) and pending[0][0] < due - self._rounding
             if overlap:
                 due = pending[0][0]
-            if audience.wakeup < due:
-                if audience.wakeup > now:
+            if attached.wakeup < due:
+                if attached.wakeup > now:
                     return
-                audience.wake()
+                attached.wake()
             elif due > now or talk is None:
                 return
             elif overlap:
@@ -272,10 +272,10 @@ class Line:
 
     def _collide(self, talk: Talk, other: Talk) -> None:
         self.collisions += 1
-        if talk.wave is None:
-            talk.wave = Wave(self.settings, talk.start, self.chance)
-            talk.wave.add(talk.start, talk.data, talk.talker, self._hold(talk))
-        talk.wave.add(other.start, other.data, other.talker, self._hold(other))
+        if talk.collision is None:
+            talk.collision = Collision(self.settings, talk.start, self.chance)
+            talk.collision.add(talk.start, talk.data, talk.talker, self._hold(talk))
+        talk.collision.add(other.start, other.data, other.talker, self._hold(other))
         talk.end = max(talk.end, other.end)
 
     def _finish(self, talk: Talk) -> None:
@@ -287,15 +287,15 @@ class Line:
         if self._pending:
             self._activate(heappop(self._pending)[2])
         self._reach_host(talk)
-        if talk.wave is not None:
-            self._audience.scatter(talk.wave, talk.end)
+        if talk.collision is not None:
+            self._attached.scatter(talk.collision, talk.end)
         elif talker is None and talk.clean:
-            self._audience.request(talk.data, talk.start, talk.end)
+            self._attached.request(talk.data, talk.start, talk.end)
         else:
-            self._audience.overhear(talk.data, talk.start, talk.end, talker, talk.clean)
+            self._attached.overhear(talk.data, talk.start, talk.end, talker, talk.clean)
         if talk is self._mending:
             self._mending = None
-            self._audience.cut_off = frozenset()
+            self._attached.cut_off = frozenset()
 
     def _hold(self, talk: Talk) -> float:
         return self.turnaround if talk.talker is None else talk.talker.turnaround
@@ -312,8 +312,8 @@ class Line:
 
     def _give(self, talk: Talk, now: float) -> None:
         """What has passed of it reaches the host."""
-        if talk.wave is not None:
-            data = self._host_hears(talk.wave, now)[talk.given :]
+        if talk.collision is not None:
+            data = self._host_hears(talk.collision, now)[talk.given :]
         elif self._heard_at_once(talk):
             data = talk.data[talk.given : self._count(talk, now)]
         else:
@@ -323,8 +323,8 @@ class Line:
 
     def _reach_host(self, talk: Talk) -> None:
         """The rest of it reaches the host."""
-        if talk.wave is not None:
-            self._arrive(self._host_hears(talk.wave, NEVER)[talk.given :], talk.end)
+        if talk.collision is not None:
+            self._arrive(self._host_hears(talk.collision, NEVER)[talk.given :], talk.end)
         elif talk.talker is not None:
             self._arrive(talk.data[talk.given :], talk.end)
         elif self.echo is not None:
@@ -333,12 +333,12 @@ class Line:
                 data = flipped(data, self.chance, 1)
             self._arrive(data, talk.end + self.echo.delay)
 
-    def _host_hears(self, wave: Wave, until: float) -> bytes:
-        return bytes(byte for _, byte in wave.heard(None, until, echo=self.echo is not None))
+    def _host_hears(self, collision: Collision, until: float) -> bytes:
+        return bytes(byte for _, byte in collision.heard(None, until, echo=self.echo is not None))
 
-    def _next_byte(self, wave: Wave, given: int) -> float:
+    def _next_byte(self, collision: Collision, given: int) -> float:
         """When the host has heard the next byte of several talkers, whom it hears one byte at a time."""
-        begins = [start for start, _ in wave.heard(None, echo=self.echo is not None)]
+        begins = [start for start, _ in collision.heard(None, echo=self.echo is not None)]
         return begins[given] + self.tau if given < len(begins) else NEVER
 
     def _arrive(self, data: bytes, when: float) -> None:

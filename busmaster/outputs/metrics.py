@@ -42,7 +42,7 @@ COUNTS = {
 LINE_COUNTS = {
     "exchanges": "Exchanges on the line",
     "cancelled": "Transactions whose callers had gone",
-    "stray_bytes": "Bytes that nobody had asked for",
+    "unasked_bytes": "Bytes that nobody had asked for",
     "tainted": "Replies that came sooner than the baud rate allows",
     "collisions": "Echoes that differ from what was sent",
     "checks": "Reads that proved the line to be in step",

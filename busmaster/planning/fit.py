@@ -181,7 +181,7 @@ class _Draft:
         self.unanswered = 0.0
         self.could_save = 0.0
         self.poll = Poll(group.name, group.period, phase=group.phase)
-        self.poll.waiter = self
+        self.poll.group = self
         self.finished = 0
         self.total = self.longest = 0.0
 
@@ -272,7 +272,7 @@ def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
         """Have what is due wait; returns when more will be."""
         while (due := schedule.next_due()) <= now:
             for poll in schedule.release(now):
-                draft: _Draft = poll.waiter
+                draft: _Draft = poll.group
                 yield 4 + len(draft.costs)
                 queue = background if draft.group.priority is Priority.BACKGROUND else waiting
                 poll.remaining = len(draft.costs)

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 from busmaster.arbiter.backlog import SHARE
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.schedule import Priority, line_time
-from busmaster.arbiter.strays import NOISY_AFTER, QUIET
+from busmaster.arbiter.unasked import NOISY_AFTER, QUIET
 from busmaster.contract.exchange import Command, Exchange
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
     from busmaster.emulator.device import Delay, Device
-    from busmaster.emulator.oracle import Oracle
+    from busmaster.emulator.traceable import TraceableMemory
 
 PACKAGE = "busmaster.protocols"
 GROUP = "busmaster.protocols"
@@ -66,7 +66,7 @@ def make_device(
     address: int,
     *,
     delay: Delay | None = None,
-    oracle: Oracle | None = None,
+    traceable: TraceableMemory | None = None,
     lively: bool = False,
     **options: Any,
 ) -> Device:
@@ -77,7 +77,7 @@ def make_device(
     from busmaster.emulator.device import Delay
 
     delay = Delay() if delay is None else delay
-    return find(name).make_device(address, delay=delay, oracle=oracle, lively=lively, **options)
+    return find(name).make_device(address, delay=delay, traceable=traceable, lively=lively, **options)
 
 
 def _own() -> Iterator[Protocol]:

@@ -56,10 +56,10 @@ class Option:
 class DeviceMaker(typing.Protocol):
     """Makes an emulated device.
 
-    It is called with an address, `delay`, `oracle`, `lively`, and those of `NodeKind.emulated` that were said. `delay`
-    is a Delay. `oracle` is None or an Oracle whose every value the device holds; its modulus must be one that the
-    protocol can carry. `lively` is True if something is to move on it from the start. Raises InvalidCommand for an
-    address or an option that the device cannot have.
+    It is called with an address, `delay`, `traceable`, `lively`, and those of `NodeKind.emulated` that were said.
+    `delay` is a Delay. `traceable` is None or a TraceableMemory whose every value the device holds; its modulus must be
+    one that the protocol can carry. `lively` is True if something is to move on it from the start. Raises
+    InvalidCommand for an address or an option that the device cannot have.
     """
 
     def __call__(self, address: int, /, *args: Any, **options: Any) -> Device: ...

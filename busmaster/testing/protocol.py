@@ -49,7 +49,7 @@ from busmaster.testing.damage import MANY_BYTES, bytewise, flips, garbage_chunks
 
 FINDINGS_EACH = 3
 """How many findings of one kind a case may add: the rest would only repeat them."""
-STRAYS = b"\x00\x7f"
+UNASKED = b"\x00\x7f"
 
 
 def check_protocol(
@@ -181,8 +181,8 @@ class _Kit:
                 if parts.said != whole.said or not _alike(parts.ending, whole.ending):
                     yield f"{case}: {run.hex(' ')} gives {whole.ending}, and {parts.ending} as {_hex(chunks)}"
             if whole.ending is not None and whole.ending.delivered:
-                more = self.hear(case, *before, run + STRAYS).ending
-                if more is None or more.rest != STRAYS:
+                more = self.hear(case, *before, run + UNASKED).ending
+                if more is None or more.rest != UNASKED:
                     yield f"{case}: what follows the reply in the same chunk is not handed back: {more}"
 
     def check_truncations(self, case: Case) -> Iterator[str]:

@@ -83,7 +83,7 @@ class Pump(asyncio.Protocol):
         """Submit it; the future gets its value or its error."""
         assert self._loop is not None
         future: asyncio.Future[Any] = self._loop.create_future()
-        transaction.waiter = future
+        transaction.tag = future
         if self.arbiter.submit(transaction, self.clock()):
             self.turn()
         return future
@@ -108,7 +108,7 @@ class Pump(asyncio.Protocol):
             if type(event) is Transaction:
                 if event.writes and event.attempts:
                     self._on_written(event, event.ended_at)
-                future = event.waiter
+                future = event.tag
                 if future is None or future.done():
                     pass  # nobody waits for it any more
                 elif event.error is None:
@@ -208,7 +208,7 @@ class Pump(asyncio.Protocol):
         transaction = late.transaction
         if transaction.writes:
             self._on_written(transaction, self.clock())
-        future = transaction.waiter
+        future = transaction.tag
         if future is not None and not future.done():
             future.set_exception(late.error)
 

@@ -29,9 +29,9 @@ from serial.rs485 import RS485Settings
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.transport import holders, identity
-from busmaster.transport.aside import aside
 from busmaster.transport.identity import Identity, identify, is_pty, resolve
 from busmaster.transport.marks import ESCAPE, MarkingSerial, Unescape, stop_marking, taker_of_marked_bytes
+from busmaster.transport.own_thread import in_own_thread
 
 if TYPE_CHECKING:
 
@@ -122,7 +122,7 @@ class SerialPort:
         self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
     ) -> PortTransport:
         """Open and configure it in a thread. Raises LineDown, after OPEN_DEADLINE at the latest."""
-        opening = aside(functools.partial(_open, self, only), f"open {self.path}")
+        opening = in_own_thread(functools.partial(_open, self, only), f"open {self.path}")
         try:
             async with asyncio.timeout(OPEN_DEADLINE):
                 device, paced, found = await asyncio.wrap_future(opening)
@@ -263,7 +263,7 @@ class PortTransport(_SerialTransport):
         self._remove_writer()
         self._write_buffer.clear()
         release = functools.partial(_release, self._serial, self._port.exclusive)
-        return aside(release, f"close {self._port.path}")
+        return in_own_thread(release, f"close {self._port.path}")
 
     def _report(self, cause: LineDown | None) -> None:
         if self._deadline is not None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Generic, NoReturn, TypeVar
 
-from busmaster.contract.exchange import MORE, Done, Expect, FrameError, Leg, Need, Sizes, no_reply
+from busmaster.contract.exchange import MORE, Done, Expect, FrameError, LaterLeg, Need, Sizes, no_reply
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import Refused
 from busmaster.wire.characters import made_of
@@ -69,7 +69,7 @@ class SingleLeg:
     __slots__ = ("request", "timing")
 
     refusals: ClassVar[Mapping[int, type[Refused]]] = _REFUSALS
-    later: ClassVar[Sequence[Leg]] = ()
+    later: ClassVar[Sequence[LaterLeg]] = ()
     closing: ClassVar[int] = 0
     answered: ClassVar[bool] = True
 

@@ -238,7 +238,7 @@ def saturated(bench: Bench, count: int, *, pause: float = 0.0) -> list[str]:
 
 
 def test_r15_after_32_answers_alike_without_a_pause_an_unlike_one_is_asked() -> None:
-    """One doubled reply would leave every later value wrong, with nothing owed and no stray byte to be seen."""
+    """One doubled reply would leave every later value wrong, with nothing owed and no unasked byte to be seen."""
     sent = saturated(Bench(), 4 * MOST_ALIKE)
     unlike = [place for place, request in enumerate(sent) if request != request_of(1)]
     assert unlike

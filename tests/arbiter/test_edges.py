@@ -237,7 +237,7 @@ def test_r3_where_the_ack_was_lost_its_packet_is_waited_for_from_the_requests_en
     assert bench.until_sent() == pytest.approx(MSC_REQUEST + packet + MSC_TAU)
 
 
-def test_r3_a_stray_byte_may_have_been_the_lost_ack_and_its_packet_is_waited_for_anew() -> None:
+def test_r3_an_unasked_byte_may_have_been_the_lost_ack_and_its_packet_is_waited_for_anew() -> None:
     bench, timings = msc_line()
     node = bench.node(1, msc.PROFILE, timings)
     bench.wait(2.0)

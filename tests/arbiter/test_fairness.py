@@ -112,7 +112,7 @@ def test_r7_writes_to_one_node_never_overtake_each_other_in_any_story(story: lis
         check()
     assert all(t.phase is Phase.ENDED for t in asked), "R8"
     for old, _ in overtaken:
-        assert not old.heard or type(old.error) is (WriteUnconfirmed if old.attempts else Superseded), "R7"
+        assert not old.wanted or type(old.error) is (WriteUnconfirmed if old.attempts else Superseded), "R7"
     assert not any(node.writes for node in desk.nodes)
     assert len(desk.dispatcher.backlog) == 0
 

@@ -116,7 +116,7 @@ def test_r15_a_retry_owes_to_itself() -> None:
 
 
 @pytest.mark.parametrize("delay", [0.102, 0.149])
-def test_r15_a_debt_is_paid_by_its_own_reply_as_a_stray(delay: float) -> None:
+def test_r15_a_debt_is_paid_by_its_own_reply_as_unasked_bytes(delay: float) -> None:
     bench = Bench()
     node = up(bench)
     bench.ask(node, retries=0)

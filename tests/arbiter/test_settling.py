@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from busmaster.arbiter.events import LatenessRaised, LineChange, LineChanged, Strayed
+from busmaster.arbiter.events import CameUnasked, LatenessRaised, LineChange, LineChanged
 from busmaster.arbiter.state import LineState
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import GarbledReply, LineNoisy, Refused
@@ -80,14 +80,14 @@ def test_r3_bytes_after_a_reply_settle_but_the_value_stands() -> None:
     assert bench.until_sent() == pytest.approx(LATENESS - 0.002)
 
 
-def test_r3_strays_on_an_idle_line_settle_too() -> None:
+def test_r3_unasked_bytes_on_an_idle_line_settle_too() -> None:
     bench = Bench()
     node = bench.node()
     bench.hear("55")
     bench.ask(node)
     assert bench.sent() == ""
     assert bench.until_sent() == pytest.approx(QUIET)
-    assert bench.arbiter.statistics(bench.now).stray_bytes == 1
+    assert bench.arbiter.statistics(bench.now).unasked_bytes == 1
 
 
 def test_r3_a_straggler_raises_its_nodes_lateness() -> None:
@@ -229,7 +229,7 @@ def test_an_echo_that_differs_is_a_collision() -> None:
     bench.hear("07 30 31 02 30 33", after=0.010)
     assert isinstance(read.error, GarbledReply)
     assert bench.arbiter.statistics(bench.now).collisions == 1
-    assert any(isinstance(e, Strayed) and e.collision for e in bench.events)
+    assert any(isinstance(e, CameUnasked) and e.collision for e in bench.events)
 
 
 def test_an_echo_that_never_comes_is_named_in_the_error() -> None:

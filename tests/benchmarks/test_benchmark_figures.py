@@ -10,12 +10,12 @@ import pytest
 
 from benchmarks import __main__ as command_line
 from benchmarks import codecs, modbus_masters
-from benchmarks.asks import hcp2_asks, msc_asks, wire_time
 from benchmarks.harness import Claim, Options, Table, Timings, quantile
 from benchmarks.late_replies import LATE
 from benchmarks.lines import Kind, Lines
 from benchmarks.loop_stalls import Hold, Watch
-from benchmarks.masters import Ask, Bare, Master, Ours, Streams
+from benchmarks.masters import Bare, Master, Ours, Question, Streams
+from benchmarks.questions import hcp2_questions, msc_questions, wire_time
 from benchmarks.simulation import Simulation
 from benchmarks.trials import ours_in_virtual_time
 from busmaster.contract.exchange import Done
@@ -30,24 +30,26 @@ QUICK = Options(quick=True)
 
 @pytest.mark.parametrize("kind", list(Kind))
 def test_ours_and_the_bare_loop_get_the_values_that_the_other_end_has(kind: Kind) -> None:
-    asks = hcp2_asks()
+    questions = hcp2_questions()
 
     async def run() -> list[int]:
-        masters: list[Master] = [Ours(hcp2.PROFILE, asks), Bare(asks), Streams(asks)]
-        with Lines(len(masters), {ask.request: ask.reply for ask in asks}, kind=kind) as lines:
+        masters: list[Master] = [Ours(hcp2.PROFILE, questions), Bare(questions), Streams(questions)]
+        with Lines(len(masters), {ask.request: ask.reply for ask in questions}, kind=kind) as lines:
             wrong = []
             for master, port in zip(masters, lines.ports, strict=True):
                 await master.open(port)
-                wrong.append(await master.run(len(asks)))
+                wrong.append(await master.run(len(questions)))
                 await master.close()
         return wrong
 
     assert asyncio.run(run()) == [0, 0, 0]
 
 
-@pytest.mark.parametrize(("profile", "asks"), [(hcp2.PROFILE, hcp2_asks()), (msc.PROFILE, msc_asks())])
-def test_the_table_of_the_other_end_is_what_our_reader_takes_for_the_value(profile: Profile, asks: list[Ask]) -> None:
-    for ask in asks:
+@pytest.mark.parametrize(("profile", "questions"), [(hcp2.PROFILE, hcp2_questions()), (msc.PROFILE, msc_questions())])
+def test_the_table_of_the_other_end_is_what_our_reader_takes_for_the_value(
+    profile: Profile, questions: list[Question]
+) -> None:
+    for ask in questions:
         exchange = ask.command.open(ask.address, profile.timings)
         step = exchange.feed(b"".join(ask.reply))
         while not isinstance(step, Done):
@@ -82,26 +84,28 @@ def test_a_hold_of_the_loop_is_seen_and_what_the_collector_took_is_told_apart() 
 
 
 def test_a_wrong_value_is_counted() -> None:
-    asks = [replace(ask, value=ask.value + 1) for ask in hcp2_asks()]
+    questions = [replace(ask, value=ask.value + 1) for ask in hcp2_questions()]
 
     async def run() -> int:
-        master = Ours(hcp2.PROFILE, asks)
-        with Lines(1, {ask.request: ask.reply for ask in asks}) as lines:
+        master = Ours(hcp2.PROFILE, questions)
+        with Lines(1, {ask.request: ask.reply for ask in questions}) as lines:
             await master.open(lines.ports[0])
-            wrong = await master.run(len(asks))
+            wrong = await master.run(len(questions))
             await master.close()
         return wrong
 
-    assert asyncio.run(run()) == len(asks)
+    assert asyncio.run(run()) == len(questions)
 
 
 def test_the_other_end_of_a_paced_msc_line_takes_the_closing_ack_off_and_reports_dead_times() -> None:
-    asks = msc_asks()
+    questions = msc_questions()
 
     async def run() -> tuple[int, list[list[float]]]:
-        master = Bare(asks)
+        master = Bare(questions)
         settings = LineSettings(115200)
-        with Lines(1, {ask.request: ask.reply for ask in asks}, settings=settings, swallow=asks[0].closing) as lines:
+        with Lines(
+            1, {ask.request: ask.reply for ask in questions}, settings=settings, swallow=questions[0].closing
+        ) as lines:
             await master.open(lines.ports[0])
             lines.dead_times()
             wrong = await master.run(5)
@@ -115,7 +119,7 @@ def test_the_other_end_of_a_paced_msc_line_takes_the_closing_ack_off_and_reports
 
 
 def test_the_limit_of_the_wire_is_bits_and_reply_time() -> None:
-    ask = hcp2_asks()[0]
+    ask = hcp2_questions()[0]
     assert wire_time(ask, LineSettings(9600), 0.002) == pytest.approx((8 + 13) * 10 / 9600 + 0.002, abs=2 * 10 / 9600)
 
 

@@ -7,13 +7,13 @@ import logging
 import pytest
 
 from busmaster.arbiter.events import (
+    CameUnasked,
     LatenessLowered,
     LatenessRaised,
     LineChange,
     LineChanged,
     NodeChanged,
     PortFailed,
-    Strayed,
 )
 from busmaster.arbiter.health import Health
 from busmaster.bus.logbook import PAUSE, Logbook
@@ -46,10 +46,10 @@ def test_r14_each_node_is_limited_by_itself(lines: pytest.LogCaptureFixture) -> 
     assert len(lines.messages) == 3
 
 
-def test_r14_strays_are_counted_and_not_logged_but_a_collision_is(lines: pytest.LogCaptureFixture) -> None:
+def test_r14_unasked_bytes_are_counted_and_not_logged_but_a_collision_is(lines: pytest.LogCaptureFixture) -> None:
     logbook = Logbook("line")
-    logbook.note(Strayed(b"\x15"), 0.0)
-    logbook.note(Strayed(b"\x07\x31", collision=True), 0.0)
+    logbook.note(CameUnasked(b"\x15"), 0.0)
+    logbook.note(CameUnasked(b"\x07\x31", collision=True), 0.0)
     assert lines.messages == ["line: the echo differs from what was sent: a collision (07 31)"]
 
 

@@ -15,8 +15,8 @@ from busmaster.emulator.device import Delay, Device
 from busmaster.protocols.dc104.device import EmulatedDc104
 from busmaster.protocols.msc.device import EmulatedMsc
 from tests.campaigns.kinds import Kind
+from tests.campaigns.ledger import Ledger, WatchedLine
 from tests.campaigns.mixes import Edges
-from tests.campaigns.witness import Ledger, WatchedLine
 
 ACK = b"\x06"
 NOISE = bytes(byte for byte in range(256) if byte not in b"\x02\x03\x04\x06\x08\x15")

@@ -28,9 +28,9 @@ from busmaster.emulator.world import World
 from tests.campaigns.edges import EdgeLine, crowd
 from tests.campaigns.judge import Asked, BrokenRuleError, Judge, Totals
 from tests.campaigns.kinds import KINDS, elements_of
+from tests.campaigns.ledger import Ledger
 from tests.campaigns.mixes import MIXES, PROMPT, Mix
 from tests.campaigns.standing import StandingLine, StandingWorld
-from tests.campaigns.witness import Ledger
 
 LONGEST = 1800.0
 """Virtual seconds after which the faults heal, however few transactions there were."""
@@ -291,7 +291,7 @@ class Hunt:
     ) -> Transaction:
         asked.elements = elements_of(command)
         asked.urgent_ahead = self.world.arbiter.dispatcher.backlog.waiting(Priority.URGENT)
-        transaction = Transaction(node, command, priority=priority, waiter=asked, **options)
+        transaction = Transaction(node, command, priority=priority, tag=asked, **options)
         self.open[transaction] = None
         if self._record is not None:
             self.note(f"asked: {node.label}: {command} ({priority.name})")
@@ -304,7 +304,7 @@ class Hunt:
             self.note(f"cancelled: {transaction.node.label}: {transaction.command}")
             self.judge.left(transaction)
             self.world.arbiter.cancel(transaction, self.world.now)
-            self._ask(transaction.waiter.client)
+            self._ask(transaction.tag.client)
 
     # what the master says
 
@@ -327,7 +327,7 @@ class Hunt:
             self.judge.problem(f"R8: {transaction.command} ended twice, or for a caller who had gone")
             return
         del self.open[transaction]
-        client = transaction.waiter.client
+        client = transaction.tag.client
         if client < 0:
             return
         if transaction.attempts:
@@ -356,7 +356,7 @@ class Hunt:
             reads = chance.choices(self.reads, k=chance.randrange(1, 7))
             nodes = chance.choices(self.nodes, k=len(reads))
         members = [
-            Transaction(node, read, waiter=Asked(elements=elements_of(read)))
+            Transaction(node, read, tag=Asked(elements=elements_of(read)))
             for node, read in zip(nodes, reads, strict=True)
         ]
         tau = self.kind.profile.line.byte_time

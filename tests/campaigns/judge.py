@@ -22,8 +22,8 @@ from busmaster.errors import BacklogFull, NotStarted, Refused, WriteUnconfirmed
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import AUTO_START, RAM_NOT_RELIABLE, RUNNING, SYSTEM_RESET
 from tests.campaigns.kinds import Kind, echoed, elements_of
+from tests.campaigns.ledger import RECENT, ROUNDING, Frame, Ledger, WatchedLine, Written
 from tests.campaigns.mixes import AT_MOST, Mix
-from tests.campaigns.witness import RECENT, ROUNDING, Frame, Ledger, WatchedLine, Written
 
 STATES = (RUNNING | AUTO_START, SYSTEM_RESET | RAM_NOT_RELIABLE)
 """What an emulated MSC's status word can be."""
@@ -68,7 +68,7 @@ class Totals:
     lost: int = 0
     attempts: int = 0
     bad_attempts: int = 0
-    strays: int = 0
+    unasked_bytes: int = 0
     raised: int = 0
     seconds: float = 0.0
     recovery: float = 0.0
@@ -160,7 +160,7 @@ class Judge:
     def ended(self, transaction: Transaction) -> None:
         """With its value or its error."""
         totals = self.totals
-        asked: Asked = transaction.waiter or Asked(elements=elements_of(transaction.command))
+        asked: Asked = transaction.tag or Asked(elements=elements_of(transaction.command))
         if transaction.phase is not Phase.ENDED:
             self.problem(f"R8: {transaction.command} was reported while {transaction.phase.value}")
         if not transaction.attempts:
@@ -345,7 +345,7 @@ class Judge:
         totals.unseen_writes += self.ledger.unseen_writes
         totals.unasked += self.ledger.unasked
         totals.seconds += seconds
-        totals.strays += self.arbiter.statistics(self.now).stray_bytes
+        totals.unasked_bytes += self.arbiter.statistics(self.now).unasked_bytes
         for node in dispatcher.nodes:
             counters = node.counters
             totals.attempts += counters.attempts

@@ -19,7 +19,7 @@ from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import make_device
 from busmaster.wire.checks import sum8, sum16, xor
-from tests.campaigns.witness import Ledger, Witness
+from tests.campaigns.ledger import Ledger, LedgerMemory
 
 SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))
 MSC_STEP = 4
@@ -51,7 +51,7 @@ class Kind:
         return min(timings.read.lateness, timings.write.lateness, timings.packet.lateness)
 
     def device(self, ledger: Ledger, address: int) -> Device:
-        device = make_device(self.name, address, oracle=Witness(ledger, address))
+        device = make_device(self.name, address, traceable=LedgerMemory(ledger, address))
         if isinstance(device, EmulatedMsc):
             device.flags |= {flag for flag in range(64) if (flag + address) % 2}
         return device

@@ -258,7 +258,7 @@ BEYOND = (
     Mix("repeated", "a second reply, up to 300 ms after the first", {"repeated": 0.05}),
     Mix("repeated rarely", "likewise, one in 3000", {"repeated": 0.00033}),
     Mix("overdue", "replies begin after up to three times the lateness", slow=0.05, span=(1.0, 3.0), overdue=True),
-    Mix("forged", "a stray ACK, NAK or EOT before a reply", {"forged": 0.05}),
+    Mix("forged", "an unasked ACK, NAK or EOT before a reply", {"forged": 0.05}),
     Mix("duplicate", "two devices answer to one address", {"duplicate": 0.05}),
     Mix("double flips", "the same bit flipped in two bytes of a reply", {"unseen": 0.05}),
     Mix("double flips both ways", "or of a request", line={"unseen": 0.05}),

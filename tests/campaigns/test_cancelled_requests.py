@@ -78,7 +78,7 @@ class Campaign:
 
         def ask(number: int) -> None:
             element = chance.randrange(1, 100)
-            transaction = Transaction(chance.choice(nodes), hcp2.Read(element), waiter=number)
+            transaction = Transaction(chance.choice(nodes), hcp2.Read(element), tag=number)
             self.asked[number] = transaction
             arbiter.submit(transaction, self.now)
             if chance.random() < 0.5:
@@ -111,11 +111,11 @@ class Campaign:
                     end = self.now + len(request) * TAU + delay + len(frame) * TAU
                     at(end, partial(deliver, frame))
             while (event := arbiter.poll_event()) is not None:
-                if isinstance(event, Transaction) and event.waiter is not None:
+                if isinstance(event, Transaction) and event.tag is not None:
                     self.check(event, slave)
 
     def check(self, transaction: Transaction, slave: Slave) -> None:
-        number = transaction.waiter
+        number = transaction.tag
         self.completed[number] = self.completed.get(number, 0) + 1
         if transaction.error is not None:
             assert isinstance(transaction.error, BusError)

@@ -86,10 +86,10 @@ def test_r11_the_hook_of_a_node_that_returns_runs_before_its_polls() -> None:
         """What the bus does: parameters are sent again, then the node is released."""
         if change.returning:
             order.append("returned")
-            load.ask(node, hcp2.Write(7, (1.0,)), waiter=node)
+            load.ask(node, hcp2.Write(7, (1.0,)), tag=node)
 
     def release(transaction: Transaction) -> None:
-        if transaction.waiter is node:
+        if transaction.tag is node:
             order.append("written")
             load.world.arbiter.dispatcher.release_node(node)
 

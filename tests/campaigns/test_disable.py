@@ -1,4 +1,4 @@
-"""`disable()` right after a write that was not answered: sent within its bound, and never confirmed by a stray ACK.
+"""`disable()` right after a write that was not answered: sent within its bound, and never confirmed by an unasked ACK.
 
 The drive hears the write, and acknowledges it late; what comes after that it does not hear. An ACK that comes now is
 the write's, whatever the master has asked since.

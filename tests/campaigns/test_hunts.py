@@ -44,9 +44,9 @@ def test_what_the_faults_do_shows(protocol: str) -> None:
     for mix in WITHIN:
         found[mix.name] = Hunt(protocol, mix.name, 2).run(300)
     calm = found.pop("calm")
-    assert calm.bad_attempts == calm.strays == calm.unseen == 0
+    assert calm.bad_attempts == calm.unasked_bytes == calm.unseen == 0
     del found["bytewise"]
-    quiet = [name for name, totals in found.items() if totals.bad_attempts + totals.strays < 10]
+    quiet = [name for name, totals in found.items() if totals.bad_attempts + totals.unasked_bytes < 10]
     assert quiet == ["refusals"] or not quiet
     assert found["cancelled"].cancelled > found["late"].cancelled
 

@@ -10,8 +10,8 @@ import pytest
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.leg import Leg
-from busmaster.arbiter.strays import QUIET
 from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.unasked import QUIET
 from busmaster.contract.exchange import FrameError
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.msc import exchange as msc_exchange

@@ -262,7 +262,7 @@ def test_replies_are_tied_to_requests_and_what_is_odd_is_noted(tmp_path: Path) -
         packet(201, "mentor", HOST, "04 31 31 32 32 31 37 32 33 05"),
         packet(202, "mentor", NODE, "04"),
     ]
-    packets[3].outcome, packets[7].outcome = Outcome.NO_REPLY, Outcome.STRAY
+    packets[3].outcome, packets[7].outcome = Outcome.NO_REPLY, Outcome.UNASKED
     packets[3].comment = "read element 1: node 2: no reply within 100 ms"
     fields = ("_ws.col.Info", "busmaster.request_in", "busmaster.time", EXPERT, "frame.comment", "frame.p2p_dir")
     rows = dissect(tmp_path, packets, *fields)

@@ -61,7 +61,7 @@ def test_a_replay_says_what_the_arbiter_said(protocol: str, mix: str) -> None:
     assert [packet.micros for packet in packets] == sorted(packet.micros for packet in packets)
     assert tape.ended == tape.begun
 
-    judged = [packet for packet in packets if packet.outcome not in (Outcome.NONE, Outcome.STRAY)]
+    judged = [packet for packet in packets if packet.outcome not in (Outcome.NONE, Outcome.UNASKED)]
     outcomes = {(packet.transaction, packet.attempt): packet.outcome for packet in judged}
     assert len(outcomes) == len(judged)
     assert outcomes == {(one.transaction, one.number): Outcome[one.verdict.name] for one in tape.ended if one.verdict}

@@ -196,9 +196,9 @@ def test_a_file_of_the_first_version_which_numbers_no_requests_replays() -> None
     ]
 
 
-def test_strays_and_what_comes_before_the_first_request_are_left_out() -> None:
+def test_unasked_bytes_and_what_comes_before_the_first_request_are_left_out() -> None:
     packets = overheard((NODE, "15"), *READ, (NODE, "02 36 39 34 30 39 36 03 07"))
-    assert [packet.outcome for packet in packets] == [Outcome.STRAY, Outcome.NONE, Outcome.OK, Outcome.STRAY]
+    assert [packet.outcome for packet in packets] == [Outcome.UNASKED, Outcome.NONE, Outcome.OK, Outcome.UNASKED]
     assert not only(packets).changed
 
 

@@ -352,13 +352,13 @@ def test_a_port_that_does_not_open_is_a_finding(busmaster: Command, port: str) -
 
 
 def test_while_another_program_has_the_port_it_is_not_even_opened(busmaster: Command) -> None:
-    with plugged() as far_end:
-        hold = f"f = open({far_end.path!r}); print(flush=True); input()"
+    with plugged() as pty_master:
+        hold = f"f = open({pty_master.path!r}); print(flush=True); input()"
         with subprocess.Popen([sys.executable, "-ISc", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
             assert other.stdout is not None
             other.stdout.readline()
-            done = busmaster("doctor", far_end.path, *HCP2)
-            assert far_end.read(0) == b""
+            done = busmaster("doctor", pty_master.path, *HCP2)
+            assert pty_master.read(0) == b""
             other.communicate(b"\n")
     assert done.status == 1
     assert f"(process {other.pid})" in done.out

@@ -62,13 +62,13 @@ def test_where_the_driver_counts_nothing_the_marks_are_told() -> None:
 
 @pytest.mark.asyncio
 async def test_the_doctor_hears_damaged_bytes_and_counts_them() -> None:
-    with plugged() as far_end:
-        async with opened(SerialPort(far_end.path, baudrate=57600)) as wire:
+    with plugged() as pty_master:
+        async with opened(SerialPort(pty_master.path, baudrate=57600)) as wire:
             assert wire.transport is not None
             descriptor = wire.transport.get_extra_info("serial").fileno()
             settings = termios.tcgetattr(descriptor)
             settings[0] = 0  # what is written at the other end comes as the escape that it is
             termios.tcsetattr(descriptor, termios.TCSANOW, settings)
-            far_end.write(b"a\xff\x00b\xff\x00\x00c")
+            pty_master.write(b"a\xff\x00b\xff\x00\x00c")
             assert await wire.hear_all(2.0) == b"ab\x00c"
             assert wire.marked == {Mark.DAMAGED: 1, Mark.BREAK: 1}

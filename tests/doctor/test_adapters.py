@@ -15,20 +15,20 @@ import pytest
 from busmaster.doctor.adapters import Finding, inspect, latency_timer, low_latency, rs485_mode
 from busmaster.transport import identity
 from busmaster.transport.holders import Holder, holders, lock_owner, owning_group
-from tests.transport.fakes import FarEnd, plugged
+from tests.transport.fakes import PtyMaster, plugged
 from tests.transport.usb import UsbTree
 
 
 @pytest.fixture
-def far_end() -> Iterator[FarEnd]:
+def pty_master() -> Iterator[PtyMaster]:
     with plugged() as end:
         yield end
 
 
 @pytest.fixture
-def sysfs(tmp_path: Path, far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> Path:
+def sysfs(tmp_path: Path, pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A /sys in which the pty is an FTDI adapter with its timer at 16 ms."""
-    device = tmp_path / "sys/class/tty" / os.path.basename(far_end.path) / "device"
+    device = tmp_path / "sys/class/tty" / os.path.basename(pty_master.path) / "device"
     device.mkdir(parents=True)
     (device / "latency_timer").write_text("16\n")
     (tmp_path / "drivers/ftdi_sio").mkdir(parents=True)
@@ -38,9 +38,9 @@ def sysfs(tmp_path: Path, far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> P
 
 
 @pytest.fixture
-def process(far_end: FarEnd) -> Iterator[int]:
+def process(pty_master: PtyMaster) -> Iterator[int]:
     """The id of another process that has the port open and locked."""
-    hold = f"import fcntl; f = open({far_end.path!r}); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
+    hold = f"import fcntl; f = open({pty_master.path!r}); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
     with subprocess.Popen([sys.executable, "-ISc", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         other.stdout.readline()
@@ -52,12 +52,12 @@ def topics(found: tuple[Finding, ...]) -> dict[str, bool]:
     return {finding.topic: finding.ok for finding in found}
 
 
-def test_a_port_in_order_has_nothing_against_it(far_end: FarEnd) -> None:
-    assert topics(inspect(far_end.path)) == {"port": True, "permission": True, "holders": True}
+def test_a_port_in_order_has_nothing_against_it(pty_master: PtyMaster) -> None:
+    assert topics(inspect(pty_master.path)) == {"port": True, "permission": True, "holders": True}
 
 
-def test_every_fault_comes_with_what_to_do(tmp_path: Path, far_end: FarEnd, sysfs: Path, process: int) -> None:
-    found = inspect(far_end.path)
+def test_every_fault_comes_with_what_to_do(tmp_path: Path, pty_master: PtyMaster, sysfs: Path, process: int) -> None:
+    found = inspect(pty_master.path)
     assert topics(found) == {"port": True, "permission": True, "holders": False, "driver": True, "latency": False}
     assert all(finding.advice for finding in found if not finding.ok)
     text = "\n".join(finding.what for finding in found)
@@ -66,13 +66,13 @@ def test_every_fault_comes_with_what_to_do(tmp_path: Path, far_end: FarEnd, sysf
     assert "up to 16 ms" in text
 
 
-def test_a_quick_adapter_is_in_order(far_end: FarEnd, sysfs: Path) -> None:
-    timer = sysfs / "class/tty" / os.path.basename(far_end.path) / "device/latency_timer"
+def test_a_quick_adapter_is_in_order(pty_master: PtyMaster, sysfs: Path) -> None:
+    timer = sysfs / "class/tty" / os.path.basename(pty_master.path) / "device/latency_timer"
     timer.write_text("1\n")
-    assert latency_timer(far_end.path) == 1
-    assert topics(inspect(far_end.path))["latency"]
+    assert latency_timer(pty_master.path) == 1
+    assert topics(inspect(pty_master.path))["latency"]
     timer.unlink()
-    assert latency_timer(far_end.path) is None
+    assert latency_timer(pty_master.path) is None
 
 
 def test_what_is_no_port_is_said_first_and_alone(tmp_path: Path) -> None:
@@ -90,11 +90,11 @@ def test_what_is_no_port_is_said_first_and_alone(tmp_path: Path) -> None:
         assert says in finding.what
 
 
-def test_a_port_that_may_not_be_opened_names_its_group(far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_that_may_not_be_opened_names_its_group(pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda *_: False)
-    permission = inspect(far_end.path)[1]
+    permission = inspect(pty_master.path)[1]
     assert not permission.ok
-    assert f"usermod -aG {owning_group(far_end.path)} $USER" in permission.advice
+    assert f"usermod -aG {owning_group(pty_master.path)} $USER" in permission.advice
 
 
 def test_a_group_without_a_name_goes_by_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,56 +105,58 @@ def test_a_group_without_a_name_goes_by_its_number(tmp_path: Path, monkeypatch: 
     assert owning_group(str(tmp_path)) == str(tmp_path.stat().st_gid)
 
 
-def test_who_holds_and_who_locks_a_port_is_found_through_its_link(tmp_path: Path, far_end: FarEnd) -> None:
+def test_who_holds_and_who_locks_a_port_is_found_through_its_link(tmp_path: Path, pty_master: PtyMaster) -> None:
     link = tmp_path / "port"
-    link.symlink_to(far_end.path)
+    link.symlink_to(pty_master.path)
     assert holders(str(link)) == ()
     assert lock_owner(str(link)) is None
-    with open(far_end.path, "rb", buffering=0) as port:
+    with open(pty_master.path, "rb", buffering=0) as port:
         fcntl.flock(port, fcntl.LOCK_EX)
         (holder,) = holders(str(link))
         assert str(holder) == "this program"
         assert lock_owner(str(link)) == holder
 
 
-def test_whoever_emulates_the_line_on_a_pty_is_no_second_master(far_end: FarEnd) -> None:
+def test_whoever_emulates_the_line_on_a_pty_is_no_second_master(pty_master: PtyMaster) -> None:
     """An emulator has the port open too, so that clients may come and go."""
-    with open(far_end.path, "rb", buffering=0):
-        assert holders(far_end.path)
-        assert topics(inspect(far_end.path))["holders"]
+    with open(pty_master.path, "rb", buffering=0):
+        assert holders(pty_master.path)
+        assert topics(inspect(pty_master.path))["holders"]
 
 
-def test_a_process_that_cannot_be_seen_into_is_another_program(tmp_path: Path, far_end: FarEnd) -> None:
-    inode = os.stat(far_end.path)
+def test_a_process_that_cannot_be_seen_into_is_another_program(tmp_path: Path, pty_master: PtyMaster) -> None:
+    inode = os.stat(pty_master.path)
     place = f"{os.major(inode.st_dev):02x}:{os.minor(inode.st_dev):02x}:{inode.st_ino}"
     for pid, owner in ((4711, Holder(4711, "another program")), (-1, None)):
         (tmp_path / "locks").write_text(
             f"1: POSIX ADVISORY WRITE 1 00:01:2 0 EOF\n2: FLOCK ADVISORY WRITE {pid} {place} 0 EOF\n"
         )
-        assert lock_owner(far_end.path, proc=tmp_path) == owner
+        assert lock_owner(pty_master.path, proc=tmp_path) == owner
     assert str(Holder(4711, "another program")) == "another program (process 4711)"
 
 
-def test_a_system_without_these_trees_knows_nothing(tmp_path: Path, far_end: FarEnd) -> None:
-    assert lock_owner(far_end.path, proc=tmp_path / "proc") is None
+def test_a_system_without_these_trees_knows_nothing(tmp_path: Path, pty_master: PtyMaster) -> None:
+    assert lock_owner(pty_master.path, proc=tmp_path / "proc") is None
     assert lock_owner(str(tmp_path / "gone")) is None
-    assert holders(far_end.path, proc=tmp_path / "proc") == ()
+    assert holders(pty_master.path, proc=tmp_path / "proc") == ()
 
 
-def test_a_pty_has_no_rs485_mode_and_a_driver_tells_its_own(far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert rs485_mode(far_end.fd) is None
+def test_a_pty_has_no_rs485_mode_and_a_driver_tells_its_own(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert rs485_mode(pty_master.fd) is None
     for flags in (0, 1, 2 | 4):
         monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings, flags=flags: settings.__setitem__(0, flags))
-        assert rs485_mode(far_end.fd) is bool(flags & 1)
+        assert rs485_mode(pty_master.fd) is bool(flags & 1)
 
 
 def test_a_pty_has_no_low_latency_flag_and_a_driver_tells_its_own(
-    far_end: FarEnd, monkeypatch: pytest.MonkeyPatch
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert low_latency(far_end.fd) is None
+    assert low_latency(pty_master.fd) is None
     for flag in (0, 1 << 13):
         monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings, flag=flag: settings.__setitem__(4, flag))
-        assert low_latency(far_end.fd) is bool(flag)
+        assert low_latency(pty_master.fd) is bool(flag)
 
 
 # -- a name that lasts -----------------------------------------------------------------------------------------------
@@ -166,23 +168,25 @@ def name_of(port: str) -> Finding:
     return finding
 
 
-def test_the_name_to_use_for_an_adapter_is_said_unless_it_is_used(usb: UsbTree, far_end: FarEnd) -> None:
-    usb.plug(far_end.path, "A500ABC")
-    finding = name_of(far_end.path)
-    assert finding.what == f"{far_end.path} is FTDI A500ABC"
-    assert finding.advice == f"name it usb:A500ABC: {far_end.path} goes to whichever adapter is found first"
+def test_the_name_to_use_for_an_adapter_is_said_unless_it_is_used(usb: UsbTree, pty_master: PtyMaster) -> None:
+    usb.plug(pty_master.path, "A500ABC")
+    finding = name_of(pty_master.path)
+    assert finding.what == f"{pty_master.path} is FTDI A500ABC"
+    assert finding.advice == f"name it usb:A500ABC: {pty_master.path} goes to whichever adapter is found first"
     finding = name_of("usb:A500ABC")
-    assert finding.what == f"{far_end.path} is FTDI A500ABC, which usb:A500ABC finds again"
+    assert finding.what == f"{pty_master.path} is FTDI A500ABC, which usb:A500ABC finds again"
     assert not finding.advice
 
 
-def test_an_adapter_without_a_serial_number_goes_by_its_place(usb: UsbTree, far_end: FarEnd, tmp_path: Path) -> None:
-    usb.plug(far_end.path, place="1-1.2")
-    assert name_of(far_end.path).advice == "it has no serial number: leave it in this USB port"
+def test_an_adapter_without_a_serial_number_goes_by_its_place(
+    usb: UsbTree, pty_master: PtyMaster, tmp_path: Path
+) -> None:
+    usb.plug(pty_master.path, place="1-1.2")
+    assert name_of(pty_master.path).advice == "it has no serial number: leave it in this USB port"
     link = tmp_path / "links/by-path/pci-0000:00:14.0-usb-0:1.2:1.0-port0"
     link.parent.mkdir(parents=True)
-    link.symlink_to(far_end.path)
-    assert name_of(far_end.path).advice.startswith(f"name it {link}: ")
+    link.symlink_to(pty_master.path)
+    assert name_of(pty_master.path).advice.startswith(f"name it {link}: ")
     assert not name_of(str(link)).advice
 
 

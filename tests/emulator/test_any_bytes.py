@@ -21,7 +21,7 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 from busmaster.protocols._comms.device import HCP
 from busmaster.protocols._comms.mint import EmulatedMint, command_handshake, jog_on_comms1, winding
 from busmaster.protocols.dc104 import codec as dc104
@@ -108,14 +108,14 @@ HCP2_KINDS = {
     "hcp2, events": lambda: EmulatedMint(ADDRESS, events=[jog_on_comms1], fixed_decimals=True),
     "hcp2, handshake": lambda: EmulatedMint(ADDRESS, program=command_handshake, statement=0.05),
     "hcp2, winding": lambda: EmulatedMint(ADDRESS, program=winding, statement=0.05),
-    "hcp2, oracle": lambda: EmulatedMint(ADDRESS, oracle=Oracle(ADDRESS)),
+    "hcp2, traceable": lambda: EmulatedMint(ADDRESS, traceable=TraceableMemory(ADDRESS)),
     "microflex": lambda: EmulatedMicroFlex(ADDRESS, ripple=0.1),
     "microflex, current": lambda: EmulatedMicroFlex(ADDRESS, current_control=True, refuse_unmapped=True),
 }
 MENTOR_KINDS = {
     "mentor": lambda: EmulatedMentor(ADDRESS, ripple=0.1),
     "mentor, options": lambda: EmulatedMentor(ADDRESS, short_after_write=True, refuse_malformed=True),
-    "mentor, oracle": lambda: EmulatedMentor(ADDRESS, oracle=Oracle(ADDRESS, 10**4)),
+    "mentor, traceable": lambda: EmulatedMentor(ADDRESS, traceable=TraceableMemory(ADDRESS, 10**4)),
 }
 KINDS = {
     "hcp": Kind(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from busmaster.emulator.device import Delay
-from busmaster.emulator.oracle import Oracle, oracle_value
+from busmaster.emulator.traceable import TraceableMemory, traceable_value
 from busmaster.errors import InvalidCommand
 from busmaster.protocols._comms.device import HCP, HostCommsDevice
 from busmaster.registry import find, kinds, make_device
@@ -46,8 +46,8 @@ def test_something_moves_on_a_lively_device() -> None:
 
 
 def test_the_oracle_answers_in_their_place() -> None:
-    line = line_of(make_device("microflex", 2, oracle=Oracle(2)))
-    assert bytes.fromhex(ask(line, "07 30 32 02 36 34 05 07"))[3:-2] == str(oracle_value(2, 100, 0)).encode()
+    line = line_of(make_device("microflex", 2, traceable=TraceableMemory(2)))
+    assert bytes.fromhex(ask(line, "07 30 32 02 36 34 05 07"))[3:-2] == str(traceable_value(2, 100, 0)).encode()
 
 
 def test_a_protocol_that_does_not_exist_is_refused() -> None:

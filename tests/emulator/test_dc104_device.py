@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from busmaster.emulator.device import Delay
-from busmaster.emulator.oracle import Oracle, oracle_value
+from busmaster.emulator.traceable import TraceableMemory, traceable_value
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.dc104.device import EmulatedDc104, packet
 from busmaster.wire.checks import sum8
@@ -109,19 +109,19 @@ def test_parameters_outlive_a_power_failure_and_half_a_packet_does_not() -> None
 
 
 def test_the_oracle_answers_and_counts_writes() -> None:
-    oracle = Oracle(0, 2**16)
-    line = line_of(EmulatedDc104(oracle=oracle))
-    assert ask(line, write(7, oracle_value(0, 7, 0, 2**16)), 0.0) == ACK
-    assert (oracle.writes[7], oracle.strays) == (1, 0)
-    assert ask(line, read(7), 1.0) == hexed(packet(7, oracle_value(0, 7, 1, 2**16)))
+    traceable = TraceableMemory(0, 2**16)
+    line = line_of(EmulatedDc104(traceable=traceable))
+    assert ask(line, write(7, traceable_value(0, 7, 0, 2**16)), 0.0) == ACK
+    assert (traceable.writes[7], traceable.foreign_writes) == (1, 0)
+    assert ask(line, read(7), 1.0) == hexed(packet(7, traceable_value(0, 7, 1, 2**16)))
 
 
 def test_what_no_dc104_is_cannot_be_made() -> None:
     for bad in (0, 256):
         with pytest.raises(InvalidCommand):
             EmulatedDc104(maximum=bad)
-    with pytest.raises(InvalidCommand, match=r"2\*\*16 oracle values"):
-        EmulatedDc104(oracle=Oracle(0))
+    with pytest.raises(InvalidCommand, match=r"2\*\*16 traceable values"):
+        EmulatedDc104(traceable=TraceableMemory(0))
 
 
 @given(st.binary(max_size=20), st.booleans())

@@ -10,7 +10,7 @@ from busmaster.emulator.device import Delay
 from busmaster.emulator.disturbance import noise
 from busmaster.emulator.faults import BEYOND, FORGED, HEARING, NAMES, SPEAKING, WITHIN, Faults
 from busmaster.emulator.line import Line
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.registry import make_device
@@ -182,7 +182,7 @@ def test_a_reply_for_somebody_else_carries_somebody_elses_value(
 ) -> None:
     """Else a reader that does not look at the echo would not be caught."""
     address = 0 if protocol == "dc104" else 1
-    right, wrong = (make_device(protocol, address, oracle=Oracle(address, modulus)) for _ in range(2))
+    right, wrong = (make_device(protocol, address, traceable=TraceableMemory(address, modulus)) for _ in range(2))
     wrong.faults.wrong = 1.0
     answers = [bytes.fromhex(ask(line_of(device), request_)) for device in (right, wrong)]
     assert answers[0][value] != answers[1][value]

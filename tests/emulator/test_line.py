@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from busmaster.contract.profile import LineSettings
+from busmaster.emulator.collision import Collision
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.faults import HEARING, SPEAKING, Faults
 from busmaster.emulator.line import PIECE, Echo, Line
-from busmaster.emulator.wave import Wave
 from busmaster.errors import InvalidCommand
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.registry import make_device
@@ -224,14 +224,14 @@ def test_a_request_that_collides_with_a_straggler_is_lost_and_not_misheard() -> 
 @given(st.binary(min_size=1, max_size=8), st.sampled_from("NEOMS"), st.sampled_from([1, 2]))
 @settings(max_examples=50)
 def test_a_lone_talker_is_heard_as_it_spoke_in_any_framing(data: bytes, parity: str, stopbits: int) -> None:
-    wave = Wave(LineSettings(9600, 8, parity, stopbits), 3.0, Random(1))
-    wave.add(3.0, data, None)
-    heard = list(wave.heard(Ear()))
+    collision = Collision(LineSettings(9600, 8, parity, stopbits), 3.0, Random(1))
+    collision.add(3.0, data, None)
+    heard = list(collision.heard(Ear()))
     assert bytes(byte for _, byte in heard) == data
     tau = LineSettings(9600, 8, parity, stopbits).byte_time
     assert [when for when, _ in heard] == pytest.approx([3.0 + n * tau for n in range(len(data))])
-    assert list(wave.heard(None)) == []
-    assert list(wave.heard(None, echo=True)) == heard
+    assert list(collision.heard(None)) == []
+    assert list(collision.heard(None, echo=True)) == heard
 
 
 @given(st.binary(min_size=2, max_size=8), st.binary(min_size=1, max_size=8), st.floats(0, 10), st.integers())
@@ -239,9 +239,9 @@ def test_a_lone_talker_is_heard_as_it_spoke_in_any_framing(data: bytes, parity: 
 def test_a_second_talker_changes_nothing_that_ended_before_it(
     first: bytes, second: bytes, offset: float, seed: int
 ) -> None:
-    alone, both = (Wave(SETTINGS, 0.0, Random(seed)) for _ in range(2))
-    for wave in (alone, both):
-        wave.add(0.0, first, None)
+    alone, both = (Collision(SETTINGS, 0.0, Random(seed)) for _ in range(2))
+    for collision in (alone, both):
+        collision.add(0.0, first, None)
     both.add(offset * TAU, second, None)
     ear = Ear()
     ended = len(list(alone.heard(ear, until=offset * TAU)))

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from busmaster.emulator.line import Line
-from busmaster.emulator.oracle import Oracle, oracle_value
+from busmaster.emulator.traceable import TraceableMemory, traceable_value
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.mentor.device import EVEN_PARITY, SPEED_REFERENCE, EmulatedMentor, telegram
 from busmaster.wire.checks import bcc
@@ -264,21 +264,21 @@ def test_it_knows_its_own_address_and_forgets_the_rest_when_power_fails() -> Non
 
 
 def test_the_oracle_answers_for_every_parameter_and_counts_writes() -> None:
-    oracle = Oracle(14, 10**4)
-    line = line_of(EmulatedMentor(14, oracle=oracle))
-    sent = oracle_value(14, 117, 0, 10**4)
+    traceable = TraceableMemory(14, 10**4)
+    line = line_of(EmulatedMentor(14, traceable=traceable))
+    sent = traceable_value(14, 117, 0, 10**4)
     assert ask(line, write(14, f"0117{sent:+05d}")) == ACK
-    assert (oracle.writes[117], oracle.strays) == (1, 0)
-    assert ask(line, read(14, "0117"), 1.0) == hexed(telegram(117, oracle_value(14, 117, 1, 10**4)))
-    assert ask(line, read(14, "1563"), 2.0) == hexed(telegram(1563, oracle_value(14, 1563, 0, 10**4), True))
+    assert (traceable.writes[117], traceable.foreign_writes) == (1, 0)
+    assert ask(line, read(14, "0117"), 1.0) == hexed(telegram(117, traceable_value(14, 117, 1, 10**4)))
+    assert ask(line, read(14, "1563"), 2.0) == hexed(telegram(1563, traceable_value(14, 1563, 0, 10**4), True))
 
 
 def test_what_no_mentor_ii_is_cannot_be_made() -> None:
     for bad in (0, 100):
         with pytest.raises(InvalidCommand):
             EmulatedMentor(bad)
-    with pytest.raises(InvalidCommand, match=r"10\*\*4 oracle values"):
-        EmulatedMentor(1, oracle=Oracle(1))
+    with pytest.raises(InvalidCommand, match=r"10\*\*4 traceable values"):
+        EmulatedMentor(1, traceable=TraceableMemory(1))
 
 
 @pytest.mark.parametrize("whole", [True, False])

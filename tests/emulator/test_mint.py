@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from busmaster.emulator.motion import Motion
-from busmaster.emulator.oracle import Oracle, oracle_value
+from busmaster.emulator.traceable import TraceableMemory, traceable_value
 from busmaster.protocols._comms.device import HCP, HCP2, number_text, numbers
 from busmaster.protocols._comms.mint import EmulatedMint, command_handshake, jog_on_comms1, winding
 from busmaster.wire.checks import xor
@@ -319,16 +319,16 @@ def test_a_restart_loses_what_was_in_ram() -> None:
     assert value(ask(line, read(1, 1), 2.0)) == "0"
 
 
-# The oracle
+# The traceable
 
 
 def test_with_an_oracle_every_element_tells_node_element_and_writes() -> None:
-    mint = EmulatedMint(7, oracle=Oracle(7))
+    mint = EmulatedMint(7, traceable=TraceableMemory(7))
     line = line_of(mint)
-    assert value(ask(line, read(7, 5))) == str(oracle_value(7, 5, 0))
-    assert ask(line, write(7, 5, str(oracle_value(7, 5, 0)))) == ACK
-    assert value(ask(line, read(7, 5))) == str(oracle_value(7, 5, 1))
-    assert mint.oracle is not None
-    assert mint.oracle.strays == 0
-    ask(line, write(7, 5, str(oracle_value(6, 5, 1))))
-    assert mint.oracle.strays == 1
+    assert value(ask(line, read(7, 5))) == str(traceable_value(7, 5, 0))
+    assert ask(line, write(7, 5, str(traceable_value(7, 5, 0)))) == ACK
+    assert value(ask(line, read(7, 5))) == str(traceable_value(7, 5, 1))
+    assert mint.traceable is not None
+    assert mint.traceable.foreign_writes == 0
+    ask(line, write(7, 5, str(traceable_value(6, 5, 1))))
+    assert mint.traceable.foreign_writes == 1

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
-from busmaster.emulator.oracle import Oracle, oracle_value
+from busmaster.emulator.traceable import TraceableMemory, traceable_value
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.msc.device import COUNT, RUN_FLAG, EmulatedMsc, packet
 from tests.emulator.lines import arrivals, ask, ask_bytewise, hexed, line_of
@@ -317,14 +317,14 @@ def test_a_power_failure_clears_program_and_data_unless_there_is_a_battery() -> 
 
 
 def test_the_oracle_holds_data_values_and_counts_writes() -> None:
-    oracle = Oracle(5, 2**31)
-    line = line_of(EmulatedMsc(5, oracle=oracle))
-    sent = oracle_value(5, 2008, 0, 2**31)
+    traceable = TraceableMemory(5, 2**31)
+    line = line_of(EmulatedMsc(5, traceable=traceable))
+    sent = traceable_value(5, 2008, 0, 2**31)
     answer(line, request(5, "DWRITE", 2008, value=sent), 0.0)
-    assert (oracle.writes[2008], oracle.strays) == (1, 0)
+    assert (traceable.writes[2008], traceable.foreign_writes) == (1, 0)
     block = bytes.fromhex(answer(line, request(5, "BREAD", 2008), 20.0))[13:-2]
     values = [int.from_bytes(block[i : i + 4], "big") for i in range(0, 128, 4)]
-    assert values == [oracle_value(5, 2008 + 4 * i, int(i == 0), 2**31) for i in range(32)]
+    assert values == [traceable_value(5, 2008 + 4 * i, int(i == 0), 2**31) for i in range(32)]
 
 
 @pytest.mark.parametrize(
@@ -334,7 +334,7 @@ def test_the_oracle_holds_data_values_and_counts_writes() -> None:
         lambda: EmulatedMsc(16),
         lambda: EmulatedMsc(1, model="MSC-1000"),
         lambda: EmulatedMsc(1, address_step=3),
-        lambda: EmulatedMsc(1, oracle=Oracle(1)),
+        lambda: EmulatedMsc(1, traceable=TraceableMemory(1)),
     ],
 )
 def test_what_no_msc_is_cannot_be_made(bad: object) -> None:

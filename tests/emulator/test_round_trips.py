@@ -38,7 +38,7 @@ Step = tuple[Command[Any], Any]
 
 
 class Master:
-    """A master in virtual time. `asks` returns the value, or raises."""
+    """A master in virtual time. `ask` returns the value, or raises."""
 
     def __init__(self, profile: Profile, *devices: Device, **options: Any) -> None:
         self.line = Line(profile.line, devices, chance=Random(1), **options)
@@ -49,7 +49,7 @@ class Master:
     def knows(self, profile: Profile, address: int) -> None:
         self.nodes[address] = self.world.node(profile, address)
 
-    def asks(self, command: Command[Any], address: int | None = None) -> Any:
+    def ask(self, command: Command[Any], address: int | None = None) -> Any:
         node = next(iter(self.nodes.values())) if address is None else self.nodes[address]
         transaction: Transaction = self.world.request(node, command)
         assert self.world.run_until(lambda: transaction.phase is Phase.ENDED, 60.0)
@@ -65,9 +65,9 @@ class Master:
         for command, expected in steps:
             if isinstance(expected, type) and issubclass(expected, BusError):
                 with pytest.raises(expected):
-                    self.asks(command)
+                    self.ask(command)
             else:
-                assert self.asks(command) == expected, str(command)
+                assert self.ask(command) == expected, str(command)
 
 
 MSC_STEPS: list[Step] = [
@@ -186,7 +186,7 @@ def test_a_device_does_not_hear_what_another_is_asked(protocol: str, address: in
         "msc": msc.DataRead(2008),
     }
     for other in others:
-        assert master.asks(untouched.get(protocol, mentor.Read(1, 17)), other.address) == 0
+        assert master.ask(untouched.get(protocol, mentor.Read(1, 17)), other.address) == 0
 
 
 words = st.integers(0, 65535)
@@ -210,8 +210,8 @@ def test_a_broadcast_reaches_all_and_the_line_goes_on() -> None:
     drives = [EmulatedMentor(address) for address in (11, 14)]
     master = Master(mentor.PROFILE, *drives)
     master.knows(mentor.PROFILE, 0)
-    assert master.asks(mentor.Write(1, 17, 250), 0) is None
-    assert [master.asks(mentor.Read(1, 17), drive.address) for drive in drives] == [250, 250]
+    assert master.ask(mentor.Write(1, 17, 250), 0) is None
+    assert [master.ask(mentor.Read(1, 17), drive.address) for drive in drives] == [250, 250]
 
 
 # HCP and HCP2 on one line
@@ -230,11 +230,11 @@ def test_hcp_and_hcp2_controllers_share_a_line() -> None:
             write = hcp.Write if address < 4 else hcp2.Write
             read = hcp.Read if address < 4 else hcp2.Read
             value = address * 100 + number
-            master.asks(write(1 + number, (value,)), address)
-            assert master.asks(read(1 + number), address) == value
+            master.ask(write(1 + number, (value,)), address)
+            assert master.ask(read(1 + number), address) == value
     assert master.line.collisions == 0
     statistics = master.world.arbiter.statistics(master.world.now)
-    assert statistics.stray_bytes == 0
+    assert statistics.unasked_bytes == 0
     assert statistics.exchanges == statistics.completed == 2 * 8 * 40
 
 
@@ -246,7 +246,7 @@ def test_msc_reads_right_through_two_naks_and_four_bad_packets() -> None:
     controller.set_value(2008, 1234)
     controller.naks_ahead, controller.bad_packets_ahead = 2, 4
     master = Master(msc.PROFILE, controller)
-    assert master.asks(msc.DataRead(2008)) == 1234
+    assert master.ask(msc.DataRead(2008)) == 1234
     master.leaves_off()
     assert controller.retransmitted == 4
     assert not controller.unacknowledged
@@ -256,10 +256,10 @@ def test_msc_writes_through_three_naks_and_is_refused_at_the_fourth() -> None:
     controller = EmulatedMsc(3)
     master = Master(msc.PROFILE, controller)
     controller.naks_ahead = 3
-    assert master.asks(msc.DataWrite(2008, 5)) is None
+    assert master.ask(msc.DataWrite(2008, 5)) is None
     controller.naks_ahead = 4
     with pytest.raises(Refused):
-        master.asks(msc.DataWrite(2008, 6))
+        master.ask(msc.DataWrite(2008, 6))
     assert controller.value(2008) == 5
 
 
@@ -268,7 +268,7 @@ def test_msc_never_takes_a_packet_whose_ack_was_lost_for_the_answer() -> None:
     controller.set_value(2008, 1234)
     controller.missing_acks_ahead = 1
     master = Master(msc.PROFILE, controller)
-    assert master.asks(msc.DataRead(2008)) == 1234
+    assert master.ask(msc.DataRead(2008)) == 1234
     master.leaves_off()
     assert not controller.unacknowledged
     counted = master.world.arbiter.statistics(master.world.now)
@@ -284,14 +284,14 @@ def test_a_packet_that_was_never_acknowledged_does_not_come_again_into_other_exc
     master.line.send(bytes.fromhex("02 03 00 08 00 00 44 52 45 41 44 2C 07 D8 02 76"), 2.0)  # another master's
     master.world.run(4.5)
     assert not first.unacknowledged
-    assert master.asks(msc.DataRead(2008), 4) == 44
+    assert master.ask(msc.DataRead(2008), 4) == 44
 
 
 def test_twenty_parameters_in_one_run_cost_at_most_65_percent_of_twenty_reads() -> None:
     def line_bytes(*commands: Command[Any]) -> int:
         master = Master(mentor.PROFILE, EmulatedMentor(14))
         for command in commands:
-            master.asks(command)
+            master.ask(command)
         passed = (entry.split(maxsplit=2) for entry in master.transcript)
         return sum(len(bytes.fromhex(data)) for _, way, data in passed if way in "<>")
 
@@ -302,8 +302,8 @@ def test_twenty_parameters_in_one_run_cost_at_most_65_percent_of_twenty_reads() 
 
 def test_a_dc104_write_is_awaited_until_its_eeprom_is_written() -> None:
     master = Master(dc104.PROFILE, EmulatedDc104(eeprom=Delay(0.4)))
-    assert master.asks(dc104.Write(1, 5)) is None
-    assert master.asks(dc104.Read(1)) == 5
+    assert master.ask(dc104.Write(1, 5)) is None
+    assert master.ask(dc104.Read(1)) == 5
 
 
 def test_a_node_that_is_not_there_does_not_answer() -> None:
@@ -311,4 +311,4 @@ def test_a_node_that_is_not_there_does_not_answer() -> None:
         master = Master(find(protocol).profile, make_device(protocol, 1))
         master.knows(find(protocol).profile, 2)
         with pytest.raises(NoReply):
-            master.asks(command, 2)
+            master.ask(command, 2)

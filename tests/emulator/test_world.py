@@ -12,7 +12,7 @@ from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo, Line
-from busmaster.emulator.oracle import Oracle, oracle_value
+from busmaster.emulator.traceable import TraceableMemory, traceable_value
 from busmaster.emulator.world import StuckWorldError, World
 from busmaster.errors import LineDown, NoReply
 from busmaster.protocols._comms.mint import EmulatedMint
@@ -107,7 +107,7 @@ def test_unplugging_fails_what_waits_and_plugging_in_lets_it_go_on() -> None:
 
 
 def transcript(seed: int) -> list[str]:
-    mint = EmulatedMint(2, delay=Delay(0.001, 0.01), oracle=Oracle(2))
+    mint = EmulatedMint(2, delay=Delay(0.001, 0.01), traceable=TraceableMemory(2))
     mint.faults = Faults.parse(["lost=0.1", "flip=0.1", "late=0.2", "trailing=0.1", "split=0.3", "babble=0.05"])
     lines: list[str] = []
     world = World(Line(SETTINGS, [mint, EmulatedMint(3)], chance=Random(seed)), record=lines.append)
@@ -145,10 +145,10 @@ def test_faults_inside_the_assumption_give_no_wrong_value_and_progress_goes_on()
             for read in event.poll.results:
                 if read.error is None:
                     good += 1
-                    if read.value != oracle_value(read.node.address, element_of(read), 0):
+                    if read.value != traceable_value(read.node.address, element_of(read), 0):
                         wrong.append(f"{world.now}: {read.node.label}, {read.command} = {read.value}")
 
-    devices = [EmulatedMint(address, oracle=Oracle(address)) for address in range(1, 5)]
+    devices = [EmulatedMint(address, traceable=TraceableMemory(address)) for address in range(1, 5)]
     faults = ["lost=.05", "late=.05", "late_by=.14", "flip=.05", "truncated=.05", "doubled=.05", "wrong=.05"]
     faults += ["leading=.05", "trailing=.05", "babble=.02", "split=.05", "nak=.05"]
     for device in devices:

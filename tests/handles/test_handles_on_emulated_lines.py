@@ -259,4 +259,4 @@ async def test_controllers_of_both_host_comms_protocols_share_a_line() -> None:
             assert [snapshot[point].value for point in points] == [
                 100 * number + value for number in range(4) for value in (0, 3, 16)
             ]
-        assert bus.statistics().stray_bytes == bus.statistics().collisions == 0
+        assert bus.statistics().unasked_bytes == bus.statistics().collisions == 0

@@ -306,11 +306,11 @@ def test_a_damaged_stale_packet_is_acked_when_the_line_pauses() -> None:
         assert listener.expired() == Done(None, send=ACK)
 
 
-@pytest.mark.parametrize("stray", [ACK, NAK, b"\x00" + STALE, b"\x02\xff" + bytes(300)])
-def test_what_is_no_stale_packet_is_not_answered(stray: bytes) -> None:
+@pytest.mark.parametrize("unasked", [ACK, NAK, b"\x00" + STALE, b"\x02\xff" + bytes(300)])
+def test_what_is_no_stale_packet_is_not_answered(unasked: bytes) -> None:
     listener = StalePacketListener()
-    with pytest.raises(FrameError, match="stray") as error:
-        listener.feed(stray)
+    with pytest.raises(FrameError, match="unasked") as error:
+        listener.feed(unasked)
     assert error.value.send == b""
     assert listener.feed(STALE) == Done(None, send=ACK)
 

@@ -11,7 +11,7 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -50,7 +50,7 @@ KINDS = {
 }
 
 
-class Teller(Oracle):
+class Teller(TraceableMemory):
     """The memory of a device whose values say which node has said them, and as the how manieth."""
 
     def __init__(self, node: int, modulus: int, told: Told) -> None:
@@ -74,7 +74,7 @@ def make_line(protocol: str, told: Told) -> Line:
     kind = KINDS[protocol]
     devices = []
     for address in kind.addresses:
-        device = make_device(protocol, address, delay=PROMPT, oracle=Teller(address, kind.modulus, told))
+        device = make_device(protocol, address, delay=PROMPT, traceable=Teller(address, kind.modulus, told))
         if isinstance(device, EmulatedMsc):
             device.packet_delay = PROMPT
         devices.append(device)

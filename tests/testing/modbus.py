@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from busmaster.contract.exchange import MORE, Command, Done, Expect, FrameError, Leg, Need, Sizes, no_reply
+from busmaster.contract.exchange import MORE, Command, Done, Expect, FrameError, LaterLeg, Need, Sizes, no_reply
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.device import Device
@@ -35,7 +35,7 @@ class Asking:
     """One attempt: the unit and function are echoed, an exception is three bytes, everything ends in a CRC."""
 
     sizes = Sizes(7, 7)
-    later: Sequence[Leg] = ()
+    later: Sequence[LaterLeg] = ()
     closing = 0
     answered = True
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from busmaster.contract.exchange import Command, Done, Expect, FrameError, Leg, Need, Sizes, no_reply
+from busmaster.contract.exchange import Command, Done, Expect, FrameError, LaterLeg, Need, Sizes, no_reply
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import Refused
 from busmaster.testing import Foreign, NotConformant, RoundTrip, Unseen, answers_of, check_protocol
@@ -144,7 +144,7 @@ class ClosingWithMoreThanItSays(Asking):
 
 
 class WithALegTooMany(Asking):
-    later = (Leg(MODBUS.timings.packet, Sizes(1, 1)),)
+    later = (LaterLeg(MODBUS.timings.packet, Sizes(1, 1)),)
 
 
 class Unanswered(Asking):

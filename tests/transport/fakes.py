@@ -78,7 +78,7 @@ class Recorder(asyncio.Protocol):
                 await self._changed.wait()
 
 
-class FarEnd:
+class PtyMaster:
     """The master side of a pty; `path` is where its port is opened."""
 
     def __init__(self) -> None:
@@ -114,15 +114,15 @@ class FarEnd:
 
 
 @contextlib.contextmanager
-def plugged(link: Path | None = None) -> Iterator[FarEnd]:
+def plugged(link: Path | None = None) -> Iterator[PtyMaster]:
     """A fresh pty, with a symlink to it if one is wanted; unplugged at the end."""
-    far_end = FarEnd()
+    pty_master = PtyMaster()
     if link is not None:
-        link.symlink_to(far_end.path)
+        link.symlink_to(pty_master.path)
     try:
-        yield far_end
+        yield pty_master
     finally:
-        far_end.unplug()
+        pty_master.unplug()
         if link is not None:
             link.unlink()
 
@@ -153,9 +153,9 @@ async def closed(transport: PortTransport, recorder: Recorder) -> None:
 
 
 @contextlib.contextmanager
-def plugged_high() -> Iterator[FarEnd]:
+def plugged_high() -> Iterator[PtyMaster]:
     """A pty whose number no other process gets when it is gone: the lowest is given, and many lower ones are free."""
-    ends = sorted((FarEnd() for _ in range(SPARE_NUMBERS)), key=lambda end: end.number)
+    ends = sorted((PtyMaster() for _ in range(SPARE_NUMBERS)), key=lambda end: end.number)
     for end in ends[:-1]:
         end.unplug()
     try:
@@ -165,19 +165,19 @@ def plugged_high() -> Iterator[FarEnd]:
 
 
 @contextlib.contextmanager
-def with_the_number_of(gone: FarEnd) -> Iterator[FarEnd]:
+def with_the_number_of(gone: PtyMaster) -> Iterator[PtyMaster]:
     """Another pty that has the number of one that is gone; the lower ones are taken meanwhile, if they were free."""
-    lower: list[FarEnd] = []
+    lower: list[PtyMaster] = []
     deadline = time.monotonic() + PATIENCE
-    while (far_end := FarEnd()).path != gone.path:
+    while (pty_master := PtyMaster()).path != gone.path:
         assert time.monotonic() < deadline, f"{gone.path} was not given again"
-        if far_end.number < gone.number:
-            lower.append(far_end)
+        if pty_master.number < gone.number:
+            lower.append(pty_master)
         else:  # it is still being closed
-            far_end.unplug()
+            pty_master.unplug()
             time.sleep(0.001)
     try:
-        yield far_end
+        yield pty_master
     finally:
-        for end in (far_end, *lower):
+        for end in (pty_master, *lower):
             end.unplug()

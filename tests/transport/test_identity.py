@@ -12,20 +12,20 @@ import pytest
 from busmaster.errors import LineDown
 from busmaster.transport import identity
 from busmaster.transport.identity import Identity, identify, lasting_name, resolve, usb_devices
-from tests.transport.fakes import FarEnd, plugged, plugged_high, with_the_number_of
+from tests.transport.fakes import PtyMaster, plugged, plugged_high, with_the_number_of
 from tests.transport.usb import UsbTree
 
 CH340 = "1a86:7523"
 
 
 @pytest.fixture
-def one() -> Iterator[FarEnd]:
+def one() -> Iterator[PtyMaster]:
     with plugged() as end:
         yield end
 
 
 @pytest.fixture
-def two() -> Iterator[FarEnd]:
+def two() -> Iterator[PtyMaster]:
     with plugged() as end:
         yield end
 
@@ -34,7 +34,7 @@ def two() -> Iterator[FarEnd]:
 
 
 def test_an_adapter_with_a_serial_number_is_known_by_it_wherever_it_is_plugged_in(
-    usb: UsbTree, one: FarEnd, two: FarEnd
+    usb: UsbTree, one: PtyMaster, two: PtyMaster
 ) -> None:
     usb.plug(one.path, "A500ABC", place="1-1.1")
     known = identify(one.path)
@@ -61,7 +61,7 @@ def test_another_serial_number_interface_or_port_of_an_interface_is_another_devi
 
 
 def test_an_adapter_without_a_serial_number_is_known_by_where_it_is_plugged_in(
-    usb: UsbTree, one: FarEnd, two: FarEnd
+    usb: UsbTree, one: PtyMaster, two: PtyMaster
 ) -> None:
     usb.plug(one.path, place="1-1.1", maker="QinHeng", kind=CH340)
     usb.plug(two.path, place="1-1.2", maker="QinHeng", kind=CH340)
@@ -78,7 +78,7 @@ def test_an_adapter_without_a_serial_number_is_known_by_where_it_is_plugged_in(
 
 
 def test_adapters_that_have_all_the_same_serial_number_are_known_by_where_they_are(
-    usb: UsbTree, one: FarEnd, two: FarEnd
+    usb: UsbTree, one: PtyMaster, two: PtyMaster
 ) -> None:
     usb.plug(one.path, "0001", place="1-1")
     alone = identify(one.path)
@@ -110,7 +110,7 @@ def test_a_port_that_the_kernel_does_not_describe_has_just_gone(usb: UsbTree, mo
 
 
 def test_a_serial_number_is_resolved_to_the_path_that_its_adapter_has_now(
-    usb: UsbTree, one: FarEnd, two: FarEnd
+    usb: UsbTree, one: PtyMaster, two: PtyMaster
 ) -> None:
     usb.plug(one.path, "A500ABC", place="1-1")
     usb.plug(two.path, "34:85:18:AC", place="1-2", interface=2)
@@ -119,7 +119,7 @@ def test_a_serial_number_is_resolved_to_the_path_that_its_adapter_has_now(
     assert resolve("/dev/anything") == "/dev/anything"
 
 
-def test_a_serial_number_that_is_not_there_says_what_is(usb: UsbTree, one: FarEnd, two: FarEnd) -> None:
+def test_a_serial_number_that_is_not_there_says_what_is(usb: UsbTree, one: PtyMaster, two: PtyMaster) -> None:
     with pytest.raises(LineDown, match="usb:A500ABC is not plugged in: there is no USB serial port at all; plug it in"):
         resolve("usb:A500ABC")
     usb.plug(one.path, "A500XYZ", place="1-1")
@@ -131,7 +131,9 @@ def test_a_serial_number_that_is_not_there_says_what_is(usb: UsbTree, one: FarEn
         assert f"one without a lasting name ({two.path})" in caught.value.what
 
 
-def test_an_adapter_with_several_interfaces_wants_one_of_them_named(usb: UsbTree, one: FarEnd, two: FarEnd) -> None:
+def test_an_adapter_with_several_interfaces_wants_one_of_them_named(
+    usb: UsbTree, one: PtyMaster, two: PtyMaster
+) -> None:
     usb.plug(one.path, "A500ABC", interface=0)
     usb.plug(two.path, "A500ABC", interface=1)
     with pytest.raises(LineDown, match=r"usb:A500ABC could be any of usb:A500ABC:[01] .*, usb:A500ABC:[01] ") as caught:
@@ -141,13 +143,13 @@ def test_an_adapter_with_several_interfaces_wants_one_of_them_named(usb: UsbTree
 
 
 def test_the_lasting_name_is_the_serial_number_or_else_the_link_that_udev_keeps(
-    usb: UsbTree, one: FarEnd, two: FarEnd, tmp_path: Path
+    usb: UsbTree, one: PtyMaster, two: PtyMaster, tmp_path: Path
 ) -> None:
     for folder, end in (("by-path", one), ("by-id", two)):
         (tmp_path / "links" / folder).mkdir(parents=True)
         (tmp_path / "links" / folder / "it").symlink_to(end.path)
 
-    def name_of(end: FarEnd) -> str:
+    def name_of(end: PtyMaster) -> str:
         return lasting_name(next(device for device in usb_devices() if device.path == end.path))
 
     usb.plug(one.path, place="1-1")
@@ -162,7 +164,7 @@ def test_the_lasting_name_is_the_serial_number_or_else_the_link_that_udev_keeps(
 # -- pseudo-terminals ------------------------------------------------------------------------------------------------
 
 
-def test_a_pseudo_terminal_stays_the_same_whatever_is_done_to_it(one: FarEnd, two: FarEnd) -> None:
+def test_a_pseudo_terminal_stays_the_same_whatever_is_done_to_it(one: PtyMaster, two: PtyMaster) -> None:
     known = identify(one.path)
     descriptor = os.open(one.path, os.O_RDWR | os.O_NOCTTY)
     os.write(descriptor, b"x")
@@ -174,7 +176,7 @@ def test_a_pseudo_terminal_stays_the_same_whatever_is_done_to_it(one: FarEnd, tw
     assert not known.accepts(identify(two.path))
 
 
-def with_reused_number(check: Callable[[Identity, FarEnd], None], link: Path | None = None) -> None:
+def with_reused_number(check: Callable[[Identity, PtyMaster], None], link: Path | None = None) -> None:
     """Check what was known of a pseudo-terminal against another one that got its number."""
     with plugged_high() as end:
         if link is not None:
@@ -186,7 +188,7 @@ def with_reused_number(check: Callable[[Identity, FarEnd], None], link: Path | N
 
 
 def test_the_number_of_a_pseudo_terminal_does_not_make_it_the_same() -> None:
-    def check(known: Identity, heir: FarEnd) -> None:
+    def check(known: Identity, heir: PtyMaster) -> None:
         other = identify(heir.path)
         assert not known.accepts(other)
         assert str(known).startswith("the pseudo-terminal made at 20")
@@ -197,7 +199,7 @@ def test_the_number_of_a_pseudo_terminal_does_not_make_it_the_same() -> None:
 def test_a_link_left_behind_is_not_followed_to_a_number_reused_but_one_made_anew_is(tmp_path: Path) -> None:
     link = tmp_path / "line"
 
-    def check(known: Identity, heir: FarEnd) -> None:
+    def check(known: Identity, heir: PtyMaster) -> None:
         assert not known.accepts(identify(str(link)))
         link.unlink()
         link.symlink_to(heir.path)
@@ -207,7 +209,7 @@ def test_a_link_left_behind_is_not_followed_to_a_number_reused_but_one_made_anew
     with_reused_number(check, link)
 
 
-def test_a_link_to_a_link_is_followed_when_either_is_made_anew(tmp_path: Path, one: FarEnd, two: FarEnd) -> None:
+def test_a_link_to_a_link_is_followed_when_either_is_made_anew(tmp_path: Path, one: PtyMaster, two: PtyMaster) -> None:
     (tmp_path / "outer").symlink_to("inner")
     (tmp_path / "inner").symlink_to(one.path)
     known = identify(str(tmp_path / "outer"))
@@ -216,7 +218,7 @@ def test_a_link_to_a_link_is_followed_when_either_is_made_anew(tmp_path: Path, o
     assert known.accepts(identify(str(tmp_path / "outer")))
 
 
-def test_devices_of_different_kinds_are_never_the_same(usb: UsbTree, one: FarEnd, two: FarEnd) -> None:
+def test_devices_of_different_kinds_are_never_the_same(usb: UsbTree, one: PtyMaster, two: PtyMaster) -> None:
     usb.plug(one.path, "A500ABC")
     (usb.root / "dev/char/1:3").touch()
     known = [identify(path) for path in (one.path, two.path, os.devnull)]

@@ -18,7 +18,7 @@ from busmaster.arbiter.counters import DriverErrors
 from busmaster.transport import kernel
 from busmaster.transport.kernel import DELAYED_ACK, TIOCGICOUNT, Socket, open_port
 from busmaster.transport.tcp import TcpPort
-from tests.transport.fakes import PATIENCE, FarEnd, Recorder, closed, opened, plugged, standing_still
+from tests.transport.fakes import PATIENCE, PtyMaster, Recorder, closed, opened, plugged, standing_still
 
 Runner = Callable[[Coroutine[Any, Any, None]], None]
 LATER = 60.0
@@ -26,7 +26,7 @@ LATER = 60.0
 
 
 @pytest.fixture
-def far_end() -> Iterator[FarEnd]:
+def pty_master() -> Iterator[PtyMaster]:
     with plugged() as end:
         yield end
 
@@ -62,8 +62,8 @@ def driver(monkeypatch: pytest.MonkeyPatch) -> Driver:
 
 
 @pytest.mark.asyncio
-async def test_what_a_stopped_tty_does_not_take_has_not_left(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_what_a_stopped_tty_does_not_take_has_not_left(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     port = open_port(transport)
     assert port.unsent(0.0) == 0
     termios.tcflow(transport._fd, termios.TCOOFF)
@@ -73,13 +73,13 @@ async def test_what_a_stopped_tty_does_not_take_has_not_left(far_end: FarEnd) ->
     termios.tcflow(transport._fd, termios.TCOON)
     await recorder.until(lambda r: r.flow == ["pause", "resume"])
     assert port.unsent(0.0) == 0
-    assert far_end.read() == b"05\x05"
+    assert pty_master.read() == b"05\x05"
     await closed(transport, recorder)
 
 
 @pytest.mark.asyncio
-async def test_what_lies_in_the_drivers_queue_has_not_left(far_end: FarEnd, driver: Driver) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_what_lies_in_the_drivers_queue_has_not_left(pty_master: PtyMaster, driver: Driver) -> None:
+    transport, recorder = await opened(pty_master.path)
     driver.queue = 8
     assert open_port(transport).unsent(0.0) == 8
     await closed(transport, recorder)
@@ -87,10 +87,10 @@ async def test_what_lies_in_the_drivers_queue_has_not_left(far_end: FarEnd, driv
 
 @pytest.mark.asyncio
 async def test_the_drivers_counts_run_from_the_opening_or_the_reset_and_over_their_end(
-    far_end: FarEnd, driver: Driver
+    pty_master: PtyMaster, driver: Driver
 ) -> None:
     driver.counts = {6: 10, 7: 20, 8: 2**31 - 1, 9: 40, 10: 50}  # frame, overrun, parity, brk, buf_overrun
-    transport, recorder = await opened(far_end.path)
+    transport, recorder = await opened(pty_master.path)
     port = open_port(transport)
     assert port.errors() == DriverErrors(0, 0, 0, 0, 0)
     driver.counts = {6: 11, 7: 22, 8: -(2**31) + 2, 9: 44, 10: 55}
@@ -101,8 +101,8 @@ async def test_the_drivers_counts_run_from_the_opening_or_the_reset_and_over_the
 
 
 @pytest.mark.asyncio
-async def test_a_pty_has_no_counts_of_a_driver(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_a_pty_has_no_counts_of_a_driver(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     assert open_port(transport).errors() is None
     await closed(transport, recorder)
 

@@ -22,7 +22,7 @@ from busmaster.registry import make_device
 from busmaster.transport.marks import Unescape
 from busmaster.transport.serial_port import PortTransport
 from busmaster.wire.checks import xor
-from tests.transport.fakes import FarEnd, Recorder, closed, opened, plugged
+from tests.transport.fakes import PtyMaster, Recorder, closed, opened, plugged
 
 HEARD = [
     (b"a\xffb", None),
@@ -39,7 +39,7 @@ RAW = termios.INPCK | termios.PARMRK
 
 
 @pytest.fixture
-def far_end() -> Iterator[FarEnd]:
+def pty_master() -> Iterator[PtyMaster]:
     with plugged() as end:
         yield end
 
@@ -115,42 +115,42 @@ def test_a_lone_ff_from_a_tty_that_marks_no_more_is_a_byte() -> None:
 
 
 @pytest.mark.asyncio
-async def test_the_tty_doubles_ff_and_the_protocol_never_sees_that(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_the_tty_doubles_ff_and_the_protocol_never_sees_that(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     device = transport.get_extra_info("serial")
     transport.pause_reading()
-    far_end.write(bytes.fromhex("01 ff 00 ff ff"))
+    pty_master.write(bytes.fromhex("01 ff 00 ff ff"))
     readable(device.fileno())
     assert os.read(device.fileno(), 100) == bytes.fromhex("01 ff ff 00 ff ff ff ff")
     transport.resume_reading()
-    far_end.write(bytes.fromhex("01 ff 00 ff ff"))
+    pty_master.write(bytes.fromhex("01 ff 00 ff ff"))
     await recorder.until(lambda r: len(r.received) == 5)
     assert recorder.received == bytes.fromhex("01 ff 00 ff ff")
     await closed(transport, recorder)
 
 
-async def marked(far_end: FarEnd) -> tuple[PortTransport, Marked]:
+async def marked(pty_master: PtyMaster) -> tuple[PortTransport, Marked]:
     """A port whose pty lets through what is written into it: its own PARMRK is cleared behind the port's back."""
     recorder = Marked()
-    transport = await SerialPort(far_end.path, baudrate=57600).open(lambda: recorder)
+    transport = await SerialPort(pty_master.path, baudrate=57600).open(lambda: recorder)
     set_input_flags(transport.get_extra_info("serial").fileno(), 0)
     return transport, recorder
 
 
 @pytest.mark.asyncio
-async def test_errors_and_breaks_come_in_order_with_the_data(far_end: FarEnd) -> None:
-    transport, recorder = await marked(far_end)
-    far_end.write(SAID)
+async def test_errors_and_breaks_come_in_order_with_the_data(pty_master: PtyMaster) -> None:
+    transport, recorder = await marked(pty_master)
+    pty_master.write(SAID)
     await recorder.until(lambda _: joined(recorder.pieces) == HEARD)
     await closed(transport, recorder)
 
 
 @pytest.mark.asyncio
-async def test_a_mark_split_over_reads_is_put_together(far_end: FarEnd) -> None:
-    transport, recorder = await marked(far_end)
+async def test_a_mark_split_over_reads_is_put_together(pty_master: PtyMaster) -> None:
+    transport, recorder = await marked(pty_master)
     transport.pause_reading()
     for byte in SAID:
-        far_end.write(bytes((byte,)))
+        pty_master.write(bytes((byte,)))
         readable(transport.get_extra_info("serial").fileno())
         transport._read_ready()
     assert joined(recorder.pieces) == HEARD
@@ -158,10 +158,10 @@ async def test_a_mark_split_over_reads_is_put_together(far_end: FarEnd) -> None:
 
 
 @pytest.mark.asyncio
-async def test_a_protocol_that_knows_no_marks_takes_a_damaged_byte_for_data(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_a_protocol_that_knows_no_marks_takes_a_damaged_byte_for_data(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     set_input_flags(transport.get_extra_info("serial").fileno(), 0)
-    far_end.write(SAID)
+    pty_master.write(SAID)
     await recorder.heard(b"c")
     assert recorder.received == b"".join(piece for piece, _ in HEARD)
     await closed(transport, recorder)
@@ -171,22 +171,22 @@ async def test_a_protocol_that_knows_no_marks_takes_a_damaged_byte_for_data(far_
 
 
 @pytest.mark.asyncio
-async def test_whatever_another_program_left_set_is_cleared(far_end: FarEnd) -> None:
-    bystander = os.open(far_end.path, os.O_RDWR | os.O_NOCTTY)
+async def test_whatever_another_program_left_set_is_cleared(pty_master: PtyMaster) -> None:
+    bystander = os.open(pty_master.path, os.O_RDWR | os.O_NOCTTY)
     left = ("BRKINT", "IGNBRK", "IGNPAR", "IMAXBEL", "ISTRIP", "INLCR", "IGNCR", "ICRNL", "IXON", "IXOFF", "IXANY")
     iuclc = 0o001000
     set_input_flags(bystander, iuclc | sum(getattr(termios, name) for name in left))
-    transport, recorder = await opened(far_end.path)
+    transport, recorder = await opened(pty_master.path)
     assert input_flags(bystander) == RAW
     await closed(transport, recorder)
     os.close(bystander)
 
 
 @pytest.mark.asyncio
-async def test_a_port_that_is_closed_marks_no_more_for_whoever_opens_it_next(far_end: FarEnd) -> None:
-    bystander = os.open(far_end.path, os.O_RDWR | os.O_NOCTTY)
+async def test_a_port_that_is_closed_marks_no_more_for_whoever_opens_it_next(pty_master: PtyMaster) -> None:
+    bystander = os.open(pty_master.path, os.O_RDWR | os.O_NOCTTY)
     for exclusive, left in ((True, 0), (False, RAW)):
-        transport, recorder = await opened(far_end.path, exclusive=exclusive)
+        transport, recorder = await opened(pty_master.path, exclusive=exclusive)
         assert input_flags(bystander) == RAW
         await closed(transport, recorder)
         assert input_flags(bystander) == left
@@ -194,20 +194,20 @@ async def test_a_port_that_is_closed_marks_no_more_for_whoever_opens_it_next(far
 
 
 @pytest.mark.asyncio
-async def test_a_port_that_is_configured_anew_still_marks(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_a_port_that_is_configured_anew_still_marks(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     device = transport.get_extra_info("serial")
     await asyncio.to_thread(device.apply_settings, {"baudrate": 9600})
     assert input_flags(device.fileno()) == RAW
-    far_end.write(bytes.fromhex("ff 41"))
+    pty_master.write(bytes.fromhex("ff 41"))
     await recorder.heard(b"\xff\x41")
     await closed(transport, recorder)
 
 
 @pytest.mark.asyncio
-async def test_a_rate_that_only_this_system_has_survives(far_end: FarEnd) -> None:
+async def test_a_rate_that_only_this_system_has_survives(pty_master: PtyMaster) -> None:
     recorder = Recorder()
-    transport = await SerialPort(far_end.path, baudrate=250_000).open(lambda: recorder)
+    transport = await SerialPort(pty_master.path, baudrate=250_000).open(lambda: recorder)
     settings = bytearray(44)
     fcntl.ioctl(transport.get_extra_info("serial").fileno(), TCGETS2, settings)
     assert struct.unpack_from("II", settings, 36) == (250_000, 250_000)
@@ -216,7 +216,7 @@ async def test_a_rate_that_only_this_system_has_survives(far_end: FarEnd) -> Non
 
 @pytest.mark.asyncio
 async def test_where_the_driver_refuses_to_mark_data_passes_as_before(
-    far_end: FarEnd, monkeypatch: pytest.MonkeyPatch
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     really_set = termios.tcsetattr
 
@@ -224,9 +224,9 @@ async def test_where_the_driver_refuses_to_mark_data_passes_as_before(
         really_set(descriptor, when, [settings[0] & ~termios.PARMRK, *settings[1:]])
 
     monkeypatch.setattr(termios, "tcsetattr", refuse)
-    transport, recorder = await opened(far_end.path)
+    transport, recorder = await opened(pty_master.path)
     assert not transport.get_extra_info("serial").marks
-    far_end.write(SAID)
+    pty_master.write(SAID)
     await recorder.heard(b"c")
     assert recorder.received == SAID
     await closed(transport, recorder)
@@ -241,19 +241,19 @@ def reply(value: int, element: bytes = b"01") -> bytes:
 
 
 @pytest.mark.asyncio
-async def test_a_reply_with_a_damaged_byte_fails_the_attempt_and_is_counted(far_end: FarEnd) -> None:
+async def test_a_reply_with_a_damaged_byte_fails_the_attempt_and_is_counted(pty_master: PtyMaster) -> None:
     """Two flipped bits in two bytes pass any exclusive-or: only the UART knows."""
 
     async def node() -> None:
         """Answers what it is asked: the first time with a mark within."""
         damage = b"\xff\x00"
         while True:
-            if request := await asyncio.to_thread(far_end.read, 0.02):
+            if request := await asyncio.to_thread(pty_master.read, 0.02):
                 good = reply(234, request[4:6])
-                far_end.write(good[:3] + damage + good[3:])
+                pty_master.write(good[:3] + damage + good[3:])
                 damage = b""
 
-    async with Bus(SerialPort(far_end.path, baudrate=57600)) as bus:
+    async with Bus(SerialPort(pty_master.path, baudrate=57600)) as bus:
         transport = bus.pump._transport
         assert transport is not None
         set_input_flags(transport.get_extra_info("serial").fileno(), 0)

@@ -23,13 +23,13 @@ from serial.rs485 import RS485Settings
 from busmaster.errors import LineDown
 from busmaster.transport import serial_port
 from busmaster.transport.serial_port import SerialPort
-from tests.transport.fakes import FarEnd, Recorder, closed, opened, plugged
+from tests.transport.fakes import PtyMaster, Recorder, closed, opened, plugged
 
 TIOCGEXCL = 0x80045440
 
 
 @pytest.fixture
-def far_end() -> Iterator[FarEnd]:
+def pty_master() -> Iterator[PtyMaster]:
     with plugged() as end:
         yield end
 
@@ -53,8 +53,8 @@ def slow_driver(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
 
 
 @pytest.mark.asyncio
-async def test_a_slow_opening_leaves_the_loop_free(far_end: FarEnd, slow_driver: threading.Event) -> None:
-    opening = asyncio.ensure_future(opened(far_end.path))
+async def test_a_slow_opening_leaves_the_loop_free(pty_master: PtyMaster, slow_driver: threading.Event) -> None:
+    opening = asyncio.ensure_future(opened(pty_master.path))
     await asyncio.sleep(0.02)
     assert not opening.done()
     slow_driver.set()
@@ -63,33 +63,33 @@ async def test_a_slow_opening_leaves_the_loop_free(far_end: FarEnd, slow_driver:
 
 @pytest.mark.asyncio
 async def test_an_opening_that_does_not_come_back_is_given_up_and_its_port_released(
-    far_end: FarEnd, slow_driver: threading.Event, monkeypatch: pytest.MonkeyPatch
+    pty_master: PtyMaster, slow_driver: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(serial_port, "OPEN_DEADLINE", 0.02)
     with pytest.raises(LineDown, match="did not open within"):
-        await opened(far_end.path)
-    await _is_released_in_the_end(far_end.path, slow_driver)
+        await opened(pty_master.path)
+    await _is_released_in_the_end(pty_master.path, slow_driver)
 
 
 @pytest.mark.asyncio
-async def test_a_cancelled_opening_releases_its_port(far_end: FarEnd, slow_driver: threading.Event) -> None:
-    opening = asyncio.ensure_future(opened(far_end.path))
+async def test_a_cancelled_opening_releases_its_port(pty_master: PtyMaster, slow_driver: threading.Event) -> None:
+    opening = asyncio.ensure_future(opened(pty_master.path))
     await asyncio.sleep(0)
     opening.cancel()
     with pytest.raises(asyncio.CancelledError):
         await opening
-    await _is_released_in_the_end(far_end.path, slow_driver)
+    await _is_released_in_the_end(pty_master.path, slow_driver)
 
 
 @pytest.mark.asyncio
-async def test_an_opening_cancelled_when_it_was_all_but_done_is_closed_again(far_end: FarEnd) -> None:
+async def test_an_opening_cancelled_when_it_was_all_but_done_is_closed_again(pty_master: PtyMaster) -> None:
     class Cancels(Recorder):
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
             super().connection_made(transport)
             opening.cancel()
 
     recorder = Cancels()
-    opening = asyncio.ensure_future(SerialPort(far_end.path, baudrate=57600).open(lambda: recorder))
+    opening = asyncio.ensure_future(SerialPort(pty_master.path, baudrate=57600).open(lambda: recorder))
     with pytest.raises(asyncio.CancelledError):
         await opening
     await recorder.lost()
@@ -111,7 +111,7 @@ async def _is_released_in_the_end(path: str, slow_driver: threading.Event) -> No
 
 
 @pytest.mark.asyncio
-async def test_the_port_is_configured_in_a_thread_alone(far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_port_is_configured_in_a_thread_alone(pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch) -> None:
     threads = set()
     really_ask = termios.tcgetattr
 
@@ -120,16 +120,16 @@ async def test_the_port_is_configured_in_a_thread_alone(far_end: FarEnd, monkeyp
         return really_ask(descriptor)
 
     monkeypatch.setattr(termios, "tcgetattr", ask)  # each configuration begins with it
-    transport, recorder = await opened(far_end.path)
-    assert f"open {far_end.path}" in threads
+    transport, recorder = await opened(pty_master.path)
+    assert f"open {pty_master.path}" in threads
     assert threading.main_thread().name not in threads
     await closed(transport, recorder)
 
 
 @pytest.mark.asyncio
-async def test_a_pty_opens_again_and_again_whatever_framing_the_protocol_has(far_end: FarEnd) -> None:
+async def test_a_pty_opens_again_and_again_whatever_framing_the_protocol_has(pty_master: PtyMaster) -> None:
     for _ in range(3):
-        transport, recorder = await opened(far_end.path, bytesize=7, parity="E")
+        transport, recorder = await opened(pty_master.path, bytesize=7, parity="E")
         await closed(transport, recorder)
 
 
@@ -143,12 +143,12 @@ async def test_descriptors_above_1023_work() -> None:
     try:
         while not taken or taken[-1] < 1030:
             taken.append(os.open(os.devnull, os.O_RDONLY))
-        with plugged() as far_end:
-            transport, recorder = await opened(far_end.path)
+        with plugged() as pty_master:
+            transport, recorder = await opened(pty_master.path)
             assert transport.get_extra_info("serial").fileno() > 1023
             transport.write(b"ping")
-            assert far_end.read() == b"ping"
-            far_end.write(b"pong")
+            assert pty_master.read() == b"ping"
+            pty_master.write(b"pong")
             await recorder.heard(b"pong")
             await closed(transport, recorder)
     finally:
@@ -173,33 +173,33 @@ def _taken(bystander: int) -> tuple[bool, bool]:
 
 
 @pytest.mark.asyncio
-async def test_both_locks_are_taken_and_given_back(far_end: FarEnd) -> None:
-    bystander = os.open(far_end.path, os.O_RDWR | os.O_NOCTTY)  # keeps the pty, and with it a forgotten flag, alive
-    transport, recorder = await opened(far_end.path)
+async def test_both_locks_are_taken_and_given_back(pty_master: PtyMaster) -> None:
+    bystander = os.open(pty_master.path, os.O_RDWR | os.O_NOCTTY)  # keeps the pty, and with it a forgotten flag, alive
+    transport, recorder = await opened(pty_master.path)
     inherited = os.dup(transport.get_extra_info("serial").fileno())  # as by a process forked meanwhile
     assert _taken(bystander) == (True, True)
     await closed(transport, recorder)
     assert _taken(bystander) == (False, False)
     os.close(inherited)
-    transport, recorder = await opened(far_end.path, exclusive=False)
+    transport, recorder = await opened(pty_master.path, exclusive=False)
     assert _taken(bystander) == (False, False)
     await closed(transport, recorder)
     os.close(bystander)
 
 
 @pytest.mark.asyncio
-async def test_a_second_opening_says_that_this_program_has_it(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
-    with pytest.raises(LineDown, match=f"{far_end.path} is in use by this program; "):
-        await opened(far_end.path)
+async def test_a_second_opening_says_that_this_program_has_it(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
+    with pytest.raises(LineDown, match=f"{pty_master.path} is in use by this program; "):
+        await opened(pty_master.path)
     await closed(transport, recorder)
-    await closed(*await opened(far_end.path))
+    await closed(*await opened(pty_master.path))
 
 
 @pytest.fixture
-def locked_elsewhere(far_end: FarEnd) -> Iterator[int]:
+def locked_elsewhere(pty_master: PtyMaster) -> Iterator[int]:
     """The id of another process that has locked the port."""
-    lock = f"import fcntl; f = open({far_end.path!r}); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
+    lock = f"import fcntl; f = open({pty_master.path!r}); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
     with subprocess.Popen([sys.executable, "-ISc", lock], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdin is not None
         assert other.stdout is not None
@@ -209,9 +209,9 @@ def locked_elsewhere(far_end: FarEnd) -> Iterator[int]:
 
 
 @pytest.mark.asyncio
-async def test_a_second_opening_says_which_other_program_has_it(far_end: FarEnd, locked_elsewhere: int) -> None:
+async def test_a_second_opening_says_which_other_program_has_it(pty_master: PtyMaster, locked_elsewhere: int) -> None:
     with pytest.raises(LineDown, match=rf"is in use by python\S* \(process {locked_elsewhere}\)"):
-        await opened(far_end.path)
+        await opened(pty_master.path)
 
 
 # -- what only some drivers have -------------------------------------------------------------------------------------
@@ -221,26 +221,30 @@ async def test_a_second_opening_says_which_other_program_has_it(far_end: FarEnd,
     ("option", "says"), [("rs485", "no RS-485 mode; leave rs485 out"), ("low_latency", "no low-latency flag; leave")]
 )
 @pytest.mark.asyncio
-async def test_a_driver_without_it_is_named_and_the_port_released(far_end: FarEnd, option: str, says: str) -> None:
-    with pytest.raises(LineDown, match=f"the driver of {far_end.path} has {says}"):
-        await opened(far_end.path, **{option: True})
-    await closed(*await opened(far_end.path))
+async def test_a_driver_without_it_is_named_and_the_port_released(
+    pty_master: PtyMaster, option: str, says: str
+) -> None:
+    with pytest.raises(LineDown, match=f"the driver of {pty_master.path} has {says}"):
+        await opened(pty_master.path, **{option: True})
+    await closed(*await opened(pty_master.path))
 
 
 @pytest.mark.asyncio
-async def test_driver_extras_are_touched_only_when_asked_for(far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_driver_extras_are_touched_only_when_asked_for(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked = []
     monkeypatch.setattr(serial.Serial, "_set_rs485_mode", lambda _, settings: asked.append(settings))
     monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda _, flag: asked.append(flag))
-    await closed(*await opened(far_end.path))
+    await closed(*await opened(pty_master.path))
     assert asked == []
     settings = RS485Settings(rts_level_for_tx=False, rts_level_for_rx=True)
     recorder = Recorder()
-    port = SerialPort(far_end.path, baudrate=57600, rs485=settings, low_latency=False)
+    port = SerialPort(pty_master.path, baudrate=57600, rs485=settings, low_latency=False)
     await closed(await port.open(lambda: recorder), recorder)
     assert asked == [settings, False]
     asked.clear()
-    await closed(*await opened(far_end.path, rs485=True, low_latency=True))
+    await closed(*await opened(pty_master.path, rs485=True, low_latency=True))
     assert asked[0].rts_level_for_tx is True
     assert asked[1] is True
 
@@ -283,13 +287,13 @@ async def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
 )
 @pytest.mark.asyncio
 async def test_every_refusal_is_one_sentence_about_the_port(
-    far_end: FarEnd, monkeypatch: pytest.MonkeyPatch, error: Exception, says: str
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch, error: Exception, says: str
 ) -> None:
     def refuse(_: serial.Serial) -> None:
         raise error
 
     monkeypatch.setattr(serial.Serial, "open", refuse)
     with pytest.raises(LineDown, match=says) as caught:
-        await opened(far_end.path)
-    assert far_end.path in str(caught.value)
+        await opened(pty_master.path)
+    assert pty_master.path in str(caught.value)
     assert caught.value.__cause__ is None

@@ -21,7 +21,7 @@ from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport import pump as pump_module
 from busmaster.transport.pump import STUCK_AFTER, Pump
-from tests.transport.fakes import FarEnd, plugged, standing_still
+from tests.transport.fakes import PtyMaster, plugged, standing_still
 from tests.transport.test_marks import reply
 
 WINDOW = hcp2.PROFILE.timings.read.window
@@ -260,19 +260,21 @@ def test_closing_does_not_wait_for_output_that_is_held() -> None:
 
 
 @pytest.fixture
-def far_end() -> Iterator[FarEnd]:
+def pty_master() -> Iterator[PtyMaster]:
     with plugged() as end:
         yield end
 
 
 @pytest.mark.asyncio
-async def test_a_tty_stopped_for_longer_than_any_window_delays_its_replies_and_mixes_none(far_end: FarEnd) -> None:
+async def test_a_tty_stopped_for_longer_than_any_window_delays_its_replies_and_mixes_none(
+    pty_master: PtyMaster,
+) -> None:
     async def said() -> bytes:
-        while not (data := await asyncio.to_thread(far_end.read, 0.05)):
+        while not (data := await asyncio.to_thread(pty_master.read, 0.05)):
             pass
         return data
 
-    async with Bus(SerialPort(far_end.path, baudrate=57600)) as bus:
+    async with Bus(SerialPort(pty_master.path, baudrate=57600)) as bus:
         axis = Hcp2Controller(bus, 1)
         transport: Any = bus.pump._transport
         termios.tcflow(transport._fd, termios.TCOOFF)
@@ -285,28 +287,28 @@ async def test_a_tty_stopped_for_longer_than_any_window_delays_its_replies_and_m
         termios.tcflow(transport._fd, termios.TCOON)
         for value in (1, 2, 3):
             assert len(await said()) == requested
-            far_end.write(reply(value))
+            pty_master.write(reply(value))
         assert await asyncio.gather(*readings) == [1, 2, 3]
 
 
 @pytest.mark.asyncio
 async def test_a_tty_stopped_for_good_takes_the_line_down_in_words(
-    far_end: FarEnd, monkeypatch: pytest.MonkeyPatch
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pump_module, "STUCK_AFTER", 0.1)
-    async with Bus(SerialPort(far_end.path, baudrate=57600)) as bus:
+    async with Bus(SerialPort(pty_master.path, baudrate=57600)) as bus:
         axis = Hcp2Controller(bus, 1)
         transport: Any = bus.pump._transport
         termios.tcflow(transport._fd, termios.TCOOFF)
         with pytest.raises(
             LineDown,
-            match=f"nothing has left {far_end.path} for 0.1 s: flow control holds it or the adapter is stuck; "
+            match=f"nothing has left {pty_master.path} for 0.1 s: flow control holds it or the adapter is stuck; "
             "check CTS, replug",
         ):
             await axis.read(1, retries=0)
         while bus.pump._transport in (None, transport):  # noqa: ASYNC110  # reopened by itself
             await asyncio.sleep(0.001)
-        assert far_end.read(patience=0.01) == b""
+        assert pty_master.read(patience=0.01) == b""
 
 
 class Server:

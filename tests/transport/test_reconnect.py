@@ -20,7 +20,7 @@ from busmaster.transport.identity import Identity
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
-from tests.transport.fakes import FarEnd, Recorder, plugged
+from tests.transport.fakes import PtyMaster, Recorder, plugged
 
 
 @asynccontextmanager
@@ -298,13 +298,13 @@ async def test_a_pty_that_is_unplugged_and_comes_back_at_its_link_is_picked_up(t
     link, recorder = tmp_path / "line", Recorder()
     async with kept(SerialPort(str(link), baudrate=57600), recorder):
         for n in range(3):
-            with plugged(link) as far_end:
+            with plugged(link) as pty_master:
                 await recorder.connected(n + 1)
-                far_end.write(b"%d" % n)
+                pty_master.write(b"%d" % n)
                 await recorder.heard(b"%d" % n)
                 assert recorder.transport is not None
                 recorder.transport.write(b"hello")
-                assert far_end.read() == b"hello"
+                assert pty_master.read() == b"hello"
             await recorder.lost(n + 1)
     assert all(isinstance(loss, LineDown) for loss in recorder.losses)
 
@@ -346,9 +346,9 @@ def test_closing_ends_a_run_that_waits_for_its_next_attempt() -> None:
 
 @pytest.mark.asyncio
 async def test_closing_while_an_opening_is_under_way_closes_what_it_opens(tmp_path: Path) -> None:
-    with plugged() as far_end:
+    with plugged() as pty_master:
         recorder = Recorder()
-        connection = Connection(SerialPort(far_end.path, baudrate=57600), recorder)
+        connection = Connection(SerialPort(pty_master.path, baudrate=57600), recorder)
         opening = asyncio.ensure_future(connection.open())
         await asyncio.sleep(0)
         await connection.close()
@@ -371,17 +371,17 @@ async def test_a_transport_that_never_closes_is_aborted(monkeypatch: pytest.Monk
 
 @pytest.mark.asyncio
 async def test_flow_control_reaches_the_protocol() -> None:
-    with plugged() as far_end:
-        await _flood(far_end)
+    with plugged() as pty_master:
+        await _flood(pty_master)
 
 
-async def _flood(far_end: FarEnd) -> None:
+async def _flood(pty_master: PtyMaster) -> None:
     recorder = Recorder()
-    async with kept(SerialPort(far_end.path, baudrate=57600), recorder):
+    async with kept(SerialPort(pty_master.path, baudrate=57600), recorder):
         await recorder.connected()
         assert recorder.transport is not None
         recorder.transport.write(bytes(200_000))
         while "resume" not in recorder.flow:
-            far_end.read(patience=0.001)
+            pty_master.read(patience=0.001)
             await asyncio.sleep(0)
     assert recorder.flow == ["pause", "resume"]

@@ -24,7 +24,7 @@ from busmaster.transport import serial_port
 from busmaster.transport.identity import identify
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
-from tests.transport.fakes import FarEnd, Recorder, opened, plugged, plugged_high, with_the_number_of
+from tests.transport.fakes import PtyMaster, Recorder, opened, plugged, plugged_high, with_the_number_of
 from tests.transport.usb import UsbTree
 
 PATIENCE = 5.0
@@ -87,15 +87,15 @@ def name(tmp_path: Path) -> Path:
     return tmp_path / "ttyUSB0"
 
 
-def give(name: Path, end: FarEnd) -> None:
+def give(name: Path, end: PtyMaster) -> None:
     name.unlink(missing_ok=True)
     name.symlink_to(end.path)
 
 
 @pytest.fixture
-def ends() -> Iterator[list[FarEnd]]:
+def ends() -> Iterator[list[PtyMaster]]:
     """Far ends, unplugged at the end."""
-    made = [FarEnd() for _ in range(4)]
+    made = [PtyMaster() for _ in range(4)]
     yield made
     for end in made:
         end.unplug()
@@ -106,7 +106,7 @@ def ends() -> Iterator[list[FarEnd]]:
 
 @pytest.mark.asyncio
 async def test_two_adapters_that_came_back_in_the_other_order_are_refused(
-    usb: UsbTree, name: Path, ends: list[FarEnd]
+    usb: UsbTree, name: Path, ends: list[PtyMaster]
 ) -> None:
     ours, other, back = ends[:3]
     usb.plug(ours.path, "A500ABC", place="1-1")
@@ -135,7 +135,7 @@ async def test_two_adapters_that_came_back_in_the_other_order_are_refused(
 
 @pytest.mark.asyncio
 async def test_another_device_is_not_even_opened(
-    usb: UsbTree, name: Path, ends: list[FarEnd], monkeypatch: pytest.MonkeyPatch
+    usb: UsbTree, name: Path, ends: list[PtyMaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Opening would configure it, flush it and toggle its lines under somebody else's feet."""
     ours, other = ends[:2]
@@ -155,7 +155,7 @@ async def test_another_device_is_not_even_opened(
 
 @pytest.mark.asyncio
 async def test_a_restart_accepts_the_other_device_and_so_does_accept_device(
-    usb: UsbTree, name: Path, ends: list[FarEnd]
+    usb: UsbTree, name: Path, ends: list[PtyMaster]
 ) -> None:
     ours, other = ends[:2]
     usb.plug(ours.path, "A500ABC", place="1-1")
@@ -173,7 +173,7 @@ async def test_a_restart_accepts_the_other_device_and_so_does_accept_device(
 
 @pytest.mark.asyncio
 async def test_a_serial_number_follows_its_adapter_to_any_name_and_never_takes_another(
-    usb: UsbTree, ends: list[FarEnd], name: Path
+    usb: UsbTree, ends: list[PtyMaster], name: Path
 ) -> None:
     ours, other, back = ends[:3]
     usb.plug(ours.path, "A500ABC", place="1-1")
@@ -212,9 +212,9 @@ async def test_a_number_of_a_pseudo_terminal_that_another_device_got_is_refused(
 
 @pytest.mark.asyncio
 async def test_the_same_pseudo_terminal_is_opened_again_though_its_times_and_owner_changed(name: Path) -> None:
-    with plugged() as far_end:
-        async with kept(Attempts(far_end.path, baudrate=57600)) as (_, recorder, causes):
-            os.chmod(far_end.path, 0o666)
+    with plugged() as pty_master:
+        async with kept(Attempts(pty_master.path, baudrate=57600)) as (_, recorder, causes):
+            os.chmod(pty_master.path, 0o666)
             assert recorder.transport is not None
             recorder.transport._lose(None)  # type: ignore[attr-defined]  # as the transport does when a read fails
             await recorder.connected(2)
@@ -223,7 +223,7 @@ async def test_the_same_pseudo_terminal_is_opened_again_though_its_times_and_own
 
 @pytest.mark.asyncio
 async def test_what_was_opened_is_looked_at_too_not_only_the_name(
-    ends: list[FarEnd], monkeypatch: pytest.MonkeyPatch
+    ends: list[PtyMaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The name may go to another device between the look and the opening."""
     monkeypatch.setattr(serial_port, "identify", lambda _: identify(ends[1].path))
@@ -240,7 +240,7 @@ async def test_what_was_opened_is_looked_at_too_not_only_the_name(
 
 @pytest.mark.asyncio
 async def test_an_error_of_the_opening_ioctl_is_told_once_and_tried_again_until_it_works(
-    name: Path, ends: list[FarEnd], monkeypatch: pytest.MonkeyPatch
+    name: Path, ends: list[PtyMaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     give(name, ends[0])
     port = Attempts(str(name), baudrate=57600)
@@ -263,7 +263,7 @@ async def test_an_error_of_the_opening_ioctl_is_told_once_and_tried_again_until_
 
 
 @contextmanager
-def locked_elsewhere(end: FarEnd) -> Iterator[int]:
+def locked_elsewhere(end: PtyMaster) -> Iterator[int]:
     """The id of another process that has locked the port."""
     lock = f"import fcntl; f = open({end.path!r}); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
     with subprocess.Popen([sys.executable, "-ISc", lock], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
@@ -275,7 +275,7 @@ def locked_elsewhere(end: FarEnd) -> Iterator[int]:
 
 @pytest.mark.asyncio
 async def test_a_port_that_another_program_took_meanwhile_is_told_once_with_its_holder(
-    name: Path, ends: list[FarEnd]
+    name: Path, ends: list[PtyMaster]
 ) -> None:
     give(name, ends[0])
     port = Attempts(str(name), baudrate=57600)
@@ -295,7 +295,7 @@ async def test_a_port_that_another_program_took_meanwhile_is_told_once_with_its_
 
 @pytest.mark.asyncio
 async def test_the_events_of_a_bus_tell_why_its_port_does_not_come_back_and_another_device_can_be_accepted(
-    usb: UsbTree, name: Path, ends: list[FarEnd]
+    usb: UsbTree, name: Path, ends: list[PtyMaster]
 ) -> None:
     ours, other = ends[:2]
     usb.plug(ours.path, "A500ABC")

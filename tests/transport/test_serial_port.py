@@ -15,11 +15,11 @@ from busmaster.errors import InvalidCommand, LineDown
 from busmaster.transport import serial_port
 from busmaster.transport.endpoints import is_paced
 from busmaster.transport.serial_port import SerialPort
-from tests.transport.fakes import FarEnd, closed, opened, plugged
+from tests.transport.fakes import PtyMaster, closed, opened, plugged
 
 
 @pytest.fixture
-def far_end() -> Iterator[FarEnd]:
+def pty_master() -> Iterator[PtyMaster]:
     with plugged() as end:
         yield end
 
@@ -51,35 +51,35 @@ def test_values_that_no_port_can_have_are_refused_when_it_is_built(options: dict
         SerialPort(**values)
 
 
-def test_a_link_shows_what_it_leads_to_now(far_end: FarEnd, tmp_path: Path) -> None:
+def test_a_link_shows_what_it_leads_to_now(pty_master: PtyMaster, tmp_path: Path) -> None:
     port = SerialPort(str(tmp_path / "line"), baudrate=57600)
     assert port.presence() is None
     with plugged(tmp_path / "line") as other:
         seen = port.presence()
         assert seen == SerialPort(other.path, baudrate=57600).presence()
-        assert seen != SerialPort(far_end.path, baudrate=57600).presence()
+        assert seen != SerialPort(pty_master.path, baudrate=57600).presence()
     assert port.presence() is None
 
 
 @pytest.mark.asyncio
-async def test_bytes_go_both_ways_unchanged(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_bytes_go_both_ways_unchanged(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     assert recorder.connections == 1
     every_byte = bytes(range(256))
     transport.write(every_byte)
-    assert far_end.read() == every_byte
-    far_end.write(every_byte)
+    assert pty_master.read() == every_byte
+    pty_master.write(every_byte)
     await recorder.until(lambda r: len(r.received) == 256)
     assert recorder.received == every_byte
     await closed(transport, recorder)
 
 
 @pytest.mark.asyncio
-async def test_a_pty_is_unpaced_unless_told(far_end: FarEnd) -> None:
+async def test_a_pty_is_unpaced_unless_told(pty_master: PtyMaster) -> None:
     for told, expected in ((None, False), (True, True), (False, False)):
-        transport, recorder = await opened(far_end.path, paced=told)
+        transport, recorder = await opened(pty_master.path, paced=told)
         assert transport.get_extra_info("paced") is expected
-        assert is_paced(SerialPort(far_end.path, baudrate=57600, paced=told), transport) is expected
+        assert is_paced(SerialPort(pty_master.path, baudrate=57600, paced=told), transport) is expected
         await closed(transport, recorder)
 
 
@@ -87,39 +87,39 @@ async def test_a_pty_is_unpaced_unless_told(far_end: FarEnd) -> None:
 
 
 @pytest.mark.asyncio
-async def test_a_write_on_an_empty_buffer_leaves_in_the_same_call(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_a_write_on_an_empty_buffer_leaves_in_the_same_call(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     transport.write(bytes.fromhex("07 30 35"))
-    assert far_end.read() == bytes.fromhex("07 30 35")  # the loop has not turned since
+    assert pty_master.read() == bytes.fromhex("07 30 35")  # the loop has not turned since
     await closed(transport, recorder)
 
 
 @pytest.mark.asyncio
-async def test_what_the_driver_does_not_take_follows_in_order(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_what_the_driver_does_not_take_follows_in_order(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     flood = b"".join(b"%07d\n" % n for n in range(40_000))
     transport.write(flood[:300_000])
     transport.write(flood[300_000:])
     arrived = b""
     while len(arrived) < len(flood):
-        arrived += far_end.read(patience=0.001)
+        arrived += pty_master.read(patience=0.001)
         await asyncio.sleep(0)
     assert arrived == flood
     transport.write(b"next")
-    assert far_end.read() == b"next"
+    assert pty_master.read() == b"next"
     await closed(transport, recorder)
 
 
 @pytest.mark.asyncio
-async def test_a_single_byte_that_has_not_left_pauses_the_protocol_until_it_has(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_a_single_byte_that_has_not_left_pauses_the_protocol_until_it_has(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     while not recorder.flow:
         transport.write(b"x")
     assert transport.get_write_buffer_size() == 1
     transport.write(b"y")
     assert recorder.flow == ["pause"]
     while "resume" not in recorder.flow:
-        far_end.read(patience=0.001)
+        pty_master.read(patience=0.001)
         await asyncio.sleep(0)
     assert recorder.flow == ["pause", "resume"]
     assert transport.get_write_buffer_size() == 0
@@ -130,12 +130,12 @@ async def test_a_single_byte_that_has_not_left_pauses_the_protocol_until_it_has(
 
 
 @pytest.mark.asyncio
-async def test_a_hang_up_is_reported_at_once_and_once(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
-    far_end.unplug()
+async def test_a_hang_up_is_reported_at_once_and_once(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
+    pty_master.unplug()
     await recorder.lost()
     assert isinstance(recorder.losses[0], LineDown)
-    assert str(recorder.losses[0]) == f"{far_end.path} was lost: it hung up"
+    assert str(recorder.losses[0]) == f"{pty_master.path} was lost: it hung up"
     transport.write(b"x")
     transport.close()
     transport.abort()
@@ -144,9 +144,9 @@ async def test_a_hang_up_is_reported_at_once_and_once(far_end: FarEnd) -> None:
 
 
 @pytest.mark.asyncio
-async def test_a_write_to_a_lost_port_reports_the_loss_and_not_from_within_the_write(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
-    far_end.unplug()
+async def test_a_write_to_a_lost_port_reports_the_loss_and_not_from_within_the_write(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
+    pty_master.unplug()
     transport.write(b"x")
     assert recorder.losses == []
     assert transport.is_closing()
@@ -158,27 +158,27 @@ async def test_a_write_to_a_lost_port_reports_the_loss_and_not_from_within_the_w
 
 
 @pytest.mark.asyncio
-async def test_a_port_lost_with_output_waiting_reports_the_loss(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_a_port_lost_with_output_waiting_reports_the_loss(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     transport.write(bytes(300_000))
-    far_end.unplug()
+    pty_master.unplug()
     await recorder.lost()
     assert isinstance(recorder.losses[0], LineDown)
 
 
 @pytest.mark.asyncio
-async def test_a_loss_is_found_by_writing_while_reading_is_paused(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_a_loss_is_found_by_writing_while_reading_is_paused(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     transport.pause_reading()
     transport.write(bytes(300_000))
-    far_end.unplug()
+    pty_master.unplug()
     await recorder.lost()
     assert isinstance(recorder.losses[0], LineDown)
 
 
 @pytest.mark.asyncio
-async def test_being_woken_with_nothing_to_read_is_no_loss(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_being_woken_with_nothing_to_read_is_no_loss(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     transport._read_ready()  # as when another program reads the port too, and was quicker
     await asyncio.sleep(0)
     assert recorder.losses == []
@@ -189,8 +189,8 @@ async def test_being_woken_with_nothing_to_read_is_no_loss(far_end: FarEnd) -> N
 
 
 @pytest.mark.asyncio
-async def test_closing_a_stopped_line_does_not_wait_for_its_output(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_closing_a_stopped_line_does_not_wait_for_its_output(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     transport.write(bytes(300_000))
     loop = asyncio.get_running_loop()
     began = loop.time()
@@ -202,27 +202,27 @@ async def test_closing_a_stopped_line_does_not_wait_for_its_output(far_end: FarE
 
 
 @pytest.mark.asyncio
-async def test_closing_discards_what_has_not_left(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_closing_discards_what_has_not_left(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     transport.write(bytes(300_000))
     await closed(transport, recorder)
-    assert len(far_end.rest()) < 5000  # of some 70,000 that the pty had taken: what lay ready to be read
+    assert len(pty_master.rest()) < 5000  # of some 70,000 that the pty had taken: what lay ready to be read
 
 
 @pytest.mark.asyncio
-async def test_an_abort_is_a_close_from_here(far_end: FarEnd) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_an_abort_is_a_close_from_here(pty_master: PtyMaster) -> None:
+    transport, recorder = await opened(pty_master.path)
     transport.abort()
     await recorder.lost()
     assert recorder.losses == [None]
-    assert repr(transport) == f"<PortTransport {far_end.path} closing>"
+    assert repr(transport) == f"<PortTransport {pty_master.path} closing>"
 
 
 @pytest.mark.asyncio
 async def test_a_driver_that_never_lets_go_delays_a_close_by_its_deadline_alone(
-    far_end: FarEnd, monkeypatch: pytest.MonkeyPatch
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    transport, recorder = await opened(far_end.path)
+    transport, recorder = await opened(pty_master.path)
     letting_go = threading.Event()
     monkeypatch.setattr(termios, "tcflush", lambda *_: letting_go.wait())
     monkeypatch.setattr(serial_port, "CLOSE_DEADLINE", 0.02)
@@ -235,8 +235,8 @@ async def test_a_driver_that_never_lets_go_delays_a_close_by_its_deadline_alone(
 
 
 @pytest.mark.asyncio
-async def test_an_abort_does_not_wait_for_the_driver(far_end: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
-    transport, recorder = await opened(far_end.path)
+async def test_an_abort_does_not_wait_for_the_driver(pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch) -> None:
+    transport, recorder = await opened(pty_master.path)
     letting_go = threading.Event()
     monkeypatch.setattr(termios, "tcflush", lambda *_: letting_go.wait())
     transport.close()

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 from busmaster.emulator.chance import Chance
 from busmaster.emulator.device import NAK, Delay, Device
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import xor
 
@@ -72,7 +72,7 @@ class HostCommsDevice(Device):
     """A slave of either protocol. A kind of device says what its elements hold: `read_element`, `write_element`.
 
     `fixed_decimals` sends "12.5000" instead of "12.5". `all_or_nothing` refuses a multi-value write before it stores
-    any of it. With an `oracle` every element is the oracle's.
+    any of it. With an `traceable` every element is the traceable's.
     """
 
     def __init__(
@@ -81,13 +81,13 @@ class HostCommsDevice(Device):
         framing: Framing = HCP2,
         *,
         delay: Delay | None = None,
-        oracle: Oracle | None = None,
+        traceable: TraceableMemory | None = None,
         fixed_decimals: bool = False,
         all_or_nothing: bool = False,
     ) -> None:
         super().__init__(address, delay=delay)
         self.framing = framing
-        self.oracle = oracle
+        self.traceable = traceable
         self.fixed_decimals = fixed_decimals
         self.all_or_nothing = all_or_nothing
         self._prefix = framing.prefix(address)
@@ -209,7 +209,7 @@ class HostCommsDevice(Device):
             self.reply(NAK, now)
 
     def _answer_read(self, element: int, now: float) -> None:
-        value = self.read_element(element, now) if self.oracle is None else self.oracle.read(element)
+        value = self.read_element(element, now) if self.traceable is None else self.traceable.read(element)
         text = None if value is None else number_text(value, self.fixed_decimals)
         if text is None or len(text) > LONGEST_REPLY:
             self.reply(NAK, now)
@@ -227,8 +227,8 @@ class HostCommsDevice(Device):
         for number, value in zip(elements, values, strict=True):
             if value is None or number > self.framing.last_element:
                 return False
-            if self.oracle is not None:
-                self.oracle.write(number, value)
+            if self.traceable is not None:
+                self.traceable.write(number, value)
             elif not self.write_element(number, value, now):
                 return False
         return True
@@ -241,7 +241,7 @@ class HostCommsDevice(Device):
             return reply
         element = int(reply[1:3], self.framing.base)
         other = chance.randrange(1, self.framing.last_element)
-        text = reply[3:-2] if self.oracle is None else number_text(self.oracle.elsewhere())
+        text = reply[3:-2] if self.traceable is None else number_text(self.traceable.elsewhere())
         return telegram(self.framing, other + (other >= element), text)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from busmaster.contract.arguments import is_decimal
 from busmaster.emulator.device import NEVER, Delay, held
 from busmaster.emulator.motion import Axis, Motion
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 from busmaster.protocols._comms.device import HCP2, Framing, HostCommsDevice, sendable
 
@@ -55,7 +55,7 @@ class EmulatedMint(HostCommsDevice):
         program: Program | None = None,
         events: Sequence[Event] = (),
         delay: Delay | None = None,
-        oracle: Oracle | None = None,
+        traceable: TraceableMemory | None = None,
         fixed_decimals: bool = False,
         all_or_nothing: bool = False,
         refuse_reserved: bool = False,
@@ -67,7 +67,7 @@ class EmulatedMint(HostCommsDevice):
             address,
             framing,
             delay=delay,
-            oracle=oracle,
+            traceable=traceable,
             fixed_decimals=fixed_decimals,
             all_or_nothing=all_or_nothing,
         )

@@ -51,7 +51,7 @@ class EmulatedCtAnsi(EmulatedMentor):
         number = self.value(parameter, now)
         sign = "-" if number < 0 else "+" if self.plus else ""
         digits = str(abs(number))
-        if self.has_decimal(parameter) and self.oracle is None:
+        if self.has_decimal(parameter) and self.traceable is None:
             digits = f"{abs(number) // FINE}.{abs(number) % FINE}"
         summed = b"%04d" % parameter + (sign + digits.zfill(self.width - len(sign))).encode() + b"\x03"
         return b"\x02" + summed + bytes((bcc(summed),))
@@ -61,7 +61,7 @@ class EmulatedCtAnsi(EmulatedMentor):
         if not VALUE.fullmatch(data) or len(data) > LONGEST_VALUE:
             return None
         value = Decimal(data.decode().strip())
-        steps = value * FINE if self.oracle is None and parameter.fine else value
+        steps = value * FINE if self.traceable is None and parameter.fine else value
         return int(steps) * FINE if steps == int(steps) else None
 
 

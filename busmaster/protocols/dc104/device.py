@@ -13,7 +13,7 @@ import math
 from busmaster.contract.arguments import is_decimal
 from busmaster.emulator.chance import Chance
 from busmaster.emulator.device import NAK, Delay, Device, held
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import sum8
 
@@ -32,7 +32,7 @@ class EmulatedDc104(Device):
     """The drive of a line. Parameters 1 to `maximum`; `allow_zero`: 0 too. `read_only` ones refuse writes.
 
     `eeprom` is the time that storing takes. `silent`: a read of what is not there gets no answer, in place of NAK,
-    since the document names none. `lively`: parameter 1 moves. With an `oracle` every value is the oracle's.
+    since the document names none. `lively`: parameter 1 moves. With an `traceable` every value is the traceable's.
     """
 
     def __init__(
@@ -46,20 +46,20 @@ class EmulatedDc104(Device):
         silent: bool = False,
         lively: bool = False,
         delay: Delay | None = None,
-        oracle: Oracle | None = None,
+        traceable: TraceableMemory | None = None,
     ) -> None:
         super().__init__(address, delay=delay)
         if not 1 <= maximum <= LAST_PARAMETER:
             raise InvalidCommand(f"the last parameter is from 1 to {LAST_PARAMETER}, not {maximum}")
-        if oracle is not None and oracle.modulus > 2**16:
-            raise InvalidCommand(f"a DC104 carries 2**16 oracle values, not {oracle.modulus}")
+        if traceable is not None and traceable.modulus > 2**16:
+            raise InvalidCommand(f"a DC104 carries 2**16 traceable values, not {traceable.modulus}")
         self.registers = [0] * (LAST_PARAMETER + 1)
         self.parameters = range(0 if allow_zero else 1, maximum + 1)
         self.read_only = read_only
         self.eeprom = Delay(0.01) if eeprom is None else eeprom
         self.silent = silent
         self.lively = lively
-        self.oracle = oracle
+        self.traceable = traceable
         self.routes = (bytes((STX, READ)), bytes((STX, WRITE)))
         self._frame = bytearray()
         self._heard_at = 0.0
@@ -119,22 +119,22 @@ class EmulatedDc104(Device):
             self.reply(NAK, now)
 
     def _read(self, parameter: int, now: float) -> int:
-        if self.oracle is not None:
-            return self.oracle.read(parameter)
+        if self.traceable is not None:
+            return self.traceable.read(parameter)
         if self.lively and parameter == LIVE:
             return 2**15 + round(SWING * math.sin(now / TURN * math.tau))
         return self.registers[parameter]
 
     def _write(self, parameter: int, value: int) -> None:
         self.registers[parameter] = value
-        if self.oracle is not None:
-            self.oracle.write(parameter, value)
+        if self.traceable is not None:
+            self.traceable.write(parameter, value)
 
     def disguise(self, reply: bytes, chance: Chance) -> bytes:
         if reply[0] != STX:
             return reply
         other = chance.randrange(0, LAST_PARAMETER)
-        value = int.from_bytes(reply[2:4], "big") if self.oracle is None else self.oracle.elsewhere()
+        value = int.from_bytes(reply[2:4], "big") if self.traceable is None else self.traceable.elsewhere()
         return packet(other + (other >= reply[1]), value)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from busmaster.contract.arguments import is_decimal
 from busmaster.emulator.device import NEVER, Delay, held
 from busmaster.emulator.motion import Ramp
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 from busmaster.protocols._comms.device import HCP2, HostCommsDevice, sendable
 
@@ -68,12 +68,12 @@ class EmulatedMicroFlex(HostCommsDevice):
         host_reference: bool = True,
         ripple: float = 0.0,
         delay: Delay | None = None,
-        oracle: Oracle | None = None,
+        traceable: TraceableMemory | None = None,
         refuse_unmapped: bool = False,
         firmware: int = 5221,
         acceleration: float = 50.0,
     ) -> None:
-        super().__init__(address, HCP2, delay=delay, oracle=oracle)
+        super().__init__(address, HCP2, delay=delay, traceable=traceable)
         self.current_control = current_control
         self.host_reference = host_reference
         self.ripple = ripple

@@ -17,7 +17,7 @@ from functools import lru_cache
 from typing import Any, ClassVar, NoReturn, TypeVar
 
 from busmaster.contract.arguments import whole_number
-from busmaster.contract.exchange import Command, Done, Expect, FrameError, Leg, Need, Sizes
+from busmaster.contract.exchange import Command, Done, Expect, FrameError, LaterLeg, Need, Sizes
 from busmaster.contract.profile import Batch, LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand, NoSuchParameter, Refused
@@ -213,7 +213,7 @@ class RunReading:
         numbers = [run.number + run.step * i for i in range(run.count)]
         self.request, echo = read_request(address, run.menu, run.number)
         self.timing = timing
-        self.later: Sequence[Leg] = (Leg(timing, self.sizes, sent=1),) * (run.count - 1)
+        self.later: Sequence[LaterLeg] = (LaterLeg(timing, self.sizes, sent=1),) * (run.count - 1)
         self._short = _SHORT_COMMANDS[run.step]
         self._next = [b"%02d%02d" % (run.menu, number) for number in reversed(numbers[1:])]
         self._leg = self.reading(self.request, echo, timing)

@@ -19,7 +19,7 @@ from typing import Any
 from busmaster.emulator.chance import Chance
 from busmaster.emulator.device import NAK, Delay, Device, held
 from busmaster.emulator.motion import Ramp
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import bcc
 
@@ -80,7 +80,7 @@ class EmulatedMentor(Device):
 
     `acceleration` is in 0.1 % per second; `ripple` by how much of itself, 0 to 1, the feedback swings with the shaft.
     `short_after_write`: short commands work after a write too. `refuse_malformed`: a read request that is none is
-    answered by NAK, not by silence. With an `oracle` every parameter is the oracle's.
+    answered by NAK, not by silence. With an `traceable` every parameter is the traceable's.
     """
 
     def __init__(
@@ -92,18 +92,18 @@ class EmulatedMentor(Device):
         short_after_write: bool = False,
         refuse_malformed: bool = False,
         delay: Delay | None = None,
-        oracle: Oracle | None = None,
+        traceable: TraceableMemory | None = None,
     ) -> None:
         super().__init__(address, delay=delay)
         if not 1 <= address <= 99:
             raise InvalidCommand(f"a Mentor II has an address from 1 to 99, not {address}")
-        if oracle is not None and oracle.modulus > 10**4:
-            raise InvalidCommand(f"a Mentor II carries 10**4 oracle values, not {oracle.modulus}")
+        if traceable is not None and traceable.modulus > 10**4:
+            raise InvalidCommand(f"a Mentor II carries 10**4 traceable values, not {traceable.modulus}")
         self.parameters = dict(PARAMETERS)
         self.ripple = ripple
         self.short_after_write = short_after_write
         self.refuse_malformed = refuse_malformed
-        self.oracle = oracle
+        self.traceable = traceable
         tens, units = divmod(address, 10)
         self._prefix = b"\x04%d%d%d%d" % (tens, tens, units, units)
         plain = (self._prefix, BROADCAST)
@@ -142,8 +142,8 @@ class EmulatedMentor(Device):
         """Of menu x 100 + number. Raises KeyError for one that does not exist."""
         if parameter not in self.parameters:
             raise KeyError(parameter)
-        if self.oracle is not None:
-            return self.oracle.read(parameter)
+        if self.traceable is not None:
+            return self.traceable.read(parameter)
         if parameter == SPEED_FEEDBACK:
             return self._feedback(now)
         if parameter == SERIAL_ADDRESS:
@@ -285,8 +285,8 @@ class EmulatedMentor(Device):
         fine = self._fine_of(parameter, data)
         if fine is None:
             return False
-        if self.oracle is not None:
-            self.oracle.write(int(name), fine / FINE)
+        if self.traceable is not None:
+            self.traceable.write(int(name), fine / FINE)
         elif parameter.low * FINE <= fine <= parameter.high * FINE:
             self.set_value(int(name), fine / FINE, now)
         else:
@@ -313,7 +313,7 @@ class EmulatedMentor(Device):
             return reply
         parameter = int(reply[1:5].translate(SEVEN_BITS))
         other = chance.randrange(0, 9999)
-        data = reply[5:-2].translate(SEVEN_BITS) if self.oracle is None else b"%+05d" % self.oracle.elsewhere()
+        data = reply[5:-2].translate(SEVEN_BITS) if self.traceable is None else b"%+05d" % self.traceable.elsewhere()
         summed = b"%04d" % (other + (other >= parameter)) + data + b"\x03"
         disguised = b"\x02" + summed + bytes((bcc(summed),))
         return disguised.translate(EVEN_PARITY) if reply[0] != STX else disguised

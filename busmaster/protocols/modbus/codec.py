@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, TypeVar
 
 from busmaster.contract.arguments import whole_number
-from busmaster.contract.exchange import MORE, Done, FrameError, Leg, Sizes, Step, no_reply
+from busmaster.contract.exchange import MORE, Done, FrameError, LaterLeg, Sizes, Step, no_reply
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand, Refused
@@ -92,7 +92,7 @@ class Conversation(Generic[T]):
         "timing",
     )
 
-    later: ClassVar[Sequence[Leg]] = ()
+    later: ClassVar[Sequence[LaterLeg]] = ()
     closing: ClassVar[int] = 0
 
     def __init__(

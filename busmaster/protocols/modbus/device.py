@@ -13,7 +13,7 @@ from typing import Any
 
 from busmaster.emulator.chance import Chance
 from busmaster.emulator.device import NEVER, Delay, Device, held
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 
 BROADCAST = 0
@@ -51,7 +51,7 @@ class EmulatedModbus(Device):
     """A unit, 1 to 247. Each table is as long as what it is given.
 
     `functions` are those that it has; any other is answered by exception 1. `read_only`: holding registers that refuse
-    writes, with exception 3. `lively`: register 0 of both tables moves. With an `oracle` every register is its.
+    writes, with exception 3. `lively`: register 0 of both tables moves. With an `traceable` every register is its.
     """
 
     def __init__(
@@ -66,13 +66,13 @@ class EmulatedModbus(Device):
         read_only: frozenset[int] = frozenset(),
         lively: bool = False,
         delay: Delay | None = None,
-        oracle: Oracle | None = None,
+        traceable: TraceableMemory | None = None,
     ) -> None:
         super().__init__(address, delay=delay)
         if address not in ALL:
             raise InvalidCommand(f"a Modbus unit has an address from 1 to 247, not {address}")
-        if oracle is not None and oracle.modulus > 2**16:
-            raise InvalidCommand(f"a register carries 2**16 oracle values, not {oracle.modulus}")
+        if traceable is not None and traceable.modulus > 2**16:
+            raise InvalidCommand(f"a register carries 2**16 traceable values, not {traceable.modulus}")
         if not functions <= FIXED | COUNTED:
             raise InvalidCommand(
                 f"an emulated unit knows the functions {sorted(FIXED | COUNTED)}, not {sorted(functions)}"
@@ -84,7 +84,7 @@ class EmulatedModbus(Device):
         self.functions = functions
         self.read_only = read_only
         self.lively = lively
-        self.oracle = oracle
+        self.traceable = traceable
         self.routes = (bytes((address,)), bytes((BROADCAST,)))
         self._frame = b""
         self._heard_until = 0.0
@@ -198,8 +198,8 @@ class EmulatedModbus(Device):
         return bytes((function, len(data))) + data
 
     def _word(self, words: Sequence[int], place: int, now: float) -> int:
-        if self.oracle is not None:
-            return self.oracle.read(place)
+        if self.traceable is not None:
+            return self.traceable.read(place)
         if self.lively and place == LIVE:
             return 2**15 + round(SWING * math.sin(now / TURN * math.tau))
         return words[place]
@@ -231,9 +231,9 @@ class EmulatedModbus(Device):
         if not self.read_only.isdisjoint(range(first, first + len(values))):
             raise Illegal(ILLEGAL_VALUE)
         self.registers[first : first + len(values)] = values
-        if self.oracle is not None:
+        if self.traceable is not None:
             for place, value in enumerate(values, first):
-                self.oracle.write(place, value)
+                self.traceable.write(place, value)
 
     def _say(self, answer: bytes, now: float) -> None:
         body = bytes((self.address,)) + answer
@@ -243,8 +243,8 @@ class EmulatedModbus(Device):
         """As if another unit had said it."""
         other = chance.randrange(ALL.start, ALL.stop - 1)
         body = bytes((other + (other >= reply[0]),)) + reply[1:-2]
-        if self.oracle is not None and reply[1] in (READ_HOLDING, READ_INPUTS):
-            body = body[:3] + self.oracle.elsewhere().to_bytes(2, "big") * ((len(body) - 3) // 2)
+        if self.traceable is not None and reply[1] in (READ_HOLDING, READ_INPUTS):
+            body = body[:3] + self.traceable.elsewhere().to_bytes(2, "big") * ((len(body) - 3) // 2)
         return body + crc(body)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from busmaster.contract.arguments import is_decimal
 from busmaster.emulator.chance import Chance
 from busmaster.emulator.device import NAK, NEVER, Delay, Device, held
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import sum16
 
@@ -64,7 +64,7 @@ class EmulatedMsc(Device):
     `address_step` is what data addresses grow by from one 32-bit value to the next: 4, 2 or 1, since the document does
     not say whether they count bytes. `addresses` of them exist. `read_only_flags` (inputs, timers) cannot be set or
     cleared. `battery`: data outlives a power failure and the program starts again. `packet_delay` is from the end of
-    an ACK to the packet that follows it. With an `oracle` every data value is the oracle's.
+    an ACK to the packet that follows it. With an `traceable` every data value is the traceable's.
 
     `naks_ahead`, `missing_acks_ahead` and `bad_packets_ahead` are for tests: so many of the next requests are refused
     unheeded, of the next ACKs left out, of the next packets sent with a wrong bit.
@@ -84,7 +84,7 @@ class EmulatedMsc(Device):
         period: float = 0.1,
         delay: Delay | None = None,
         packet_delay: Delay | None = None,
-        oracle: Oracle | None = None,
+        traceable: TraceableMemory | None = None,
     ) -> None:
         super().__init__(address, delay=delay)
         if address not in UNITS or model not in MODELS or address_step not in (1, 2, 4):
@@ -94,15 +94,15 @@ class EmulatedMsc(Device):
             )
         if period < SHORTEST_PERIOD:
             raise InvalidCommand(f"its program counts every {SHORTEST_PERIOD} s at most, not every {period:g} s")
-        if oracle is not None and oracle.modulus > 2**31:
-            raise InvalidCommand(f"an MSC carries 2**31 oracle values, not {oracle.modulus}")
+        if traceable is not None and traceable.modulus > 2**31:
+            raise InvalidCommand(f"an MSC carries 2**31 traceable values, not {traceable.modulus}")
         self.model = model
         self.address_step = address_step
         self.read_only_flags = read_only_flags
         self.battery = battery
         self.period = period
         self.packet_delay = Delay() if packet_delay is None else packet_delay
-        self.oracle = oracle
+        self.traceable = traceable
         self.flags: set[int] = set()
         """The numbers, 0 to 255, of those that are on."""
         self.status = RUNNING | AUTO_START
@@ -302,17 +302,17 @@ class EmulatedMsc(Device):
         if len(operand) > 2:
             self._store(number, place, operand[2:])
             return b""
-        if self.oracle is None:
+        if self.traceable is None:
             return bytes(self._memory[place])
         numbers = range(number, number + (place.stop - place.start) // self._width, self.address_step)
-        return b"".join(self.oracle.read(at).to_bytes(VALUE, "big") for at in numbers)
+        return b"".join(self.traceable.read(at).to_bytes(VALUE, "big") for at in numbers)
 
     def _store(self, address: int, place: slice, data: bytes) -> None:
         self._memory[place] = data
-        if self.oracle is not None:
+        if self.traceable is not None:
             for index in range(len(data) // VALUE):
                 value = int.from_bytes(data[index * VALUE : (index + 1) * VALUE], "big", signed=True)
-                self.oracle.write(address + index * self.address_step, value)
+                self.traceable.write(address + index * self.address_step, value)
 
     def _perform_on_flag(self, name: bytes, flag: int) -> bytes | None:
         if flag >= FLAGS:
@@ -343,8 +343,8 @@ class EmulatedMsc(Device):
             return reply
         other = chance.randrange(UNITS.start, UNITS.stop - 1)
         body = reply[HEADER:-2]
-        if self.oracle is not None and body.startswith(b"DREAD,"):
-            body = body[:-VALUE] + self.oracle.elsewhere().to_bytes(VALUE, "big")
+        if self.traceable is not None and body.startswith(b"DREAD,"):
+            body = body[:-VALUE] + self.traceable.elsewhere().to_bytes(VALUE, "big")
         return packet(other + (other >= self.address), body)
 
 
@@ -354,9 +354,11 @@ def packet(unit: int, body: bytes) -> bytes:
     return bytes((STX,)) + summed + sum16(summed).to_bytes(2, "big")
 
 
-def make_device(address: int, *, delay: Delay, oracle: Oracle | None, lively: bool, **options: Any) -> EmulatedMsc:
+def make_device(
+    address: int, *, delay: Delay, traceable: TraceableMemory | None, lively: bool, **options: Any
+) -> EmulatedMsc:
     """Make a unit; if it is lively, its program counts."""
-    controller = EmulatedMsc(address, delay=delay, oracle=oracle, **options)
+    controller = EmulatedMsc(address, delay=delay, traceable=traceable, **options)
     if lively:
         controller.flags.add(RUN_FLAG)
     return controller

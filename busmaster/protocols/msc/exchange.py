@@ -27,7 +27,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from busmaster.contract.exchange import MORE, Done, Expect, FrameError, Leg, Need, Refused, Sizes, Step, no_reply
+from busmaster.contract.exchange import MORE, Done, Expect, FrameError, LaterLeg, Need, Refused, Sizes, Step, no_reply
 from busmaster.contract.timing import Timings
 from busmaster.wire.checks import sum16
 from busmaster.wire.readers import ACK, NAK, STX
@@ -128,7 +128,9 @@ class PacketExchange(Generic[T]):
     def __init__(self, request: bytes, timings: Timings, reply: Reply | None, decode: Callable[[bytes], T]) -> None:
         self.request = request
         self.timing = timings.write if reply is None else timings.read
-        self.later: Sequence[Leg] = () if reply is None else (Leg(timings.packet, Sizes(reply.size, LONGEST_PACKET)),)
+        self.later: Sequence[LaterLeg] = (
+            () if reply is None else (LaterLeg(timings.packet, Sizes(reply.size, LONGEST_PACKET)),)
+        )
         self.closing = 0 if reply is None else len(ACK)
         self.answers = (ACK,) if reply is None else (reply.header,)
         self._packet_timing = timings.packet
@@ -266,7 +268,7 @@ class StalePacketListener:
         if size and len(buffer) >= size and is_sound(buffer[:size]):
             return Done(None, send=ACK, rest=buffer[size:])
         if buffer[0] != STX[0] or len(buffer) > LONGEST_PACKET:
-            raise FrameError(f"{len(buffer)} stray bytes, the first of them {buffer[0]:02x}")
+            raise FrameError(f"{len(buffer)} unasked bytes, the first of them {buffer[0]:02x}")
         self._buffer = buffer
         return MORE
 

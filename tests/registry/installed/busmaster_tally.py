@@ -23,7 +23,7 @@ from busmaster.contract.items import Item
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.device import Delay, Device, held
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 from busmaster.registry import NodeKind, Option, Protocol, everywhere
 from busmaster.wire.readers import SingleLeg
 
@@ -195,9 +195,11 @@ class TallyDialect:
         return Count(request.item) if request.kind is Kind.READ else Preset(request.item, int(request.value))
 
 
-def make_device(address: int, /, *, delay: Delay, oracle: Oracle | None, lively: bool, gate: int = 1) -> Device:
-    if oracle is not None:
-        raise InvalidCommand("a turnstile has no oracle")
+def make_device(
+    address: int, /, *, delay: Delay, traceable: TraceableMemory | None, lively: bool, gate: int = 1
+) -> Device:
+    if traceable is not None:
+        raise InvalidCommand("a turnstile has no traceable")
     return EmulatedTurnstile(address, delay=delay, gate=gate)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.masters import Ask
+from benchmarks.masters import Question
 from busmaster.contract.profile import LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
@@ -14,32 +14,32 @@ NODES = (2, 3, 4, 5)
 ELEMENTS = (1, 2, 100)
 
 
-def hcp2_asks() -> list[Ask]:
+def hcp2_questions() -> list[Question]:
     """Three elements of four nodes; replies of 13 bytes, as a position in user units has them."""
-    asks = []
+    questions = []
     for address in NODES:
         for element in ELEMENTS:
             value = 1000.25 + 100 * address + element
             body = b"%02X%.2f" % (element, value) + ETX
             command = hcp2.Read(element)
             request = command.open(address, hcp2.PROFILE.timings).request
-            asks.append(Ask(command, address, request, (STX + body + bytes((xor(body),)),), value))
-    return asks
+            questions.append(Question(command, address, request, (STX + body + bytes((xor(body),)),), value))
+    return questions
 
 
-def msc_asks() -> list[Ask]:
+def msc_questions() -> list[Question]:
     """One data address of four units: an ACK, a packet, and the host's ACK."""
-    asks = []
+    questions = []
     for unit in NODES:
         value = -1000 * unit
         command = msc.DataRead(2000 + unit)
         request = command.open(unit, msc.PROFILE.timings).request
         reply = packet(unit, b"DREAD," + value.to_bytes(4, "big", signed=True))
-        asks.append(Ask(command, unit, request, (ACK, reply), value, closing=ACK))
-    return asks
+        questions.append(Question(command, unit, request, (ACK, reply), value, closing=ACK))
+    return questions
 
 
-def wire_time(ask: Ask, settings: LineSettings, delay: float) -> float:
+def wire_time(ask: Question, settings: LineSettings, delay: float) -> float:
     """Seconds that the bits of this transaction and the device's reply time take, and nothing else."""
     bits = len(ask.request) + sum(map(len, ask.reply)) + len(ask.closing)
     return bits * settings.byte_time + delay

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from busmaster.emulator.device import Device
 from busmaster.emulator.line import Line, Talk
-from busmaster.emulator.oracle import Oracle
+from busmaster.emulator.traceable import TraceableMemory
 
 REMEMBERED = 2048
 """Answers and writes that are kept: far more than can still be on their way, and fewer than the narrowest protocol has
@@ -182,7 +182,7 @@ class Ledger:
         return any(frame.cause < begin < frame.end - ROUNDING and frame.start < end for frame in self._frames)
 
 
-class Witness(Oracle):
+class LedgerMemory(TraceableMemory):
     """The memory of one device: it keeps no values, the ledger does."""
 
     def __init__(self, ledger: Ledger, node: int) -> None:

@@ -18,7 +18,7 @@ ROUNDING = 1e-6
 """Of a bit: times are floats."""
 
 
-class Wave:
+class Collision:
     """The line from `start` on, a level a bit time, and who drives it when.
 
     A talker that starts off the grid of the first is moved up to the next bit: never into the past, so that what was

@@ -10,7 +10,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def aside(work: Callable[[], T], name: str) -> Future[T]:
+def in_own_thread(work: Callable[[], T], name: str) -> Future[T]:
     """Run `work` in a daemon thread of its own, and return the future of its result.
 
     A pool will not do: its threads are joined at exit, and a driver can keep one blocked for minutes.

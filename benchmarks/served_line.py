@@ -1,8 +1,8 @@
 """The emulated Modbus line, served on a pty from a process of its own, with its faults set from here.
 
-`python -m benchmarks.far_end` is told what to serve in a line of JSON, and prints the path. Each further line there is
-an order: {"unit": 3, "dead": true} takes a unit off the line, {"log": true} asks for what passed on the line since the
-last time: (seconds, "host" or "line", bytes, seconds taken), {"faults": {"lost": 0.01}} has faults strike each frame.
+`python -m benchmarks.served_line` is told what to serve in a line of JSON, and prints the path. Each further line there
+is an order: {"unit": 3, "dead": true} takes a unit off the line, {"log": true} asks for what passed on the line since
+the last time: (seconds, "host" or "line", bytes, seconds taken), {"faults": {"lost": 0.01}} sets the faults of frames.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class LoggedLine(Line):
             self.log.append((start, who, length, length * self.tau))
 
 
-class FarEnd:
+class ServedLine:
     """Units 1 to `units` on a paced line of 57600 baud. Use it in `with`; `path` is the port."""
 
     def __init__(self, units: int, *, delay: dict[str, Any] | None = None, seed: int = 1) -> None:
@@ -74,9 +74,9 @@ class FarEnd:
         self.path = ""
         self._process: subprocess.Popen[bytes] | None = None
 
-    def __enter__(self) -> FarEnd:
+    def __enter__(self) -> ServedLine:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.far_end"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
+            [sys.executable, "-m", "benchmarks.served_line"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
         )
         part_from(self._process.pid, paced=True)
         self.path = self._ask(self._order)

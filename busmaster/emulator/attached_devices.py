@@ -11,15 +11,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from busmaster.emulator.chance import Chance
+from busmaster.emulator.collision import Collision
 from busmaster.emulator.device import NEVER, Device
 from busmaster.emulator.disturbance import misses
-from busmaster.emulator.wave import Wave
 
 Say = Callable[[Device, float, bytes], None]
 """A device is going to say something: from when on, and what."""
 
 
-class Audience:
+class AttachedDevices:
     """The devices of a line. `say` is called with what they say in answer."""
 
     def __init__(self, say: Say, chance: Chance, tau: float) -> None:
@@ -80,10 +80,10 @@ class Audience:
             listeners = self.devices
         self.hear([device for device in listeners if device is not talker], data, start, end)
 
-    def scatter(self, wave: Wave, end: float) -> None:
+    def scatter(self, collision: Collision, end: float) -> None:
         """What several talkers made of each other's bytes passed; each heard what did not fall in its own talking."""
         for device in self.devices:
-            for start, byte in wave.heard(device):
+            for start, byte in collision.heard(device):
                 self.hear((device,), bytes((byte,)), start, end)
 
     def wake(self) -> None:

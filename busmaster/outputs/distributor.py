@@ -24,7 +24,7 @@ FAREWELL = 5.0
 """Seconds in which the outputs write what they still hold, when the line is closed."""
 
 
-class Fan:
+class Distributor:
     """The outputs of one bus. `tell` is called, on the loop, with what happens to them."""
 
     def __init__(self, bus: Bus, tell: Callable[[str], None] = lambda _: None) -> None:

@@ -12,7 +12,7 @@ SPREAD = 10_007
 """A prime, so that values still lie far apart when they wrap in a narrow range. Counts up to it stay exact."""
 
 
-def oracle_value(node: int, element: int, writes: int, modulus: int = 10**12) -> int:
+def traceable_value(node: int, element: int, writes: int, modulus: int = 10**12) -> int:
     """From 0 to modulus - 1: who is asked (`node`), for what (`element`), and after how many writes to it.
 
     `modulus` is how many values the protocol can carry: 10**12 for HCP and HCP2 (exact as text), 2**31 for MSC,
@@ -21,28 +21,28 @@ def oracle_value(node: int, element: int, writes: int, modulus: int = 10**12) ->
     return (((node << 16) + element) * SPREAD + writes) % modulus
 
 
-class Oracle:
+class TraceableMemory:
     """The memory of one device in a campaign: in place of values it keeps the number of writes to each element."""
 
     def __init__(self, node: int, modulus: int = 10**12) -> None:
         self.node = node
         self.modulus = modulus
         self.writes: defaultdict[int, int] = defaultdict(int)
-        self.strays = 0
+        self.foreign_writes = 0
         """Writes taken whose value was meant for another node or element, or was garbled unnoticed."""
 
     def read(self, element: int) -> int:
-        return oracle_value(self.node, element, self.writes[element], self.modulus)
+        return traceable_value(self.node, element, self.writes[element], self.modulus)
 
     def elsewhere(self) -> int:
         """A value of another node: what a reply carries that answers for somebody else."""
-        return oracle_value(self.node + 1, 0, 0, self.modulus)
+        return traceable_value(self.node + 1, 0, 0, self.modulus)
 
     def write(self, element: int, value: float, slack: int = 64) -> None:
-        """Counts it. The writer is to send `oracle_value(node, element, n)` with n within `slack` of the count."""
+        """Counts it. The writer is to send `traceable_value(node, element, n)` with n within `slack` of the count."""
         count = self.writes[element]
         self.writes[element] = count + 1
-        base = oracle_value(self.node, element, 0, self.modulus)
+        base = traceable_value(self.node, element, 0, self.modulus)
         sent = (round(value) - base) % self.modulus
         if abs(sent - count) > slack:
-            self.strays += 1
+            self.foreign_writes += 1

@@ -6,7 +6,7 @@ from collections import deque
 from math import inf
 
 from busmaster.arbiter.counters import LineCounters
-from busmaster.arbiter.events import Event, LatenessRaised, Strayed
+from busmaster.arbiter.events import CameUnasked, Event, LatenessRaised
 from busmaster.arbiter.health import NodeRecord
 from busmaster.contract.exchange import Done, FrameError, Listener, Need
 
@@ -18,7 +18,7 @@ STRAGGLER_SHARE = 0.75
 STRAGGLER_MARGIN = 1.6
 LONGEST_LATENESS = 0.5
 STRAGGLER_MEMORY = 1.0
-"""Seconds after which a stray byte is no longer blamed on the last unanswered request."""
+"""Seconds after which a unasked byte is no longer blamed on the last unanswered request."""
 LOOKS = 10
 """In so many parts of a lateness the line is looked at while a straggler may come."""
 LOOK_SLACK = 0.005
@@ -27,7 +27,7 @@ LONGEST_RUN = 512
 """Bytes between two silences that are kept to be told apart; more is noise."""
 
 
-class Strays:
+class UnaskedBytes:
     """The bytes between exchanges, of one line."""
 
     def __init__(self, events: deque[Event], counters: LineCounters) -> None:
@@ -46,10 +46,10 @@ class Strays:
 
     def note(self, data: bytes, now: float, quiet: float) -> None:
         """Count them; `quiet` is the silence, in seconds, after which a run of noise is over."""
-        self._counters.stray_bytes += len(data)
+        self._counters.unasked_bytes += len(data)
         if len(self.run) < LONGEST_RUN:
             self.run += data
-        self._events.append(Strayed(data))
+        self._events.append(CameUnasked(data))
         if now - self.last_byte > quiet or self._noise_since == inf:
             self._noise_since = now
         self.last_byte = now
