@@ -16,10 +16,9 @@ from busmaster.arbiter.events import Event
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.learned import Learning
 from busmaster.arbiter.line_machine import LineMachine
-from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import EXCHANGE, READY
 from busmaster.arbiter.tap import Attempt
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.contract.learning import Learned, documented
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
@@ -123,7 +122,10 @@ class Arbiter(LineMachine):
             self._advance(now)
 
     def close(self, now: float) -> None:
-        """Fail whatever waits with BusClosed. The exchange on the wire runs out; then the line is OFFLINE."""
+        """Fail whatever waits with BusClosed. The exchange on the wire runs out; then the line is OFFLINE.
+
+        `failing` says whether some of it has not ended yet.
+        """
         if self._closed:
             return
         self._closed = True
@@ -133,6 +135,11 @@ class Arbiter(LineMachine):
         self.dispatcher.fail_all(now)
         if self.state is not EXCHANGE:
             self._go_offline(now)
+
+    @property
+    def failing(self) -> bool:
+        """Whether some of what failed with the line has not ended yet: further calls of `handle_timeout` end it."""
+        return len(self.dispatcher.failing) > 0
 
     # outputs, pumped in this order
 
@@ -153,6 +160,8 @@ class Arbiter(LineMachine):
             earliest = deadlines.schedule
         if deadlines.expiry < earliest:
             earliest = deadlines.expiry
+        if deadlines.failing < earliest:
+            earliest = deadlines.failing
         if deadlines.health < earliest:
             earliest = deadlines.health
         return earliest

@@ -48,7 +48,7 @@ class Choice:
         while (transaction := dispatcher.next(now)) is not None:
             node = transaction.node
             try:
-                timings = node.timings if node.learning is None else node.timings_for(transaction)
+                timings = node.timings if node.learning is None else transaction.timings()
                 exchange = transaction.command.open(node.address, timings)
                 answers = exchange.answers  # a protocol may lack it: found out here, it fails this one alone
             except Exception as bug:
@@ -173,7 +173,9 @@ class Choice:
 
         def suits(other: Transaction) -> bool:
             node = other.node
-            if other.writes or node not in nodes or node.writes or not self._dispatcher.may_go(other, now):
+            if other.writes or node not in nodes or not self._dispatcher.may_go(other, now):
+                return False
+            if self._dispatcher.writes.queues[node]:  # no read overtakes a write to its node
                 return False
             exchange = _opened(other)
             if exchange is None or _is_decisive((other, exchange)) or unfit(exchange.answers, node):
@@ -234,7 +236,7 @@ class Choice:
         for node, command, exchange in _fit_checks(nodes, unfit):
             check = self._dispatcher.check(node, command, now)
             if node.learning is not None:
-                exchange = command.open(node.address, node.timings_for(check))
+                exchange = command.open(node.address, check.timings())
             return check, exchange
         return None
 
@@ -278,6 +280,6 @@ def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:
 def _opened(transaction: Transaction) -> Exchange[Any] | None:
     """None where its protocol cannot encode it: that is told when its turn has come."""
     try:
-        return transaction.command.open(transaction.node.address, transaction.node.timings_for(transaction))
+        return transaction.command.open(transaction.node.address, transaction.timings())
     except Exception:
         return None

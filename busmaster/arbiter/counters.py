@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from busmaster.arbiter.events import Mark
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.learned import LearnedTimes
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, SETTLING, LineState
 
 

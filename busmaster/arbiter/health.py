@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import enum
-from collections import deque
 from collections.abc import Callable, Sequence
 from math import inf
 from typing import Any
 
 from busmaster.arbiter.counters import NodeCounters
-from busmaster.arbiter.learned import AGAIN, AT_FIRST, AT_LAST, NEVER, Learning
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.learned import Learning
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
@@ -90,7 +88,6 @@ class NodeRecord:
         "unheard",
         "up_since",
         "usual",
-        "writes",
     )
 
     def __init__(self, profile: Profile, address: int, timings: Timings, retries: int, line: str = "") -> None:
@@ -112,7 +109,6 @@ class NodeRecord:
         """Replies in a row since then."""
         self.last_reply = -inf
         self.up_since = -inf
-        self.writes: deque[Transaction] = deque()
         self.counters = NodeCounters()
         self.probe_delay = FIRST_PROBE_DELAY
         self.probe_at = inf
@@ -136,17 +132,6 @@ class NodeRecord:
         self.lateness_until = inf
         """When a lateness that was raised comes down again, if all replies are prompt until then."""
         self._before_raised: Timings | None = None
-
-    def timings_for(self, transaction: Transaction) -> Timings:
-        """Return the times of the next attempt: a learned window only for a read that is repeated if it is over."""
-        if self.learning is None:
-            return self.timings
-        retried, hurry = transaction.retried, AT_LAST
-        if self.failures or self.health is UNKNOWN or self.health is DOWN or (transaction.probe != transaction.check):
-            hurry = NEVER
-        elif transaction.check or (retried < transaction.retries and not transaction.writes and retried < 2):
-            hurry = AGAIN if retried else AT_FIRST
-        return self.learning.timings(transaction.command, self.timings, hurry)
 
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
         """It has answered rightly, after so many seconds."""

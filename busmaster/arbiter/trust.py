@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from busmaster.arbiter.events import Mark
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.in_step import ANY_BYTE, Awaited, InStep
 from busmaster.arbiter.learned import LATE_SHARE
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.unasked import QUIET, UnaskedBytes
 from busmaster.contract.exchange import Done
