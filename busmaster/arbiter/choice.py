@@ -175,7 +175,7 @@ class Choice:
             node = other.node
             if other.writes or node not in nodes or not self._dispatcher.may_go(other, now):
                 return False
-            if self._dispatcher.writes.queues[node]:  # no read overtakes a write to its node
+            if self._dispatcher.writes.queues.get(node):  # no read overtakes a write to its node
                 return False
             exchange = _opened(other)
             if exchange is None or _is_decisive((other, exchange)) or unfit(exchange.answers, node):

@@ -3,9 +3,8 @@
 Theory of operation
 -------------------
 One half-duplex line, many nodes, anonymous replies: at most one exchange is on the line (R1), and no byte of an earlier
-one can come when the next begins (R3), but for one that a learned window did not wait for, which is owed (R15). It is
-told the time with every call and sends nothing itself: its owner pumps `poll_transmit`, then `poll_event`, then arms a
-timer for `poll_timeout`. Early or repeated calls change nothing.
+one can come when the next begins (R3), unless its window was learned (R15). It is told the time and sends nothing: its
+owner pumps `poll_transmit`, then `poll_event`, and arms a timer for `poll_timeout`. Calls too early change nothing.
 
 The line is in one of five states; `_line_due` is when the state ends by itself.
 from busmaster.arbiter.mark import Mark
