@@ -8,6 +8,7 @@ from math import inf
 from typing import Any
 
 from busmaster.arbiter.counters import NodeCounters
+from busmaster.arbiter.learned import Learning
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
@@ -71,6 +72,7 @@ class NodeRecord:
         "label",
         "last_reply",
         "lateness_until",
+        "learning",
         "line",
         "probe_at",
         "probe_delay",
@@ -96,6 +98,8 @@ class NodeRecord:
         self.label = profile.label(address)
         self.timings = timings
         self.retries = retries
+        self.learning: Learning | None = None
+        """What is learned of its reply times, where that is wished for."""
         self.health = UNKNOWN
         self.failures = 0
         """Transactions in a row that failed without a valid reply."""
