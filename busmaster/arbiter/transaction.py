@@ -45,6 +45,8 @@ class Phase(enum.Enum):
 
 
 IDLE, QUEUED, PARKED, ON_WIRE, FAILING, ENDED = Phase
+LEFT = "the line is being left: only its safe state is still written"
+"""Why a write is superseded that is not of the safe state, once that is being sent."""
 
 
 class Timeline(NamedTuple):

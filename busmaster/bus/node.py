@@ -10,9 +10,8 @@ from threading import get_ident
 from typing import Any, Protocol, TypeVar, Unpack
 
 from busmaster.arbiter.counters import NodeStatistics
-from busmaster.arbiter.dispatcher import LEFT
 from busmaster.arbiter.health import Health, NodeRecord
-from busmaster.arbiter.transaction import Priority, Timeline, Transaction
+from busmaster.arbiter.transaction import LEFT, Priority, Timeline, Transaction
 from busmaster.bus.requester import ORDINARY, CommandOptions, Requester, RequestOptions
 from busmaster.bus.samples import Sample
 from busmaster.bus.shared_line import SharedLine
