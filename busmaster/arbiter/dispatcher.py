@@ -417,8 +417,6 @@ class Dispatcher:
         before = node.health
         flaps = health.flaps(node, now)
         health.note_success(node, now)
-        if before is DOWN and node.learning is not None:
-            node.learning.doubt()
         if before is DOWN and not flaps:
             self.probes.budget.node_returned(now)
             for other in self.nodes:

@@ -244,6 +244,8 @@ def flaps(node: NodeRecord, now: float) -> bool:
 def note_success(node: NodeRecord, now: float) -> None:
     """A reply came. The caller reports the change of health."""
     node.failures = 0
+    if node.health is DOWN and node.learning is not None:
+        node.learning.doubt()  # it may have come back as another device
     if node.health is SUSPECT:
         node.replies += 1
         if node.replies < UP_AFTER_REPLIES or now - node.failed_at < UP_AFTER_CALM:
