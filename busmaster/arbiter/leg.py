@@ -50,6 +50,7 @@ class Leg:
         "end",
         "first_bytes",
         "latency",
+        "learns",
         "longest",
         "out",
         "paced",
@@ -66,6 +67,8 @@ class Leg:
         """When the first byte of its reply was received."""
         self.first_bytes = b""
         """What came then, at once."""
+        self.learns = False
+        """Its node's times are learned: how the reply's bytes came is noted."""
         self.pause = 0.0
         """The longest pause, in seconds, between two arrivals of its bytes."""
         self.went_on_at = -inf
@@ -105,9 +108,10 @@ class Leg:
     def gap_over(self, now: float) -> float:
         """When the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
         timing, latency, byte_time = self.timing, self.latency, self.byte_time
-        if self.went_on_at >= self.begun_at and now - self.went_on_at > self.pause:
-            self.pause = now - self.went_on_at
-        self.went_on_at = now
+        if self.learns:
+            if self.went_on_at >= self.begun_at and now - self.went_on_at > self.pause:
+                self.pause = now - self.went_on_at
+            self.went_on_at = now
         due = now + timing.byte_gap + latency + byte_time
         limit = self.end + timing.window + latency + self.longest * byte_time + timing.byte_gap
         return due if due < limit else limit

@@ -36,6 +36,7 @@ class OnWire:
         self.transaction = transaction
         self.exchange = exchange
         self.came_unasked = False
+        self.leg.learns = transaction.node.learning is not None
         request, timing = exchange.request, exchange.timing
         due = self.leg.begin(timing, len(request), exchange.sizes.longest, now)
         self._deadlines.line = due if exchange.answered else self.leg.end + timing.turnaround
