@@ -32,6 +32,8 @@ class SharedLine:
         self.pump: Pump
         self.logbook = Logbook(name)
         self.closed = False
+        self.only_safe = False
+        """Whether no write is accepted any more but those of the safe state."""
         self.thread = 0
         """In which its loop runs; 0 while the bus is not open."""
         self.loop_runs: Callable[[], bool] = lambda: False
