@@ -146,7 +146,9 @@ def test_r15_an_ack_and_the_replies_behind_it_pay_what_is_owed(behind: list[int]
     node = up(Bench())
     for key in (bytes.fromhex(ACK), *owed):
         in_step.owe((key,), node, 0.0, 0.15)
-    assert in_step.heard(bytes.fromhex(ACK) + b"".join(owed), 1.0) is node
+    payer = in_step.heard(bytes.fromhex(ACK) + b"".join(owed), 1.0)
+    assert payer is not None
+    assert payer.node is node
     assert in_step.debts == []
 
 

@@ -80,6 +80,7 @@ def test_the_least_and_the_most_can_be_sent(fits: Callable[[], Any]) -> None:
     "mistake",
     [
         lambda: ReadRegisters(-1),
+        lambda: ReadRegisters(-1, 2),
         lambda: ReadRegisters(65536),
         lambda: ReadRegisters(0, 0),
         lambda: ReadRegisters(0, 126),
