@@ -109,17 +109,21 @@ class MqttOutput(Output):
     # on the thread
 
     def work(self) -> None:
+        """Publish until it is stopped. What is left in memory then goes to disk, if it may."""
         asyncio.run(self._in_time())
 
     def rest(self, seconds: float) -> None:
-        """What comes while the broker is away goes to disk, if it may."""
+        """Wait so many seconds, or until it is stopped. What comes while the broker is away goes to disk, if it may."""
         over = time.monotonic() + seconds
         while not self._stop.is_set() and time.monotonic() < over:
             self._put_by()
             self._stop.wait(min(SPILL_EVERY, seconds))
 
     async def _in_time(self) -> None:
-        """Whatever happens, what is left in memory is on disk when this ends, if it may: before the process does."""
+        """Publish until it is stopped.
+
+        Whatever happens, what is left in memory is on disk when this ends, if it may: before the process does.
+        """
         try:
             async with anyio.create_task_group() as tasks:
                 if self._spool is not None:
@@ -130,7 +134,7 @@ class MqttOutput(Output):
             self._put_by()
 
     async def _hurry(self, scope: anyio.CancelScope) -> None:
-        """A broker that does not answer when all is to end is not waited for to the last moment."""
+        """Give up on a broker that does not answer when all is to end: it is not waited for to the last moment."""
         while not self._stop.is_set():  # noqa: ASYNC110  # another thread sets it
             await anyio.sleep(TICK)
         await anyio.sleep(HURRY)
@@ -161,7 +165,7 @@ class MqttOutput(Output):
                 time.sleep(PAUSE)
 
     async def _send_spilled(self, client: Client) -> None:
-        """All that is on disk; what comes meanwhile goes behind it. When all is to end the rest stays there."""
+        """Send all that is on disk; what comes meanwhile goes behind it. When all is to end the rest stays there."""
         while self._spool is not None and self.spilled and not self._stop.is_set():
             up_to, records = self._spool.oldest(AT_ONCE)
             await self._send(client, (Outgoing(topic, payload, retain) for topic, payload, retain, _ in records))
@@ -213,7 +217,7 @@ class MqttOutput(Output):
         return client
 
     async def _send(self, client: Client, messages: Iterable[Outgoing]) -> None:
-        """In order, and acknowledged at QoS 1. Raises what went wrong first."""
+        """Send the messages in order, and acknowledged at QoS 1. Raises what went wrong first."""
         under_way: deque[asyncio.Task[None]] = deque()
         try:
             for number, (topic, payload, retain) in enumerate(messages, 1):
@@ -231,7 +235,7 @@ class MqttOutput(Output):
             await asyncio.gather(*under_way, return_exceptions=True)
 
     def _fill(self, most: int) -> bool:
-        """What was not acknowledged comes first."""
+        """Hold up to `most` values, and return whether there are any. What was not acknowledged comes first."""
         size = sum(map(size_of, self._held))
         while size < most and (item := self.take()) is not None:
             self._held.append(item)
@@ -252,7 +256,7 @@ class MqttOutput(Output):
                 yield Outgoing(self._topic("values", topic_part(point.key)), payload, settings.retain)
 
     def _changes(self) -> Iterator[Outgoing]:
-        """What is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
+        """Yield what is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
         now = {"line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")}
         for node in self._bus.nodes:
             now[f"health/{topic_part(node.label.removeprefix('node '))}"] = ("health", node.health.value)
@@ -268,7 +272,10 @@ class MqttOutput(Output):
     # commands
 
     async def _listen(self, client: Client, tasks: TaskGroup) -> None:
-        """Raises MqttError when the broker goes away, also while there is nothing to send."""
+        """Obey commands as they come.
+
+        Raises MqttError when the broker goes away, also while there is nothing to send.
+        """
         async for message in client.messages:
             name = str(message.topic).removeprefix(self._topic("set/"))
             refusal = self._refusal(name, message)
@@ -279,7 +286,7 @@ class MqttOutput(Output):
                 tasks.start_soon(self._obey, client, name, message.payload)
 
     def _refusal(self, name: str, message: Message) -> str:
-        """Why a command is not obeyed, "" if it is."""
+        """Return why a command is not obeyed, "" if it is."""
         if name not in self._commands:
             return "the line's file does not allow this: see allow_commands"
         if message.retain:
@@ -300,7 +307,7 @@ class MqttOutput(Output):
         await self._answer(client, name, refusal)
 
     async def _write(self, point: Point[Any], payload: object) -> None:
-        """On the loop that owns the line."""
+        """Write the point on the loop that owns the line."""
         value = command_value(payload)
         assert self._owner is not None
         work = point.write(value, start_within=START_WITHIN)
@@ -312,7 +319,10 @@ class MqttOutput(Output):
 
 
 def command_value(payload: object) -> Any:
-    """The number, or the several, that somebody wants to have written. Raises InvalidCommand for anything else."""
+    """Return the number, or the list of them, that somebody wants to have written.
+
+    Raises InvalidCommand for anything else.
+    """
     text = bytes(payload).decode(errors="replace") if isinstance(payload, bytes | bytearray) else str(payload)
     try:
         value = json.loads(text, parse_constant=lambda name: name)
@@ -325,12 +335,12 @@ def command_value(payload: object) -> Any:
 
 
 def topic_part(name: str) -> str:
-    """Without what has a meaning in topics."""
+    """Return the name without what has a meaning in topics."""
     return name.replace("+", "_").replace("#", "_")
 
 
 def secrets(settings: MqttSettings) -> tuple[str | None, str | None, ssl.SSLContext | None]:
-    """User name, password and TLS context. Raises InvalidCommand for a file that cannot be read."""
+    """Return user name, password and TLS context. Raises InvalidCommand for a file that cannot be read."""
     password = tls = None
     try:
         if settings.password_file is not None:
