@@ -148,7 +148,7 @@ class InStep:
         return max((d.until for d in self.debts if now < d.until and _could_be(d, answers)), default=inf)
 
     def forgive(self, answers: Sequence[bytes]) -> None:
-        """Forgive what is owed and could look so: with no unlike exchange to ask, R3's assumption must do, and doubt."""
+        """Forgive what is owed and could look so: nothing unlike can be asked, R3's assumption must do, and doubt."""
         forgiven = [debt for debt in self.debts if _could_be(debt, answers)]
         self._doubted += [(debt.key, debt.asked + LAPSE) for debt in forgiven]
         self.debts = [debt for debt in self.debts if not _could_be(debt, answers)]

@@ -93,7 +93,7 @@ class Leg:
         self.out = max(self.out, now) + count * self.byte_time
 
     def begin(self, timing: ReplyTiming, said: int, longest: int, now: float) -> float:
-        """Begin a leg: `said` bytes of the host, a reply of at most `longest`. Returns when the reply must have begun."""
+        """Begin a leg of `said` bytes, a reply of at most `longest`, and return when the reply must have begun."""
         self.timing = timing
         self.longest = longest
         self.begun = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import io
 import os
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
@@ -69,6 +70,8 @@ def note(line: str, level: Level = Level.INFO) -> None:
     try:
         sys.stderr.flush()
         os.write(sys.stderr.fileno(), text.encode(errors="backslashreplace"))  # past the buffer, where it would stay
+    except io.UnsupportedOperation:
+        sys.stderr.write(text)  # a program of ours runs within another, which has put a stream of its own there
     except OSError:
         pass
 
