@@ -73,6 +73,7 @@ class Arbiter(LineMachine):
         self.dispatcher.nodes.append(node)
         if profile.listen is not None and self._unasked.listener is None:
             self._unasked.listener = profile.listen()
+        # An earlier master may have asked this node just before the port was opened: that reply is waited out (R3).
         self._quarantine = max(self._quarantine, self._up_at + node.lateness + self._leg.latency + self.byte_time)
         return node
 
@@ -94,6 +95,7 @@ class Arbiter(LineMachine):
 
     def answer_counts(self, now: float) -> bool:
         """Return whether a caller's time is over while something is on the wire: what has come is handed over first."""
+        # A loop that stood still may look at its timers before it reads: what lies unread came in time.
         return self.state is EXCHANGE and now >= self._deadlines.expiry
 
     def submit(self, transaction: Transaction, now: float) -> bool:
@@ -105,6 +107,7 @@ class Arbiter(LineMachine):
         if self.state is READY:
             self._advance(now)
             return True
+        # A write may have superseded others, which is to be told, and a `start_by` sets a deadline.
         return not waits or transaction.writes or transaction.start_by < inf
 
     def cancel(self, transaction: Transaction, now: float) -> None:
@@ -160,11 +163,12 @@ class Arbiter(LineMachine):
     def poll_event(self) -> Event | None:
         """Take out the next event, in the order of `events`, or return None."""
         if self.dispatcher.unnoted is not None:
-            self.dispatcher.note_success()
+            self.dispatcher.note_success()  # only now: the next request has left
         return self.events.popleft() if self.events else None
 
     def poll_timeout(self) -> float:
         """Return when `handle_timeout` is to be called, in seconds on the caller's clock; inf if nothing is due."""
+        # It is asked after every byte that comes. A call of `min` takes more than twice as long.
         deadlines = self._deadlines
         earliest = deadlines.line
         if deadlines.schedule < earliest:

@@ -50,6 +50,7 @@ class _Fifo:
         """Take out the first of the first few that suits, or return None."""
         passed: list[Transaction] = []
         found = None
+        # Only the first few: equal polls by the hundred must not be searched for an unlike one at every exchange.
         while self.live > len(passed) and len(passed) < LOOKED_AT and found is None:
             transaction = self._entries.popleft()
             if transaction.phase is not QUEUED:
@@ -207,6 +208,7 @@ class Backlog:
 
     def promote(self, transaction: Transaction, priority: Priority) -> None:
         """Move a transaction to the front of a higher class: a write that a write of that class must not overtake."""
+        # Not discarded and left to be swept: it is QUEUED all the time, and would be served from its old place too.
         self.queues[transaction.priority].remove(transaction)
         transaction.priority = priority
         self.push_front(transaction)

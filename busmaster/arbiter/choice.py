@@ -80,11 +80,13 @@ class Choice:
         def alike(other: Sequence[bytes], node: NodeRecord) -> bool:
             return other == answers
 
+        # Only its first attempt: a late answer to that one is not the retry's, which needs proof as any other does.
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
         elif _is_decisive(first) and now < in_step.awaited_until(self._last_byte):
             chosen = self._while_awaited(first, now) or in_step.awaited_until(self._last_byte)
         elif transaction.probe and in_step.clashes(answers, now, transaction.node):
+            # The reply to the probe before may still come, and would be taken for this one's.
             chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
         elif in_step.clashes(answers, now):
             chosen = self._instead_of(first, now)
@@ -98,7 +100,7 @@ class Choice:
             chosen = self._another(first, now, alike) or first
         if chosen is first:
             self._gone_before = 0
-        if not isinstance(chosen, tuple):
+        if not isinstance(chosen, tuple):  # a time: in the proof (tests/proof) that is no float
             self._dispatcher.backlog.restore(transaction)
         else:
             if chosen[0] is not transaction:
@@ -138,6 +140,7 @@ class Choice:
             worth_it = first[0].writes or not first[0].attempts
             if worth_it and not (owing or asked):  # all are silent: a check of its own node costs no more than it would
                 asked = [first[0].node]
+            # Who owes goes first: its answer pays at once, another node's only when the lateness is over.
             other = self._ask_check([*owing, *asked], now, clashes)
             if other is None and not any(_fit_checks(silent, proves_nothing)):  # there is nothing unlike to ask
                 over = in_step.over(answers)
@@ -179,6 +182,7 @@ class Choice:
             if self._dispatcher.writes.queues.get(node):  # no read overtakes a write to its node
                 return False
             exchange = _opened(other)
+            # A last attempt must not go while something is awaited, not even in place of a check.
             if exchange is None or _is_decisive((other, exchange)) or unfit(exchange.answers, node):
                 return False
             opened.append(exchange)
@@ -191,7 +195,7 @@ class Choice:
         """Return a check of a node that owes what it is to be asked for: its answer would not be believed. Returns None
         for a node that is likely to be dead."""
         node = first[0].node
-        if node.silent or self._gone_before >= MOST_BEFORE:
+        if node.silent or self._gone_before >= MOST_BEFORE:  # a death would cost the living an exchange
             return None
         self._gone_before += 1
         return self._ask_check([node], now, lambda answers, node: self._in_step.clashes(answers, now, node))
@@ -249,6 +253,7 @@ class Choice:
             if node.address != node.profile.broadcast and node.suspended_until <= now
         ]
         alive = [node for node in nodes if not node.silent]
+        # Two stable sorts in place of one by a negated time: the proof's instants (tests/proof) have no negative.
         alive.sort(key=lambda node: node.last_reply, reverse=True)
         alive.sort(key=lambda node: node.health is not UP)
         return alive, [node for node in nodes if node.silent]

@@ -98,11 +98,11 @@ class Dispatcher:
         if self.fault is not None:
             self._end(transaction, now, name_error(self.fault(), transaction))
             return False
-        if transaction.writes and transaction.priority is URGENT:
+        if transaction.writes and transaction.priority is URGENT:  # even if it fails below: no enable may follow it
             self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
         waiting = self.backlog.queues[transaction.priority].live
         if transaction.writes:
-            waiting = max(waiting, len(self.writes.queues[node]))
+            waiting = max(waiting, len(self.writes.queues[node]))  # those that are parked are in no class
         if waiting >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return False
@@ -133,7 +133,7 @@ class Dispatcher:
         """Take out the transaction that may be sent now, or return None."""
         while (transaction := self.backlog.pop()) is not None:
             node = transaction.node
-            if transaction.start_by < now and (
+            if transaction.start_by < now and (  # queued right now, it is in time: its caller's clock was read earlier
                 transaction.finish_by <= now or (transaction.queued < now and not transaction.attempts)
             ):
                 self._end(transaction, now, too_late(transaction, now))
@@ -173,7 +173,7 @@ class Dispatcher:
         transaction.attempts += 1
         transaction.started = now
         transaction.first_byte = -inf
-        transaction.late = False
+        transaction.late = False  # an earlier attempt may have been; this one's value is not late for that
 
     # what came of an attempt
 
@@ -184,7 +184,7 @@ class Dispatcher:
         transaction.value = value
         transaction.last_byte = now
         self.unnoted = transaction
-        if transaction.writes or transaction.node.health is not UP:
+        if transaction.writes or transaction.node.health is not UP:  # its next write may go; its polls may resume
             self.note_success()
 
     def note_success(self) -> None:
@@ -237,7 +237,7 @@ class Dispatcher:
     def broken(self, transaction: Transaction, bug: Exception, now: float) -> None:
         """Fail a transaction over which the protocol's reader failed: a bug there. To ask again would meet it again."""
         what = f"a bug in the {transaction.node.profile.name} reader: {bug!r}"
-        transaction.node.counters.garbled += 1
+        transaction.node.counters.garbled += 1  # but no failure of the node: a bug says nothing of its health
         kind = WriteUnconfirmed if transaction.writes else BusError
         error = make_error(kind, what, transaction)
         error.hint = "this is not the line's fault: please report it, with a capture"
@@ -257,7 +257,7 @@ class Dispatcher:
             transaction.refusals += 1
             self._requeue(transaction, now)
             return
-        node.last_reply = now
+        node.last_reply = now  # a refusal is an answer too (R11)
         if node.health is not UP:
             self._heard(node, now)
         transaction.refused_cycles += 1
@@ -297,7 +297,7 @@ class Dispatcher:
         self.note_success()
         for transaction in self._expiries.due(now):
             if not transaction.wanted or (transaction.attempts and transaction.finish_by >= now):
-                continue
+                continue  # its caller has gone, or it was started in time: then only its `finish_by` ends it
             if transaction.phase is FAILING:
                 continue  # it ends next, with what became of the line
             if transaction.phase is ON_WIRE:
@@ -418,7 +418,7 @@ class Dispatcher:
         before = node.health
         flaps = health.flaps(node, now)
         health.note_success(node, now)
-        if before is DOWN and not flaps:
+        if before is DOWN and not flaps:  # the others may be back too; a flapping node tells nothing about them
             self.probes.budget.node_returned(now)
             for other in self.nodes:
                 if other.health is DOWN:
@@ -455,7 +455,7 @@ class Dispatcher:
         what overtakes it, nor if that cannot be sent itself (R7)."""
         for write in list(self.writes.queues[node]):
             if write.phase is ON_WIRE:
-                write.superseded = True
+                write.superseded = True  # it runs out, but is not repeated behind what overtakes it
             elif above is None or write.priority > above:
                 if write.phase is QUEUED:
                     self.backlog.discard(write, PARKED)

@@ -43,4 +43,5 @@ class Expiries:
         self._set_deadline()
 
     def _set_deadline(self) -> None:
+        # Behind the moment, which is still in time. A fixed nanosecond is lost in a clock that is months old.
         self._deadlines.expiry = nextafter(self._heap[0][0], inf) if self._heap else inf
