@@ -205,6 +205,7 @@ class ProbeBudget:
             # only what is longer than a probe, and only what was not counted when the same pause was looked at before
             earned = BUDGET_IDLE_SHARE * (pause - max(probe, before))
             self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)
+        # One that goes on is kept whole: looking at the counters must not cut it into pieces that are worth nothing.
         self._pause = 0.0 if over else pause
 
     def node_returned(self, now: float) -> None:
@@ -264,7 +265,7 @@ def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> N
     A broadcast fails for what its echo was: that says nothing of a node, and there is none to be probed.
     """
     if node.address == node.profile.broadcast:
-        return
+        return  # its probe cannot be sent, and would be chosen and paid for again and again
     node.failures += 1
     node.failed_at = now
     node.replies = 0

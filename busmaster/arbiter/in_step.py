@@ -156,6 +156,7 @@ class InStep:
     def doubtful_answer(self, answers: Sequence[bytes]) -> None:
         """Pay the oldest debt of this kind: its reply came, or the right answer, and one of the two is still owed."""
         for place, debt in enumerate(self.debts):
+            # not where talkers may have met on the line: there, only a whole reply that came late pays
             if debt.awaited is None and _could_be(debt, answers):
                 del self.debts[place]
                 return
@@ -211,6 +212,7 @@ class InStep:
             first = first or debt
             awaited.remove(debt)
             if all(other.node is debt.node for other in self.debts if other.key == debt.key):
+                # all that its request left: the lone byte, too, that could have been a part of this reply
                 self.debts = [other for other in self.debts if (other.node, other.asked) != (debt.node, debt.asked)]
         if run:
             self.owe((ANY_BYTE,), None, now, now)

@@ -229,6 +229,7 @@ class Learning:
         for leg, packet in ((kind.first, False), (kind.packet, True)):
             times = self._known.get((name, packet))
             if times is not None and times.trusted and max(times.slowest, times.heard, times.pause) < inf:
+                # As the epoch before: it counts until this run has an epoch of its own, and is forgotten then.
                 leg.slowest.before, leg.heard.before, leg.pause.before = times.slowest, times.heard, times.pause
                 leg.doubts = TRUSTED_AGAIN_AFTER
         return kind

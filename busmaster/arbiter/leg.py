@@ -100,8 +100,9 @@ class Leg:
         self.pause = 0.0
         self._follows = None
         out = self.out
+        # no calls of `max`: this is done for every request
         self.out = self.end = end = (out if out > now else now) + said * self.byte_time
-        if self.paced and said:
+        if self.paced and said:  # where nothing is said the node goes on by itself: MSC's packet follows its ACK
             self.taint_until = now + TAINT_SHARE * said * self.byte_time
         return end + timing.window + self.latency
 

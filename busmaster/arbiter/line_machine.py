@@ -245,7 +245,7 @@ class LineMachine:
         if transaction.node.profile.noise_tolerant:
             heard, data = data, wire.without_noise(data)
             self._counters.noise_bytes += len(heard) - len(data)
-            self._unasked.last_byte = now
+            self._unasked.last_byte = now  # noise that is passed over breaks a silence all the same
             if not data:
                 return b""
         leg.begun = True
@@ -289,7 +289,7 @@ class LineMachine:
             if self._in_step.alert or step.rest:
                 verdict = self._trust.weigh(wire, step, now)
                 if isinstance(verdict, str):
-                    self._disbelieve(verdict, step, now)
+                    self._disbelieve(verdict, step, now)  # before what follows: it proves not that its request left
                     return
                 if verdict is not None:
                     self._deadlines.line = verdict
@@ -306,7 +306,7 @@ class LineMachine:
         self.dispatcher.succeeded(transaction, step.value, now)
         if step.rest:
             self._unasked.note(step.rest, now, leg.quiet())
-        if step.rest or wire.came_unasked or (self._echo.owed and not answered):
+        if step.rest or wire.came_unasked or (self._echo.owed and not answered):  # a broadcast's echo may never come
             self._settle(now)
             return
         self._unasked.unanswered_one = None
@@ -315,7 +315,7 @@ class LineMachine:
     def _disbelieve(self, what: str, step: Done[Any], now: float) -> None:
         self._counters.doubted += 1
         if self._wire.transaction is not None:
-            self._wire.transaction.node.unheard = 0
+            self._wire.transaction.node.unheard = 0  # heard, if not believed: what it owes it is asked for itself
         if step.rest:
             self._unasked.note(step.rest, now, self._leg.quiet())
         self._attempt_failed(FrameError(what, send=step.send), now, doubted=True)
@@ -340,7 +340,7 @@ class LineMachine:
         elif error.heard:
             unasked.blame(now)
             unasked.run[:] = error.heard
-        spared = error.whole and not self._in_step.debts
+        spared = error.whole and not self._in_step.debts  # its reply has begun: the silence alone is waited for (R3)
         both = what is TWO_ANSWERS
         if both:
             self._in_step.said_twice(now)
@@ -369,7 +369,7 @@ class LineMachine:
         self._end_exchange()
         self.dispatcher.refused(transaction, refusal, certain, now)
         if transaction.writes and certain:
-            self._leg.answered()
+            self._leg.answered()  # what was refused has left, as what was answered has
             self._release(self._leg.timing.turnaround, now)
         else:
             self._settle(now, begun=confirmed and certain)
@@ -388,7 +388,7 @@ class LineMachine:
         """Let the next request follow `hold` seconds behind our own last byte: the outcome was certain."""
         if self._closed:
             self._go_offline(now)
-        elif hold or not self._advance(now):
+        elif hold or not self._advance(now):  # behind a closing ACK, in the same write: waiting for it took a timer
             free = max(self._leg.out, now) + hold
             self._enter(HOLDOFF if free > now else READY, now)
             self._deadlines.line = free if free > now else inf
@@ -431,7 +431,7 @@ class LineMachine:
         if self.state is OFFLINE:
             return
         self._settle(now)
-        if not self.noisy:
+        if not self.noisy:  # on a noisy line nothing is sent, not even an ACK
             self._answer_unasked(unasked.reply_to(data), now)
         if unasked.babbling(now) and not self.noisy:
             self.noisy = True
@@ -452,7 +452,7 @@ class LineMachine:
             self._wire.say(send, now)
             owed = self._echo.owed
             self._settle(now)
-            self._echo.owed = owed
+            self._echo.owed = owed  # which the settle forgot: this is echoed, too
         return bool(send)
 
     def _strip_echo(self, data: bytes, now: float) -> bytes:

@@ -55,10 +55,12 @@ class OnWire:
         if learning is None or not leg.begun:
             return
         heard = max(0.0, leg.begun_at - leg.end - leg.latency)
+        # An adapter may hand over a whole reply at once: its first byte came so much earlier.
         begun = max(0.0, heard - (len(leg.first_bytes) - 1) * leg.byte_time)
         pause = leg.pause if leg.went_on_at < leg.begun_at else max(leg.pause, now - leg.went_on_at)
         packet = leg.timing is not exchange.timing
         learning.note(transaction.command, packet, begun, heard, max(0.0, pause - leg.latency), leg.byte_time)
+        # Only a learned window that is nearly missed says that the node has become slower; the document's says nothing.
         if leg.timing.silence is not None and heard > LATE_SHARE * leg.timing.window:
             learning.doubt()
 
@@ -91,7 +93,7 @@ class OnWire:
         transaction = self.transaction
         assert transaction is not None
         limit = transaction.node.profile.exchange_limit
-        self.learn(now)
+        self.learn(now)  # before the next leg begins, which takes the place of this one's times
         if step.send and limit is not None and (now - transaction.started > limit or self._urgent_waits()):
             raise cast("Abandonable", self.exchange).abandon()
         self._deadlines.line = self.leg.begin(step.timing, len(step.send), step.sizes.longest, now)

@@ -86,7 +86,7 @@ def _least(pairs: Iterable[Pair], own: float, reach: float, pieces: int) -> Gene
     for piece in bends:
         for x in sorted(piece):
             if least <= ROUNDING:
-                return best
+                return best  # it meets nobody there, and among equals the earliest wins
             overlap += slope * (x - at)
             slope += piece[x]
             at = x

@@ -96,5 +96,6 @@ class Probes:
     def _put_off(self, now: float) -> None:
         """Look again when the next probe is due; a free one may have to wait for the line to be idle."""
         self.plan()
+        # Never a time that is past: the owner would call again at once, and find the same.
         if self._deadlines.health <= now:
             self._deadlines.health = now + LONGEST_BUDGET_WAIT

@@ -96,6 +96,8 @@ class Schedule:
             poll.active = False
             poll.preparation = None
             del self.polls[poll]
+            # Its entry stays until its turn comes, and is swept only where what was removed outgrows what is left: a
+            # removal must not cost a walk over all polls.
             if len(self._heap) > 2 * len(self.polls) + AT_ONCE:
                 self._heap = [entry for entry in self._heap if entry[2].active]
                 heapq.heapify(self._heap)
@@ -121,6 +123,7 @@ class Schedule:
         due = self.release(now)
         while self._demanded:
             poll = self._demanded.popleft()
+            # What is due now does not run yet, and at most one cycle of a poll is under way (R10).
             if poll.active and not poll.running and poll not in due:
                 poll.due = now
                 due.append(poll)
@@ -221,7 +224,7 @@ class Schedule:
         try:
             return next(search)
         except StopIteration as found:
-            base = since + found.value
+            base = since + found.value  # the search may take several slices: its offset counts from when it began
             poll.phase = (base - self._epoch) % poll.period
             self._start(poll, base, now)
             self._placing = None
@@ -231,7 +234,7 @@ class Schedule:
         """Find where it meets least those that have their place, if all spread over the time that there is."""
         load = 0.0
         others = []
-        for number, other in enumerate(tuple(self.polls), 1):
+        for number, other in enumerate(tuple(self.polls), 1):  # a copy: polls come and go between two slices
             load += other.cost / other.period
             if other.placed:
                 others.append(other)

@@ -131,6 +131,7 @@ class Transaction:
         self.finish_by = finish_by
         """Its caller waits no longer, and nothing is sent from then on."""
         if finish_by < inf:
+            # a start_by is met by what starts right at it, but at finish_by nothing is sent any more
             self.start_by = min(start_by, nextafter(finish_by, -inf))
         self.tag = tag
         self.poll = poll
@@ -168,6 +169,7 @@ class Transaction:
         node, hurry = self.node, AT_LAST
         if node.learning is None:
             return node.timings
+        # A check is made as a probe is, but nobody waits for it: a learned window will do.
         if node.failures or node.health is UNKNOWN or node.health is DOWN or self.probe != self.check:
             hurry = NEVER
         elif self.check or (self.retried < self.retries and not self.writes and self.retried < 2):

@@ -70,6 +70,7 @@ class Trust:
         leg, awaited = wire.leg, None
         over = leg.past()
         if leg.timing.silence is not None:  # it may meet with what is said then, and only a part of it be heard
+            # its node goes on by itself with the legs that need no word from the host (MSC: the packet after its ACK)
             over += sum(later.timing.lateness for later in exchange.later if not later.sent)
             silence = max(QUIET, transaction.node.timings.read.byte_gap) + leg.latency + leg.byte_time
             awaited = Awaited(transaction.command, leg.timing.window, silence)

@@ -108,7 +108,7 @@ class UnaskedBytes:
     def blame_for(self, node: NodeRecord, asked: float, first_byte: float) -> None:
         """Blame the node whose reply to an earlier request came, though the line had gone on."""
         self.unanswered(node, asked, node.timings.read.lateness)
-        self.looked(first_byte, first_byte)
+        self.looked(first_byte, first_byte)  # its time is known: it did not lie unread
         self.blame(first_byte)
 
     # what may be owed an answer: MSC sends a packet again until it is ACKed

@@ -24,6 +24,7 @@ class Writes:
         """Have the write wait behind an earlier write to its node, and lend that one its class."""
         write.phase = PARKED
         first = self.queues[write.node][0]
+        # They may not change places (R7), and the higher class is not to wait until the lower one has its turn.
         if first.priority > write.priority and first.phase is QUEUED:
             self._backlog.promote(first, write.priority)
 

@@ -312,6 +312,7 @@ def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
 
 
 def _fitting_baudrate(drafts: Sequence[_Draft], line: LineSettings) -> Generator[int, None, int | None]:
+    # They share one line: where one device has a single rate, another cannot be had by any.
     if any(node.profile.fixed_rate for draft in drafts for node, _ in draft.exchanges):
         return None
     for baudrate in BAUDRATES:
@@ -330,6 +331,7 @@ def _fitting_baudrate(drafts: Sequence[_Draft], line: LineSettings) -> Generator
 def _rounded_up(seconds: float) -> float:
     """Round up to two digits: to a period that somebody would write down."""
     unit = 10.0 ** (floor(log10(seconds)) - 1)
+    # 0.14 / 0.01 is a little more than 14 in floats, and would become 0.15.
     return round(ceil(seconds / unit - 1e-9) * unit, 9)
 
 

@@ -62,6 +62,7 @@ def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: flo
         said = before + sent * byte_time + receive_latency
         whole = timing.window + timing.byte_gap + sizes.longest * byte_time
         quiet = max(QUIET, timing.byte_gap) + receive_latency + byte_time
+        # A line that is not silent for longer is NOISY: nobody waits longer, but fails with LineNoisy.
         trickle = min(sizes.longest * quiet, NOISY_AFTER + quiet)
         worst = max(worst, said + max(whole, timing.lateness + byte_time) + trickle + quiet)
         before = said + whole
