@@ -173,7 +173,7 @@ async def feed(line: ConfiguredLine, overheard: Overheard, show: Callable[[Snaps
                     if snapshot is not None:
                         show(snapshot)
     finally:
-        for group in overheard.groups:
+        for group in overheard.groups:  # what the last period heard, before the outputs end
             group.turn(time.monotonic(), time.time())
             group.close()
         await line.outputs.close()
