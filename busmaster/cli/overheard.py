@@ -73,6 +73,7 @@ class HeardGroup:
 
     def turn(self, now: float, wall: float) -> Snapshot | None:
         """Hand on what was heard since the last time, and return it; None where nothing was."""
+        # stays on its grid, whatever was slept through
         due, self.due = self.due, self.due + self.period * max(1, (now - self.due) // self.period)
         if not self._heard:
             return None
