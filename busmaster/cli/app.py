@@ -176,6 +176,7 @@ def status_of(error: BaseException) -> int:
             return INTERRUPTED
         case SystemExit():
             return error.code if isinstance(error.code, int) else FAILED
+        # an OSError, too: so it comes before that case
         case BrokenPipeError():
             forget_standard_output()
             return OK
@@ -185,7 +186,7 @@ def status_of(error: BaseException) -> int:
         case BusError():
             return complain(bus_error_text(error), FAILED)
         case OSError():
-            if not can_flush():
+            if not can_flush():  # a full disk: Python would complain of what is still held once more at exit
                 forget_standard_output()
             what = error.strerror or str(error)
             return complain(f"{error.filename}: {what}" if error.filename else what, FAILED)

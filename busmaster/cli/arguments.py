@@ -68,6 +68,7 @@ class Connection:
         """
         where = self.endpoint()
         recording = capturing(self.capture, port=where.name, protocol=self.protocol, echo=where.echo)
+        # left with the command, when no loop runs any more: leaving waits for the disk
         return Bus(where, tap=click.get_current_context().with_resource(recording))
 
     def open_handle(self, bus: Bus, address: int) -> Handle:
@@ -175,7 +176,7 @@ def connected(command: F) -> F:
         click.option("--retries", type=Whole(min=0), metavar="N", help="How often a read is tried again."),
         capture_option,
     )
-    for option in reversed(options):
+    for option in reversed(options):  # the help lists first what was put on last
         gathered = option(gathered)
     return gathered  # type: ignore[return-value]  # the decorated function takes more than the one it wraps
 

@@ -47,7 +47,7 @@ def emulated_line() -> Iterator[str]:
         [sys.executable, "-m", "busmaster.cli.demo_line"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        start_new_session=True,
+        start_new_session=True,  # Ctrl-C reaches all of a terminal's group; the line is to end after its master
         text=True,
     )
     with process:

@@ -32,7 +32,7 @@ async def draw(picture: Callable[[], Frame], act: Callable[[Action], object]) ->
     """
     before = terminal_state()
     ours, theirs = socket.socketpair()
-    with theirs:
+    with theirs:  # left open here, it would hide from `hear` that the screen has ended
         command = [sys.executable, "-m", "busmaster.cli.live", str(theirs.fileno())]
         process = await anyio.to_thread.run_sync(
             lambda: subprocess.Popen(command, pass_fds=[theirs.fileno()]), abandon_on_cancel=False
@@ -49,7 +49,7 @@ async def draw(picture: Callable[[], Frame], act: Callable[[Action], object]) ->
         writer.close()
         with anyio.CancelScope(shield=True):
             await anyio.to_thread.run_sync(see_off, process)
-        if process.returncode:
+        if process.returncode:  # one that was killed has left the terminal as it was drawing on it
             restore_terminal(before)
     return status
 

@@ -39,6 +39,7 @@ class Ending:
     def __enter__(self) -> Ending:
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
+                # a shell starts what runs in its background deaf to Ctrl-C, and so it is to stay
                 if signal.getsignal(number) is not signal.SIG_IGN:
                     self._before[number] = signal.signal(number, self._heard)
         return self
@@ -60,6 +61,7 @@ class Ending:
                 os._exit(128 + number)
             return
         self.number, self._since = number, now
+        # raised while the loop runs, or is being closed, it would break that; there the task is cancelled
         if not self._running:
             self._unwind()
         if self._cancel is not None:
@@ -77,9 +79,10 @@ class Ending:
         async def cancellable() -> T:
             loop, task = asyncio.get_running_loop(), asyncio.current_task()
             assert task is not None
+            # threadsafe, though it is this thread: nothing else wakes a loop that waits in select
             self._cancel = lambda: loop.call_soon_threadsafe(task.cancel)
             try:
-                if self.number:
+                if self.number:  # heard while there was no task yet to cancel
                     raise asyncio.CancelledError
                 return await function(*arguments)
             finally:

@@ -213,6 +213,7 @@ class Screen(App[None]):
 
     async def listen(self, connection: socket.socket) -> None:
         """Take every frame that the connection brings; end the screen when it ends."""
+        # asyncio's own limit, 64 KiB a line, raises at some hundred points
         reader, self.writer = await asyncio.open_connection(sock=connection, limit=FRAME_LIMIT)
         try:
             while line := await reader.readline():
@@ -247,6 +248,7 @@ class Screen(App[None]):
         if row is None or self.frame is None:
             return
         if self.frame.read_only or not row.writable:
+            # a name may have brackets, which would be taken for markup
             self.notify(f"{row.node} {row.item} is read-only", markup=False)
             return
 
@@ -277,7 +279,7 @@ class Screen(App[None]):
             table.clear()
             self.shown = keys
             for number in range(len(keys)):
-                table.add_row(*(Text() for _ in COLUMNS), key=str(number))
+                table.add_row(*(Text() for _ in COLUMNS), key=str(number))  # two groups may have the same point
         old = OLD_AFTER * max((group.period for group in frame.groups), default=1.0)
         before = ""
         for number, row in enumerate(frame.rows):
@@ -288,7 +290,7 @@ class Screen(App[None]):
                 cells |= node_cells(nodes.get(row.node, NodeRow(row.node, "")), self.widths)
             for name, cell in cells.items():
                 shown = table.get_cell(str(number), name)
-                if (shown, shown.style) != (cell, cell.style):
+                if (shown, shown.style) != (cell, cell.style):  # texts are equal to rich whatever their style
                     table.update_cell(str(number), name, cell)
             before = row.node
 

@@ -76,7 +76,7 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
     """Listen to the line of a file until Ctrl-C. Nothing is ever sent, whoever asks for it."""
     protocol = only_protocol(file)
     kind = find(protocol)
-    line = ConfiguredLine(silent(file), tell=note)
+    line = ConfiguredLine(silent(file), tell=note)  # never entered: its bus opens no port
     points = {point for group in file.groups for point in line.members(group)}
     overheard = Overheard(kind.protocol, points)
 
@@ -114,7 +114,7 @@ class Listener(asyncio.Protocol):
         self._recorder = recorder
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
-        self._offset = time.time() - time.monotonic()
+        self._offset = time.time() - time.monotonic()  # once: a clock that is set moves no frame
         self.lost: asyncio.Future[None] = self._loop.create_future()
 
     def data_received(self, data: bytes) -> None:

@@ -82,6 +82,7 @@ def is_journal(stream: TextIO, device_and_inode: str) -> bool:
         status = os.fstat(stream.fileno())
     except (OSError, ValueError):
         return False
+    # the variable is inherited: whoever redirects our standard error leaves it as it was
     return device_and_inode == f"{status.st_dev}:{status.st_ino}"
 
 
@@ -101,13 +102,14 @@ class SteadyOutput:
     def print(self, lines: Iterable[str]) -> None:
         """Print and flush, past the stream's buffer, in which what failed would stay. Raises BrokenPipeError."""
         texts = list(lines)
+        # a line that a full disk has cut off stays so: a line end keeps the next one apart from it
         data = ("\n" * self._torn + "".join(f"{printable(line)}\n" for line in texts)).encode(errors="backslashreplace")
         written = 0
         try:
             while written < len(data):
                 written += os.write(sys.stdout.fileno(), data[written:])
         except BrokenPipeError:
-            raise
+            raise  # a reader that has left ends the command, here as everywhere
         except OSError as error:
             self._failed(error.strerror or str(error), data[:written], len(texts))
         else:

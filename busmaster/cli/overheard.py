@@ -73,6 +73,7 @@ class HeardGroup:
 
     def turn(self, now: float, wall: float) -> Snapshot | None:
         """Hand on what was heard since the last time, and return it; None where nothing was."""
+        # stays on its grid, whatever was slept through
         due, self.due = self.due, self.due + self.period * max(1, (now - self.due) // self.period)
         if not self._heard:
             return None
@@ -173,7 +174,7 @@ async def feed(line: ConfiguredLine, overheard: Overheard, show: Callable[[Snaps
                     if snapshot is not None:
                         show(snapshot)
     finally:
-        for group in overheard.groups:
+        for group in overheard.groups:  # what the last period heard, before the outputs end
             group.turn(time.monotonic(), time.time())
             group.close()
         await line.outputs.close()

@@ -70,7 +70,7 @@ def command(path: str, port: str | None, capture: str | None, view: View) -> int
         except SystemExit as ended:
             if ended.code != 128 + signal.SIGTERM:
                 raise
-            status = OK
+            status = OK  # how a service is stopped is no failure of it
         return status if running.left_safely else FAILED
 
 
@@ -90,7 +90,7 @@ class Running:
         entered = False
         self.line.outputs.tell = self._tell_of_output
         try:
-            with hangups() as heard:
+            with hangups() as heard:  # first of all: SIGHUP ends a process that does not hear it
                 async with self.line:
                     entered = True
                     try:
@@ -153,6 +153,7 @@ class Running:
         Raises OSError, and InvalidCommand, naming line and key, for what is wrong with the file.
         """
         file = load(self._path)
+        # made for its complaints alone: `take` wants a file of which a line can be made
         ConfiguredLine(file, port=self.line.bus.endpoint)
         return file
 
@@ -184,7 +185,7 @@ def hangups() -> Iterator[MemoryObjectReceiveStream[None]]:
         except anyio.WouldBlock:
             pass
 
-    ours = threading.current_thread() is threading.main_thread()
+    ours = threading.current_thread() is threading.main_thread()  # asyncio hears signals nowhere else
     loop = asyncio.get_running_loop()
     with send, receive:
         if ours:

@@ -28,11 +28,13 @@ class ServiceManager:
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         path = environment.get("NOTIFY_SOCKET", "")
+        # @ stands for the zero byte that begins an abstract address
         self._address = "\0" + path[1:] if path.startswith("@") else path
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if path else None
         if self._socket is not None:
-            self._socket.setblocking(False)
+            self._socket.setblocking(False)  # a manager that does not read holds up no line
         micros = environment.get("WATCHDOG_USEC", "")
+        # a child inherits what was meant for its parent: the process id tells
         wanted = micros.isdecimal() and environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self.interval = int(micros) / 1e6 if wanted and path else 0.0
 

@@ -13,4 +13,5 @@ def printable(text: str) -> str:
     """
     if text.isprintable():
         return text
+    # Python calls no space printable but the plain one; those of any width (Zs) move nothing
     return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else json.dumps(c)[1:-1] for c in text)

@@ -155,7 +155,7 @@ class Watch:
     def announce(self, text: str, level: Level = Level.NOTICE) -> None:
         """Add to the last events; print a line on standard error, unless the screen that shows them is there."""
         self.tell(text)
-        if not (shown_on_screen(self.view) and sys.stderr.isatty()):
+        if not (shown_on_screen(self.view) and sys.stderr.isatty()):  # a line there would tear the picture
             note(text, level)
 
     def picture(self) -> Frame:
@@ -249,6 +249,7 @@ class Watch:
         return Row(
             point.node.label,
             point.item,
+            # by its exact type: words and flags are ints, too, and are shown by their names
             value if type(value) in (int, float) or value is None else value_text(value),
             short_unit(point.unit),
             good.age(now) if good else None,
@@ -320,6 +321,7 @@ async def print_cycles(watch: Watch, group: PollGroup) -> None:
     """Print every cycle, in a thread: a reader that is slow costs snapshots, never line time."""
     async for snapshot in group:
         watch.saw(snapshot)
+        # abandoned: a reader that has stopped reading would keep the command from ending
         await anyio.to_thread.run_sync(print_cycle, watch, snapshot, abandon_on_cancel=True)
 
 
@@ -346,7 +348,7 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
         status = await draw(watch.picture, lambda action: tasks.start_soon(watch.act, action))
         if status == FAILED and watch.output is not None:
             status = OK
-            watch.view = replace(view, plain=True)
+            watch.view = replace(view, plain=True)  # what happens is told on standard error from now on
             note("the screen is gone; polling goes on without it", Level.WARNING)
         else:
             tasks.cancel_scope.cancel()

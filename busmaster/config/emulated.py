@@ -48,6 +48,7 @@ def line_settings(file: LineFile) -> LineSettings:
 def _device(file: LineFile, name: str) -> Device:
     node, section = file.nodes[name], file.emulator.nodes[name]
     emulated = {option.name for option in node.kind.emulated}
+    # said of the node or of its device, an option is one and the same
     options = {key: value for key, value in node.options.items() if key in emulated} | dict(section.options)
     with (section.table or node.table).at():
         device = make_device(node.protocol, node.address, delay=section.delay, lively=section.lively, **options)

@@ -51,6 +51,7 @@ def read_emulator(table: Table, nodes: Mapping[str, NodeKind]) -> EmulatorSectio
     table.only("paced", "seed", "lively", "reply_delay", "faults", "nodes")
     shared = table.table("faults")
     every = EmulatedSection(_delay(table, Delay()), _faults(shared, {}), table.flag("lively", True))
+    # of its own each: faults are set anew while a line is emulated
     sections = {name: replace(every, faults=_faults(shared, {})) for name in nodes}
     for one in table.tables("nodes"):
         with one.at():

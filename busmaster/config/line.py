@@ -93,6 +93,7 @@ class ConfiguredLine:
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         for name, group in list(self.groups.items()):
             same = before.groups[name] == file.groups.get(name) and wanted[name] == self._wanted[name]
+            # by identity: points are equal whatever their scale and unit, which may be what changed
             if not (same and all(map(is_, wanted[name], self._wanted[name]))):
                 del self.groups[name]
                 group.close()
@@ -124,7 +125,7 @@ class ConfiguredLine:
                 priority=group.priority,
             )
             for group in self.file.groups.values()
-            if group.name not in self.groups
+            if group.name not in self.groups  # one that runs is in the plan of the bus already
         )
         return self.bus.plan(*planned)
 
@@ -142,7 +143,7 @@ class ConfiguredLine:
                         priority=group.priority,
                         points=self._wanted[group.name],
                     )
-        self.groups = {name: self.groups[name] for name in self.file.groups}
+        self.groups = {name: self.groups[name] for name in self.file.groups}  # in the file's order
 
     def _handle(self, node: NodeSection) -> Handle:
         options = dict(node.options)
@@ -158,7 +159,7 @@ class ConfiguredLine:
                 own.rename(node.name)  # what messages and the screen call it
         for point in node.points.values():
             with point.table.at(*(["item"] if "item" in point.table else [])):
-                handle.point(point.item)
+                handle.point(point.item)  # looked up for its complaint, which has the line here
         return handle
 
     def _members(self, group: GroupSection) -> Iterator[NamedPoint]:
@@ -166,7 +167,7 @@ class ConfiguredLine:
             with group.table.at("points", number):
                 for name in self._names(text):
                     point = self._point(*name)
-                    point.command.open(point.node.address, Node.of(point).timings)
+                    point.command.open(point.node.address, Node.of(point).timings)  # refused here, not while it runs
                     yield point
 
     def _names(self, text: str) -> Iterator[tuple[str, str]]:
@@ -181,7 +182,7 @@ class ConfiguredLine:
             if node not in self.nodes:
                 raise InvalidCommand(f"no such node {node!r}; {meant(node, self.nodes)}")
             section = self.file.nodes[node]
-            known = {*section.points, *section.options.get("symbols", ())}
+            known = {*section.points, *section.options.get("symbols", ())}  # a1-3 may be a name, and then is no range
             for item in (name for part in listed(items) for name in expanded(part, known)):
                 yield node, item
 
@@ -198,7 +199,7 @@ class ConfiguredLine:
         if section is None:
             source = _known(handle, name, node.points)
             return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
-        decimals = 0 if node.kind.takes_decimals else section.decimals
+        decimals = 0 if node.kind.takes_decimals else section.decimals  # else they are the handle's: not twice
         rounds = node.kind.takes_decimals and (section.decimals or node.kind.decimals(section.item))
         whole = not rounds and node.kind.whole_numbers(section.item)  # else the handle rounds, to its decimals
         scale = Scale.of(section.factor, section.offset, decimals, whole=whole)
@@ -249,7 +250,7 @@ def check_same_line(before: LineFile, after: LineFile) -> None:
         raise InvalidCommand("other settings of the port need a restart: nothing of the file was taken")
     own = {_address(node): node for node in before.nodes.values()}
     for node in after.nodes.values():
-        known = before.nodes.get(node.name) or own.get(_address(node))
+        known = before.nodes.get(node.name) or own.get(_address(node))  # renamed, it has other settings
         if known is not None and _settings(known) != _settings(node):
             raise InvalidCommand(f"other settings of node {node.name!r} need a restart: nothing of the file was taken")
 

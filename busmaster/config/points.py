@@ -35,7 +35,7 @@ class Scale:
         """
         if not factor:
             raise InvalidCommand("a factor of 0 makes every value the same")
-        return cls(Fraction(repr(factor)) / 10**decimals, Fraction(repr(offset)), whole)
+        return cls(Fraction(repr(factor)) / 10**decimals, Fraction(repr(offset)), whole)  # repr: 0.1 is a tenth
 
     @property
     def trivial(self) -> bool:
@@ -51,7 +51,7 @@ class Scale:
         plus = self.offset.numerator * self.factor.denominator
 
         def read(number: Any) -> Any:
-            if type(number) is int:
+            if type(number) is int:  # not isinstance: a word or a flag is an int, too, and stays what it is
                 return (number * times + plus) / below
             if type(number) is float:
                 return float(f"{(number * times + plus) / below:.15g}")
@@ -63,7 +63,7 @@ class Scale:
         """Return the line's number, or run of numbers, for a value."""
         if isinstance(value, list | tuple):
             return tuple(map(self.write, value))
-        if type(value) is int or (type(value) is float and math.isfinite(value)):
+        if type(value) is int or (type(value) is float and math.isfinite(value)):  # inf is the protocol's to refuse
             exact = (Fraction(repr(value)) - self.offset) / self.factor
             return rounded(exact) if self.whole else float(exact)
         return value

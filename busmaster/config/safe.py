@@ -96,14 +96,14 @@ class SafeWrite:
                 item,
                 [number],
                 priority=Priority.URGENT,
-                idempotent=True,
+                idempotent=True,  # its protocol has said so, or `repeatable`
                 verify=True,
                 safe=True,
                 finish_within=within,
             )
             return send
 
-        prepare(LONGEST)
+        prepare(LONGEST)  # what would be refused at the end is refused when the file is read
         return cls(point, value, node, prepare)
 
 
@@ -133,11 +133,11 @@ class SafeState:
         by_node: dict[Node, list[SafeWrite]] = {}
         for write in self.writes:
             by_node.setdefault(write.node, []).append(write)
-        with anyio.CancelScope(shield=True):
+        with anyio.CancelScope(shield=True):  # the signal that ends the line has cancelled this task
             async with anyio.create_task_group() as tasks:
                 for node, writes in by_node.items():
-                    node.note_stop()
-                    node.suspend(0.0)
+                    node.note_stop()  # what was decided before must not undo it
+                    node.suspend(0.0)  # also one that somebody has suspended
                     tasks.start_soon(_leave, bus, writes, deadline, outcomes)
         return outcomes
 

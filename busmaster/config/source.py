@@ -45,10 +45,10 @@ class Source:
             self.data: dict[str, Any] = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             found = AT.search(str(error))
-            line = (found and found[1]) or len(text.splitlines())
+            line = (found and found[1]) or len(text.splitlines())  # "at end of document" has no number
             what = AT.sub("", str(error))
             raise FileError(f"{name}:{line}: this is no TOML: {what[:1].lower()}{what[1:]}") from None
-        self._places = places(text.replace("\r\n", "\n"))
+        self._places = places(text.replace("\r\n", "\n"))  # as tomllib itself reads it
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Source:

@@ -82,7 +82,7 @@ class Table:
     def number(self, key: str, default: T | _Required = REQUIRED) -> float | T:
         """Read a finite number."""
         value: float | T = self._take(key, (int, float), default, "a number")
-        if isinstance(value, float) and not math.isfinite(value):
+        if isinstance(value, float) and not math.isfinite(value):  # TOML has inf and nan
             raise self.error(f"must be finite, not {value}", key)
         return value
 
@@ -208,7 +208,7 @@ class Table:
                 raise self.error(f"{key!r} is missing: {meant}")
             return default
         value = self.data[key]
-        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):  # True is an int to Python
             raise self.error(f"must be {meant}, not {shown(value)}", key)
         return value
 
