@@ -58,6 +58,7 @@ class _Exchange:
         if last is None or self.kind is None or self.judge()[0] is Outcome.NO_REPLY:
             return False
         if last.kind is Kind.NOISE:
+            # no reader looks for the start of a reply in noise, but for these
             return not self.kind.profile.noise_tolerant
         return frame.kind is Kind.NOISE
 
@@ -138,7 +139,7 @@ class Assembler:
 
     def attempted(self, attempt: Attempt) -> None:
         """Take it that an attempt is over, and how it ended."""
-        if attempt is self._exchange.attempt:
+        if attempt is self._exchange.attempt:  # that of an exchange before was read from the attempt itself
             self._now = max(self._now, attempt.ended_at)
             self._rest()
             self._release()
@@ -147,7 +148,7 @@ class Assembler:
         """Hold back nothing that is over: for long nothing has happened."""
         self._now = now
         self._rest()
-        if self._exchange.over:
+        if self._exchange.over:  # a master's exchange that goes on is not judged by its silence
             self._release()
 
     def finish(self, now: float) -> None:
@@ -216,6 +217,7 @@ class Assembler:
 
         MSC's closing ACK comes with the next request. An echo that differs is left as it came: the line collided.
         """
+        # The last alone is tried first: an echo that never came must not use up the next one.
         for owed in (self._sent, self._echo_owed):
             length = min(len(owed), len(data))
             if length and data[:length] == owed[:length]:
@@ -267,6 +269,7 @@ class Assembler:
             target = exchange.packets[0]
         elif target is None:
             ended = self._now if attempt is None or attempt.verdict is None else attempt.ended_at
+            # Nothing came that could carry the outcome: a packet without bytes does.
             name = "" if exchange.kind is None else exchange.kind.name
             target = Packet(self._micros(ended), name, Direction.NODE, b"", exchange.node)
             self._mark(target)

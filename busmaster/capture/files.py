@@ -49,6 +49,7 @@ class CaptureFiles:
     def flush(self) -> None:
         """Write what was taken. Raises OSError where not all can be written; the rest is kept."""
         while self._pending:
+            # unbuffered: a disk that fills up takes a part, and says how much
             written = self._file.write(self._pending) or 0
             del self._pending[:written]
             self._size += written
@@ -77,7 +78,7 @@ class CaptureFiles:
         while True:
             self.path = self._name()
             try:
-                file = io.FileIO(self.path, "xb")
+                file = io.FileIO(self.path, "xb")  # exclusive: what is there is never overwritten
             except FileExistsError:
                 self._number += 1
                 continue

@@ -109,7 +109,7 @@ class PcapngWriter:
         self._port = port
         self._interfaces: dict[str, int] = {}
         self._write(_SECTION, struct.pack("<IHHq", _BYTE_ORDER, 1, 0, -1) + _options((_APPLICATION, b"busmaster")))
-        self._interface_of("")
+        self._interface_of("")  # the statistics at the end are of interface 0, in a capture without packets too
 
     def write(self, packet: Packet) -> None:
         """Write one packet."""
@@ -193,6 +193,7 @@ def _packet(micros: int, protocol: str, data: bytes, options: list[tuple[int, by
     header = _HEADERS.get(data[0]) if data else None
     if header is None or len(data) < header.size:
         raise CaptureError("a packet without our header, or of a later version")
+    # Headers of older versions end sooner: they number no requests.
     _, capture_id, direction, outcome, node, transaction, attempt, joined = (*header.unpack_from(data), 0, 0, 0)[:8]
     comment, *notes = [value.decode(errors="replace") for code, value in options if code == _COMMENT] or [""]
     dropped = dict(options).get(_DROPPED)

@@ -149,6 +149,7 @@ class Recorder:
 
     def _end(self) -> None:
         """Write the rest, if the disk takes it."""
+        # First, as nothing is drained before a disk that was full takes something again.
         self._flush()
         self._drain()
         self._assembler.finish(time.monotonic())
@@ -164,6 +165,7 @@ class Recorder:
     def _drain(self) -> None:
         """Write what waits in small helpings, so that the loop never waits long for the interpreter."""
         handled = 0
+        # While the disk is full the events stay where their number is bounded.
         while self._events and self.error is None:
             self._handle(self._events.popleft())
             self._unwritten += 1
@@ -186,6 +188,7 @@ class Recorder:
         """
         self._writer.finish(round(time.time() * 1e6), self.dropped)
         if self._try(self._files.begin_next):
+            # each file has a head, and can be read alone
             self._writer = PcapngWriter(self._files, port=self._port)
 
     def _try(self, work: Callable[[], None]) -> bool:
@@ -213,7 +216,7 @@ class Recorder:
             self._assembler.passed(event.now, event.data, event.sender, event.attempt)
 
     def _write(self, packet: Packet) -> None:
-        dropped = self.dropped
+        dropped = self.dropped  # read once: the loop counts on meanwhile
         packet.dropped = dropped - self._reported
         self._reported = dropped
         self._writer.write(packet)

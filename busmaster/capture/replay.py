@@ -133,7 +133,7 @@ class _Run:
             return
         self.note(heard)
         self._given_up = None
-        if not heard.packet.joined:
+        if not heard.packet.joined:  # readers of several legs weigh what came in one piece
             self._hand_over()
         self._heard += heard.packet.frame
         self._answered = self._answered or bool(heard.packet.frame)

@@ -125,6 +125,7 @@ def _permission(path: str) -> Finding:
 
 def _holders(path: str, proc: Path) -> Finding:
     device = os.path.realpath(path)
+    # Whoever emulates the line on a pseudo-terminal has it open as well, and is no second master.
     found = [str(holder) for holder in holders(path, proc=proc) if not serves(proc / str(holder.pid), device)]
     if not found:
         return Finding("holders", True, "no other program has it open")

@@ -163,6 +163,7 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
     heard = await wire.hear_all(LISTENING)
     talk = diagnosis.unasked(heard, patient.protocol)
     tell(talk)
+    # Another master, or what may be one, must not be disturbed. Noise is no reason not to ask.
     if heard and (patient.protocol is None or diagnosis.spoken(heard, patient.protocol)):
         return
     settings = where.settings
@@ -206,6 +207,7 @@ async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
     with patient.progress("measuring", len(living) * PROBES) as bar:
         for record in living:
             for left in reversed(range(PROBES)):
+                # The last one waits out the lateness, so that nothing of this node is left for the next.
                 record.probes.append(await prober.ask(record.address, alone=not left))
                 bar.advance()
     return records

@@ -229,6 +229,7 @@ class _Hearing:
         driver.feed(data)
         for send in driver.said:
             now = say(send)
+        # else the node would be left with something unacknowledged
         if driver.ending is not None and driver.ending.send:
             say(driver.ending.send)
         return now + (driver.timing.byte_gap if driver.begun else driver.timing.lateness)

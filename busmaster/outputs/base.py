@@ -122,10 +122,11 @@ class Output(ABC):
         """Values that wait on disk, and those that the thread had to drop from there."""
         self._capacity = settings.buffer
         self._say = say
-        self._waiting: deque[Item] = deque()
+        self._waiting: deque[Item] = deque()  # loop and thread share it without a lock: what they do with it is atomic
         self._stop = threading.Event()
         self._reopen = threading.Event()
         self._retry = FIRST_RETRY
+        # A daemon: one that hangs on a disk or a network must not keep the process from ending.
         self._thread = threading.Thread(target=self._run, name=f"busmaster {kind}", daemon=True)
 
     # on the loop that owns the line
@@ -212,7 +213,7 @@ class Output(ABC):
     def _run(self) -> None:
         """Work until stopped. Whatever goes wrong is told and tried again: it must not end the thread."""
         while True:
-            last = self._stop.is_set()
+            last = self._stop.is_set()  # before the try: one that is stopped in the midst of a failing try gets another
             try:
                 self.work()
                 return
@@ -254,6 +255,7 @@ class BatchOutput(Output, Generic[Formatted]):
         try:
             stopped = False
             while not stopped:
+                # before the queue is emptied, so that what was offered until then is written
                 stopped = self._stop.wait(TICK)
                 if self._reopen.is_set():
                     self._reopen.clear()
@@ -290,6 +292,7 @@ class BatchOutput(Output, Generic[Formatted]):
             self._size += size_of(item)
             if not self._stop.is_set():
                 time.sleep(PAUSE)
+        # What is not written here, as events in CSV, is no loss.
         if not self._batch:
             self.written += self._size
             self._size = 0

@@ -87,6 +87,7 @@ class Distributor:
         seconds, and what comes meanwhile waits for its successor. Raises InvalidCommand, having changed nothing, if an
         extra is missing.
         """
+        # Made before anything is changed: an extra may be missing.
         fresh = {kind: self._make(kind, *one) for kind, one in wanted.items() if not one.same(self._wanted.get(kind))}
         kept = [output for output in self._outputs if output.kind in wanted and output.kind not in fresh]
         leaving = {output.kind: output for output in self._outputs if output not in kept}
@@ -96,6 +97,7 @@ class Distributor:
             output.reopen()
         self._take_in(groups)
         with anyio.CancelScope(shield=True):
+            # Closing waits for a thread, and perhaps for a disk: never on the loop that owns the line.
             await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in leaving.values()))
             for kind, output in fresh.items():
                 if kind in leaving:
@@ -108,6 +110,7 @@ class Distributor:
         What was polled is still handed on, and written within FAREWELL seconds.
         """
         with anyio.CancelScope(shield=True):
+            # They end with the bus's streams. Cancelled, they would leave behind what was polled last.
             await asyncio.gather(*self._feeding.values(), return_exceptions=True)
             if self._watching is not None:
                 self._watching.cancel()
@@ -140,6 +143,7 @@ class Distributor:
             for output in self._outputs:
                 if not output.groups or group.name in output.groups:
                     output.offer(snapshot)
+                    # cycles for which the loop was too busy count as well
                     output.miss((cycles.dropped - lost) * len(group.points))
             lost = cycles.dropped
 

@@ -76,22 +76,24 @@ class GrowingFile:
 
     def _opened(self, path: str) -> int:
         folder = os.path.dirname(path)
+        # No other folder is made: one that is missing was refused at the start, as it may be mistyped.
         if folder and "%" in os.path.dirname(self._pattern):
             os.makedirs(folder, FOLDER_MODE, exist_ok=True)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, self._mode)
         if ends_in_a_half_line(path):
-            os.write(descriptor, b"\n")
+            os.write(descriptor, b"\n")  # else the first new line would be taken for the rest of the half one
             self._tell(f"{path} ended in the middle of a line, which was closed off")
         return descriptor
 
     def _write(self, descriptor: int, lines: bytes) -> None:
         """Write the lines whole. What the disk has no room for is cut off again. Raises OSError then."""
-        end = os.lseek(descriptor, 0, os.SEEK_END)
+        end = os.lseek(descriptor, 0, os.SEEK_END)  # looked at each time: one that was emptied needs its head again
         rest = memoryview(lines if end else self._head + lines)
         try:
             while rest:
                 rest = rest[os.write(descriptor, rest) :]
         except OSError:
+            # the same lines come again when there is room, and must not follow a half one
             os.ftruncate(descriptor, end)
             raise
 

@@ -103,6 +103,7 @@ class MqttOutput(Output):
 
     def close(self, within: float) -> None:
         super().close(within)
+        # A thread that hangs may be in the midst of it.
         if self._spool is not None and not self._thread.is_alive():
             self._spool.close()
 
@@ -170,7 +171,7 @@ class MqttOutput(Output):
             up_to, records = self._spool.oldest(AT_ONCE)
             await self._send(client, (Outgoing(topic, payload, retain) for topic, payload, retain, _ in records))
             values = sum(record.values for record in records)
-            self._spool.remove(up_to, values)
+            self._spool.remove(up_to, values)  # only now: what is lost before it was acknowledged is sent again
             self.written += values
             self.spilled = self._spool.values
             self._put_by()
@@ -185,9 +186,10 @@ class MqttOutput(Output):
             tasks.start_soon(self._listen, client, tasks)
             stopped = False
             while not stopped:
-                stopped = self._stop.is_set()
+                stopped = self._stop.is_set()  # looked at first, so that a last round sends what waits
                 await self._send(client, list(self._changes()))
                 await self._send_spilled(client)
+                # What is on disk is older: nothing in memory may overtake it.
                 while not self.spilled and self._fill(AT_ONCE):
                     await self._send(client, (message for item in self._held for message in self._messages(item)))
                     self.written += sum(map(size_of, self._held))
@@ -213,7 +215,7 @@ class MqttOutput(Output):
             max_inflight_messages=AT_ONCE,
             logger=self._quiet,
         )
-        client.pending_calls_threshold = AT_ONCE
+        client.pending_calls_threshold = AT_ONCE  # above it aiomqtt logs a warning, and so many are meant
         return client
 
     async def _send(self, client: Client, messages: Iterable[Outgoing]) -> None:

@@ -41,6 +41,7 @@ class Retention:
         Each table has a `time`. The first table is the large one: by it the size is brought down.
         """
         clock, now = time.time(), time.monotonic()
+        # The size needs no clock: it is held while the clock is not believed, too.
         if self._bytes is not None and used(database) > self._bytes:
             forget_oldest(database, tables)
         if self._days is None:
@@ -49,6 +50,7 @@ class Retention:
         if now < self._next or not trusted:
             return
         deleted = max(delete_older(database, table, clock - self._days * DAY) for table in tables)
+        # After a full piece there is more: at a high rate one piece a minute would never keep up.
         self._next = now if deleted >= AT_ONCE else now + EVERY
 
     def _trusts(self, database: sqlite3.Connection, tables: tuple[str, ...], clock: float, now: float) -> bool:

@@ -126,7 +126,7 @@ class _Server:
             making = asyncio.get_running_loop().run_in_executor(self._maker, self._make, accept)
             self._making[accept] = making
             making.add_done_callback(lambda _: self._making.pop(accept))
-        return await asyncio.shield(making)
+        return await asyncio.shield(making)  # one that goes away must not cancel it for the others
 
 
 def response(status: str, content_type: str, body: bytes, **headers: str) -> bytes:

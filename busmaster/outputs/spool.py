@@ -40,6 +40,7 @@ class Spool:
         try:
             try:
                 self._database = _opened(path)
+            # Not damaged, but held by another process, say: to move it aside would take it from there.
             except sqlite3.OperationalError:
                 raise
             except sqlite3.DatabaseError as error:
@@ -94,6 +95,7 @@ class Spool:
 
 def _opened(path: str) -> sqlite3.Connection:
     os.close(os.open(path, os.O_CREAT | os.O_RDWR, 0o640))
+    # Nothing to wait for: who has it keeps it. It is opened and closed by another thread than the one that uses it.
     database = sqlite3.connect(path, timeout=0.0, check_same_thread=False)
     try:
         for setting in ("locking_mode = exclusive", "journal_mode = wal", "synchronous = normal"):

@@ -111,13 +111,14 @@ class SqliteOutput(BatchOutput[Rows]):
 
     def _open(self) -> sqlite3.Connection:
         if self._database is None:
+            # SQLite would make the file with a mode of its own.
             os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, self._mode))
             database = self._database = sqlite3.connect(self._path, timeout=BUSY)
             [version] = database.execute("pragma user_version").fetchone()
             [tables] = database.execute("select count(*) from sqlite_master").fetchone()
-            if version != VERSION and tables:
+            if version != VERSION and tables:  # an empty file has version 0 as well, and may be filled
                 raise InvalidCommand(f"{self._path} is a database of something else")
-            database.execute("pragma journal_mode = wal")
+            database.execute("pragma journal_mode = wal")  # others may read while it grows
             database.execute("pragma synchronous = normal")
             database.executescript(SCHEMA)
             database.execute(f"pragma user_version = {VERSION}")

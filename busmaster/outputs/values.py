@@ -75,6 +75,7 @@ def json_value(value: Any) -> Any:
         case float():
             if not math.isfinite(value):
                 return None
+            # Above 2**53 a float no longer tells one whole number from the next.
             return int(value) if value.is_integer() and abs(value) < 2**53 else value
         case AbstractSet():
             return sorted(value)

@@ -74,7 +74,7 @@ def make_device(
 
     Raises InvalidCommand for a kind that does not exist, see `DeviceMaker`.
     """
-    from busmaster.emulator.device import Delay
+    from busmaster.emulator.device import Delay  # naming protocols loads no emulated device
 
     delay = Delay() if delay is None else delay
     return find(name).make_device(address, delay=delay, traceable=traceable, lively=lively, **options)

@@ -149,7 +149,7 @@ class Protocol:
         if not self.kinds:
             raise InvalidCommand(f"{self.profile.name}: a protocol has at least one kind of node")
         for kind in self.kinds:
-            object.__setattr__(kind, "protocol", self)
+            object.__setattr__(kind, "protocol", self)  # frozen, but made before the protocol that lists it
 
     @property
     def name(self) -> str:
@@ -173,6 +173,7 @@ class Protocol:
             raise InvalidCommand(f"{self.name} has no command {name!r}: use {', '.join(self.commands)}")
         arguments = {key: _frozen(value) for key, value in written.items() if key != "command"}
         for part in dataclasses.fields(kind):  # type: ignore[arg-type]  # every command is a dataclass
+            # An option has one form: neither a number nor a text stands for true.
             if isinstance(part.default, bool) and not isinstance(arguments.get(part.name, False), bool):
                 raise InvalidCommand(f"{self.name}: {name}: {part.name} is true or false, not {arguments[part.name]!r}")
         try:

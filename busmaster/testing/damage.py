@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from itertools import combinations, pairwise
 from random import Random
 
-FEW_BYTES = 10
+FEW_BYTES = 10  # so many are cut in all ways, 511 at most
 MANY_BYTES = 64
 
 

@@ -73,7 +73,7 @@ def check_protocol(
     tried.
     """
     kit = _Kit(profile, list(cases), names, list(unseen), Random(seed))
-    if not kit.cases:
+    if not kit.cases:  # without a case nothing is tried, and so nothing found
         raise NotConformant(profile.name, ["there is no case"])
     findings = [*check_addresses(profile), *check_checks(profile), *check_invalid(invalid)]
     for case in kit.cases:

@@ -68,6 +68,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
                 f"at {self._now:g} s nothing is ready and no timer is set; these wait for ever:{waiting}"
             )
         later = self._now + seconds
+        # A wait too short to change the sum would leave time where it is, and its timer never due.
         self._now = later if later > self._now else math.nextafter(later, math.inf)
         return 0.0
 
