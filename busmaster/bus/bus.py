@@ -145,7 +145,7 @@ class Bus:
             try:
                 await self.pump.run_out()
             finally:
-                await self._let_go()
+                await self._let_go()  # when cancelled too: the port would stay open and be opened again for ever
 
     async def _let_go(self) -> None:
         """Close the port, as nothing is on the wire, or nobody waits for its end."""

@@ -228,7 +228,7 @@ class Node:
             raise Superseded("the node was told to stop since this was decided", node=record, command=str(command))
         if line.only_safe and command.writes and not options.safe:
             raise Superseded(LEFT, node=record, command=str(command), hint="")
-        transaction = Transaction(
+        transaction = Transaction(  # by position: keywords cost more, and this is done for every request
             record,
             command,
             options.priority,

@@ -194,6 +194,7 @@ class PollGroup:
     def sampled(self, transaction: Transaction) -> None:
         """Make the samples of an exchange that is over. Runs in the pump: no user code but decoders."""
         read: _Read = transaction.tag
+        # Samples are made as each exchange ends: all of a large group's at the end of its cycle would hold the loop.
         if self._cycle != self._poll.cycles:
             self._cycle = self._poll.cycles
             self._samples = read.blank.copy()
@@ -215,9 +216,9 @@ class PollGroup:
         """Hand the snapshot of a cycle round whose exchanges are over. Runs in the pump: no user code."""
         poll = self._poll
         if poll.fresh is None:
-            poll.cost = self._line_time
+            poll.cost = self._line_time  # the cycle before says what one costs: nobody weighs all groups
         if self._refusals:
-            self._fall_back()
+            self._fall_back()  # no snapshot yet: the single reads follow in the same period
             return
         self._age()
         self._tally.note(poll, self._qualities)
@@ -241,7 +242,7 @@ class PollGroup:
                 quality = Quality.STALE
             try:
                 value = point.value_of(transaction.value if place is None else transaction.value[place])
-            except GarbledReply as bad:
+            except GarbledReply as bad:  # an error of its point alone: the exchange's other points are sound
                 error, quality = bad, Quality.BAD
         timeline = transaction.timeline()
         finished = transaction.ended_at

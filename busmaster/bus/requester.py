@@ -89,6 +89,7 @@ class RequestOptions:
     safe: bool = False
 
     def __post_init__(self) -> None:
+        # A bare 0 is not the member URGENT: such a write would pass R7 by.
         if type(self.priority) is not Priority:
             object.__setattr__(self, "priority", checked_priority(self.priority))
         if self.start_within is not None:

@@ -127,6 +127,7 @@ class SharedLine:
     def is_stale(self, point: Point[Any], started: float) -> bool:
         """Return whether a write to the point's quantity, or to all of its node, has ended since its read began."""
         touched = self._touched
+        # Of the quantity: points of other names and scales read it too. A read that starts as the write ends is fresh.
         return max(touched.get(point.quantity, -inf), touched.get(point.node, -inf), self._all_touched) > started
 
     # misuse

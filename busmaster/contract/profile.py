@@ -82,6 +82,7 @@ class Profile:
     fixed_rate: bool = False
     exchange_limit: float | None = None
     listen: Callable[[], Listener] | None = field(default=None, compare=False)
+    # Compared apart: a second handle that leaves it open asks for the same node (Node.check_shared).
     merge: Callable[[Sequence[Command[Any]]], Sequence[Batch]] | None = field(default=None, compare=False)
 
     def label(self, address: int) -> str:

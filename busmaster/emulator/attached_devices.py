@@ -59,6 +59,7 @@ class AttachedDevices:
             self.overhear(frame, start, end, None, whole=False)
             return
         left: list[Device] = []
+        # Asked while it waits for something too, as a Mentor II drive does after a read: else all hear byte by byte.
         for device in routed:
             if device in self.cut_off or (self._faulty(device) and misses(device, start, end, True, self._chance)):
                 self._note(device, end)

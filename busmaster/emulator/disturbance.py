@@ -95,7 +95,7 @@ def noise(chance: Chance, longest: int) -> bytes:
 
 def flipped(data: bytes, chance: Chance, count: int) -> bytes:
     """Return the data with the same bit flipped in `count` bytes; in fewer where there are not so many."""
-    mask = 1 << chance.randrange(0, 8)
+    mask = 1 << chance.randrange(0, 8)  # one for all: two bits in one place are what an exclusive-or does not see (R5)
     changed = bytearray(data)
     places = list(range(len(data)))
     for _ in range(min(count, len(places))):

@@ -201,9 +201,10 @@ class Line:
         if talk is not None:
             end = talk.end
             chunk = talk.chunk or self.chunk
-            if self.prompt:
+            if self.prompt:  # in pieces: a pause as long as a long frame would look like its end
                 chunk = min(chunk or self._piece, self._piece) if talk.given else 1
             if talk.collision is not None:
+                # A stray byte that came only with the end of the host's request could be taken for its reply.
                 end = min(end, self._next_byte(talk.collision, talk.given))
             elif chunk and self._heard_at_once(talk):
                 end = min(end, talk.start + (talk.given + chunk) * self.tau)
@@ -257,6 +258,7 @@ class Line:
             talk = self._active
             due = NEVER if talk is None else talk.end
             pending = self._pending
+            # Back to back is no overlap, though floats may say so by a hair.
             overlap = bool(pending) and pending[0][0] < due - self._rounding
             if overlap:
                 due = pending[0][0]
@@ -348,7 +350,7 @@ class Line:
             return
         if self.latency or self.echo is not None or arrivals:
             when += self.latency
-            if arrivals and arrivals[-1][0] > when:
+            if arrivals and arrivals[-1][0] > when:  # a late echo still comes before the reply
                 when = arrivals[-1][0]
             arrivals.append((when, data))
         else:

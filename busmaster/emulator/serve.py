@@ -58,7 +58,7 @@ class LineServer(ABC):
         """
         result: Future[T] = Future()
         self._actions.put((action, result))
-        if self._closing or not self._thread.is_alive():
+        if self._closing or not self._thread.is_alive():  # behind the put: a thread that ends empties the queue once
             raise RuntimeError(f"{self.path} is no longer served")
         os.write(self._button, b".")
         return result.result()
@@ -106,7 +106,7 @@ class LineServer(ABC):
             self._error = error
         finally:
             self._shut()
-            self._closing = True
+            self._closing = True  # before the queue is emptied: who puts later must see it
             while not self._actions.empty():
                 self._actions.get()[1].set_exception(RuntimeError(f"{self.path} is no longer served"))
 
@@ -183,6 +183,7 @@ class PtyServer(LineServer):
         self.dropped += len(data) - taken
 
     def _shut(self) -> None:
+        # A server that began later may have replaced the link.
         if self._link is not None and os.path.islink(self._link) and os.readlink(self._link) == self._device:
             os.unlink(self._link)
         os.close(self._slave)

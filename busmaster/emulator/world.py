@@ -52,7 +52,7 @@ class World:
         tap: Tap | None = None,
     ) -> None:
         self.line = line
-        line.prompt = False
+        line.prompt = False  # a world asks at each of its deadlines
         self.now = now
         self.plugged = False
         self.arbiter = Arbiter(
@@ -90,6 +90,7 @@ class World:
 
     def at(self, when: float, action: Callable[[], object]) -> None:
         """Call `action` at that time, after what the line and the arbiter have to do then."""
+        # Of two at one time the first goes first; the functions themselves have no order.
         heapq.heappush(self._actions, (max(when, self.now), next(self._order), action))
 
     def plug(self) -> None:

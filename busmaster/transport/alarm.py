@@ -24,7 +24,7 @@ SOON = 0.02
 """What is due within so many seconds is worth a timer of the kernel's; of a longer wait a millisecond is little."""
 TFD_NONBLOCK = os.O_NONBLOCK
 TFD_CLOEXEC = os.O_CLOEXEC
-CLOCK_MONOTONIC = 1
+CLOCK_MONOTONIC = 1  # linux/time.h
 EXPIRATIONS = 8
 """Bytes of a timerfd's count of expirations."""
 
@@ -36,6 +36,7 @@ class Alarm:
         self._loop = loop
         self._ring = ring
         self._handle: asyncio.TimerHandle | None = None
+        # A timer of the kernel's would ring in the machine's time.
         self._precise = None if is_virtual(loop) else kernel_timer(loop, self._on_expiry)
         self._is_set = False
 

@@ -83,7 +83,7 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
         raise InvalidCommand(f"a port is named by text, such as '/dev/ttyUSB0?baudrate=57600', not {url!r}")
     if "://" not in url:
         path, _, query = url.partition("?")
-        if HOST_PORT.fullmatch(path) and not path.startswith(USB):
+        if HOST_PORT.fullmatch(path) and not path.startswith(USB):  # usb:12345678 looks like a host and its port
             raise InvalidCommand(f"{path!r} is no device path; a TCP port is written socket://{path}")
         return _serial_port(path, _options(query, SERIAL_OPTIONS), defaults)
     scheme, _, rest = url.partition("://")
@@ -121,7 +121,7 @@ def _tcp_port(url: str) -> TcpPort:
 def _options(query: str, known: Mapping[str, Callable[[str], object]]) -> dict[str, Any]:
     """Parse `a=1&b=2` by the table of what is known."""
     options: dict[str, Any] = {}
-    for key, text in parse_qsl(query, keep_blank_values=True):
+    for key, text in parse_qsl(query, keep_blank_values=True):  # an empty value is to be refused, not passed over
         if key not in known:
             raise InvalidCommand(f"no such port option {key!r}; {meant(key, known)}")
         try:

@@ -183,6 +183,7 @@ def identify(path: str) -> Identity:
         return UsbIdentity(device, alone=not any(_is_double(device, other) for other in usb_devices()))
     if is_pty(path):
         return PtyIdentity(path)
+    # Where the kernel describes devices at all, one that it does not describe has just gone.
     if stat.S_ISCHR(status.st_mode) and _entry(status.st_rdev).parent.is_dir() and not _entry(status.st_rdev).exists():
         raise OSError(errno.ENODEV, os.strerror(errno.ENODEV), path)
     return TtyIdentity(os.path.realpath(path), status.st_rdev)

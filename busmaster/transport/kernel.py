@@ -66,7 +66,7 @@ class _Descriptor(OpenPort):
     def __init__(self, transport: asyncio.Transport, descriptor: int) -> None:
         super().__init__(transport)
         self._fd = descriptor
-        self._input = select.poll()
+        self._input = select.poll()  # select() fails above descriptor 1023
         self._input.register(descriptor, select.POLLIN)
 
     def unread(self) -> bool:
@@ -98,6 +98,7 @@ class Tty(_Descriptor):
         now, before = self._counted(), self._before
         if now is None or before is None:
             return None
+        # The counts have 32 bits, and wrap.
         framing, overruns, parity, breaks, lost = (
             (now[field] - before[field]) & WRAP for field in (FRAME, OVERRUN, PARITY, BRK, BUF_OVERRUN)
         )

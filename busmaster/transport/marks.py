@@ -41,6 +41,7 @@ def mark_errors(descriptor: int) -> bool:
     settings[0] = _INPUT_FLAGS
     with contextlib.suppress(termios.error):
         termios.tcsetattr(descriptor, termios.TCSANOW, settings)
+    # Asked, since a driver may leave out a flag without an error.
     return bool(termios.tcgetattr(descriptor)[0] & termios.PARMRK)
 
 

@@ -84,6 +84,7 @@ class Pump(asyncio.Protocol):
         assert self._loop is not None
         future: asyncio.Future[Any] = self._loop.create_future()
         transaction.tag = future
+        # A request that only waits changes nothing that is to be sent, told or timed.
         if self.arbiter.submit(transaction, self.clock()):
             self.turn()
         return future
@@ -108,7 +109,7 @@ class Pump(asyncio.Protocol):
         while event is not None:
             if type(event) is Transaction:
                 if event.writes and event.attempts:
-                    self._on_written(event, event.ended_at)
+                    self._on_written(event, event.ended_at)  # before its caller wakes: no snapshot slips in between
                 future = event.tag
                 if future is None or future.done():
                     pass  # nobody waits for it any more
@@ -127,8 +128,9 @@ class Pump(asyncio.Protocol):
                     self.tap.attempted(event)
             else:
                 self._on_event(event)
-            event = arbiter.poll_event() if arbiter.events else None
+            event = arbiter.poll_event() if arbiter.events else None  # a call less on the way of a reply
         due = arbiter.poll_timeout()
+        # An alarm that rings too early changes nothing, so one is never moved to a later time.
         if due < self._armed:
             self._arm(due)
         if self._run_out is not None and not self._runs():
@@ -151,7 +153,7 @@ class Pump(asyncio.Protocol):
 
     def stop(self) -> None:
         """Stop the timer: the bus is closed. Whoever still waits is told now, where nobody saw `run_out` through."""
-        while self.arbiter.failing:
+        while self.arbiter.failing:  # a few at a time: a thousand callers told in one turn held the loop for 5 ms
             self.arbiter.handle_timeout(self.clock())
             self.turn()
         if self._alarm is not None:
@@ -230,6 +232,7 @@ class Pump(asyncio.Protocol):
         now = self.clock()
         unread = False
         if self._port is not None:
+            # The kernel is asked only now, and before anything runs out: a blocked loop may run timers before it reads.
             line_due = self.arbiter.line_due(now)
             if line_due or self.arbiter.answer_counts(now):
                 unread = self._port.unread()
@@ -257,6 +260,6 @@ class Pump(asyncio.Protocol):
         """Take the line down, and with it what has not left. The port is opened again as after any loss."""
         self._gave_up = f"nothing has left {self._name} for {STUCK_AFTER:g} s: {port.stuck_because}"
         self._port = None
-        port.discard_unsent()
+        port.discard_unsent()  # before the abort, which would leave it to the kernel to send on
         if self._transport is not None:
             self._transport.abort()

@@ -57,21 +57,21 @@ class Connection:
 
     async def open(self) -> None:
         """Open it once, now. Raises LineDown."""
-        self._came_back()
+        self._came_back()  # what is there already is no return
         link = _Link(self.endpoint.name, self._protocol, self._closing)
         transport = await self.endpoint.open(lambda: link, self._device)
         # of this opening: the same device may have come back at another place, and is known from there on
         self._device = transport.get_extra_info("identity")
         self._link = link
-        self._told.clear()
-        if self._closing.is_set():
+        self._told.clear()  # it was open in between: the same reason is news again
+        if self._closing.is_set():  # closed while it opened: until now there was nothing to close
             await self.close()
 
     async def try_open(self) -> None:
         """Open it once, now, and tell why where that fails: `run` goes on trying."""
         try:
             await self.open()
-        except Exception as error:
+        except Exception as error:  # not LineDown alone: any other would end the reconnecting, unseen
             self._tell("open", error)
 
     def accept_device(self) -> None:
@@ -85,7 +85,7 @@ class Connection:
             lasted = await self._stay()
             if self._closing.is_set():
                 return
-            if lasted > self._longest_delay:
+            if lasted > self._longest_delay:  # a port that opens and is lost at once is not hammered
                 delay = self._first_delay
             returned = await self._wait(delay)
             delay = self._first_delay if returned else min(2 * delay, self._longest_delay)
@@ -102,7 +102,7 @@ class Connection:
                 await link.lost.wait()
         except TimeoutError:
             pass
-        finally:
+        finally:  # when cancelled too: a bus that was left holds no port
             if not link.lost.is_set():
                 link.transport.abort()
         await asyncio.sleep(0)  # an aborted transport says so at the next turn of the loop
@@ -194,7 +194,7 @@ class _Link(asyncio.Protocol):
         try:
             self._protocol.connection_lost(None if self._closing.is_set() else self._cause(exc))
         finally:
-            self.lost.set()
+            self.lost.set()  # `run` waits for this, whatever the protocol raises
 
     def _cause(self, exc: Exception | None) -> LineDown:
         if isinstance(exc, LineDown):

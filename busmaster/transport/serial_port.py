@@ -352,7 +352,7 @@ def _equip(port: SerialPort, device: serial.Serial) -> None:
 def _refusal(port: SerialPort, error: Exception) -> LineDown:
     """Return why it did not open, in words, and what to try."""
     path, code = port.path, _code(error)
-    if code in (errno.EBUSY, errno.EAGAIN):
+    if code in (errno.EBUSY, errno.EAGAIN):  # the driver's flag, the lock
         owner = holders.lock_owner(path) or next(iter(holders.holders(path)), "another program")
         return LineDown(
             f"{path} is in use by {owner}", hint="end that first: two masters on one line garble each other"

@@ -74,7 +74,7 @@ class TcpPort:
         try:
             async with asyncio.timeout(CONNECT_DEADLINE):
                 transport, _protocol = await loop.create_connection(protocol_factory, self.host, self.port)
-        except TimeoutError:
+        except TimeoutError:  # ahead of OSError, which it is one of
             raise LineDown(
                 f"{self.name} did not answer within {CONNECT_DEADLINE:g} s", hint="check its address, power and network"
             ) from None

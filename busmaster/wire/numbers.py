@@ -28,7 +28,7 @@ def format_number(value: SupportsFloat) -> str:
     The fifth decimal rounds half away from zero, on the decimal text that Python shows for the value. Raises
     InvalidCommand for NaN, infinity, what is no number, and what takes more than 20 characters.
     """
-    if not hasattr(value, "__float__"):
+    if not hasattr(value, "__float__"):  # text has none: float() would take it
         raise InvalidCommand(f"{value!r} is not a number")
     number = int(value) if isinstance(value, int) else float(value)
     if -_TOO_BIG < number < _TOO_BIG:
@@ -63,7 +63,7 @@ def parse_number(field: bytes) -> float:
 
     Spaces around it are dropped. Raises FrameError for anything else, such as "nan", "1_0" or an empty field.
     """
-    if field.translate(_NUMBER_CHARACTERS) == field:
+    if field.translate(_NUMBER_CHARACTERS) == field:  # float() alone would take "1_0"
         try:
             value = float(field)
         except ValueError:
