@@ -21,6 +21,7 @@ from busmaster.wire.readers import NAK, AcknowledgeReader, TelegramReader, teleg
 LINE = LineSettings(57600)
 CHECKED = (1, 2, 3, 4, 5, 6, 7, 99)
 """Elements that every controller has, the cheap reads that tell one answer from another (R15)."""
+# read to the letter, the 50 ms and 100 ms more make the lateness
 TIMINGS = Timings.uniform(ReplyTiming(nominal=0.05, window=0.1, lateness=0.15, byte_gap=0.02))
 """Both documents: "normally within 50ms", but other work "could delay the reply by 100mS"."""
 

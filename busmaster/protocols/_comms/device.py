@@ -30,6 +30,7 @@ ELEMENT_AT = 4
 DATA_AT = 6
 KEPT = 80
 """Bytes of a frame that are kept. A data field that is longer is only counted, and refused at its end."""
+# a space behind digits ends a value, and what follows up to the next comma is skipped
 NUMBER = re.compile(rb" *([+-]?(?:\d+\.?\d*|\.\d+))(?: .*)?")
 
 
@@ -135,7 +136,7 @@ class HostCommsDevice(Device):
 
     def hear_byte(self, byte: int, now: float) -> None:
         frame = self._frame
-        if self._check_due:
+        if self._check_due:  # whatever stands here is the check, the reset byte too
             frame.append(byte)
             self._handle(bytes(frame), self._data_length, now)
             self._ground()
@@ -198,6 +199,7 @@ class HostCommsDevice(Device):
         name = frame[ELEMENT_AT:DATA_AT]
         checked = not reads or framing.read_checked
         right = not checked or xor(frame[framing.check_from : -1]) == frame[-1]
+        # a lower-case digit in an element is refused like element 00; in a node it meets silence
         element = int(name, framing.base) if not name.strip(framing.digits) else 0
         if not right or not 1 <= element <= framing.last_element:
             self.reply(NAK, now)
@@ -219,14 +221,14 @@ class HostCommsDevice(Device):
 
     def _store(self, element: int, data: bytes, now: float) -> bool:
         """Store value by value and stop at the first bad one: the ACK or NAK is for the whole."""
-        if not data[-1:].isdigit():
+        if not data[-1:].isdigit():  # the notes: the last character must be a digit
             return False
         values = numbers(data)
         elements = range(element, element + len(values))
         if self.all_or_nothing and (None in values or not all(map(self._may_write, elements))):
             return False
         for number, value in zip(elements, values, strict=True):
-            if value is None or number > self.framing.last_element:
+            if value is None or number > self.framing.last_element:  # those before it stay stored, says HCP2's note
                 return False
             if self.traceable is not None:
                 self.traceable.write(number, value)

@@ -59,6 +59,7 @@ class CommsHandle(Handle):
         """Return the point of a named element: decoded, with its unit, and read-only if the map says so."""
 
         def encode(value: Any) -> Command[None]:
+            # what a map names is a level, which may be written twice (R7); only Comms 1 to 5 start events
             return self.write_command(element.number, (value,), idempotent=True)
 
         return Point(

@@ -154,7 +154,7 @@ class EmulatedMint(HostCommsDevice):
             return self.comms[element]
         value = self._read_io(element) if element >= FIRST_IO else self._read_axis(element, now)
         if value is None and not self.refuse_reserved:
-            return 0
+            return 0  # the note does not say how reserved elements answer
         return value
 
     def write_element(self, element: int, value: float, now: float) -> bool:
@@ -165,7 +165,7 @@ class EmulatedMint(HostCommsDevice):
                 self.outputs = round(value)
             return element == OUTPUTS
         self.comms[element] = single(value) if self.single_precision else value
-        if element <= LAST_EVENT:
+        if element <= LAST_EVENT:  # an event starts even if the value is the same
             for event in self.events:
                 event(self, element, now)
         return True

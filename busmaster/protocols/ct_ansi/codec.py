@@ -24,7 +24,7 @@ from busmaster.wire.readers import ETX, STX, telegram_sizes
 
 LONGEST_DATA = 12
 _NUMBER = re.compile(rb" *([+-]?(?:\d+\.?\d*|\.\d+))", re.ASCII)
-_HEXADECIMAL = re.compile(rb" *X([0-9A-Fa-f]+)")
+_HEXADECIMAL = re.compile(rb" *X([0-9A-Fa-f]+)")  # which products send spaces or an X is not known: both are taken
 
 
 class Reading(ParameterReading[float]):
@@ -119,6 +119,7 @@ class Write:
 PROFILE = Profile(
     name="ct-ansi",
     title="CT-ANSI",
+    # a second digit of 0 means a group, and nobody answers
     addresses=tuple(address for address in range(11, 100) if address % 10),
     broadcast=0,
     line=LineSettings(9600, bytesize=7, parity="E"),

@@ -37,7 +37,7 @@ class Reading(SingleLeg):
 
     length: ClassVar[int] = 5
     sizes: ClassVar[Sizes] = Sizes(length, length)
-    starts: ClassVar[bytes] = STX + NAK
+    starts: ClassVar[bytes] = STX + NAK  # the manual has NAK for writes alone: here it is taken for a refusal
 
     def __init__(self, parameter: int, timing: ReplyTiming) -> None:
         super().__init__(packet(READ, parameter), timing)
@@ -62,7 +62,7 @@ class Reading(SingleLeg):
         if parameter != self._parameter:
             raise FrameError(f"wrong echo: parameter {parameter} in place of {self._parameter}", heard=buffer)
         if check != sum8(bytes((parameter, high, low))):
-            raise FrameError("bad checksum", whole=not rest)
+            raise FrameError("bad checksum", whole=not rest)  # only a whole frame is spared the lateness (R3)
         return Done(high << 8 | low, rest=rest)
 
     def expired(self, started: bool, /) -> Done[int]:
@@ -138,7 +138,8 @@ PROFILE = Profile(
     line=LineSettings(19200),
     timings=Timings(_READ_TIMING, _WRITE_TIMING, packet=_READ_TIMING),
     probe=Read(1),
+    # a reply names its parameter, which tells these apart (R15)
     checks=tuple(Read(parameter) for parameter in range(1, 9)),
-    fixed_rate=True,
+    fixed_rate=True,  # 19200 baud and no other
 )
 """The document gives no times. A write is answered when it is completed, EEPROM included: hence its longer window."""

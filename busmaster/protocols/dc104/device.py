@@ -21,7 +21,7 @@ STX, READ, WRITE = 0x02, 0xAA, 0x55
 ACK = b"\x06"
 SIZES = {READ: 4, WRITE: 6}
 LAST_PARAMETER = 255
-BYTE_GAP = 0.05
+BYTE_GAP = 0.05  # the manual does not say how a drive finds the start of a packet again
 """Seconds after which what was begun is forgotten."""
 LIVE = 1
 """The parameter that moves on a lively drive: a sine about the middle of its range."""

@@ -46,7 +46,7 @@ class Write(WriteElements):
 
 
 def _reset(address: int) -> bytes:
-    return EOT + b"%X" % address * 2
+    return EOT + b"%X" % address * 2  # sent twice, which guards a read: it has no check
 
 
 PROFILE = Profile(
@@ -57,5 +57,5 @@ PROFILE = Profile(
     timings=TIMINGS,
     probe=Read(1),
     checks=tuple(Read(element) for element in CHECKED),
-    shares_line_with=frozenset({"hcp2"}),
+    shares_line_with=frozenset({"hcp2"}),  # a telegram of the one means nothing to the other
 )

@@ -30,6 +30,7 @@ class Read(ReadElement):
     @lru_cache(maxsize=4096)
     def encode(address: int, element: int) -> tuple[bytes, bytes]:
         echo = b"%02X" % element
+        # begun after STX, the check would be right for node 2, the note's example: there node and STX cancel out
         body = b"%02X\x02%b" % (address, echo) + ENQ
         return BEL + body + bytes((xor(body),)), echo
 
@@ -54,5 +55,5 @@ PROFILE = Profile(
     timings=TIMINGS,
     probe=Read(1),
     checks=tuple(Read(element) for element in CHECKED),
-    shares_line_with=frozenset({"hcp"}),
+    shares_line_with=frozenset({"hcp"}),  # a telegram of the one means nothing to the other
 )

@@ -199,6 +199,7 @@ class EmulatedMicroFlex(HostCommsDevice):
     def writable(self, element: int) -> bool:
         if element == COMMAND_WORD:
             return True
+        # the outputs too are read-only here, unlike those of a controller
         applies = TORQUE_REFERENCE if self.current_control else SPEED_REFERENCE
         return self.host_reference and element == applies
 

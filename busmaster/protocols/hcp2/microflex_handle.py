@@ -104,7 +104,7 @@ class MicroFlexDrive(CommsHandle):
         A cancelled caller's disable is not sent: shield it where it must go out.
         """
         within = seconds(within, f"{self.node.label}: within")
-        self.node.note_stop()
+        self.node.note_stop()  # before the write, so that a cancel_errors under way keeps no enable bit from now on
         await self._command(_NOTHING, priority=Priority.URGENT)
         return await self._await_enabled(False, within, Priority.URGENT)
 
@@ -120,12 +120,13 @@ class MicroFlexDrive(CommsHandle):
 
         async def command(cancel: CommandWord) -> None:
             """Decide anew for each write: the drive may have been disabled meanwhile, by whomever."""
+            # the cancel bit alone would disable a drive that runs; bits that the note does not define stay 0
             kept = word & CommandWord.ENABLE if self.node.stops == stops else _NOTHING
             await self._command(kept | cancel, stops_seen=stops if kept else None)
 
         try:
             await command(CommandWord.CANCEL)
-        except BaseException:
+        except BaseException:  # a cancellation too: no error latches while the bit is set
             try:
                 await _to_the_end(self._clear_cancel(command))
             except BusError:
@@ -161,9 +162,9 @@ class MicroFlexDrive(CommsHandle):
             while True:
                 try:
                     await command(_NOTHING)
-                except BusClosed:
+                except BusClosed:  # nothing can be sent any more
                     raise
-                except BusError as error:
+                except BusError as error:  # dropped by a disable, too: it is decided anew
                     last = error
                 else:
                     return

@@ -104,7 +104,7 @@ class MentorDialect:
             frame = Frame(Kind.WRITE, Direction.HOST, data, node, "write", _parameter(data[6:10]), value, fault)
         else:
             frame = Frame(Kind.READ, Direction.HOST, data, node, "read", _parameter(data[5:9]), fault=fault)
-        self._armed = None
+        self._armed = None  # a drive forgets its last read at any EOT
         self._asked = None if node == 0 else frame
         return frame
 
@@ -144,7 +144,7 @@ class MentorDialect:
             frame.fault = checked(data, 1, bcc) or frame.fault
         elif data[0] == ACK and reading:
             frame.fault = "an ACK answers no read"
-        if reading and data[0] != ACK:
+        if reading and data[0] != ACK:  # EOT, too: a parameter that is not there is where short commands go on from
             self._armed = asked
         return frame
 
@@ -159,6 +159,7 @@ class MentorDialect:
 
     def write(self, menu: int, number: int, text: str) -> Command[None]:
         """Return the command that writes what a listener has read from the line."""
+        # the form is told by sign and number of characters alone, as a drive tells it
         signed = text[:1] in ("+", "-")
         value = bool(int(text)) if len(text) == 1 else int(text)
         return Write(menu, number, value, wide=not signed and len(text) == 5, high_resolution=len(text) == 6)

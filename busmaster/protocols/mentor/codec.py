@@ -44,7 +44,8 @@ _BS = b"\x08"
 T = TypeVar("T")
 
 _SHORT_COMMANDS = {1: ACK, 0: NAK, -1: _BS}
-_SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))
+_SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))  # a port that knows only 8N1 brings the parity in bit 7
+# to reads and writes alike: some other makers' nodes say NAK to a read
 _REFUSALS = {NAK[0]: Refused, EOT[0]: NoSuchParameter}
 _PARAMETER = re.compile(r"(\d{1,2})\.(\d{1,2})", re.ASCII)
 _VALUE = re.compile(rb"[+-]?\d+")
@@ -151,6 +152,7 @@ class Write:
         object.__setattr__(self, "text", self._format())
 
     def _format(self) -> str:
+        # a drive goes by the number of characters: +12000, sent with six, would be taken for 1200.0
         if self.wide and self.high_resolution:
             raise InvalidCommand("a parameter is written either wide or in high resolution")
         if isinstance(self.value, bool):
@@ -316,11 +318,12 @@ PROFILE = Profile(
     title="Mentor II",
     addresses=range(1, 100),
     broadcast=0,
-    line=LineSettings(9600, bytesize=7, parity="E"),
+    line=LineSettings(9600, bytesize=7, parity="E"),  # ten bits a character, as 8N1 has
     timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.15, lateness=0.3, byte_gap=0.05)),
     probe=Read(1, 17),
+    # a reply names its parameter, which tells these apart (R15)
     checks=tuple(Read(1, number) for number in range(17, 22)),
-    shares_line_with=frozenset({"ct-ansi"}),
+    shares_line_with=frozenset({"ct-ansi"}),  # with addresses that are drives to both: 11 to 99 without the tens
 )
 CHAINED = replace(PROFILE, merge=merge_runs)
 """For lines on which short commands are safe: poll groups read neighbours as runs."""

@@ -200,7 +200,7 @@ class EmulatedMentor(Device):
 
     def hear_byte(self, byte: int, now: float) -> None:
         character = byte & 0x7F
-        if self._check_due:
+        if self._check_due:  # whatever stands here is the check, EOT too
             self._frame.append(character)
             self._handle(bytes(self._frame), now)
             self._ground()
@@ -254,11 +254,13 @@ class EmulatedMentor(Device):
         if step is None or self._last is None:
             self._last = None
         else:
+            # what comes next at a menu's end is not said: here the number plus one, be it there or not
             self._answer_read(self._last + step, now)
 
     def _handle(self, frame: bytes, now: float) -> None:
         """Obey a whole request, to this drive or to all."""
         self._last = None
+        # a damaged check of a write may be ENQ: that makes no read of it
         if frame[-1] == ENQ and len(frame) == READ_SIZE:
             if self._is_mine(frame):
                 self._answer_read(int(frame[TEXT_AT:-1]), now)
@@ -266,6 +268,7 @@ class EmulatedMentor(Device):
         taken = bcc(frame[TEXT_AT + 1 : -1]) == frame[-1] and self._write(frame[6:10], frame[10:-2], now)
         if not self._is_mine(frame):
             return
+        # the guide does not say whether short commands work after a write: by default not
         if taken and self.short_after_write:
             self._last = int(frame[6:10])
         self._say(ACK if taken else NAK, now)

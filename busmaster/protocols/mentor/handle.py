@@ -176,6 +176,7 @@ class MentorDrive(Handle):
         if requests.verify:
             check = Read(place.menu, place.number)
             found = await requests.read_back(check)
+            # a reply has five characters always, and so not the tenths that were written
             if abs(found * 10 - command.value) >= 10 if high_resolution else found != command.value:
                 raise VerifyFailed(
                     f"{parameter} reads {found} after {command.text} was written", node=self.node, command=str(check)

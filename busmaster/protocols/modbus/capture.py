@@ -43,6 +43,7 @@ class ModbusDialect:
         self._asked: Frame | None = None
 
     def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
+        # cut by what a frame says of its length, never by pauses: adapters and networks make pauses of their own
         if data[0] > HIGHEST_UNIT or (len(data) > 1 and data[1] & ~REFUSED not in FUNCTIONS):
             return -1
         lengths = self._lengths(data, sender)
@@ -91,7 +92,7 @@ class ModbusDialect:
             value = words_text(raw[7:-2]) if function == WRITE_REGISTERS else bits_text(raw[7:-2], count)
         item = f"{table}:{first}" if count == 1 else f"{table}:{first}:{count}"
         frame = Frame(kind, Direction.HOST, raw, unit, kind.value, item, value)
-        self._asked = None if unit == BROADCAST else frame
+        self._asked = None if unit == BROADCAST else frame  # nobody answers a write to all
         return frame
 
     def _reply(self, raw: bytes) -> Frame:

@@ -100,7 +100,9 @@ class Conversation(Generic[T]):
     ) -> None:
         self.request = with_crc(body)
         self.answered = body[0] != BROADCAST
+        # nobody answers a write to all: the units are left as long as an answer would take
         self.timing = timing if self.answered else replace(timing, turnaround=max(timing.turnaround, timing.nominal))
+        # it names no register: of two like reads only R15 tells the answers apart
         self.answers = (header,) if self.answered else ()
         self.starts = header[:1] if self.answered else b""
         self._header = header
@@ -126,7 +128,7 @@ class Conversation(Generic[T]):
         if len(buffer) < size:
             return MORE
         if with_crc(buffer[: size - 2]) != buffer[:size]:
-            raise FrameError("bad CRC", whole=len(buffer) == size)
+            raise FrameError("bad CRC", whole=len(buffer) == size)  # only a whole frame is spared the lateness (R3)
         return Done(self._decode(buffer[len(header) : size - 2]), rest=buffer[size:])
 
     def _refused(self, buffer: bytes) -> Step[T]:
@@ -136,6 +138,7 @@ class Conversation(Generic[T]):
             raise FrameError("bad CRC")  # or a damaged function code before a longer reply: not whole
         code = buffer[2]
         name = EXCEPTIONS.get(code, f"exception {code}")
+        # the CRC guards a refusal, so it is believed at once
         raise Refused(f"refused: {name}", confirm=False, hint=HINTS.get(code))
 
     def expired(self, started: bool, /) -> Done[T]:
@@ -190,7 +193,7 @@ class ReadBits:
         """Begin the read. Raises InvalidCommand for the broadcast address."""
 
         def decode(payload: bytes) -> tuple[bool, ...]:
-            states = int.from_bytes(payload, "little")
+            states = int.from_bytes(payload, "little")  # the first is bit 0 of the first byte
             return tuple(bool(states >> place & 1) for place in range(self.count))
 
         return _ask(address, READS[self.table], self.first, self.count, (self.count + 7) // 8, timings, decode)
@@ -296,9 +299,10 @@ PROFILE = Profile(
     name="modbus",
     title="Modbus RTU",
     addresses=range(1, 248),
-    line=LineSettings(19200, parity="E"),
+    line=LineSettings(19200, parity="E"),  # the standard's default; 8N1 is common
     timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.2, lateness=0.4, byte_gap=0.02, turnaround=SILENCE)),
-    probe=ReadRegisters(0),
+    probe=ReadRegisters(0),  # a unit without it refuses, which is an answer too (R11)
+    # unit, function and length are all that tells answers apart, so the lengths differ (R15)
     checks=tuple(ReadRegisters(0, count) for count in range(1, 5)),
     broadcast=BROADCAST,
 )

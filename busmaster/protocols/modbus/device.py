@@ -16,6 +16,7 @@ from busmaster.emulator.device import NEVER, Delay, Device, held
 from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 
+# none of this is the codec's: a misreading on one side is not to be hidden by the same on the other
 BROADCAST = 0
 ALL = range(1, 248)
 READ_COILS, READ_DISCRETES, READ_HOLDING, READ_INPUTS = 1, 2, 3, 4
@@ -119,6 +120,7 @@ class EmulatedModbus(Device):
 
         A frame begins after a silence, or where one to this unit ended. What is for others is let pass.
         """
+        # up to the start of this byte, of which `now` is the end
         if now - self.tau - self._heard_until > self._pause:
             self._end_of_frame(now)
         self._heard_until = now
@@ -126,7 +128,7 @@ class EmulatedModbus(Device):
         self.attentive = self._frame[0] in (self.address, BROADCAST)
         self.wakeup = NEVER
         if not self.attentive:
-            self._frame = self._frame[:1]
+            self._frame = self._frame[:1]  # its own address within another's frame begins nothing
         elif len(self._frame) == self._length(self._frame):
             frame, self._frame, self.attentive = self._frame, b"", False
             self._obey(frame, now)
@@ -135,6 +137,7 @@ class EmulatedModbus(Device):
 
     def take(self, frame: bytes, now: float) -> bool:
         start = now - len(frame) * self.tau
+        # a request that only silence ends is heard byte by byte
         if (self._frame and start - self._heard_until <= self._pause) or len(frame) != self._length(frame):
             return False
         self._frame = b""
@@ -150,6 +153,7 @@ class EmulatedModbus(Device):
     def _end_of_frame(self, now: float) -> None:
         frame, self._frame = self._frame, b""
         self.attentive, self.wakeup = False, NEVER
+        # half a request is forgotten; a function that it lacks is exception 1, once the silence has shown its end
         unknown = len(frame) >= SHORTEST and frame[0] == self.address and self._length(frame) is None
         if unknown and crc(frame[:-2]) == frame[-2:]:
             self._say(bytes((frame[1] | EXCEPTION, ILLEGAL_FUNCTION)), now)

@@ -98,7 +98,7 @@ class MscDialect:
     def _sender(self, raw: bytes, command: str) -> Direction:
         op = OPS.get(command)
         length = len(raw) - _FRAMING
-        if op is None or op.request == op.reply == length:
+        if op is None or op.request == op.reply == length:  # RFLAG's reply is as long as its request
             in_turn = self._answer == raw or (self._asked is not None and self._acked and not self._answer)
             return Direction.NODE if in_turn else Direction.HOST
         as_long = length != op.request if command in _OPEN_ENDED else length == op.reply

@@ -252,6 +252,7 @@ def _data_batches(commands: Sequence[Command[Any]], step: int) -> list[Batch]:
             if (address - first) % step == 0 and address - first < BLOCK * step
         }
         waiting = [(address, i) for address, i in waiting if i not in reached]
+        # a BREAD is always of 32 values: none may reach beyond the last address
         if len(reached) > 1 and first + (BLOCK - 1) * step <= HIGHEST_ADDRESS:
             batches.append(Batch(PickedData(first, tuple(reached.values())), tuple(reached)))
     return batches
@@ -282,6 +283,7 @@ def _block_of(payload: bytes) -> tuple[int, ...]:
 def _state_of(payload: bytes) -> bool:
     state = int.from_bytes(payload, "big")
     if state > 1:
+        # the packet was sound: without an ACK it would come again, into other exchanges
         raise FrameError(f"a flag's state must be 0 or 1, not {state}", send=ACK)
     return state == 1
 
@@ -308,9 +310,9 @@ PROFILE = Profile(
     line=LineSettings(9600),
     timings=Timings(read=_FIRST, write=_FIRST, packet=ReplyTiming(0.5, 1.0, 1.0, 0.1)),
     probe=ReadStatus(),
-    checks=(ReadStatus(), ReadFlag(0)),
-    exchange_limit=2.0,
-    listen=StalePacketListener,
-    fixed_rate=True,
+    checks=(ReadStatus(), ReadFlag(0)),  # a reply repeats the name of its command, which tells these two apart (R15)
+    exchange_limit=2.0,  # a packet that is damaged again and again is then ACKed away and asked for anew
+    listen=StalePacketListener,  # a packet whose ACK was lost would be repeated five times, into other exchanges
+    fixed_rate=True,  # 9600 baud and no other
 )
 """The document gives no times."""

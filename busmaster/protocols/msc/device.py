@@ -17,6 +17,7 @@ from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
 from busmaster.wire.checks import sum16
 
+# none of this is the codec's: a misreading on one side is not to be hidden by the same on the other
 STX, ACK_BYTE, NAK_BYTE = 0x02, 0x06, 0x15
 ACK = b"\x06"
 UNITS = range(1, 16)
@@ -99,7 +100,7 @@ class EmulatedMsc(Device):
         self.model = model
         self.address_step = address_step
         self.read_only_flags = read_only_flags
-        self.battery = battery
+        self.battery = battery  # the manual does not say what survives without power
         self.period = period
         self.packet_delay = Delay() if packet_delay is None else packet_delay
         self.traceable = traceable
@@ -213,7 +214,7 @@ class EmulatedMsc(Device):
         elif length == self._size:
             whole = bytes(frame)
             frame.clear()
-            if whole[1] == self.address:
+            if whole[1] == self.address:  # a packet to another unit was counted through, for its data may hold an STX
                 self._handle(whole, now)
 
     def wake(self, now: float) -> None:
@@ -245,9 +246,9 @@ class EmulatedMsc(Device):
         body = frame[HEADER:-2]
         name = body[: body.find(b",") + 1]
         operand = body[len(name) :]
-        if len(operand) == REPLIES.get(name):
+        if len(operand) == REPLIES.get(name):  # on two wires it may hear its own packet come back
             return
-        self._packet = b""
+        self._packet = b""  # the manual does not say what becomes of it: here it is forgotten
         if self.naks_ahead:
             self.naks_ahead -= 1
             self.reply(NAK, now)
@@ -264,7 +265,7 @@ class EmulatedMsc(Device):
             self.missing_acks_ahead -= 1
         else:
             heard_at = self.reply(ACK, now)
-            self.lag = 0.0
+            self.lag = 0.0  # of a late answer only the ACK is late
         if answer:
             self._packet = packet(self.address, name + answer)
             self._retransmissions = 0

@@ -40,9 +40,9 @@ LONGEST_BODY = 240
 LONGEST_PACKET = LONGEST_BODY + FRAMING
 UNITS = range(1, 16)
 
-RESENDS = 3
-HOST_NAKS = 5
-STALE_PACKETS = 6
+RESENDS = 3  # the manual leaves the number to the host
+HOST_NAKS = 5  # a controller sends its packet again five times at most
+STALE_PACKETS = 6  # one packet, and the five times that it is sent again
 
 
 def packet(unit: int, body: bytes) -> bytes:
@@ -161,7 +161,7 @@ class PacketExchange(Generic[T]):
         if self._acked and self._reply is None:
             raise FrameError("an ACK within other bytes, behind a packet that answers something else")
         if not self._acked:
-            if buffer[0] == ACK[0]:
+            if buffer[0] == ACK[0]:  # ACK and packet may arrive in one piece
                 del buffer[0]
                 return self._accepted()
             if buffer == NAK:
@@ -207,6 +207,7 @@ class PacketExchange(Generic[T]):
 
     def _resend(self) -> Expect:
         if self._resends == RESENDS:
+            # a NAK for a damaged packet looks like one for a request that cannot be met, which this many confirm
             raise Refused(f"refused {1 + RESENDS} times", confirm=False)
         self._resends += 1
         self._failure = Refused()
@@ -219,9 +220,11 @@ class PacketExchange(Generic[T]):
         return MORE
 
     def _take(self, whole: bytes) -> Step[T]:
+        # a packet before the ACK is never the reply, however well it fits: a reply names no data address
         reply = self._reply if self._acked else None
         mine = reply is not None and reply.echoed_by(whole)
         if not is_sound(whole):
+            # its length may be what was damaged: where it ends is then not known
             if reply is None or len(whole) != reply.size or len(self._buffer) > len(whole):
                 return self._swallow()
             return self._ask_again(FrameError("bad checksum", whole=mine, send=ACK))

@@ -69,9 +69,11 @@ class MscController(Handle):
         self.symbols = dict(symbols or {})
         for name, symbol in self.symbols.items():
             DataRead(symbol)
+            # it could not be told from an item
             if not name or name in self.items() or is_decimal(name) or set(name) & set(":=, "):
                 raise InvalidCommand(f"{name!r} cannot be the name of a symbol")
         known = Merging(address_step, model in MODELS_WITH_RFLAGS)
+        # one that says nothing leaves what another handle of this unit said: a wrong step would give wrong values
         profile = self.profile if known == Merging() else replace(self.profile, merge=known)
         super().__init__(bus, address, timings=timings, retries=retries, profile=profile)
 
@@ -224,6 +226,7 @@ class MscController(Handle):
         """
         if options.get("priority") is None:
             options["priority"] = Priority.BACKGROUND
+        # the program does not use the table meanwhile, so nothing consumes a value that is written twice
         await self.write_block(where, values, progress=progress, verify=True, idempotent=True, **options)
 
     async def find_address_step(self, where: int | str) -> int:
@@ -237,7 +240,7 @@ class MscController(Handle):
         found = {step: await self._value_or_none(address + step) for step in ADDRESS_STEPS}
         bytewise = found[4] == block[1]
         valuewise = found[1] == block[1] and found[4] == block[4]
-        if bytewise == valuewise:
+        if bytewise == valuewise:  # values that are alike fit both steps, those that change neither
             raise InvalidCommand(
                 f"{self.node.label}: the values from {address} on do not tell the address step: "
                 "point at some that differ, or give address_step"
@@ -286,6 +289,7 @@ class MscController(Handle):
         except Refused:
             if part.size in (1, BLOCK) or step is None:
                 raise
+            # the block may reach beyond the data area where its first values do not
             places = [place(part.at, i, step) for i in range(part.size)]
             return tuple([await ask(DataRead(at)) for at in places])
         return found[: part.size] if isinstance(found, tuple) else (found,)
