@@ -80,7 +80,7 @@ class Handle(ABC):
     def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
         """Return what writes one value to ITEM. Raises InvalidCommand for one that cannot be sent."""
         point = self.point(item)
-        encoder(point)(value)
+        self.node.check(encoder(point)(value))
 
         async def send() -> None:
             await point.write(value)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypedDict, TypeVar, Unpack, cast
 
 from busmaster.arbiter.transaction import COMMAND, Priority
+from busmaster.bus.limits import Limit
 from busmaster.bus.samples import Sample
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.contract.exchange import Command
@@ -148,6 +149,14 @@ class Requester(Protocol):
         """Have poll groups propose `merge` for this node's reads from now on, in place of what its profile had."""
         ...
 
+    def limit(self, limit: Limit, /) -> None:
+        """Refuse, from now on, every write beyond a limit, whatever names what it writes."""
+        ...
+
+    def check(self, *commands: Command[Any]) -> None:
+        """Raise InvalidCommand if one of these writes is beyond a limit: before the first of several is sent."""
+        ...
+
     async def request(
         self,
         command: Command[T],
@@ -155,9 +164,10 @@ class Requester(Protocol):
         *,
         touches: Command[Any] | None = None,
         stops_seen: int | None = None,
+        stop: bool = False,
         **options: Unpack[CommandOptions],
     ) -> T:
-        """Run one command and return its value.
+        """Run one command and return its value. One that stops the node (`stop`) is held by no limit.
 
         `touches` is the command that reads what a write changes: samples of that which are older than the write are
         marked stale; without it, all of the node's. With `stops_seen` it raises Superseded, and sends nothing, if the

@@ -13,6 +13,7 @@ from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.transaction import Transaction
+from busmaster.bus.limiter import Limiter
 from busmaster.bus.logbook import Logbook
 from busmaster.bus.points import Point
 from busmaster.bus.samples import Sample
@@ -32,6 +33,8 @@ class SharedLine:
         self.arbiter = arbiter
         self.pump: Pump
         self.logbook = Logbook(name)
+        self.limiter: Limiter | None = None
+        """None while nothing is limited."""
         self.closed = False
         self.thread = 0
         """In which its loop runs; 0 while the bus is not open."""

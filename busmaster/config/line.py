@@ -47,6 +47,8 @@ class ConfiguredLine:
         self.nodes: dict[str, Handle] = {name: self._handle(node) for name, node in file.nodes.items()}
         self.groups: dict[str, PollGroup] = {}
         self._points: dict[str, NamedPoint] = {}
+        for node in file.nodes.values():
+            self._limit(node)
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
         self.outputs = Distributor(self.bus, tell)
         if outputs:
@@ -121,6 +123,18 @@ class ConfiguredLine:
                 handle.point(point.item)
         return handle
 
+    def _limit(self, node: NodeSection) -> None:
+        """Hold what the file says of its points, by whatever name they are written."""
+        for name, point in node.points.items():
+            if point.limited:
+                with point.table.at():
+                    self._point(node.name, name).limit(
+                        minimum=point.minimum,
+                        maximum=point.maximum,
+                        max_step=point.max_step,
+                        writable=point.writable,
+                    )
+
     def _members(self, group: GroupSection) -> Iterator[NamedPoint]:
         for number, text in enumerate(group.points):
             with group.table.at("points", number):
@@ -155,11 +169,11 @@ class ConfiguredLine:
         if section is None:
             source = _known(handle, name, node.points)
             return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
-        decimals = 0 if node.kind.takes_decimals else section.decimals
         rounds = node.kind.takes_decimals and (section.decimals or node.kind.decimals(section.item))
         whole = not rounds and node.kind.whole_numbers(section.item)  # else the handle rounds, to its decimals
-        scale = Scale.of(section.factor, section.offset, decimals, whole=whole)
-        return NamedPoint.of(handle.point(section.item), where=where, name=name, unit=section.unit, scale=scale)
+        scale = Scale.of(section.factor, section.offset, whole=whole)
+        source = handle.point(section.item)
+        return NamedPoint.of(source, where=where, name=name, unit=section.unit, scale=scale, declared=section.writable)
 
     def _add_outputs(self) -> None:
         for kind, settings in self.file.outputs.items():

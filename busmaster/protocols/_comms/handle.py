@@ -90,9 +90,9 @@ class CommsHandle(Handle):
             await self._verify(requests, number, value)
 
     def writes(self, element: int | str, values: Sequence[float]) -> list[WriteElements]:
-        """What `write` sends. Raises InvalidCommand for a value that cannot be sent; and where the map has names, for a
-        name that it calls read-only, or that another value of the list would go to; for its number where it is
-        definite."""
+        """What `write` sends. Raises InvalidCommand for a value that cannot be sent, or is beyond a limit; and where
+        the map has names, for a name that it calls read-only, or that another value of the list would go to; for its
+        number where it is definite."""
         number = element if isinstance(element, int) else self._lookup(element).number
         if self.definite or not isinstance(element, int):
             for known in self.elements.values():
@@ -100,7 +100,9 @@ class CommsHandle(Handle):
                     raise InvalidCommand(f"{self.node.label}: {known.name} is read-only")
         if not values:
             raise InvalidCommand(f"{self.node.label}: there is no value to write")
-        return [self.write_command(number + offset, part) for offset, part in telegrams(values)]
+        commands = [self.write_command(number + offset, part) for offset, part in telegrams(values)]
+        self.node.check(*commands)
+        return commands
 
     def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
         """Consecutive elements, in as many telegrams as it takes."""

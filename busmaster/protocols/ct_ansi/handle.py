@@ -106,7 +106,7 @@ class CtAnsiDrive(Handle):
         return await self.point(item).read()
 
     def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
-        encoder(self.point(item))(value)
+        self.node.check(encoder(self.point(item))(value))
         return lambda: self.write(item, value, verify=verify)
 
     def _write(self, menu: int, number: int, value: float) -> Write:

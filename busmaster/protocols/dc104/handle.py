@@ -82,7 +82,7 @@ class Dc104Drive(Handle):
                 )
 
     def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
-        encoder(self.point(item))(value)
+        self.node.check(encoder(self.point(item))(value))
         return lambda: self.write(int(item), value, verify=verify)
 
     def _read(self, parameter: int) -> Read:

@@ -198,7 +198,7 @@ class MentorDrive(Handle):
         return await self.point(item).read()
 
     def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
-        encoder(self.point(item))(value)
+        self.node.check(encoder(self.point(item))(value))
         parameter, _, kind = item.partition(":")
         return lambda: self.write(parameter, value, wide=kind == "wide", high_resolution=kind == "hires", verify=verify)
 

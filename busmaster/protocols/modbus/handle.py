@@ -167,7 +167,9 @@ class ModbusUnit(Handle):
         place = Place.parse(item)
         if place.table not in WRITABLE:
             raise InvalidCommand(f"{self.node.label}: {item} is read-only")
-        return place.write(values)
+        commands = place.write(values)
+        self.node.check(*commands)
+        return commands
 
     async def _verify(self, requests: SeveralRequests, written: WriteCoils | WriteRegisters) -> None:
         count = len(written.values)
