@@ -40,7 +40,7 @@ def command(path: str, port: str | None, capture: str | None, view: View) -> int
     click.get_current_context().call_on_close(lambda: sys.setswitchinterval(usual))
     sys.setswitchinterval(SWITCH_INTERVAL)
     with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
-        return until_ended(run, ConfiguredLine(file, port=endpoint, tap=recorder), view)
+        return until_ended(run, ConfiguredLine(file, port=endpoint, tap=recorder, read_only=view.read_only), view)
 
 
 async def run(line: ConfiguredLine, view: View) -> int:
@@ -48,7 +48,7 @@ async def run(line: ConfiguredLine, view: View) -> int:
     try:
         async with line:
             entered = True
-            watch = Watch(line.bus, line.file.title, view)
+            watch = Watch(line.bus, line.file.title, view, gate=line.gate)
             if not line.groups:
                 note("nothing is polled: the file has no [groups.NAME]")
             for group in line.groups.values():

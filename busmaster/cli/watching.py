@@ -25,6 +25,7 @@ from busmaster.cli.output import emit_all, json_line, note, value_text
 from busmaster.cli.parsing import parse_value
 from busmaster.doctor import uart
 from busmaster.errors import BusError, InvalidCommand
+from busmaster.gate.gate import Gate, Wish
 from busmaster.outputs.values import cycle_fields, event_text
 
 KEPT_PERIODS = 1_000
@@ -40,13 +41,14 @@ STATES = {LineState.OFFLINE: "offline", LineState.SETTLING: "settling"}
 class Watch:
     """What a person sees of a bus while its groups are polled. Times are in seconds since it was made.
 
-    `view` says how it is shown.
+    `view` says how it is shown, `gate` is what the writes of the screen pass.
     """
 
-    def __init__(self, bus: Bus, title: str, view: View) -> None:
+    def __init__(self, bus: Bus, title: str, view: View, *, gate: Gate | None = None) -> None:
         self.bus = bus
         self.title = title
         self.view = view
+        self.gate = gate or Gate(bus, read_only=view.read_only)
         self.start = bus.now()
         self.groups: list[PollGroup] = []
         self.events: deque[str] = deque(maxlen=KEPT_EVENTS)
@@ -132,7 +134,7 @@ class Watch:
                 self._pause()
             case "suspend":
                 self._suspend(action.target)
-            case "write" if not self.view.read_only:
+            case "write":
                 await self._write(action)
         self._counted = -math.inf
 
@@ -157,11 +159,12 @@ class Watch:
             return
         name = f"{action.target} {action.item}"
         try:
-            await point.write(parse_value(action.value))
-        except (BusError, InvalidCommand) as error:
-            self.tell(f"{name} = {action.value}: {error.what if isinstance(error, BusError) else error}")
-        else:
-            self.tell(f"{name} = {action.value} written")
+            value = parse_value(action.value)
+        except InvalidCommand as error:
+            self.tell(f"{name} = {action.value}: {error}")
+            return
+        write = await self.gate.write(Wish(door="screen", by="key w", name=point.key, point=point, value=value))
+        self.tell(f"{name} = {action.value} {'written' if write.ok else f': {write.error}'}".replace(" :", ":"))
 
     def _utilisation(self, now: float, busy: float) -> float:
         self._loads.append((now, busy))

@@ -18,6 +18,7 @@ from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
 from busmaster.contract.arguments import guess, is_decimal, meant
 from busmaster.errors import InvalidCommand
+from busmaster.gate.gate import Gate
 from busmaster.outputs.distributor import Distributor
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
@@ -30,7 +31,8 @@ class ConfiguredLine:
     `nodes` are the handles by the file's names; `groups` the poll groups, once it is entered. Raises FileError, which
     names line and key, for what the protocols or the outputs cannot do. `port` is used instead of the file's. `tap`
     sees every byte. Without `outputs` nothing is recorded or published. `tell` is called, on the loop, with what
-    happens to the outputs.
+    happens to the outputs. `read_only` lets nothing from outside be written: `gate` is what all of that
+    passes.
     """
 
     def __init__(
@@ -41,6 +43,7 @@ class ConfiguredLine:
         outputs: bool = True,
         tap: Tap | None = None,
         tell: Callable[[str], None] = lambda _: None,
+        read_only: bool = False,
     ) -> None:
         self.file = file
         self.bus = Bus(port or file.port, tap=tap, strict=file.strict)
@@ -50,7 +53,9 @@ class ConfiguredLine:
         for node in file.nodes.values():
             self._limit(node)
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
-        self.outputs = Distributor(self.bus, tell)
+        self.gate = Gate(self.bus, read_only=read_only)
+        self.outputs = Distributor(self.bus, tell, gate=self.gate)
+        self.gate.record = self.outputs.record
         if outputs:
             self._add_outputs()
 
