@@ -34,6 +34,7 @@ GROUPS = 200
 POINTS_EACH = 3
 STREAMS = 100
 WAITING = 500
+MOST_WAITING = 900
 PERIODS = (0.25, 0.5, 1.0, 2.0, 0.1, 0.3, 0.7, 5.0)
 SETTINGS = LineSettings(57600)
 DELAY = 0.002
@@ -92,6 +93,8 @@ def run(options: Options) -> Outcome:
     calls: Holds = {}
     for _ in range(options.pick(10, 1)):
         outcome.wrong += _watched(lambda watch: _all_calls(watch, calls))
+        outcome.wrong += _watched(lambda watch: _all_fail(watch, calls, "line lost", _lose))
+        outcome.wrong += _watched(lambda watch: _all_fail(watch, calls, "bus closed", _close))
     table = Table(f"{len(NODES) * len(ELEMENTS)} points, {GROUPS} groups: longest hold of the loop", COLUMNS)
     for name, holds in calls.items():
         own = median(hold.own for hold in holds)
@@ -183,6 +186,36 @@ async def _all_calls(watch: Watch, calls: Holds) -> int:
         await _requests(turn, list(values))
         await turn.hold("leaving the bus", lambda: bus.__aexit__(None, None, None), 0.0)
     return wrong
+
+
+async def _all_fail(watch: Watch, calls: Holds, what: str, fail: Callable[[Bus], Any]) -> int:
+    """Everything that waits at once; half of it in a group."""
+    with Lines(1, replies()) as lines:
+        bus = Bus(lines.ports[0])
+        turn = Round(bus, watch, calls)
+        await bus.__aenter__()
+        await asyncio.sleep(0.2)
+        axes = [Hcp2Controller(bus, node) for node in NODES]
+        values = {axis.element(n): value_of(axis.node.address, n) for axis in axes for n in ELEMENTS}
+        group = _group(bus, "large", 0.4, list(values))
+        await asyncio.sleep(1.0)
+        reading = [asyncio.create_task(point.read()) for point in (list(values) * 2)[:MOST_WAITING]]
+        await asyncio.sleep(0)
+        await turn.hold(f"{what} with {len(values)} points and {MOST_WAITING} waiting", lambda: fail(bus), 0.3)
+        wrong = wrong_in(group, values)
+        got = await asyncio.gather(*reading, return_exceptions=True)
+        asked = (list(values) * 2)[:MOST_WAITING]
+        wrong += sum(not isinstance(v, BusError) and v != values[point] for v, point in zip(got, asked, strict=True))
+        await bus.__aexit__(None, None, None)
+    return wrong
+
+
+def _lose(bus: Bus) -> None:
+    bus.pump.connection_lost(OSError("unplugged"))
+
+
+def _close(bus: Bus) -> Awaitable[None]:
+    return bus.__aexit__(None, None, None)
 
 
 async def _one_large_group(turn: Round, values: dict[Point[Any], float]) -> int:

@@ -13,8 +13,8 @@ from random import Random
 
 from benchmarks.harness import Claim, Options, Outcome, Table
 from busmaster.arbiter.events import Event, Polled
-from busmaster.arbiter.schedule import Poll, set_members
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.schedule import set_members
+from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Line

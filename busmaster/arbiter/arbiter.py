@@ -15,10 +15,9 @@ from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import Event
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.line_machine import LineMachine
-from busmaster.arbiter.schedule import Poll
 from busmaster.arbiter.state import EXCHANGE, READY
 from busmaster.arbiter.tap import Attempt
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed
@@ -114,7 +113,10 @@ class Arbiter(LineMachine):
             self._advance(now)
 
     def close(self, now: float) -> None:
-        """Fail whatever waits with BusClosed. The exchange on the wire runs out; then the line is OFFLINE."""
+        """Fail whatever waits with BusClosed. The exchange on the wire runs out; then the line is OFFLINE.
+
+        `failing` says whether some of it has not ended yet.
+        """
         if self._closed:
             return
         self._closed = True
@@ -124,6 +126,11 @@ class Arbiter(LineMachine):
         self.dispatcher.fail_all(now)
         if self.state is not EXCHANGE:
             self._go_offline(now)
+
+    @property
+    def failing(self) -> bool:
+        """Whether some of what failed with the line has not ended yet: further calls of `handle_timeout` end it."""
+        return len(self.dispatcher.failing) > 0
 
     # outputs, pumped in this order
 
@@ -144,6 +151,8 @@ class Arbiter(LineMachine):
             earliest = deadlines.schedule
         if deadlines.expiry < earliest:
             earliest = deadlines.expiry
+        if deadlines.failing < earliest:
+            earliest = deadlines.failing
         if deadlines.health < earliest:
             earliest = deadlines.health
         return earliest

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from busmaster.arbiter.events import Mark
 from busmaster.arbiter.histogram import Histogram
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, SETTLING, LineState
 
 

@@ -19,12 +19,25 @@ from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.endings import make_error, name_error, too_late
 from busmaster.arbiter.events import Event, LatenessLowered, NodeChanged, Overdue, Polled, Sampled
 from busmaster.arbiter.expiries import Expiries
+from busmaster.arbiter.failing_transactions import FailingTransactions, take_out
 from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
 from busmaster.arbiter.probes import Probes
-from busmaster.arbiter.schedule import Poll, Schedule
+from busmaster.arbiter.schedule import Schedule
 from busmaster.arbiter.state import SETTLING
 from busmaster.arbiter.tap import Attempt
-from busmaster.arbiter.transaction import BACKGROUND, ENDED, IDLE, ON_WIRE, PARKED, QUEUED, URGENT, Transaction
+from busmaster.arbiter.transaction import (
+    BACKGROUND,
+    ENDED,
+    FAILING,
+    IDLE,
+    ON_WIRE,
+    PARKED,
+    QUEUED,
+    URGENT,
+    Poll,
+    Transaction,
+)
+from busmaster.arbiter.writes import Writes
 from busmaster.contract.exchange import Command
 from busmaster.errors import (
     BacklogFull,
@@ -61,6 +74,7 @@ class Dispatcher:
         self.backlog = Backlog()
         self.schedule = Schedule()
         self.nodes: list[NodeRecord] = []
+        self.writes = Writes(self.backlog)
         self.counters = counters
         self.fault: Callable[[], BusError] | None = None
         """Makes the error with which everything fails while the line cannot be used."""
@@ -69,6 +83,7 @@ class Dispatcher:
         self._capacity = capacity
         self._jitter = jitter
         self._expiries = Expiries(deadlines)
+        self.failing = FailingTransactions(deadlines)
 
     # requests
 
@@ -85,14 +100,14 @@ class Dispatcher:
             self._supersede(node, now)
         waiting = self.backlog.queues[transaction.priority].live
         if transaction.writes:
-            waiting = max(waiting, len(node.writes))
+            waiting = max(waiting, len(self.writes.queues[node]))
         if waiting >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return False
         if (node.health is DOWN or now < node.suspended_until) and not self._may_ask(transaction, now):
             return False
         if transaction.writes:
-            node.writes.append(transaction)
+            self.writes.queues[node].append(transaction)
         if transaction.deadline == inf:
             transaction.deadline = now + RETRY_PATIENCE
         if transaction.start_by < inf:
@@ -108,7 +123,7 @@ class Dispatcher:
         self.counters.cancelled += 1
         if transaction.phase is QUEUED:
             self.backlog.discard(transaction, PARKED)
-        if transaction.phase is PARKED:
+        if transaction.phase is not ON_WIRE:
             self.probes.budget.refund(transaction.probe_cost)
             self._end(transaction, now)
 
@@ -120,8 +135,8 @@ class Dispatcher:
                 transaction.finish_by <= now or (transaction.queued < now and not transaction.attempts)
             ):
                 self._end(transaction, now, too_late(transaction, now))
-            elif transaction.writes and node.writes[0] is not transaction:
-                self._park(transaction)
+            elif transaction.writes and not self.writes.is_first(transaction):
+                self.writes.park(transaction)
             elif (node.health is not DOWN and not node.holds and node.suspended_until <= now) or self._may_ask(
                 transaction, now
             ):
@@ -137,7 +152,7 @@ class Dispatcher:
         if node.health is DOWN or node.holds or node.suspended_until > now:
             return False
         in_time = transaction.start_by >= now or (transaction.attempts > 0 and transaction.finish_by > now)
-        return in_time and not (transaction.writes and node.writes[0] is not transaction)
+        return in_time and not (transaction.writes and not self.writes.is_first(transaction))
 
     def started(self, transaction: Transaction, now: float) -> None:
         """Its next attempt goes out now."""
@@ -259,15 +274,15 @@ class Dispatcher:
     # everything at once
 
     def fail_all(self, now: float) -> None:
-        """End whatever waits, with the current fault."""
-        fault = self.fault
-        assert fault is not None
-        for node in self.nodes:
-            for write in [w for w in node.writes if w.phase is PARKED]:
-                self._end(write, now, name_error(fault(), write))
-        for transaction in self.backlog.drain():
-            transaction.phase = PARKED
-            self._end(transaction, now, name_error(fault(), transaction))
+        """Take out whatever waits, to end with the current fault: the first few now, the others with `fail_more`."""
+        assert self.fault is not None
+        self.failing.add(take_out(self.writes.queues.values(), self.backlog), self.fault())
+        self.fail_more(now)
+
+    def fail_more(self, now: float) -> None:
+        """End a bounded piece of what was taken out: the deadline has passed already while there is more."""
+        for transaction, error in self.failing.next(now):
+            self._end(transaction, now, error)
 
     def expire(self, now: float) -> None:
         """Tell callers whose time is over: nothing was sent, or it was, and how it ends is not known (R12).
@@ -278,6 +293,8 @@ class Dispatcher:
         for transaction in self._expiries.due(now):
             if not transaction.wanted or (transaction.attempts and transaction.finish_by >= now):
                 continue
+            if transaction.phase is FAILING:
+                continue  # it ends next, with what became of the line
             if transaction.phase is ON_WIRE:
                 transaction.wanted = False
                 self.counters.cancelled += 1
@@ -425,16 +442,9 @@ class Dispatcher:
         transaction.deadline = now + (poll.patience if poll is not None else RETRY_PATIENCE)
         self.backlog.push(transaction)
 
-    def _park(self, write: Transaction) -> None:
-        """An earlier write to its node is not over: it waits, and lends that one its class (R7)."""
-        write.phase = PARKED
-        first = write.node.writes[0]
-        if first.priority > write.priority and first.phase is QUEUED:
-            self.backlog.promote(first, write.priority)
-
     def _supersede(self, node: NodeRecord, now: float) -> None:
         """An urgent write overtakes: what it overtakes is never sent after it, nor if it cannot be sent itself (R7)."""
-        for write in list(node.writes):
+        for write in list(self.writes.queues[node]):
             if write.phase is ON_WIRE:
                 write.superseded = True
             elif write.priority > URGENT:
@@ -448,7 +458,7 @@ class Dispatcher:
             unsure = transaction.unsure or (transaction.attempts > 0 and not isinstance(error, NOT_DONE))
             if unsure and error is not None and not isinstance(error, WriteUnconfirmed):
                 error = make_error(WriteUnconfirmed, f"it was sent and not answered, then: {error.what}", transaction)
-            self._next_write(transaction)
+            self.writes.over(transaction)
         if not transaction.attempts:
             transaction.exchanges_ahead = self.counters.exchanges - transaction.exchanges_ahead
             transaction.settling_ahead = self.counters.spent[SETTLING] - transaction.settling_ahead
@@ -477,12 +487,3 @@ class Dispatcher:
         """What the line has counted so far is not what it waits for: it is taken off when it has waited."""
         transaction.exchanges_ahead = self.counters.exchanges
         transaction.settling_ahead = self.counters.spent[SETTLING]
-
-    def _next_write(self, transaction: Transaction) -> None:
-        writes = transaction.node.writes
-        if writes and writes[0] is transaction:
-            writes.popleft()
-            if writes and writes[0].phase is PARKED:
-                self.backlog.push_front(writes[0])
-        elif transaction in writes:
-            writes.remove(transaction)

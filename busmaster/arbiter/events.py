@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
+from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.tap import Attempt
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.errors import BusError
-
-if TYPE_CHECKING:
-    from busmaster.arbiter.health import Health, NodeRecord
-    from busmaster.arbiter.schedule import Poll
 
 
 @dataclass(slots=True)
@@ -69,13 +66,6 @@ class LatenessLowered:
 
     node: NodeRecord
     lateness: float
-
-
-class Mark(enum.Enum):
-    """What the UART says of a byte that it received."""
-
-    DAMAGED = "parity or framing error"
-    BREAK = "break"
 
 
 class LineChange(enum.Enum):

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import enum
-from collections import deque
 from collections.abc import Callable, Sequence
 from math import inf
 from typing import Any
 
 from busmaster.arbiter.counters import NodeCounters
-from busmaster.arbiter.transaction import Transaction
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
@@ -88,7 +86,6 @@ class NodeRecord:
         "unheard",
         "up_since",
         "usual",
-        "writes",
     )
 
     def __init__(self, profile: Profile, address: int, timings: Timings, retries: int, line: str = "") -> None:
@@ -108,7 +105,6 @@ class NodeRecord:
         """Replies in a row since then."""
         self.last_reply = -inf
         self.up_since = -inf
-        self.writes: deque[Transaction] = deque()
         self.counters = NodeCounters()
         self.probe_delay = FIRST_PROBE_DELAY
         self.probe_at = inf

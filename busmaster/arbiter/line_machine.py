@@ -5,8 +5,7 @@ Theory of operation
 One half-duplex line, many nodes, anonymous replies: at most one exchange is on the line (R1), and no byte of an earlier
 one can come when the next begins (R3). It is told the time with every call and sends nothing itself: its owner pumps
 `poll_transmit`, then `poll_event`, then arms a timer for `poll_timeout`. Early or repeated calls change nothing.
-
-The line is in one of five states; `_line_due` is when the state ends by itself.
+What ends each of the five states by itself is its deadline.
 
 =========  =====================  =======================  ==========================  ====================
 state      data received          its deadline             line_up / line_down         submit, poll due
@@ -37,10 +36,11 @@ from busmaster.arbiter.choice import Choice
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.echo import Echo
-from busmaster.arbiter.events import CameUnasked, LineChange, LineChanged, Mark
+from busmaster.arbiter.events import CameUnasked, LineChange, LineChanged
 from busmaster.arbiter.health import DOWN
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.leg import Leg
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
 from busmaster.arbiter.tapped import make_dispatcher
@@ -109,7 +109,7 @@ class LineMachine:
         self._settle(now)
 
     def line_down(self, cause: str, now: float) -> None:
-        """The port is gone: everything fails at once (R13)."""
+        """The port is gone: everything fails, and nothing that waited is sent any more (R13)."""
         if self.state is OFFLINE:
             return
         self._counters.losses += 1
@@ -184,6 +184,8 @@ class LineMachine:
     def handle_timeout(self, now: float, *, unread: bool = False) -> None:
         """`unread`: bytes have come that were not handed over yet, so the silence of the line is not known."""
         deadlines = self._deadlines
+        if now >= deadlines.failing:
+            self.dispatcher.fail_more(now)
         if now >= deadlines.schedule:
             self.dispatcher.release_polls(now)
         if now >= deadlines.expiry and not unread:
@@ -243,12 +245,11 @@ class LineMachine:
             wire.came_unasked = True
             return b""
         if transaction.node.profile.noise_tolerant:
-            kept = wire.without_noise(data)
-            self._counters.noise_bytes += len(data) - len(kept)
+            heard, data = data, wire.without_noise(data)
+            self._counters.noise_bytes += len(heard) - len(data)
             self._unasked.last_byte = now
-            if not kept:
+            if not data:
                 return b""
-            data = kept
         leg.begun = True
         leg.begun_at = now
         if transaction.first_byte == -inf:
@@ -388,9 +389,8 @@ class LineMachine:
             self._go_offline(now)
         elif hold or not self._advance(now):
             free = max(self._leg.out, now) + hold
-            held = free > now
-            self._enter(HOLDOFF if held else READY, now)
-            self._deadlines.line = free if held else inf
+            self._enter(HOLDOFF if free > now else READY, now)
+            self._deadlines.line = free if free > now else inf
 
     def _settle(self, now: float, begun: bool = False) -> None:
         """Discard until it has been silent long enough, and nothing can come any more (R3).

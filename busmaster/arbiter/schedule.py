@@ -9,19 +9,16 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator
 from itertools import count, islice
 from math import ceil, floor, inf
 from typing import Any
 
-from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.phases import STRIDE, quietest_offset
-from busmaster.arbiter.transaction import BACKGROUND, POLL, Priority, Transaction
+from busmaster.arbiter.transaction import BACKGROUND, POLL, Poll, Priority, Transaction
 from busmaster.contract.exchange import Exchange
 from busmaster.errors import InvalidCommand
 
-LONGEST_PATIENCE = 10.0
-"""Seconds after which a poll's cycle goes before those that came later, however long its period is."""
 FILL = 0.9
 """Cycles are spread over this share of the time when phases are chosen: the rest is left for what varies."""
 SLICE = 128
@@ -46,77 +43,6 @@ def line_time(exchange: Exchange[Any], byte_time: float, reply_time: float | Non
         wait = leg.timing.nominal / 2 if reply_time is None else reply_time
         total += (leg.sent + leg.sizes.typical) * byte_time + wait
     return total
-
-
-class Poll:
-    """Transactions that are run once a period, on the grid base + k x period.
-
-    `cost` is the line time of one cycle in seconds, for the choice of phases. `results` are its transactions: they
-    hold the outcome of the last cycle until the next one starts. `preparation`, if there is one, is work that gives it
-    its transactions and its cost: each step yields how many units it took, of about a microsecond. A poll that was
-    removed is not added again.
-    """
-
-    __slots__ = (
-        "active",
-        "base",
-        "cost",
-        "cycles",
-        "due",
-        "finished",
-        "fresh",
-        "group",
-        "jitter",
-        "missed",
-        "name",
-        "number",
-        "patience",
-        "paused",
-        "period",
-        "phase",
-        "placed",
-        "preparation",
-        "priority",
-        "remaining",
-        "results",
-        "started",
-        "wanted",
-    )
-
-    def __init__(self, name: str, period: float, *, phase: float | None = None, cost: float = 0.0) -> None:
-        if not 0.001 <= period < inf:
-            raise InvalidCommand(f"poll group {name!r}: a period is at least 0.001 s, not {period!r}")
-        if phase is not None and not 0 <= phase < period:
-            raise InvalidCommand(f"poll group {name!r}: a phase is at least 0 s and below the period, not {phase!r}")
-        self.name = name
-        self.period = period
-        self.patience = min(period, LONGEST_PATIENCE)
-        self.phase = phase
-        self.cost = cost
-        self.priority = POLL
-        self.results: Sequence[Transaction] = ()
-        self.fresh: Sequence[Transaction] | None = None
-        self.preparation: Iterator[int] | None = None
-        self.group: Any = None
-        self.base = 0.0
-        self.number = 0
-        self.due = inf
-        self.active = False
-        self.placed = False
-        self.paused = False
-        self.wanted = False
-        self.remaining = 0
-        self.started = self.finished = -inf
-        self.cycles = 0
-        self.missed = 0
-        self.jitter = Histogram()
-
-    @property
-    def running(self) -> bool:
-        return self.remaining > 0
-
-    def next_due(self) -> float:
-        return self.base + self.number * self.period
 
 
 class Schedule:

@@ -1,17 +1,19 @@
-"""Transactions: a command with its caller, priority and retries."""
+"""Transactions: a command with its caller, priority and retries; and polls, which run theirs once a period."""
 
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterator, Sequence
 from math import inf, nextafter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.histogram import Histogram
 from busmaster.contract.exchange import Command
-from busmaster.errors import BusError
+from busmaster.errors import BusError, InvalidCommand
 
-if TYPE_CHECKING:
-    from busmaster.arbiter.health import NodeRecord
-    from busmaster.arbiter.schedule import Poll
+LONGEST_PATIENCE = 10.0
+"""Seconds after which a poll's cycle goes before those that came later, however long its period is."""
 
 
 class Priority(enum.IntEnum):
@@ -27,16 +29,20 @@ URGENT, COMMAND, POLL, BACKGROUND = Priority
 
 
 class Phase(enum.Enum):
-    """Where a transaction is. A write is PARKED while an earlier write to its node is not over (R7)."""
+    """Where a transaction is. A write is PARKED while an earlier write to its node is not over (R7).
+
+    What is FAILING waited for a line that can no longer be used: it ends next, and is never sent (R13).
+    """
 
     IDLE = "idle"
     QUEUED = "queued"
     PARKED = "parked"
     ON_WIRE = "on wire"
+    FAILING = "failing"
     ENDED = "ended"
 
 
-IDLE, QUEUED, PARKED, ON_WIRE, ENDED = Phase
+IDLE, QUEUED, PARKED, ON_WIRE, FAILING, ENDED = Phase
 
 
 class Timeline(NamedTuple):
@@ -166,3 +172,74 @@ class Transaction:
             self.exchanges_ahead,
             self.settling_ahead,
         )
+
+
+class Poll:
+    """Transactions that are run once a period, on the grid base + k x period.
+
+    `cost` is the line time of one cycle in seconds, for the choice of phases. `results` are its transactions: they
+    hold the outcome of the last cycle until the next one starts. `preparation`, if there is one, is work that gives it
+    its transactions and its cost: each step yields how many units it took, of about a microsecond. A poll that was
+    removed is not added again.
+    """
+
+    __slots__ = (
+        "active",
+        "base",
+        "cost",
+        "cycles",
+        "due",
+        "finished",
+        "fresh",
+        "group",
+        "jitter",
+        "missed",
+        "name",
+        "number",
+        "patience",
+        "paused",
+        "period",
+        "phase",
+        "placed",
+        "preparation",
+        "priority",
+        "remaining",
+        "results",
+        "started",
+        "wanted",
+    )
+
+    def __init__(self, name: str, period: float, *, phase: float | None = None, cost: float = 0.0) -> None:
+        if not 0.001 <= period < inf:
+            raise InvalidCommand(f"poll group {name!r}: a period is at least 0.001 s, not {period!r}")
+        if phase is not None and not 0 <= phase < period:
+            raise InvalidCommand(f"poll group {name!r}: a phase is at least 0 s and below the period, not {phase!r}")
+        self.name = name
+        self.period = period
+        self.patience = min(period, LONGEST_PATIENCE)
+        self.phase = phase
+        self.cost = cost
+        self.priority = POLL
+        self.results: Sequence[Transaction] = ()
+        self.fresh: Sequence[Transaction] | None = None
+        self.preparation: Iterator[int] | None = None
+        self.group: Any = None
+        self.base = 0.0
+        self.number = 0
+        self.due = inf
+        self.active = False
+        self.placed = False
+        self.paused = False
+        self.wanted = False
+        self.remaining = 0
+        self.started = self.finished = -inf
+        self.cycles = 0
+        self.missed = 0
+        self.jitter = Histogram()
+
+    @property
+    def running(self) -> bool:
+        return self.remaining > 0
+
+    def next_due(self) -> float:
+        return self.base + self.number * self.period

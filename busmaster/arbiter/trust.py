@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from busmaster.arbiter.events import Mark
 from busmaster.arbiter.in_step import ANY_BYTE, InStep
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.contract.exchange import Done
 

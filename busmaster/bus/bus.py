@@ -330,7 +330,8 @@ class Bus:
             polls=1 + max(polled - low, backlog.waiting(Priority.POLL)),
             background=probed + max(low, backlog.waiting(Priority.BACKGROUND)),
         )
-        parked = sum(write.phase is Phase.PARKED for node in self._nodes.values() for write in node.record.writes)
+        queues = self._arbiter.dispatcher.writes.queues.values()
+        parked = sum(write.phase is Phase.PARKED for queue in queues for write in queue)
         longest = max((poll.patience for poll in polls if poll.results), default=1.0)
         return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 

@@ -9,8 +9,8 @@ from math import inf
 from typing import Any, NamedTuple
 
 from busmaster.arbiter.histogram import Histogram
-from busmaster.arbiter.schedule import Poll, line_time, set_members
-from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.arbiter.schedule import line_time, set_members
+from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.samples import Quality, Sample

@@ -11,8 +11,7 @@ from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.schedule import Poll
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.bus.limiter import Limiter
 from busmaster.bus.logbook import Logbook
 from busmaster.bus.points import Point

@@ -13,7 +13,7 @@ import anyio
 
 from busmaster.arbiter.counters import Quantiles
 from busmaster.arbiter.histogram import Histogram
-from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.transaction import Poll
 from busmaster.bus.points import Point
 from busmaster.bus.samples import Quality, Sample
 from busmaster.contract.arguments import whole_number

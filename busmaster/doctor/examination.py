@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeAlias
 
 import anyio.to_thread
 
-from busmaster.arbiter.events import Mark
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.tap import Tap
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings

@@ -17,7 +17,7 @@ from typing import Any
 import anyio
 
 from busmaster.arbiter.echo import Echo
-from busmaster.arbiter.events import Mark
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.tap import Attempt, Tap, Verdict
 from busmaster.arbiter.unasked import QUIET
 from busmaster.contract.driver import Driver

@@ -16,7 +16,8 @@ from math import ceil, floor, inf, log10
 from typing import Any
 
 from busmaster.arbiter.backlog import SHARE
-from busmaster.arbiter.schedule import SLICE, Poll, Priority, Schedule, line_time
+from busmaster.arbiter.schedule import SLICE, Priority, Schedule, line_time
+from busmaster.arbiter.transaction import Poll
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import LineSettings
 from busmaster.planning.merging import WEIGHING, Merge, Served, at_once, cheapest

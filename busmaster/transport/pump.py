@@ -17,11 +17,11 @@ import anyio
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import DriverErrors
-from busmaster.arbiter.events import Event, Mark, Overdue, Polled, Sampled
-from busmaster.arbiter.schedule import Poll
+from busmaster.arbiter.events import Event, Overdue, Polled, Sampled
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Attempt, Tap
-from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.errors import LineDown
 from busmaster.transport.alarm import Alarm
 from busmaster.transport.clock import clock_of
@@ -130,12 +130,12 @@ class Pump(asyncio.Protocol):
         due = arbiter.poll_timeout()
         if due < self._armed:
             self._arm(due)
-        if self._run_out is not None and arbiter.state is not LineState.EXCHANGE:
+        if self._run_out is not None and not self._runs():
             self._run_out.set()
 
     async def run_out(self) -> None:
-        """Return when nothing is on the wire: within one exchange."""
-        if self.arbiter.state is LineState.EXCHANGE:
+        """Return when nothing is on the wire, within one exchange, and whoever waited has been told."""
+        if self._runs():
             self._run_out = anyio.Event()
             await self._run_out.wait()
 
@@ -148,7 +148,10 @@ class Pump(asyncio.Protocol):
             self._port.reset()
 
     def stop(self) -> None:
-        """No timer any more: the bus is closed."""
+        """No timer any more: the bus is closed. Whoever still waits is told now, where nobody saw `run_out` through."""
+        while self.arbiter.failing:
+            self.arbiter.handle_timeout(self.clock())
+            self.turn()
         if self._alarm is not None:
             self._alarm.close()
             self._alarm = None
@@ -202,6 +205,9 @@ class Pump(asyncio.Protocol):
         self.turn()
 
     # inside
+
+    def _runs(self) -> bool:
+        return self.arbiter.state is LineState.EXCHANGE or self.arbiter.failing
 
     def _give_up_on(self, late: Overdue) -> None:
         """Its caller goes, the exchange stays: a write that is on the wire is over before anything else can be read."""

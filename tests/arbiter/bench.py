@@ -8,9 +8,9 @@ from typing import Any
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import Event, Polled
 from busmaster.arbiter.health import Health, NodeRecord
-from busmaster.arbiter.schedule import Poll, set_members
+from busmaster.arbiter.schedule import set_members
 from busmaster.arbiter.state import LineState
-from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings

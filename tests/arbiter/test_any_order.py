@@ -6,18 +6,21 @@ R1, R3, R6, R8, R10, R11; with and without an echo.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import ClassVar
 
 import hypothesis.strategies as st
+import pytest
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+from busmaster.arbiter import failing_transactions
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import NodeChanged, Polled
 from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
-from busmaster.arbiter.schedule import Poll, set_members
+from busmaster.arbiter.schedule import set_members
 from busmaster.arbiter.state import LineState
-from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.arbiter.transaction import Phase, Poll, Priority, Transaction
 from busmaster.errors import BusError
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.wire.checks import xor
@@ -27,6 +30,13 @@ LATENESS = 0.150
 ROUNDING = 1e-9
 MOST_STEPS = 1000
 """Of one `advance`."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_fail_at_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(failing_transactions, "AT_ONCE", 2)
+        yield
 
 
 def reply(element: int, value: int) -> bytes:
@@ -54,6 +64,8 @@ class AnyOrder(RuleBasedStateMachine):
         self.answers: dict[int, tuple[int, int, float]] = {}
         """Who was asked for what, and when, of each value: they are used once."""
         self.spoil_echo = False
+        self.lost: list[tuple[Transaction, int]] = []
+        """What waited or was on the wire when the port was lost, and how often it had been sent."""
 
     @initialize()
     def open_the_port(self) -> None:
@@ -127,8 +139,19 @@ class AnyOrder(RuleBasedStateMachine):
     def lose_the_port_and_find_it_again(self) -> None:
         self.arbiter.line_down("unplugged", self.now)
         self.pump()
+        self.advance(0.0)
         assert all(t.phase is Phase.ENDED for t in self.submitted), "R13"
         self.arbiter.line_up(self.now)
+        self.pump()
+
+    @rule()
+    def find_the_port_again_before_all_that_waited_has_failed(self) -> None:
+        """The others fail on a line that is up; meanwhile they may be cancelled, or the bus closed."""
+        before = [t for t in self.submitted if t.phase is not Phase.ENDED]
+        sent = [t.attempts for t in before]
+        self.arbiter.line_down("unplugged", self.now)
+        self.arbiter.line_up(self.now)
+        self.lost += zip(before, sent, strict=True)
         self.pump()
 
     @precondition(lambda self: len(self.submitted) > 8)
@@ -240,6 +263,10 @@ class AnyOrder(RuleBasedStateMachine):
         assert all(n == 1 for n in self.ended.values())
 
     @invariant()
+    def what_was_lost_with_the_port_is_not_sent_again(self) -> None:
+        assert all(transaction.attempts == sent for transaction, sent in self.lost), "R13"
+
+    @invariant()
     def nothing_waits_while_the_line_is_free(self) -> None:
         if self.arbiter.state is LineState.READY:
             assert not len(self.arbiter.dispatcher.backlog)
@@ -251,7 +278,7 @@ class AnyOrder(RuleBasedStateMachine):
         for transaction in self.submitted:
             assert transaction.phase is Phase.ENDED
             assert self.ended[id(transaction)] == (id(transaction) not in self.cancelled)
-        assert not any(node.writes for node in self.nodes)
+        assert not any(self.arbiter.dispatcher.writes.queues.values())
         assert self.arbiter.state is LineState.OFFLINE
 
 

@@ -113,7 +113,7 @@ def test_r7_writes_to_one_node_never_overtake_each_other_in_any_story(story: lis
     assert all(t.phase is Phase.ENDED for t in asked), "R8"
     for old, _ in overtaken:
         assert not old.wanted or type(old.error) is (WriteUnconfirmed if old.attempts else Superseded), "R7"
-    assert not any(node.writes for node in desk.nodes)
+    assert not any(desk.dispatcher.writes.queues.values())
     assert len(desk.dispatcher.backlog) == 0
 
 
@@ -210,7 +210,7 @@ def test_r12_writes_that_wait_behind_one_that_is_repeated_are_bounded_too() -> N
     desk = Desk(capacity=5)
     for _ in range(20):
         desk.submit(write=True, repeat=True)
-    waiting = desk.nodes[0].writes
+    waiting = desk.dispatcher.writes.queues[desk.nodes[0]]
     assert len(waiting) == 5
     desk.finish(ok=False)
     full = desk.submit(write=True)

@@ -11,8 +11,7 @@ from busmaster.arbiter.health import (
     note_failure,
     note_success,
 )
-from busmaster.arbiter.schedule import Poll
-from busmaster.arbiter.transaction import Priority
+from busmaster.arbiter.transaction import Poll, Priority
 from busmaster.errors import NodeDown, Refused, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor

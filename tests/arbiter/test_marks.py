@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from busmaster.arbiter.events import Mark
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import LineState
 from busmaster.errors import GarbledReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2

@@ -16,17 +16,8 @@ import busmaster.arbiter.phases as phases_module
 import busmaster.arbiter.schedule as schedule_module
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.phases import KINKS, STRIDE, common_divisor, quietest_offset
-from busmaster.arbiter.schedule import (
-    AT_ONCE,
-    LONGEST_PATIENCE,
-    SLICE,
-    Poll,
-    Schedule,
-    begin_cycle,
-    line_time,
-    set_members,
-)
-from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.arbiter.schedule import AT_ONCE, SLICE, Schedule, begin_cycle, line_time, set_members
+from busmaster.arbiter.transaction import LONGEST_PATIENCE, Poll, Priority, Transaction
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
 from busmaster.planning.merging import at_once

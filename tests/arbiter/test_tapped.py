@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import pytest
 
 from busmaster.arbiter.dispatcher import Dispatcher
-from busmaster.arbiter.events import Mark
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.contract.driver import EndlessExchange
 from busmaster.contract.exchange import Expect, Sizes

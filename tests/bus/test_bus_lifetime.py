@@ -21,7 +21,7 @@ from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
-from busmaster.errors import BusClosed, InvalidCommand
+from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
@@ -94,6 +94,30 @@ def test_closing_ends_even_if_whoever_closes_is_cancelled_meanwhile() -> None:
         assert not bus.running
         await asyncio.sleep(0)
         assert asyncio.all_tasks() == {asyncio.current_task()}
+
+    run_in_virtual_time(story())
+
+
+@pytest.mark.parametrize("patient", [True, False])
+def test_closing_tells_whoever_waits_however_many_they_are_and_whoever_closes_is_cancelled(patient: bool) -> None:
+    """They are told a few at a time; nobody may be forgotten when the owner does not wait for that."""
+
+    async def story() -> None:
+        bus = slow_bus()
+        await bus.__aenter__()
+        axis = Hcp2Controller(bus, 1)
+        await axis.read(1)
+        reading = [asyncio.create_task(axis.read(1)) for _ in range(500)]
+        await asyncio.sleep(0.01)
+        closing = asyncio.create_task(bus.__aexit__(None, None, None))
+        await asyncio.sleep(0)
+        assert sum(read.done() for read in reading) < 100
+        if not patient:
+            closing.cancel()
+        await asyncio.wait([closing])
+        told = await asyncio.wait_for(asyncio.gather(*reading, return_exceptions=True), 1.0)
+        assert not any(type(error) is not BusClosed for error in told[1:])
+        assert told[0] == 0.0 if patient else isinstance(told[0], BusError)
 
     run_in_virtual_time(story())
 

@@ -14,10 +14,10 @@ from typing import Any
 
 from busmaster.arbiter.events import Event, LatenessRaised, NodeChanged, Polled
 from busmaster.arbiter.health import Health, NodeRecord
-from busmaster.arbiter.schedule import Poll, line_time, set_members
+from busmaster.arbiter.schedule import line_time, set_members
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Tap
-from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults

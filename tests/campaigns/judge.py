@@ -14,8 +14,7 @@ from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
-from busmaster.arbiter.schedule import Poll
-from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.arbiter.transaction import Phase, Poll, Priority, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.errors import BacklogFull, NotStarted, Refused, WriteUnconfirmed
 from busmaster.protocols.msc import codec as msc
@@ -325,7 +324,7 @@ class Judge:
         if open_transactions:
             self.totals.lost += open_transactions
             self.problem(f"R8: {open_transactions} transactions never ended")
-        if len(dispatcher.backlog) or any(node.writes for node in dispatcher.nodes):
+        if len(dispatcher.backlog) or any(dispatcher.writes.queues.values()):
             self.problem("R8: something is left in the backlog")
 
     def sum_up(self, seconds: float) -> None:

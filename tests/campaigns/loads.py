@@ -9,8 +9,8 @@ from typing import Any
 
 from busmaster.arbiter.events import Event, NodeChanged, Polled
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.schedule import Poll, line_time, set_members
-from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.arbiter.schedule import line_time, set_members
+from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings

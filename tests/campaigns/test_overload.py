@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 
 from busmaster.arbiter.choice import MOST_BEFORE
-from busmaster.arbiter.schedule import Poll
-from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay, Device
 from busmaster.errors import BacklogFull

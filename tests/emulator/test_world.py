@@ -7,8 +7,7 @@ from random import Random
 import pytest
 
 from busmaster.arbiter.events import Event, LineChange, LineChanged, Polled
-from busmaster.arbiter.schedule import Poll
-from busmaster.arbiter.transaction import Priority, Transaction
+from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo, Line

@@ -178,25 +178,25 @@ async def test_whatever_is_sent_is_refused_and_answered_and_the_output_stays_up(
 @pytest.mark.asyncio
 async def test_refused_commands_do_not_starve_those_that_are_allowed(broker: Broker) -> None:
     async with plant(broker, "line/result/5/1") as there:
-        for number in range(3000):
+        for number in range(1000):
             await there.client.publish("line/set/5/2", str(number), qos=0)
         began = time.monotonic()
         answer = await there.ask('{"value": 8, "expires": %f}' % (time.time() + 30))
         assert answer["ok"]
         assert time.monotonic() - began < 10
-        assert there.output._arriving.refused == 3000
-        assert there.output._arriving.unanswered > 2000
-        assert len(there.records) < 1000
+        assert there.output._arriving.refused == 1000
+        assert there.output._arriving.unanswered > 500
+        assert len(there.records) < 500
 
 
 @pytest.mark.asyncio
 async def test_more_commands_than_the_line_takes_are_refused_not_kept(broker: Broker) -> None:
     async with plant(broker) as there:
-        for number in range(400):
+        for number in range(200):
             await there.send(json.dumps({"value": 1, "expires": time.time() + 30, "id": number}))
-        answers = await there.answers(400)
+        answers = await there.answers(200)
         written = [answer for _, answer in answers if answer["ok"]]
-        assert 0 < len(written) <= 400
+        assert 0 < len(written) <= 200
         assert all("waiting already" in answer["error"] for _, answer in answers if not answer["ok"])
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from busmaster import Bus, GarbledReply, Hcp2Controller, MscController, SerialPort
-from busmaster.arbiter.events import Mark
+from busmaster.arbiter.mark import Mark
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import serve_pty
 from busmaster.protocols.msc import codec as msc

@@ -1,0 +1,209 @@
+"""The search: every event of every state, over all times that it may have, until nothing new is found."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from tests.proof.adversary import act, actions, window
+from tests.proof.instants import Bound, Instant, begin_run, instant, noted, set_unit, ticks
+from tests.proof.key import restore, save, share, simplify
+from tests.proof.msc_world import MscWorld
+from tests.proof.setups import Setup
+from tests.proof.shipped import AnyTime, set_aside
+from tests.proof.wire import SCRIPT, Outside, Violation
+from tests.proof.world import Action, World
+from tests.proof.zones import Zone, at_most, copied, extended, less_than, opposite, origin, sample, tighten, within
+
+Step = tuple[Action, tuple[int, ...]]
+"""What happened, and what was chosen in it."""
+
+
+@dataclass
+class Found:
+    """What one exploration has found."""
+
+    setup: Setup
+    keys: int = 0
+    zones: int = 0
+    events: int = 0
+    seconds: float = 0.0
+    closed: bool = False
+    violations: dict[str, list[Step]] = field(default_factory=dict)
+    """The shortest history of each."""
+    left: int = 0
+    """Zones whose events were not looked at yet."""
+
+
+class Explorer:
+    """One world's search. `progress` is told of the zones found, and those done."""
+
+    def __init__(self, setup: Setup, progress: Callable[[Found, int], None] = lambda found, done: None) -> None:
+        self.found = Found(setup)
+        self._progress = progress
+        self._seen: dict[bytes, list[tuple[Zone, int]]] = {}
+        """The zones of each key, each with its place among the states."""
+        self._states: list[tuple[int, Step | None, bytes, Zone]] = []
+        """Where each came from, and how; its key and its zone."""
+        self._quiet: dict[int, set[int]] = {}
+        """Where each comes to where a deadline passes and nothing comes, waits for R15, or leaves."""
+
+    def run(self, limit: float, violations: int = 8) -> Found:
+        """Explore for at most so many seconds, or until so many kinds of violation are found."""
+        setup, found = self.found.setup, self.found
+        with set_aside(setup):
+            prepare(setup)
+            began = time.perf_counter()
+            self._begin(setup)
+            done = 0
+            while done < len(self._states) and len(found.violations) < violations:
+                found.seconds = time.perf_counter() - began
+                if found.seconds > limit:
+                    break
+                if not done % 500:
+                    self._progress(found, done)
+                self._expand(done)
+                done += 1
+            found.seconds = time.perf_counter() - began
+        found.closed = done == len(self._states)
+        found.left = len(self._states) - done
+        if found.closed:
+            self._check_progress()
+        return found
+
+    def _begin(self, setup: Setup) -> None:
+        begin_run([0])
+        SCRIPT.begin(())
+        world = world_of(setup)(instant(0, 0))
+        world.pump()
+        zone = origin()
+        simplify(world, zone)
+        self._keep(-1, None, *save(world, zone))
+
+    def _keep(self, parent: int, step: Step | None, key: bytes, zone: Zone) -> int:
+        """Remember a state, unless one that is known holds it. Returns the place of either."""
+        known = self._seen.setdefault(key, [])
+        for other, place in known:
+            if within(zone, other):
+                return place
+        place = len(self._states)
+        known.append((zone, place))
+        self._states.append((parent, step, key, zone))
+        self.found.keys, self.found.zones = len(self._seen), len(self._states)
+        return place
+
+    def _expand(self, place: int) -> None:
+        _, _, key, zone = self._states[place]
+        begin_run(sample(zone))
+        world = restore(key)
+        possible = [(action, *window(world, action)) for action in actions(world)]
+        for action, *bounds in possible:
+            begun = constrained(zone, *bounds)
+            if begun is not None:
+                self._happen(place, key, begun, action)
+
+    def _happen(self, place: int, key: bytes, zone: Zone, action: Action) -> None:
+        """Let one event happen in all its zone: piece by piece, each as one run decides."""
+        now_at = len(zone) - 2
+        pieces: list[tuple[Zone, tuple[int, ...]]] = [(zone, ())]
+        while pieces:
+            piece, script = pieces.pop()
+            begin_run(sample(piece))
+            world = restore(key)
+            problem = ""
+            outside = False
+            try:
+                act(world, action, instant(now_at, 0), instant(now_at + 1, 0), script)
+            except Violation as violation:
+                problem = str(violation)
+            except Outside:
+                outside = True
+            self.found.events += 1
+            decided, others = split(piece, noted)
+            pieces += [(other, script) for other in others]
+            asked = SCRIPT.asked
+            for at in range(len(script), len(asked)):
+                before = tuple(chosen for chosen, _ in asked[:at])
+                pieces += [(decided, (*before, other)) for other in range(1, asked[at][1])]
+            if problem:
+                self.found.violations.setdefault(problem, [*self.path(place), (action, script)])
+            elif not outside:
+                waits = AnyTime.chosen[0] or world.held or world.unread or world.said
+                simplify(world, decided)
+                next_ = self._keep(place, (action, script), *save(world, decided))
+                if action == ("timer", "line") and not waits:
+                    self._quiet.setdefault(place, set()).add(next_)
+
+    def _check_progress(self) -> None:
+        """If nothing comes, deadlines lead to a request, or to a line that is READY: they never go round."""
+        follows = {place: len(next_) for place, next_ in self._quiet.items()}
+        before: dict[int, list[int]] = {}
+        for place, next_ in self._quiet.items():
+            for other in next_:
+                before.setdefault(other, []).append(place)
+        done = [place for place in before if place not in follows]
+        while done:
+            place = done.pop()
+            for other in before.get(place, ()):
+                follows[other] -= 1
+                if not follows[other]:
+                    done.append(other)
+        round_ = [place for place, left in follows.items() if left]
+        if round_:
+            self.found.violations["progress: deadlines go round and nothing leaves"] = self.path(min(round_))
+
+    def path(self, place: int) -> list[Step]:
+        """Return how a state was come to."""
+        steps: list[Step] = []
+        while place >= 0:
+            place, step, _, _ = self._states[place]
+            if step is not None:
+                steps.append(step)
+        return steps[::-1]
+
+
+def prepare(setup: Setup) -> None:
+    """Take this world's units and kind."""
+    World.prepare(setup)
+    set_unit(World.byte_time)
+    share(command for _, command in World.kind.commands)
+    share(World.kind.profile.checks)
+
+
+def world_of(setup: Setup) -> type[World]:
+    return MscWorld if setup.kind.startswith("msc") else World
+
+
+def constrained(zone: Zone, earliest: list[Instant], latest: list[Instant], before: list[Instant]) -> Zone | None:
+    """Return the zone with two more instants: now, not before the last one (x_0) nor outside its bounds, and any time
+    from now on. None if empty."""
+    more = extended(extended(zone))
+    now = len(zone)
+    possible = tighten(more, 0, now, at_most(0))
+    for bound in earliest:
+        possible = possible and tighten(more, bound.base, now, at_most(-bound.offset))
+    for bound in latest:
+        possible = possible and tighten(more, now, bound.base, at_most(bound.offset))
+    for bound in before:
+        possible = possible and tighten(more, now, bound.base, less_than(bound.offset))
+    possible = possible and tighten(more, now, now + 1, at_most(0))
+    possible = possible and tighten(more, now + 1, now, at_most(ticks(World.setup.lapse)))
+    return more if possible else None
+
+
+def split(zone: Zone, asked: list[Bound]) -> tuple[Zone, list[Zone]]:
+    """Return the part of the zone for which all that was asked holds, and the other parts, cut off one by one."""
+    others: list[Zone] = []
+    decided = zone
+    for i, j, bound in asked:
+        if decided[i][j] <= bound:
+            continue
+        other = copied(decided)
+        if tighten(other, j, i, opposite(bound)):
+            others.append(other)
+        if decided is zone:
+            decided = copied(zone)
+        holds = tighten(decided, i, j, bound)
+        assert holds, "a sample that is not in its zone"
+    return decided, others

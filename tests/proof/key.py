@@ -1,0 +1,406 @@
+"""The key of a state: the whole world, with its times taken out into a zone, and without what can make no difference.
+
+Each thing that is left out has its argument beside it. `tests/proof/test_key.py` compares worlds that were restored
+from their key with those that were not, and shows that a wrong one is noticed.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections import deque
+from collections.abc import Callable
+from itertools import count
+from math import inf
+from typing import Any
+
+from busmaster.arbiter import in_step
+from busmaster.arbiter.health import SILENT, Health, NodeRecord
+from busmaster.arbiter.schedule import Schedule
+from busmaster.arbiter.state import EXCHANGE, SETTLING, LineState
+from busmaster.arbiter.strays import QUIET, STRAGGLER_MEMORY
+from busmaster.arbiter.transaction import BACKGROUND, COMMAND, Phase, Priority, Transaction
+from busmaster.contract.profile import Profile
+from busmaster.contract.timing import ReplyTiming, Timings
+from busmaster.errors import LineNoisy
+from tests.proof import setups
+from tests.proof.instants import Instant, Past, instant, past, ticks
+from tests.proof.wire import OLD, STRAY, Time
+from tests.proof.world import World
+from tests.proof.zones import FREE, Zone, widened
+
+LONGEST = 1.5
+"""Seconds beyond which it is not told apart how long ago something was, or is to be; or twice R15's wait."""
+
+
+def noisy() -> LineNoisy:
+    return LineNoisy("the line is noisy")
+
+
+class View:
+    """A world, and what its zone says of its times."""
+
+    def __init__(self, world: World, zone: Zone) -> None:
+        self.world = world
+        self.zone = zone
+        self.now: Instant = world.now
+
+    def past(self, time: Time, by: float = 0.0, strictly: bool = False) -> bool:
+        """Whether it is surely `by` seconds ago."""
+        if type(time) is not Instant:
+            return bool(time != inf)
+        bound = self.zone[time.base][self.now.base]
+        return bound <= 2 * (self.now.offset - time.offset - ticks(by)) + (not strictly)
+
+    def before(self, first: Time, second: Time) -> bool:
+        """Whether the one is surely not after the other."""
+        if type(first) is Instant and type(second) is Instant:
+            return self.zone[first.base][second.base] <= 2 * (second.offset - first.offset) + 1
+        if type(first) is Past and type(second) is Past:
+            return first.rank <= second.rank
+        return type(first) is not Instant and first != inf
+
+
+def transactions(world: World) -> list[Transaction]:
+    arbiter = world.arbiter
+    every = [t for queue in arbiter.dispatcher.backlog.queues for t in queue]
+    every += [t for node in world.nodes for t in node.writes]
+    return every if arbiter._wire.transaction is None else [arbiter._wire.transaction, *every]
+
+
+def longest_quiet(world: World) -> float:
+    """No silence after which something is over is longer, whoever is asked next."""
+    leg = world.arbiter._leg
+    gaps = [t.byte_gap for node in world.nodes for t in _timings(node)]
+    return max(QUIET, leg.timing.byte_gap, *gaps) + leg.latency + leg.byte_time
+
+
+def longest_window(world: World) -> float:
+    return max(t.window for node in world.nodes for t in _timings(node)) + world.arbiter._leg.latency
+
+
+def _timings(node: NodeRecord) -> tuple[ReplyTiming, ReplyTiming, ReplyTiming]:
+    return node.timings.read, node.timings.write, node.timings.packet
+
+
+# what is left out, and why
+
+
+def past_legs(view: View) -> None:
+    """`begin` sets all of a leg before any of it is read; outside an exchange only `end`, `out` and what follows are
+    read. They are asked only whether they lie ahead: `past()` of now on, `out + quiet` of now on. What the port
+    holds moves all of them, so that they stay while it may."""
+    world = view.world
+    arbiter, leg = world.arbiter, world.arbiter._leg
+    if view.past(leg.taint_until):
+        leg.taint_until = -inf
+    if arbiter.state is not EXCHANGE:
+        leg.begun = False
+        leg.begun_at = leg.taint_until = -inf
+        leg.longest = 0
+        if leg._follows is None:
+            leg._follows_until = -inf
+            if view.past(leg.end, leg.timing.lateness + leg.latency + leg.byte_time):
+                leg.end = -inf
+        elif view.past(leg._follows_until) and arbiter.state is SETTLING:
+            pass  # a stray would start it anew
+    else:
+        leg._follows = None  # by `begin`
+        leg._follows_until = -inf
+    if not world.setup.may(setups.HELD) and view.past(leg.out, longest_quiet(world), strictly=True):
+        leg.out = -inf
+
+
+def past_silences(view: View) -> None:
+    """Of the last byte is asked whether it is a silence ago, or a window; of the noise, whether it lasts too long,
+    while the line is not NOISY already; of the quarantine, whether it is over; of the settle, nothing once it is."""
+    world, strays = view.world, view.world.arbiter._strays
+    asked = max(longest_quiet(world), longest_window(world) if world.setup.in_step else 0.0)
+    if view.past(strays.last_byte, asked, strictly=True):
+        strays.last_byte = -inf
+    if world.arbiter.noisy or not world.setup.in_step:  # see shipped.py
+        strays._noise_since = -inf if strays._noise_since != inf else inf
+    if view.past(world.arbiter._quarantine):
+        world.arbiter._quarantine = -inf
+    if world.arbiter.state is not SETTLING:
+        world.arbiter._silent_at = -inf
+    world.arbiter._up_at = -inf  # for nodes that are added later
+    if not world.frozen:
+        world.arbiter._wire.output.said_at = -inf  # set with what is said next, and read when that is written
+
+
+def past_stragglers(view: View) -> None:
+    """Who was not answered is blamed within STRAGGLER_MEMORY; where nobody's lateness is raised, never."""
+    strays = view.world.arbiter._strays
+    if not view.world.setup.in_step:
+        strays.run.clear()  # `InStep.heard` alone reads it
+    one = strays.unanswered_one
+    if one is not None and not (view.world.setup.may(setups.RAISED) and not view.past(one[1], STRAGGLER_MEMORY, True)):
+        strays.unanswered_one = None
+    if strays.unanswered_one is None:
+        strays._looked = -inf
+        strays._look_at = inf
+
+
+def past_requests(view: View) -> None:
+    """Of a request's times only `started` is read, on the wire: where something is owed, or exchanges have a limit.
+    `deadline` orders polls and probes alone, `queued` counts where there is a `start_by`. Of attempts, whether there
+    were any."""
+    world = view.world
+    owed = world.setup.in_step and bool(world.arbiter._in_step.debts)
+    limited = world.kind.profile.exchange_limit is not None or owed
+    for transaction in transactions(world):
+        transaction.queued = 0.0
+        transaction.first_byte = transaction.last_byte = transaction.ended_at = transaction.refused_until = -inf
+        transaction.exchanges_ahead = 0
+        transaction.settling_ahead = 0.0
+        transaction.refused_cycles = 0
+        transaction.late = False
+        transaction.attempts = min(transaction.attempts, 1)
+        if transaction.priority <= COMMAND:
+            transaction.deadline = inf
+        if not (limited and transaction is world.arbiter._wire.transaction) and not world.frozen:
+            transaction.started = -inf
+
+
+def past_nodes(view: View) -> None:
+    """Of a node's times, the order of the last replies is read and nothing else, as long as its health is not."""
+    world = view.world
+    replied = [node for node in world.nodes if node.last_reply != -inf]
+    replied.sort(key=lambda node: sum(view.before(other.last_reply, node.last_reply) for other in replied))
+    if all(_ordered(view, a.last_reply, b.last_reply) for a in replied for b in replied):
+        for rank, node in enumerate(replied):
+            node.last_reply = past(rank, 0)  # type: ignore[assignment]
+    for node in world.nodes:
+        node.failed_at = node.up_since = -inf
+        node.lateness_until = inf  # an hour: coming down again is left out
+        node.unheard = min(node.unheard, SILENT) if world.setup.in_step else 0  # only R15 asks
+        node.replies = 0
+        if view.past(node.probe_at):
+            node.probe_at = -inf
+        node.probed_at = -inf if len(world.nodes) == 1 else node.probed_at
+
+
+def _ordered(view: View, first: Time, second: Time) -> bool:
+    return view.before(first, second) or view.before(second, first)
+
+
+def past_debts(view: View) -> None:
+    """Of a debt that has lapsed is asked only how long it was in time, and whether it was so before the request that
+    is on the wire. Of doubts, whether they are over; of what was said, whether it is SAID_MEMORY ago."""
+    world, book = view.world, view.world.arbiter._in_step
+    if not world.setup.in_step:
+        return
+    on_wire = world.arbiter._wire.transaction
+    for debt in book.debts:
+        if debt.until != inf and view.past(debt.until):
+            debt.until = -inf
+        if not (view.past(debt.asked, in_step.LAPSE, strictly=True) and view.past(debt.over)):
+            continue
+        asked: Time = debt.asked
+        over: Time = debt.over
+        if type(asked) is Instant and (on_wire is None or view.before(over, on_wire.started)):
+            apart = over - asked
+            if type(apart) is float:
+                asked, over = past(0, 0), past(0, ticks(apart))
+                debt.asked, debt.over = asked, over
+    book._doubted = [entry for entry in book._doubted if not view.past(entry[1])]
+    if view.past(book._doubt_until):
+        book._doubt_until = -inf
+    while book._said and view.past(book._said[0][1], in_step.SAID_MEMORY, strictly=True):
+        book._said.popleft()
+
+
+def past_waiting(view: View) -> None:
+    """Queues are what waits in them, in order; turns of lower classes count where there are such; why a line is down
+    is for people."""
+    world = view.world
+    arbiter, dispatcher = world.arbiter, world.arbiter.dispatcher
+    arbiter._cause = ""
+    if arbiter.noisy:
+        dispatcher.fault = noisy
+    urgent, command, *by_deadline = dispatcher.backlog.queues
+    for first in (urgent, command):
+        first._entries = deque(first)
+    for other in by_deadline:
+        if not other.live:
+            other._entries = []
+            other._order = count()
+    backlog = dispatcher.backlog
+    if not world.setup.may(setups.HEALTH):
+        backlog._streak = 0
+    backlog._streak_before, backlog._rotated_before = 0, BACKGROUND
+
+
+def past_wire(view: View) -> None:
+    """The adversary's own state: a reply that is too late never comes; what was heard is judged within its exchange;
+    what an attempt was to be answered with, while it is on the wire."""
+    world = view.world
+    world.owed = [reply for reply in world.owed if not view.past(reply.hi)]
+    for reply in world.owed:
+        if view.past(reply.lo):
+            reply.lo = -inf
+    if not world.words_are_read:
+        _past_words(world)
+    if not world.unread:
+        world.unread_by = -inf
+    if view.past(world.said_by):
+        world.said_by = -inf
+    if view.past(world.hold_until):
+        world.hold_until = -inf
+    on_wire = world.arbiter._wire.transaction
+    if on_wire is None and not world.frozen:
+        world.by = None
+        world.forged = False
+        world.cancels = 1
+    for ticket in world.live:
+        if (on_wire is None or ticket is not on_wire.waiter) and not world.frozen:
+            ticket.place = -1
+            ticket.before = False
+    world.said = b""
+    world.ended = []
+
+
+def _past_words(world: World) -> None:
+    """Where nobody reads the words, only that something comes makes a difference, and whether a node has said it."""
+    if world.unread:
+        said = {origin for _, origin in world.unread} - {STRAY}
+        world.unread = ((0, OLD if said else STRAY),)
+    for reply in world.owed:
+        if reply.kind == "reply":
+            reply.data = bytes(len(reply.data))
+            reply.ticket = None
+
+
+FORGOTTEN: list[Callable[[View], None]] = [
+    past_legs,
+    past_silences,
+    past_stragglers,
+    past_requests,
+    past_nodes,
+    past_debts,
+    past_waiting,
+    past_wire,
+]
+
+
+# saving and restoring
+
+
+class _Places:
+    """Where each instant that is kept stands in the zone: a base each, and offsets from it."""
+
+    def __init__(self) -> None:
+        self.canonical: list[tuple[int, int]] = []
+        self.of: dict[int, tuple[int, int]] = {}
+        self.kept: list[tuple[int, int]] = []
+
+    def begin(self, zone: Zone, now: Instant) -> None:
+        self.canonical = [_first_at_fixed_distance(zone, i) for i in range(len(zone))]
+        self.of.clear()
+        self.kept.clear()
+        self.place(now)
+
+    def place(self, time: Instant) -> tuple[int, int]:
+        base, shift = self.canonical[time.base]
+        offset = time.offset + shift
+        known = self.of.get(base)
+        if known is None:
+            known = self.of[base] = len(self.kept), offset
+            self.kept.append((base, offset))
+        return known[0], offset - known[1]
+
+
+_PLACES = _Places()
+
+
+def _first_at_fixed_distance(zone: Zone, i: int) -> tuple[int, int]:
+    row = zone[i]
+    for j in range(i):
+        bound = row[j]
+        if bound & 1 and bound < FREE and zone[j][i] == 2 - bound:
+            return j, bound >> 1
+    return i, 0
+
+
+def _reduce_instant(time: Instant) -> tuple[Any, ...]:
+    return instant, _PLACES.place(time)
+
+
+_shared: list[Any] = []
+_share_of: dict[Any, int] = {}
+
+
+def _recall(place: int) -> Any:
+    return _shared[place]
+
+
+def _reduce_shared(value: Any) -> tuple[Any, ...]:
+    place = _share_of.get(id(value))
+    if place is None:
+        place = next((at for at, other in enumerate(_shared) if type(other) is type(value) and other == value), None)
+        if place is None:
+            place = len(_shared)
+            _shared.append(value)
+        if _shared[place] is value:
+            _share_of[id(value)] = place
+    return _recall, (place,)
+
+
+def _reduce_unchanged(value: Any) -> tuple[Any, ...]:
+    """Of a kind that no world changes: polls are not explored."""
+    if type(value) not in _share_of:
+        _share_of[type(value)] = len(_shared)
+        _shared.append(value)
+    return _recall, (_share_of[type(value)],)
+
+
+def _reduce_member(member: Any) -> str:
+    return str(member.name)
+
+
+_TABLE: dict[type, Callable[[Any], Any]] = {
+    Instant: _reduce_instant,
+    Profile: _reduce_shared,
+    ReplyTiming: _reduce_shared,
+    Timings: _reduce_shared,
+    LineState: _reduce_member,
+    Priority: _reduce_member,
+    Phase: _reduce_member,
+    Health: _reduce_member,
+    Schedule: _reduce_unchanged,
+}
+
+
+def share(commands: Any) -> None:
+    """Commands are values that never change: they are pickled by their place."""
+    for command in commands:
+        _TABLE[type(command)] = _reduce_shared
+
+
+def simplify(world: World, zone: Zone, forgotten: list[Callable[[View], None]] | None = None) -> None:
+    """Drop from a world, in place, what can make no difference."""
+    view = View(world, zone)
+    for forget in FORGOTTEN if forgotten is None else forgotten:
+        forget(view)
+
+
+def save(world: World, zone: Zone, exact: bool = False) -> tuple[bytes, Zone]:
+    """Return the key of a world that is simple already, and the zone of the instants that are in it. Instant 0 is now.
+
+    Unless it is to be `exact`, the zone is widened where it is LONGEST.
+    """
+    _PLACES.begin(zone, world.now)
+    into = io.BytesIO()
+    pickler = pickle.Pickler(into, 5)
+    pickler.dispatch_table = _TABLE
+    pickler.dump(world)
+    kept = _PLACES.kept
+    small = [[FREE if zone[i][j] >= FREE else zone[i][j] + 2 * (a - b) for j, b in kept] for i, a in kept]
+    return into.getvalue(), small if exact else widened(small, ticks(max(LONGEST, 2 * world.setup.lapse)))
+
+
+def restore(key: bytes) -> World:
+    """Return the world again. Its instants are those of the run that was begun."""
+    world: World = pickle.loads(key)
+    return world

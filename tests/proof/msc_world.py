@@ -1,0 +1,141 @@
+"""A line of MSCs: an ACK and a packet, the host's ACK, and packets that are said again where that is lost.
+
+A unit is one talker: it takes no request while it says something, and says its packet again until it is acknowledged
+or asked anew. Bytes of a packet come one by one, or (for most of its damage) all at once: see `adversary`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tests.proof.instants import Instant
+from tests.proof.wire import Owed, Ticket, Time, Violation, choose
+from tests.proof.world import World
+
+ACK, NAK = b"\x06", b"\x15"
+SAID_AGAIN_AFTER = 0.5
+SAID_AGAIN_BY = 1.0
+"""Seconds from a packet that was not acknowledged to the next time that it is said."""
+
+
+class MscWorld(World):
+    """`Owed.kind` is "ack", "packet" or "again"; `packet` is what the unit says behind its ACK, or would say again."""
+
+    has_one_leg = False
+
+    def begin_exchange(self) -> None:
+        """What is said is sorted out in `leaves`: the host's ACKs begin nothing."""
+
+    def _begins(self) -> None:
+        self.by = None
+        self.forged = False
+        self.strays = self.cancels = 1
+        self.losses = self.setup.lost_acknowledgements
+        for reply in self.owed:
+            reply.own = False
+
+    def leaves(self, out: bytes, ticket: Ticket | None, end: Time) -> None:
+        """Byte by byte: an ACK or NAK of the host, or a whole request."""
+        at = self.now if not isinstance(self.said_by, Instant) else max(self.now, self.said_by)
+        said = out
+        while out:
+            if out[:1] in (ACK, NAK):
+                word, out = out[:1], out[1:]
+                at = at + self.byte_time
+                self._hears_word(word, at)
+            else:
+                size = 8 + int.from_bytes(out[2:4], "big")
+                request, out = out[:size], out[size:]
+                at = at + size * self.byte_time
+                self._hears_request(request, ticket, at)
+        self.said_by = at
+        if self.setup.echo:
+            self.owed.append(Owed(said, at, at + self.setup.late_echo, 0.0, kind="echo"))
+        for reply in [
+            r for r in self.owed if r.kind != "echo"
+        ]:  # collisions are left out: nobody begins while the host speaks
+            if not reply.begun and (not isinstance(reply.lo, Instant) or reply.lo < at + self.byte_time):
+                reply.lo = at + self.byte_time
+
+    def _hears_word(self, word: bytes, at: Time) -> None:
+        waiting = [reply for reply in self.owed if reply.kind == "again" and not reply.begun]
+        if not waiting:
+            return
+        if self.losses and choose(2):
+            self.losses -= 1
+            return
+        for reply in waiting:
+            self.owed.remove(reply)
+            if word == NAK:
+                self.owed.append(self._packet(reply, at))
+
+    def _hears_request(self, request: bytes, ticket: Ticket | None, at: Time) -> None:
+        exchange = self.arbiter._wire.exchange
+        resent = getattr(exchange, "_resends", 0) > 0
+        if not resent:
+            self._judge_msc()
+            self._begins()
+        unit = request[1]
+        for reply in [r for r in self.owed if r.kind == "again" and r.unit == unit and not r.begun]:
+            if not choose(2):  # else it has not heard the request
+                self.owed.remove(reply)
+        if any(reply.unit == unit for reply in self.owed):
+            return  # it is busy
+        answers = [self.kind.answer(request, place) for place in range(2)]
+        place = choose(2) if ticket is not None and answers[0] != answers[1] else 0
+        if ticket is not None:
+            ticket.place = place
+        edge = self.byte_time if self.setup.assumptions.edge else 0.0
+        timing = self.arbiter._leg.timing
+        ack = Owed(ACK, at + self.byte_time, at + timing.lateness + edge, 0.0, kind="ack")
+        ack.packet_by = at + self.kind.profile.timings.packet.lateness + edge
+        ack.unit, ack.packet, ack.left, ack.ticket = unit, answers[place], self.setup.retransmissions, ticket
+        self.owed.append(ack)
+
+    def _judge_msc(self) -> None:
+        """R1, but for packets that are said again: of those R3 alone is asked."""
+        for reply in self.owed:
+            if reply.kind != "again" and reply.own and reply.hi > self.now:
+                if self.calls is not None:
+                    self.calls.append((reply.hi, "may still come until here", reply.data))
+                raise Violation(f"R1: an {reply.kind} of an earlier request may still come as the next one leaves")
+
+    def _packet(self, before: Owed, at: Time, again: bool = False) -> Owed:
+        edge = self.byte_time if self.setup.assumptions.edge else 0.0
+        timing = self.kind.profile.timings.packet
+        gap = timing.byte_gap + (self.byte_time if self.setup.assumptions.gap_edge else 0.0)
+        if again:
+            packet = Owed(before.packet, at + SAID_AGAIN_AFTER, at + SAID_AGAIN_BY, gap, kind="again")
+        else:
+            packet = Owed(before.packet, at + self.byte_time, at + timing.lateness + edge, gap, kind="packet")
+        packet.unit, packet.packet, packet.ticket, packet.own = before.unit, before.packet, before.ticket, before.own
+        packet.left = before.left - again
+        return packet
+
+    def over(self, reply: Owed, refused: bool = False, lost: bool = False) -> None:
+        """A unit has said all of this: what it says next. Where its ACK is lost, the packet's lateness counts from the
+        request: that is assumed."""
+        if reply.kind == "ack":
+            if reply.packet and not refused:
+                self.owed.append(self._packet(reply, self.now))
+                if lost:
+                    self.owed[-1].hi = reply.packet_by
+        elif reply.left:
+            self.owed.append(self._packet(reply, self.now, again=True))
+
+    def hear_all(self, reply: Owed, damage: Any) -> None:
+        """All the rest of a packet is read at once, as it is or damaged."""
+        data = bytearray(reply.data)
+        self.owed.remove(reply)
+        if damage is not None:
+            place, bit = damage
+            if bit is None:
+                del data[place]
+            else:
+                data[place] ^= 1 << bit
+        reply.data = b""
+        self.over(reply)
+        self.hear(bytes(data), reply.origin)
+
+    def is_request(self, out: bytes) -> bool:
+        return bool(out.lstrip(ACK + NAK))

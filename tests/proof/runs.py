@@ -1,0 +1,109 @@
+"""Many worlds explored, side by side, and what was found of them kept."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+from tests.proof.explore import Explorer, Found
+from tests.proof.history import as_test, retell, told
+from tests.proof.setups import Setup
+
+ROOT = Path(__file__).parent.parent.parent
+EXPLORED = ("busmaster/arbiter", "busmaster/contract", "busmaster/wire", "busmaster/protocols", "tests/proof")
+
+
+def fingerprint() -> str:
+    """Return what changes with the code that is explored, or that explores."""
+    digest = hashlib.sha256()
+    for folder in EXPLORED:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            if path.name not in ("worlds.py", "runs.py", "__main__.py") and not path.name.startswith("test_"):
+                digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def explore(setup: Setup, limit: float) -> dict[str, Any]:
+    """Explore one world; return what is written of it."""
+    found = Explorer(setup).run(limit)
+    return {
+        "world": setup.name,
+        "keys": found.keys,
+        "zones": found.zones,
+        "events": found.events,
+        "seconds": round(found.seconds, 1),
+        "closed": found.closed,
+        "left": found.left,
+        "violations": [_violation(setup, found, problem) for problem in found.violations],
+    }
+
+
+def _violation(setup: Setup, found: Found, problem: str) -> dict[str, Any]:
+    steps = found.violations[problem]
+    calls = retell(setup, steps, problem)
+    if calls is None:
+        return {"problem": problem, "history": f"not possible as it was found: {steps}", "test": ""}
+    return {"problem": problem, "history": told(calls), "test": as_test(setup, calls, problem)}
+
+
+def line_of(result: dict[str, Any]) -> str:
+    end = "closed" if result["closed"] else f"open, {result['left']} left"
+    broken = "".join(f"\n    VIOLATION {v['problem']}" for v in result["violations"])
+    numbers = (
+        f"{result['keys']:7} keys {result['zones']:7} zones {result['events']:8} events {result['seconds']:7.1f} s"
+    )
+    return f"{numbers}  {end:18} {result['world']}{broken}"
+
+
+def table(results: Iterable[dict[str, Any]]) -> Iterator[str]:
+    """The lines of the table that the documentation shows."""
+    yield "| world | keys | zones | events | seconds | closed | violations |"
+    yield "|---|---:|---:|---:|---:|---|---|"
+    for result in results:
+        closed = "yes" if result["closed"] else f"no, {result['left']} left"
+        broken = "; ".join(v["problem"] for v in result["violations"]) or "none"
+        numbers = " | ".join(f"{result[name]}" for name in ("keys", "zones", "events", "seconds"))
+        yield f"| {result['world']} | {numbers} | {closed} | {broken} |"
+
+
+def known(path: Path, code: str) -> dict[str, dict[str, Any]]:
+    """What an earlier run has found of this very code."""
+    if not path.exists():
+        return {}
+    results = [json.loads(line) for line in path.read_text().splitlines()]
+    return {result["world"]: result for result in results if result["code"] == code}
+
+
+def run(
+    setups: Sequence[Setup], jobs: int, minutes: float, each: float, path: Path, say: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Explore what is not known yet, `jobs` at a time, for at most so many minutes; tell and write each result."""
+    code = fingerprint()
+    results = known(path, code)
+    todo = [setup for setup in setups if setup.name not in results]
+    say(f"{len(setups)} worlds, {len(setups) - len(todo)} of them known from before")
+    until = time.monotonic() + 60 * minutes
+    with ProcessPoolExecutor(jobs, max_tasks_per_child=1) as pool, path.open("a") as file:
+        running: set[Future[dict[str, Any]]] = set()
+        while todo or running:
+            while todo and len(running) < jobs and time.monotonic() < until:
+                running.add(pool.submit(explore, todo.pop(0), min(each, until - time.monotonic())))
+            if not running:
+                break
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                bug = future.exception()
+                if bug is not None:
+                    say(f"a world was not explored: {bug!r}")
+                    continue
+                result = {"code": code, **future.result()}
+                results[result["world"]] = result
+                file.write(json.dumps(result) + "\n")
+                file.flush()
+                say(f"[{len(results):3}/{len(setups)}] {line_of(result)}")
+    return [results[setup.name] for setup in setups if setup.name in results]

@@ -1,0 +1,323 @@
+"""What of the shipping code is set aside, and why that is sound. Everything else runs as it ships.
+
+- Counters and histograms: nothing that is decided depends on them. They do arithmetic that no zone can tell.
+- How long a node's replies take, as it is learned: `NodeRecord.latest` may say whatever the world names.
+- Health and the budget of probes: whether a failure is held against a node, and whether a probe is paid for, may or
+  may not be. Without HEALTH no failure is.
+- How far a straggler raises its node's lateness: to either of two values, or (without RAISED) not at all.
+- What is owed (R15), unless the world is `in_step`: whatever is asked of it, the answer may be yes or no; and what goes
+  next may be the first that waits, another, a check, or nothing until any time. So whatever R15 does is among what is
+  explored. Checks are one read of each node.
+- Whether the line has been noisy for too long: with NOISE it may be or not, at each stray byte; without, it never is.
+- Where R15 is not set aside, its spans are what the world says. They are shorter: fewer debts at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, ClassVar
+
+from busmaster.arbiter import alike, health, in_step
+from busmaster.arbiter.choice import Choice, Chosen
+from busmaster.arbiter.dispatcher import Dispatcher
+from busmaster.arbiter.health import DOWN, SUSPECT, UP, NodeRecord
+from busmaster.arbiter.strays import LONGEST_LATENESS, STRAGGLER_MEMORY, STRAGGLER_SHARE, Strays
+from busmaster.arbiter.transaction import Transaction
+from busmaster.contract.exchange import Command
+from tests.proof.setups import HEALTH, HOLDS, NOISE, RAISED, Setup
+from tests.proof.wire import choose
+
+RAISED_TO = (0.25, LONGEST_LATENESS)
+PROBED_AFTER = 0.1
+
+
+class _Uncounted:
+    """Stands for a number or a histogram that nobody reads."""
+
+    def __iadd__(self, other: Any) -> _Uncounted:
+        return self
+
+    __add__ = __radd__ = __sub__ = __rsub__ = __iadd__
+
+    def __getitem__(self, place: Any) -> _Uncounted:
+        return self
+
+    def __setitem__(self, place: Any, value: Any) -> None:
+        pass
+
+    def record(self, *arguments: Any) -> None:
+        pass
+
+    def __reduce__(self) -> str:
+        return "UNCOUNTED"
+
+
+class _NoCounters:
+    """Stands for the counters of a line or a node."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return UNCOUNTED
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        pass
+
+    def spend(self, *arguments: Any) -> float:
+        return 0.0
+
+    def mark(self, *arguments: Any) -> None:
+        pass
+
+    def __reduce__(self) -> str:
+        return "NO_COUNTERS"
+
+
+class _Budget:
+    """Stands for the budget of probes: it may pay, or not."""
+
+    probe = 0.0
+    tokens = 1.0
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        pass
+
+    def idle(self, *arguments: Any, **named: Any) -> None:
+        pass
+
+    refund = node_returned = idle
+
+    def take(self, *arguments: Any) -> bool:
+        return not choose(2)
+
+    def wait_for(self, *arguments: Any) -> float:
+        return PROBED_AFTER
+
+    def __reduce__(self) -> str:
+        return "BUDGET"
+
+
+UNCOUNTED, NO_COUNTERS, BUDGET = _Uncounted(), _NoCounters(), _Budget()
+
+
+class AnyStep:
+    """Stands for what is owed on a line: whatever is asked of it, it may say."""
+
+    last: Sequence[bytes] = ()
+    before: Sequence[bytes] = ()
+    alert = True
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        pass
+
+    def __reduce__(self) -> str:
+        return "ANY_STEP"
+
+    @property
+    def debts(self) -> Sequence[str]:
+        return ("a debt",) if choose(2) else ()
+
+    def nothing(self, *arguments: Any) -> None:
+        pass
+
+    owe = lapse = forgive = doubtful_answer = answered = said = said_twice = heard = nothing
+
+    def perhaps(self, *arguments: Any) -> bool:
+        return bool(choose(2))
+
+    clashes = doubts = perhaps
+
+    def is_doubtful(self, *arguments: Any) -> bool:
+        return self.holds[0] and bool(choose(2))
+
+    holds: ClassVar[list[bool]] = [False]
+    """Whether an answer may be held until another could have come."""
+
+
+class AnyTime:
+    """Stands for the time until which the line is held back."""
+
+    at: ClassVar[list[float]] = [0.0]
+    """Any time from now on, of the run."""
+    chosen: ClassVar[list[bool]] = [False]
+    """It was waited for in this step."""
+
+
+ANY_STEP = AnyStep()
+
+
+def no_jitter() -> float:
+    return 0.5
+
+
+@contextmanager
+def set_aside(setup: Setup) -> Iterator[None]:
+    """Replace what is set aside, for as long as one world is explored."""
+    undo: list[Callable[[], None]] = []
+
+    def put(owner: Any, name: str, value: Any) -> None:
+        before = getattr(owner, name)
+        undo.append(lambda: setattr(owner, name, before))
+        setattr(owner, name, value)
+
+    put(Dispatcher, "next", _asking(Dispatcher.next))
+    put(Dispatcher, "succeeded", _deciding(Dispatcher.succeeded))
+    put(Dispatcher, "refused", _deciding(Dispatcher.refused))
+    if not setup.in_step:
+        put(Choice, "next", _any_of_all)
+        put(Strays, "babbling", _may_be_noisy if setup.may(NOISE) else _is_never_noisy)
+        AnyStep.holds[0] = setup.may(HOLDS)
+    put(in_step, "LAPSE", setup.lapse)
+    put(in_step, "DOUBT_PERIOD", setup.doubt)
+    put(in_step, "SAID_MEMORY", setup.said_memory)
+    put(alike, "LONGEST_ALIKE", setup.alike)
+    put(alike, "LONGEST_STEADY", setup.alike + 1)
+    put(alike.Alike, "_was_untimely", _may_be_untimely)
+    put(NodeRecord, "note_reply", _untimed(NodeRecord.note_reply) if setup.in_step else _notes_nothing)
+    put(NodeRecord, "latest", _as_learned(NodeRecord.latest, setup.slowest))
+    put(Strays, "blame", _may_raise if setup.may(RAISED) else _raises_nothing)
+    if not setup.may(RAISED):
+        put(Strays, "unanswered", _blames_nobody)
+    put(health, "note_failure", _may_fail if setup.may(HEALTH) else _fails_nothing)
+    if setup.may(HEALTH):
+        put(health, "note_success", _may_be_up)
+        put(health, "flaps", lambda node, now: bool(choose(2)))
+    try:
+        yield
+    finally:
+        for step in reversed(undo):
+            step()
+
+
+def _untimed(right: Callable[..., None]) -> Callable[..., None]:
+    def note_reply(node: NodeRecord, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
+        right(node, answers, command, 0.0)
+
+    return note_reply
+
+
+class Decided:
+    """Whether an answer was taken for one in this step: a value, an acknowledgement, a refusal."""
+
+    by_answer: ClassVar[list[bool]] = [False]
+
+
+def _deciding(right: Callable[..., None]) -> Callable[..., None]:
+    def decide(dispatcher: Dispatcher, transaction: Transaction, *arguments: Any) -> None:
+        """A read that is refused once is none: a NAK may be noise before the true reply."""
+        if right.__name__ == "succeeded" or transaction.writes or transaction.refusals:
+            Decided.by_answer[0] = True
+        right(dispatcher, transaction, *arguments)
+
+    return decide
+
+
+class Asker:
+    """Who asks something in the moment in which the line is free: what waits need not be known before."""
+
+    ask: ClassVar[list[Callable[[], None]]] = [lambda: None]
+    saturated: ClassVar[list[bool]] = [False]
+    """Whether something will be asked as soon as the line is free."""
+
+
+def _asking(right: Callable[..., Any]) -> Callable[..., Any]:
+    def next_(dispatcher: Dispatcher, now: float) -> Any:
+        if not len(dispatcher.backlog) and dispatcher.fault is None:
+            Asker.ask[0]()
+        return right(dispatcher, now)
+
+    return next_
+
+
+def _any_of_all(self: Choice, now: float, last_byte: float) -> Chosen | float | None:
+    """Choose any time until which to wait, a check of any node, the first that waits, or another of its class."""
+    dispatcher = self._dispatcher
+    if Asker.saturated[0] or len(dispatcher.backlog):
+        nodes = [node for node in dispatcher.nodes if node.health is not DOWN]
+        which = choose(2 + len(nodes))
+        if which == 1:
+            AnyTime.chosen[0] = True
+            return AnyTime.at[0]
+        if which > 1:
+            node = nodes[which - 2]
+            command = node.profile.checks[0]
+            return dispatcher.check(node, command, now), command.open(node.address, node.timings)
+    transaction = dispatcher.next(now)
+    if transaction is None:
+        return None
+    first = transaction, transaction.command.open(transaction.node.address, transaction.node.timings)
+    if len(dispatcher.backlog) and choose(2):
+        other = self._another(first, now, lambda answers, node: False)
+        if other is not None:
+            dispatcher.backlog.restore(transaction)
+            return other
+    return first
+
+
+def _may_be_untimely(*arguments: Any) -> bool:
+    """How soon an answer came shows that it is its own, or not."""
+    return bool(choose(2))
+
+
+def _notes_nothing(*arguments: Any) -> None:
+    """Which reads are asked to prove that the line is in step is for the world to say."""
+
+
+def _as_learned(right: Callable[[NodeRecord, float], float], slowest: tuple[float, ...]) -> Callable[..., float]:
+    def latest(node: NodeRecord, unknown: float) -> float:
+        node.slowest = slowest[choose(len(slowest))]
+        said = right(node, unknown)
+        node.slowest = 0.0
+        return said
+
+    return latest
+
+
+def _may_raise(strays: Strays, first_byte: float) -> None:
+    if strays.unanswered_one is None:
+        return
+    node, asked, lateness = strays.unanswered_one
+    strays.unanswered_one = None
+    stalled = first_byte > strays._look_at + 0.005
+    age = (strays._looked if stalled else first_byte) - asked
+    if STRAGGLER_SHARE * lateness < age and age <= STRAGGLER_MEMORY:
+        higher = [raised for raised in RAISED_TO if raised > lateness]
+        if higher:
+            node.raise_lateness(higher[choose(len(higher))], first_byte)
+
+
+def _may_be_noisy(strays: Strays, now: float) -> bool:
+    return bool(choose(2))
+
+
+def _is_never_noisy(strays: Strays, now: float) -> bool:
+    return False
+
+
+def _blames_nobody(strays: Strays, node: NodeRecord, asked: float, lateness: float) -> None:
+    """The line is not looked at while it settles, either: a look changes nothing else."""
+
+
+def _raises_nothing(strays: Strays, first_byte: float) -> None:
+    pass
+
+
+def _fails_nothing(node: NodeRecord, now: float, jitter: Callable[[], float]) -> None:
+    pass
+
+
+def _may_fail(node: NodeRecord, now: float, jitter: Callable[[], float]) -> None:
+    held_against = choose(3)
+    if held_against and node.health is not DOWN:
+        node.failures = 1
+        node.health = SUSPECT if held_against == 1 else DOWN
+    if node.health is DOWN:
+        node.probed_at = now
+        node.probe_at = now + PROBED_AFTER
+
+
+def _may_be_up(node: NodeRecord, now: float) -> None:
+    node.failures = 0
+    if node.health is not SUSPECT or not choose(2):
+        node.health = UP

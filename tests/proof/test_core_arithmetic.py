@@ -1,0 +1,66 @@
+"""The core adds, subtracts and compares times, and takes the least and the greatest: nothing else can be explored.
+
+A length of time may be multiplied by a number where both are known. All that is multiplied, divided, negated or rounded
+in the rooms of the core stands here, with the reason for which it may.
+"""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+CORE = Path(__file__).parent.parent.parent / "busmaster"
+ROOMS = (
+    *(f"arbiter/{name}.py" for name in ("arbiter", "backlog", "choice", "deadlines", "dispatcher", "echo", "in_step")),
+    *(f"arbiter/{name}.py" for name in ("leg", "line_machine", "on_wire", "output", "probes", "strays", "trust")),
+    "contract/driver.py",
+)
+"""What runs as it ships. Not here: counters and their histograms, the budget of probes and what is learned of a node
+(health, alike), the schedule of polls: what is set aside is said in shipped.py."""
+BYTES = "a number of bytes, of a byte time that is fixed"
+COUNT = "numbers of things"
+PARAMETER = "a length that is fixed"
+ALLOWED = {
+    "2 * self.live": COUNT,
+    "-next(self._order)": COUNT,
+    "key * len(run)": COUNT,
+    "run[:1] * len(more)": COUNT,
+    "count * self.byte_time": BYTES,
+    "said * self.byte_time": BYTES,
+    "TAINT_SHARE * said * self.byte_time": BYTES,
+    "self.longest * byte_time": BYTES,
+    "count * self._leg.byte_time": BYTES,
+    "2 * leg.byte_time": BYTES,
+    "DOUBTED_LATENESSES * (debt.over - debt.asked)": "both are reckoned from one end: a lateness",
+    "leg.timing.window * 1000": "a message",
+    "self.unanswered_one[2] / LOOKS": PARAMETER,
+    "STRAGGLER_SHARE * lateness": PARAMETER,
+    "STRAGGLER_MARGIN * age": "how far a lateness is raised: set aside, it is any of two",
+}
+ROUNDING = {"abs", "round", "int", "float", "divmod", "floor", "ceil"}
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_the_core_does_no_other_arithmetic(room: str) -> None:
+    found = [ast.unparse(node) for node in ast.walk(ast.parse((CORE / room).read_text())) if _is_other(node)]
+    parts = [part for part in found if not any(part != whole and part in whole for whole in found)]
+    assert set(parts) <= set(ALLOWED)
+
+
+def _is_other(node: ast.AST) -> bool:
+    match node:
+        case ast.BinOp(op=ast.Mult() | ast.Div() | ast.FloorDiv() | ast.Mod() | ast.Pow()):
+            return True
+        case ast.AugAssign(op=ast.Mult() | ast.Div() | ast.FloorDiv() | ast.Mod() | ast.Pow()):
+            return True
+        case ast.UnaryOp(op=ast.USub(), operand=ast.Name(id=name)):
+            return name != "inf" and not name.isupper()
+        case ast.UnaryOp(op=ast.USub(), operand=ast.Constant()):
+            return False
+        case ast.UnaryOp(op=ast.USub()):
+            return True
+        case ast.Call(func=ast.Name(id=name)):
+            return name in ROUNDING
+    return False

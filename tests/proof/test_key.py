@@ -1,0 +1,148 @@
+"""What a state's key leaves out makes no difference, and a wrong omission would be noticed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import inf
+
+import pytest
+
+from busmaster.arbiter.state import EXCHANGE
+from tests.proof.key import FORGOTTEN, View, transactions
+from tests.proof.kinds import READ, WRITE, WRITE_THERE
+from tests.proof.setups import (
+    BEYOND,
+    CANCELS,
+    ECHO_FAULTS,
+    FLIPS,
+    HELD,
+    IDLE,
+    LOSS,
+    LOST,
+    NAKS,
+    RAISED,
+    STALLS,
+    STRAYS,
+    URGENT,
+    Setup,
+)
+from tests.proof.twins import Differs, walk
+
+HCP2 = Setup(commands=(READ, WRITE), adversary=(STRAYS, LOST, CANCELS, LOSS))
+PACED = replace(HCP2, paced=True, adversary=(STRAYS, NAKS), retries=1)
+ECHOES = replace(HCP2, echo=True, adversary=(ECHO_FAULTS, STRAYS))
+LATE = replace(HCP2, receive_latency=0.016, adversary=(STALLS, FLIPS))
+QUEUES = replace(HCP2, commands=(READ, WRITE, WRITE_THERE), depth=2, adversary=(IDLE, URGENT, NAKS), retries=1)
+HOLDS = replace(HCP2, adversary=(HELD,))
+MSC = replace(HCP2, kind="msc", lapse=2.5, adversary=(STRAYS, FLIPS), lost_acknowledgements=1)
+OWES = replace(HCP2, in_step=True, adversary=(BEYOND, NAKS), beyond=0.3)
+EVERY = {"hcp2": HCP2, "paced": PACED, "echo": ECHOES, "late": LATE, "queues": QUEUES, "held": HOLDS, "msc": MSC}
+WALKS = 40
+
+
+@pytest.mark.parametrize("setup", [*EVERY.values(), OWES], ids=[*EVERY, "owes"])
+def test_a_world_that_was_restored_from_its_key_has_the_same_fate(setup: Setup) -> None:
+    assert sum(walk(setup, seed) for seed in range(WALKS)) > WALKS
+
+
+def without_quarantine(view: View) -> None:
+    view.world.arbiter._quarantine = -inf
+
+
+def without_last_byte(view: View) -> None:
+    view.world.arbiter._strays.last_byte = -inf
+
+
+def without_end(view: View) -> None:
+    if view.world.arbiter.state is not EXCHANGE:
+        view.world.arbiter._leg.end = -inf
+
+
+def without_end_of_the_leg_on_the_wire(view: View) -> None:
+    if view.world.arbiter.state is EXCHANGE:
+        view.world.arbiter._leg.end = -inf
+
+
+def without_limit(view: View) -> None:
+    view.world.arbiter._leg.longest = 0
+
+
+def without_taint(view: View) -> None:
+    view.world.arbiter._leg.taint_until = -inf
+
+
+def without_settle(view: View) -> None:
+    view.world.arbiter._silent_at = -inf
+
+
+def without_packet(view: View) -> None:
+    view.world.arbiter._leg._follows = None
+
+
+def without_echo(view: View) -> None:
+    view.world.arbiter._echo.owed = b""
+
+
+def without_refusals(view: View) -> None:
+    for transaction in transactions(view.world):
+        transaction.refusals = 0
+
+
+def without_retries(view: View) -> None:
+    for transaction in transactions(view.world):
+        transaction.retried = 0
+
+
+def without_doubt(view: View) -> None:
+    for transaction in transactions(view.world):
+        transaction.unsure = False
+        transaction.attempts = 0
+
+
+def without_debts(view: View) -> None:
+    del view.world.arbiter._in_step.debts[1:]
+
+
+def without_lapse(view: View) -> None:
+    for debt in view.world.arbiter._in_step.debts:
+        debt.asked = inf
+
+
+def without_what_is_held(view: View) -> None:
+    view.world.arbiter._wire.output.held = False
+
+
+def without_what_is_being_said(view: View) -> None:
+    view.world.arbiter._leg.out = -inf
+
+
+@pytest.mark.parametrize(
+    ("forget", "setup"),
+    [
+        (without_quarantine, HCP2),
+        (without_last_byte, replace(MSC, bytewise=True, adversary=(LOST,))),
+        (without_end, HCP2),
+        (without_end_of_the_leg_on_the_wire, HCP2),
+        (without_limit, LATE),
+        (without_taint, PACED),
+        (without_settle, replace(HCP2, adversary=(RAISED, STRAYS))),
+        (without_packet, MSC),
+        (without_echo, ECHOES),
+        (without_refusals, PACED),
+        (without_retries, QUEUES),
+        (without_doubt, HCP2),
+        (without_debts, OWES),
+        (without_lapse, OWES),
+        (without_what_is_held, HOLDS),
+        (without_what_is_being_said, MSC),
+    ],
+    ids=lambda value: value.__name__ if callable(value) else "",
+)
+def test_a_wrong_omission_is_noticed(forget: Callable[[View], None], setup: Setup) -> None:
+    for seed in range(12 * WALKS):
+        try:
+            walk(setup, seed, [*FORGOTTEN, forget])
+        except Differs:
+            return
+    pytest.fail("nothing differed")

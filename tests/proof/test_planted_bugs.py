@@ -1,0 +1,315 @@
+"""A proof that finds nothing is worth what it would have found: bugs are planted in the master, and found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import inf
+from typing import Any
+
+import pytest
+
+from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.dispatcher import Dispatcher
+from busmaster.arbiter.leg import Leg
+from busmaster.arbiter.line_machine import LineMachine
+from busmaster.arbiter.on_wire import OnWire
+from busmaster.arbiter.output import Output
+from busmaster.arbiter.strays import QUIET
+from busmaster.arbiter.transaction import Transaction
+from busmaster.contract.exchange import FrameError
+from busmaster.wire import readers
+from tests.proof.explore import Explorer
+from tests.proof.history import as_test, retell, told
+from tests.proof.instants import seconds, set_unit
+from tests.proof.kinds import KINDS, READ, WRITE, WRITE_THERE
+from tests.proof.setups import (
+    CANCELS,
+    FLIPS,
+    FROZEN,
+    HELD,
+    LOSS,
+    LOST,
+    NAKS,
+    STALLS,
+    STRAYS,
+    Assumptions,
+    Setup,
+)
+
+LIMIT = 40.0
+LINE = Setup(commands=(READ, WRITE))
+MSC = Setup(kind="msc", commands=(READ,), lapse=2.5)
+LATE = replace(LINE, receive_latency=0.016)
+TURNS = replace(LINE, commands=(READ, WRITE_THERE), second_timing=True)
+
+
+def tick() -> float:
+    set_unit(KINDS["hcp2"]().profile.line.byte_time)
+    return seconds(1)
+
+
+def without_lateness(patch: Any) -> None:
+    patch.setattr(Leg, "past", lambda leg: leg.end)
+
+
+def with_lateness_a_tick_short(patch: Any) -> None:
+    right, short = Leg._past, tick()
+    patch.setattr(Leg, "_past", lambda leg, end, timing: right(leg, end, timing) - short)
+
+
+def without_the_byte_time(patch: Any) -> None:
+    patch.setattr(Leg, "_past", lambda leg, end, timing: end + timing.lateness + leg.latency)
+
+
+def without_the_adapter_in_the_lateness(patch: Any) -> None:
+    patch.setattr(Leg, "_past", lambda leg, end, timing: end + timing.lateness + leg.byte_time)
+
+
+def without_the_adapter_in_the_silence(patch: Any) -> None:
+    patch.setattr(Leg, "quiet", lambda leg: max(QUIET, leg.timing.byte_gap) + leg.byte_time)
+
+
+def with_a_silence_a_tick_short(patch: Any) -> None:
+    right, short = Leg.quiet, tick()
+    patch.setattr(Leg, "quiet", lambda leg: right(leg) - short)
+
+
+def without_settling_after_strays(patch: Any) -> None:
+    patch.setattr(LineMachine, "_stray", lambda line, data, now: line._strays.note(data, now, 0.0))
+
+
+def with_a_refused_read_that_releases(patch: Any) -> None:
+    def refused(line: LineMachine, refusal: Any, now: float) -> None:
+        transaction = line._wire.transaction
+        assert transaction is not None
+        line._end_exchange()
+        line.dispatcher.refused(transaction, refusal, True, now)
+        line._release(0.0, now)
+
+    patch.setattr(LineMachine, "_refused", refused)
+
+
+def without_settling_at_the_start(patch: Any) -> None:
+    right = LineMachine.line_up
+
+    def line_up(line: LineMachine, now: float, *, paced: bool = False) -> None:
+        right(line, now, paced=paced)
+        line._quarantine = -inf
+        line._settle(now)
+
+    patch.setattr(Arbiter, "line_up", line_up)
+
+
+def with_a_cancellation_that_clears_the_exchange(patch: Any) -> None:
+    right = Arbiter.cancel
+
+    def cancel(arbiter: Arbiter, transaction: Transaction, now: float) -> None:
+        right(arbiter, transaction, now)
+        if arbiter._wire.transaction is transaction:
+            arbiter._end_exchange()
+            arbiter.dispatcher._end(transaction, now)
+            arbiter._release(0.0, now)
+
+    patch.setattr(Arbiter, "cancel", cancel)
+
+
+def with_a_whole_frame_that_releases(patch: Any) -> None:
+    """As it was: a noise byte before the checksum makes a frame whole, and its true checksum is the next one's ACK."""
+    right = LineMachine._settle
+
+    def settle(line: LineMachine, now: float, begun: bool = False) -> None:
+        right(line, now, begun)
+        if begun:
+            line._silent_at = line._deadlines.line = now
+
+    patch.setattr(LineMachine, "_settle", settle)
+
+
+def with_a_stray_that_uses_up_the_packet(patch: Any) -> None:
+    """As it was: any stray was taken for the ACK, and what follows for over."""
+
+    def strayed(leg: Leg, now: float) -> None:
+        leg._follows = None
+
+    patch.setattr(Leg, "strayed", strayed)
+
+
+def without_the_packet_behind_an_ack(patch: Any) -> None:
+    patch.setattr(Leg, "give_up", lambda leg, later: None)
+
+
+def with_a_damaged_ack_that_is_none(patch: Any) -> None:
+    """As it was: what came in place of the ACK was not thought to be it."""
+    right = Leg.strayed
+    strayed = LineMachine._stray
+
+    def in_settling(line: LineMachine, data: bytes, now: float) -> None:
+        patch.setattr(Leg, "strayed", right)
+        strayed(line, data, now)
+        patch.setattr(Leg, "strayed", lambda leg, now: None)
+
+    patch.setattr(Leg, "strayed", lambda leg, now: None)
+    patch.setattr(LineMachine, "_stray", in_settling)
+
+
+def with_an_end_that_any_answer_moves(patch: Any) -> None:
+    """As it was: an answer that was not believed proved that its request had left."""
+    right = LineMachine._complete
+
+    def complete(line: LineMachine, step: Any, now: float) -> None:
+        leg = line._leg
+        if leg.end > leg.begun_at:
+            leg.end = leg.out = leg.begun_at
+        right(line, step, now)
+
+    patch.setattr(LineMachine, "_complete", complete)
+
+
+def without_the_turnaround(patch: Any) -> None:
+    right = LineMachine._release
+    patch.setattr(LineMachine, "_release", lambda line, hold, now: right(line, 0.0, now))
+
+
+def with_any_echo(patch: Any) -> None:
+    right = readers.find_etx
+
+    def find_etx(buffer: bytes, header: bytes, *others: Any) -> int:
+        return right(buffer, buffer[: len(header)], *others) if len(buffer) >= len(header) else 0
+
+    patch.setattr(readers, "find_etx", find_etx)
+
+
+def without_the_time_of_the_write(patch: Any) -> None:
+    patch.setattr(LineMachine, "transmitted", lambda line, now: None)
+
+
+def without_what_is_unsent(patch: Any) -> None:
+    patch.setattr(Output, "unsent", lambda output, count, now: None)
+
+
+def without_what_is_unread(patch: Any) -> None:
+    right = LineMachine.handle_timeout
+
+    def handle_timeout(line: LineMachine, now: float, *, unread: bool = False) -> None:
+        right(line, now)
+
+    patch.setattr(LineMachine, "handle_timeout", handle_timeout)
+
+
+def without_unconfirmed_writes(patch: Any) -> None:
+    """As it was: a write that was carried out and not confirmed ended as what came later."""
+    right = Dispatcher._end
+
+    def end(dispatcher: Dispatcher, transaction: Transaction, now: float, error: Any = None) -> None:
+        transaction.unsure = False
+        transaction.attempts, attempts = 0, transaction.attempts
+        right(dispatcher, transaction, now, error)
+        transaction.attempts = attempts
+
+    patch.setattr(Dispatcher, "_end", end)
+
+
+def with_a_request_that_is_forgotten(patch: Any) -> None:
+    right = Dispatcher._requeue
+
+    def requeue(dispatcher: Dispatcher, transaction: Transaction, now: float) -> None:
+        if not transaction.refusals:
+            right(dispatcher, transaction, now)
+
+    patch.setattr(Dispatcher, "_requeue", requeue)
+
+
+def with_no_deadline_behind_a_first_byte(patch: Any) -> None:
+    patch.setattr(Leg, "gap_over", lambda leg, now: inf)
+
+
+def with_damage_that_completes(patch: Any) -> None:
+    """A checksum that is not looked at."""
+    right = readers.find_etx
+
+    def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes], int]) -> int:
+        try:
+            return right(buffer, header, longest, check)
+        except FrameError as error:
+            if error.what == "bad checksum":
+                return len(buffer) - 2
+            raise
+
+    patch.setattr(readers, "find_etx", find_etx)
+
+
+def with_two_said_at_once(patch: Any) -> None:
+    """The line is thought free while the port holds what was said."""
+    right = OnWire.begin
+
+    def begin(wire: OnWire, *arguments: Any) -> None:
+        wire.output.held = False
+        right(wire, *arguments)
+
+    patch.setattr(OnWire, "begin", begin)
+    patch.setattr(Output, "unsent", lambda output, count, now: None)
+
+
+@pytest.mark.parametrize(
+    ("plant", "setup", "rule"),
+    [
+        (without_lateness, LINE, "R1"),
+        (with_lateness_a_tick_short, LINE, "R1"),
+        (without_the_byte_time, LINE, "R1"),
+        (without_the_adapter_in_the_lateness, LATE, "R1"),
+        (without_the_adapter_in_the_silence, replace(LATE, adversary=(FLIPS,), kind="dc104", lapse=1.5), "R1"),
+        (with_a_silence_a_tick_short, LINE, "R1"),
+        (without_settling_after_strays, replace(LINE, adversary=(STRAYS,)), "R1"),
+        (with_a_refused_read_that_releases, replace(LINE, adversary=(STRAYS,)), "R1"),
+        (without_settling_at_the_start, replace(LINE, adversary=(LOSS,)), "R1"),
+        (with_a_cancellation_that_clears_the_exchange, replace(LINE, adversary=(CANCELS,)), "R1"),
+        (with_a_whole_frame_that_releases, replace(LINE, adversary=(STRAYS,)), "R1"),
+        (with_a_stray_that_uses_up_the_packet, replace(MSC, adversary=(STRAYS,)), "R1"),
+        (without_the_packet_behind_an_ack, MSC, "R1"),
+        (with_a_damaged_ack_that_is_none, replace(MSC, adversary=(FLIPS,)), "R1"),
+        (with_an_end_that_any_answer_moves, replace(LINE, adversary=(STRAYS,)), "R1"),
+        (without_the_turnaround, TURNS, "R1"),
+        (without_the_time_of_the_write, replace(LINE, adversary=(FROZEN,)), "R1"),
+        (without_what_is_unsent, replace(LINE, adversary=(HELD,)), "R1"),
+        (without_what_is_unread, replace(LINE, adversary=(STALLS,)), "R1"),
+        (without_unconfirmed_writes, replace(LINE, adversary=(LOSS,)), "R7"),
+        (with_a_request_that_is_forgotten, replace(LINE, adversary=(NAKS,)), "R8"),
+        (with_no_deadline_behind_a_first_byte, LINE, "progress"),
+        (with_damage_that_completes, replace(LINE, adversary=(FLIPS,)), "R5"),
+        (with_two_said_at_once, replace(LINE, adversary=(HELD,)), "R1"),
+    ],
+    ids=lambda value: value.__name__ if callable(value) else "",
+)
+def test_a_planted_bug_is_found(
+    plant: Callable[[Any], None], setup: Setup, rule: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant(monkeypatch)
+    found = Explorer(setup).run(LIMIT, violations=1)
+    assert {problem.split(":")[0] for problem in found.violations} == {rule}
+
+
+def test_lost_bytes_that_lengthen_a_pause_are_outside_what_is_assumed_and_would_be_found() -> None:
+    line = replace(LATE, adversary=(LOST,), assumptions=Assumptions(pauses_hold_the_lost=False))
+    assert Explorer(line).run(LIMIT, violations=1).violations
+
+
+def test_output_that_is_let_go_unseen_is_outside_what_is_assumed_and_would_be_found() -> None:
+    line = replace(LINE, adversary=(HELD,), assumptions=Assumptions(held_until_asked=False))
+    assert Explorer(line).run(LIMIT, violations=1).violations
+
+
+def test_a_violation_is_told_in_times_and_bytes_and_as_a_test_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_a_cancellation_that_clears_the_exchange(monkeypatch)
+    setup = replace(LINE, adversary=(CANCELS,))
+    (problem, steps), *_ = Explorer(setup).run(LIMIT, violations=1).violations.items()
+    calls = retell(setup, steps, problem)
+    assert calls is not None
+    assert "says 07 30 31" in told(calls)
+    assert "may still come until here" in told(calls)
+    names: dict[str, Any] = {}
+    exec(as_test(setup, calls, problem), names)
+    with pytest.raises(AssertionError, match="R1"):
+        names["test_found_by_the_proof"]()
+    monkeypatch.undo()
+    names["test_found_by_the_proof"]()

@@ -1,0 +1,30 @@
+"""The worlds that continuous integration holds: no promise is broken in them, and they are explored to the end."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.proof.explore import Explorer
+from tests.proof.history import retell, told
+from tests.proof.setups import Setup
+from tests.proof.worlds import GROUPS, quick, worlds
+
+LIMIT = 150.0
+"""Seconds for one world: a few of a core that does nothing else."""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(LIMIT + 30)
+@pytest.mark.parametrize("setup", list(quick()), ids=lambda setup: setup.name)
+def test_nothing_breaks_a_promise_in_a_world_that_is_explored_to_the_end(setup: Setup) -> None:
+    found = Explorer(setup).run(LIMIT)
+    for problem, steps in found.violations.items():
+        calls = retell(setup, steps, problem)
+        pytest.fail(f"{problem}\n{told(calls) if calls is not None else steps}")
+    assert found.closed
+
+
+def test_each_world_has_a_name_of_its_own() -> None:
+    named = [setup for group in GROUPS for setup in GROUPS[group]()]
+    assert len({setup.name for setup in named}) == len(set(named))
+    assert {setup.name for setup in worlds(list(GROUPS))} == {setup.name for setup in named}

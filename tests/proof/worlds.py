@@ -1,0 +1,141 @@
+"""The worlds that are explored: every feature of the adversary with every other, and every kind of line.
+
+Not the full product: all features at once do not close.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+
+from tests.proof.kinds import READ, READ_THERE, READ_UNLIKE, WRITE, WRITE_THERE
+from tests.proof.setups import (
+    ALL,
+    BEYOND,
+    CANCELS,
+    ECHO_FAULTS,
+    FLIPS,
+    HEALTH,
+    HELD,
+    HOLDS,
+    IDLE,
+    LOSS,
+    LOST,
+    MARKS,
+    NAKS,
+    NOISE,
+    RAISED,
+    STALLS,
+    STRAYS,
+    URGENT,
+    Assumptions,
+    Setup,
+)
+
+LAPSES = {"dc104": 1.5, "mentor": 0.8, "msc": 2.5}
+"""In place of LAPSE: longer than the longest lateness."""
+DAMAGE: tuple[tuple[int, int | None], ...] = ((0, 0), (1, 1), (3, 0), (6, 5), (13, 0), (17, 0), (9, None))
+"""Of an MSC's packet of 18 bytes: STX, unit, length, name, data and checksum hit, and a byte lost."""
+
+
+def _line(kind: str = "hcp2", *adversary: str, commands: tuple[int, ...] = (READ, WRITE)) -> Setup:
+    lapse = next((seconds for name, seconds in LAPSES.items() if kind.startswith(name)), 0.4)
+    return Setup(kind=kind, commands=commands, adversary=adversary, lapse=lapse)
+
+
+def quick() -> Iterator[Setup]:
+    """What continuous integration explores: each kind of line, and each feature that breaks a wire, alone."""
+    for kind in ("hcp", "mentor", "dc104", "msc"):
+        yield _line(kind)
+    for feature in (LOST, MARKS, CANCELS, STRAYS, FLIPS):
+        yield _line("hcp2", feature)
+    for feature in (FLIPS, MARKS, STRAYS):
+        yield _line("msc", feature)
+    yield replace(_line(commands=(READ, WRITE_THERE)), second_timing=True)
+    yield replace(_line("dc104"), receive_latency=0.016)
+    yield replace(_line("hcp2", ECHO_FAULTS), echo=True)
+    yield replace(_line("hcp2", STRAYS, commands=(WRITE,)), paced=True)
+    yield replace(_line("msc"), lost_acknowledgements=1)
+
+
+def lines() -> Iterator[Setup]:
+    """Every kind of line, each with what breaks a wire."""
+    for kind in ("hcp2", "hcp2, other checksums", "hcp", "mentor", "dc104", "dc104, other checksums", "msc"):
+        hit = MARKS if kind == "mentor" else FLIPS  # its parity tells
+        for adversary in ((), (hit,), (LOST,), (NAKS,), (STRAYS,)):
+            yield _line(kind, *adversary)
+    for kind in ("hcp2", "mentor", "dc104", "msc"):
+        for adversary in ((), (STRAYS,), (LOST,)):
+            yield replace(_line(kind, *adversary), paced=True)
+            yield replace(_line(kind, *adversary), receive_latency=0.016)
+        hit = MARKS if kind == "mentor" else FLIPS
+        for faults in ((), (ECHO_FAULTS,), (ECHO_FAULTS, hit)):
+            yield replace(_line(kind, *faults), echo=True)
+        if kind != "msc":
+            yield replace(_line(kind, ECHO_FAULTS, STRAYS), echo=True)
+        yield replace(_line(kind, ECHO_FAULTS), echo=True, receive_latency=0.016)
+        yield replace(_line(kind, hit), assumptions=Assumptions("received byte", "received byte"))
+    for kind in ("hcp2", "mentor", "msc"):
+        for adversary in ((), (LOST,), (NAKS,)):
+            yield _line(kind, *adversary, commands=(READ, WRITE_THERE))
+    yield replace(_line(commands=(WRITE,)), receive_latency=0.016, cuts=True)
+    yield replace(_line("dc104"), receive_latency=0.016, cuts=True)
+    yield replace(_line(commands=(READ, WRITE_THERE)), second_timing=True)
+    yield replace(_line("hcp2", LOST, commands=(READ, WRITE_THERE)), second_timing=True)
+    yield replace(_line("hcp2", NAKS, commands=(READ, WRITE, READ_UNLIKE)), retries=1)
+    yield replace(_line("hcp2", IDLE), depth=2)
+
+
+def packets() -> Iterator[Setup]:
+    """MSC: packets damaged, said again, and the host's ACK lost."""
+    yield replace(_line("msc"), damage=DAMAGE)
+    yield replace(_line("msc"), bytewise=True)
+    yield replace(_line("msc"), lost_acknowledgements=1)
+    yield replace(_line("msc", FLIPS), damage=DAMAGE, lost_acknowledgements=1)
+    yield replace(_line("msc", LOST), damage=DAMAGE)
+    yield replace(_line("msc", STRAYS), damage=DAMAGE)
+    yield replace(_line("msc"), damage=DAMAGE, lost_acknowledgements=1, receive_latency=0.016)
+    yield replace(_line("msc", URGENT), damage=DAMAGE)
+
+
+def pairs() -> Iterator[Setup]:
+    """HCP2, one node: each feature, and each two of them."""
+    for one in ALL:
+        yield _line("hcp2", one)
+    for two in combinations(ALL, 2):
+        yield _line("hcp2", *two)
+
+
+def msc_pairs() -> Iterator[Setup]:
+    """MSC: each two features that need no long silence of the port."""
+    for two in combinations((FLIPS, LOST, MARKS, NAKS, STRAYS, CANCELS, URGENT, LOSS, HOLDS, NOISE), 2):
+        yield _line("msc", *two)
+
+
+def in_step() -> Iterator[Setup]:
+    """What is owed told by the shipping code, and replies that come after their lateness, in order (R15)."""
+    for commands in ((READ,), (WRITE,), (READ, READ_UNLIKE), (READ, WRITE), (READ, READ_THERE)):
+        yield replace(_line("hcp2", BEYOND, commands=commands), in_step=True, whole=True, lapse=0.25, beyond=0.24)
+
+
+GROUPS = {
+    "quick": quick,
+    "lines": lines,
+    "packets": packets,
+    "pairs": pairs,
+    "msc pairs": msc_pairs,
+    "in step": in_step,
+}
+LARGE = (HEALTH, HELD, LOSS, RAISED, STALLS, STRAYS, BEYOND)
+"""Features whose worlds are large: they come last, so that what is not closed within the time is theirs."""
+
+
+def worlds(groups: list[str]) -> list[Setup]:
+    """Return the worlds of these groups, each once, small ones first."""
+    found = {setup.name: setup for group in groups for setup in GROUPS[group]()}
+    return sorted(found.values(), key=_size)
+
+
+def _size(setup: Setup) -> float:
+    return sum(map(setup.may, LARGE)) + 0.5 * len(setup.adversary) + 2 * (setup.receive_latency > 0) + 4 * setup.in_step
