@@ -85,6 +85,26 @@ def test_r12_what_has_waited_too_long_is_not_picked_either() -> None:
     assert late.attempts == 0
 
 
+def test_r15_nothing_goes_before_another_to_a_node_that_rests() -> None:
+    """Each rest is one of its own: dead, suspended, or waiting for the hook of its return."""
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    bench.ask(other, hcp2.Read(7))
+    asked = bench.ask(node)
+    may_go, dispatcher = bench.arbiter.dispatcher.may_go, bench.arbiter.dispatcher
+    assert may_go(asked, bench.now)
+    node.health = Health.DOWN
+    assert not may_go(asked, bench.now)
+    node.health = Health.UP
+    node.holds = 1
+    assert not may_go(asked, bench.now)
+    dispatcher.release_node(node)
+    assert may_go(asked, bench.now)
+    node.suspended_until = bench.now + 1.0
+    assert not may_go(asked, bench.now)
+    assert may_go(asked, node.suspended_until)
+
+
 # checks
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import (
+    MOST_ANSWERED,
     Health,
     NodeRecord,
     note_failure,
@@ -36,6 +37,25 @@ def fail(record: NodeRecord, now: float) -> Health:
 
 def changes(bench: Bench) -> list[Health]:
     return [event.after for event in bench.events if isinstance(event, NodeChanged)]
+
+
+# what is remembered of a node
+
+
+def test_r15_a_few_reads_that_it_has_answered_are_remembered_each_once_and_no_write() -> None:
+    record = node()
+    reads = [hcp2.Read(element) for element in range(1, MOST_ANSWERED + 2)]
+    note = record.note_reply
+    note((b"\x06",), hcp2.Write(1, (5,)), 0.004)
+    assert record.answered == {}
+    note((b"1",), reads[0], 0.004)
+    note((b"1",), reads[1], 0.004)
+    assert record.answered == {(b"1",): reads[0]}, "two that are answered alike are one"
+    for number, read in enumerate(reads):
+        note((b"answer %d" % number,), read, 0.004)
+    assert len(record.answered) == MOST_ANSWERED
+    note((b"1",), hcp2.Write(1, (5,)), 0.004)
+    assert record.answered[b"1",] is reads[0]
 
 
 # what a node's health is

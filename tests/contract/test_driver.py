@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from busmaster.contract.driver import MOST_LEGS, Driver, Ending, EndlessExchange
-from busmaster.contract.exchange import Expect, FrameError, Refused, Sizes, Step
+from busmaster.contract.exchange import Done, Expect, FrameError, Refused, Sizes, Step
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
 
@@ -130,3 +130,85 @@ def test_an_exchange_that_wants_one_leg_after_the_other_is_found_out(end: Any) -
     driver = Driver(Odd(Expect(hcp2.PROFILE.timings.read, Sizes(1, 1), NAK)))
     assert isinstance(end(driver).error, EndlessExchange)
     assert len(driver.said) == MOST_LEGS
+
+
+def test_an_ending_says_what_it_was() -> None:
+    assert str(Ending(5.0)) == "the value 5.0"
+    assert str(Ending(5.0, rest=b"\x00\x7f")) == "the value 5.0 and 00 7f left over"
+    assert str(Ending(error=FrameError("bad checksum"))) == "FrameError('bad checksum')"
+
+
+def test_endings_are_the_same_by_value_and_kind_of_error_not_by_its_words() -> None:
+    assert Ending(5.0).same_as(Ending(5.0))
+    for other in (Ending(6.0), Ending(5.0, send=ACK), Ending(5.0, rest=ACK), Ending(5.0, error=FrameError("one"))):
+        assert not Ending(5.0).same_as(other)
+    assert Ending(error=FrameError("one")).same_as(Ending(error=FrameError("other")))
+    assert not Ending(error=FrameError("one")).same_as(Ending(error=Refused("one")))
+    assert not Ending(error=FrameError("one"), silent=True).same_as(Ending(error=FrameError("one")))
+
+
+def test_only_a_frame_error_that_says_so_is_whole() -> None:
+    assert Ending(error=FrameError("bad checksum", whole=True)).is_whole
+    for ending in (Ending(5.0), Ending(error=FrameError("cut")), Ending(error=Refused("no"))):
+        assert not ending.is_whole
+    assert [Ending(error=error).is_bug for error in (None, FrameError("one"), Refused("no"), KeyError("x"))] == [
+        False,
+        False,
+        False,
+        True,
+    ]
+    assert (Ending(5.0).delivered, Ending(error=Refused("no")).delivered) == (True, False)
+
+
+def test_a_frame_error_says_nothing_that_nobody_told_it() -> None:
+    plain = FrameError("cut short")
+    assert (str(plain), plain.what, plain.whole, plain.send, plain.heard) == ("cut short", "cut short", False, b"", b"")
+
+
+def test_an_empty_chunk_before_a_reply_is_harmless_and_begins_nothing() -> None:
+    driver = reading().feed(b"")
+    assert (driver.ending, driver.begun) == (None, False)
+    assert driver.feed(VALUE).ending == Ending(5.0)
+
+
+def test_a_failure_of_the_hosts_own_ends_it_and_later_bytes_do_not_count() -> None:
+    driver = reading()
+    driver.fail(FrameError("the port is gone", send=ACK))
+    assert driver.ending is not None
+    assert (driver.ending.send, driver.ending.silent) == (ACK, False)
+    ended = driver.ending
+    driver.feed(VALUE)
+    driver.expire()
+    assert driver.ending is ended
+    refused = reading()
+    refused.fail(Refused("no"))
+    assert refused.ending is not None
+    assert refused.ending.send == b""
+
+
+def test_bytes_after_silence_make_the_failure_no_silence() -> None:
+    driver = reading()
+    driver.feed(VALUE[:2]).expire()
+    assert driver.ending is not None
+    assert not driver.ending.silent
+
+
+@pytest.mark.parametrize("legs", [MOST_LEGS, MOST_LEGS + 1])
+def test_as_many_legs_in_a_row_as_the_limit_says_are_followed(legs: int) -> None:
+    driver = Driver(Counted(None, legs=legs))
+    ending = driver.feed(b"1").ending
+    assert ending is not None
+    assert (ending.delivered, len(driver.said)) == (legs <= MOST_LEGS, MOST_LEGS)
+
+
+@dataclass
+class Counted(Odd):
+    """An exchange that wants some more legs, and then is done."""
+
+    legs: int = 0
+
+    def feed(self, _data: bytes, /) -> Step[Any]:
+        if not self.legs:
+            return Done(5)
+        self.legs -= 1
+        return Expect(self.timing, self.sizes, NAK)

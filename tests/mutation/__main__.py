@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.mutation.places import ROOMS, Mutant, drawn
-from tests.mutation.trial import Verdict, copied, tried
+from tests.mutation.trial import Copy, Verdict
 
 ROOT = Path(__file__).parents[2]
 EQUIVALENT = Path(__file__).with_name("equivalent.json")
@@ -63,18 +63,19 @@ def try_all(mutants: list[Mutant], session: Path, options: argparse.Namespace) -
             say(f"{number}/{len(mutants)} {verdict.outcome:8} {verdict.seconds:6.0f} s  {mutant.module}:{mutant.line}")
 
 
-COPY: list[tuple[Path, bool]] = []
+COPY: list[tuple[Copy, bool]] = []
 """The copy of this process, and whether only the nearest tests are run in it."""
 
 
 def start_in_a_copy(folder: Path, near: bool) -> None:
     """Make a process its copy."""
-    COPY.append((copied(ROOT, folder / multiprocessing.current_process().name), near))
+    COPY.append((Copy(ROOT, folder / multiprocessing.current_process().name), near))
 
 
 def judged(mutant: Mutant) -> tuple[Mutant, Verdict]:
     """Try it in this process's copy."""
-    return mutant, tried(mutant, *COPY[0])
+    copy, near = COPY[0]
+    return mutant, copy.tried(mutant, near)
 
 
 def read(session: Path) -> list[dict[str, Any]]:
@@ -100,13 +101,13 @@ def report(verdicts: Iterable[dict[str, Any]]) -> None:
     survivors = []
     for verdict in verdicts:
         outcome = verdict["outcome"]
-        if outcome == "survived" and changed(verdict["diff"]) in excused:
+        if outcome == "survived" and changed(verdict) in excused:
             outcome = "excused"
         if outcome == "survived":
             survivors.append(verdict)
         counts[verdict["room"], outcome] += 1
     for verdict in survivors:
-        say(f"\n{verdict['module']}:{verdict['line']} {verdict['operator']}\n{changed(verdict['diff'])}")
+        say(f"\n{verdict['operator']} in line {verdict['line']} of {changed(verdict)}")
     say(f"\n{'room':10} {'killed':>7} {'excused':>8} {'survived':>9} {'score':>7}")
     for room in [*ROOMS, "all"]:
         killed, excused_ones, survived = (
@@ -118,10 +119,12 @@ def report(verdicts: Iterable[dict[str, Any]]) -> None:
             say(f"{room:10} {killed:7} {excused_ones:8} {survived:9} {killed / judged_ones:7.1%}")
 
 
-def changed(diff: str) -> str:
-    """The changed lines of a diff, without where they are: an excuse outlives the moving of a line."""
-    lines = [line for line in diff.splitlines() if line[:1] in "+-" and line[:3] not in ("+++", "---")]
-    return "\n".join(line[:1] + " " + line[1:].strip() for line in lines)
+def changed(verdict: dict[str, Any]) -> str:
+    """A survivor's module, its changed lines and the one before, without numbers: an excuse outlives their moving."""
+    lines = [line for line in verdict["diff"].splitlines() if line[:3] not in ("---", "+++") and line[:2] != "@@"]
+    first = next(number for number, line in enumerate(lines) if line[:1] in "+-")
+    shown = lines[max(first - 1, 0) : first] + [line for line in lines if line[:1] in "+-"]
+    return "\n".join([verdict["module"], *(line[:1] + " " + line[1:].strip() for line in shown)])
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from random import Random
-from typing import Any
+from typing import Any, TypeAlias
 
 ROOMS: dict[str, tuple[str, ...]] = {
     "arbiter": ("busmaster/arbiter/*.py",),
@@ -25,6 +25,11 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "pump": ("busmaster/transport/pump.py", "busmaster/transport/marks.py"),
 }
 """The rooms whose mutants count, by patterns of their files."""
+IDLE = {"core/ReplaceComparisonOperator_Is_Eq", "core/ReplaceComparisonOperator_IsNot_NotEq"}
+"""Operators that change nothing here: `is` compares None, members of enums, and objects that equal only themselves."""
+
+Span: TypeAlias = tuple[tuple[int, int], tuple[int, int]]
+"""From the first (line, column) to behind the last."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,19 +60,21 @@ def mutants_of(room: str, path: Path, root: Path) -> Iterator[Mutant]:
     from cosmic_ray.plugins import get_operator, operator_names
 
     inert = inert_spans(path.read_text())
-    tree = get_ast_from_path(path)
+    nodes = list(ast_nodes(get_ast_from_path(path)))
+    found: dict[str, list[Span]] = {}
     for name in sorted(operator_names()):
         kind = get_operator(name)
-        if kind.arguments():
-            continue  # it wants a name that somebody has to think of
-        operator = kind()
-        spans = (span for node in ast_nodes(tree) for span in operator.mutation_positions(node))
-        for occurrence, (start, end) in enumerate(spans):
+        if kind.arguments() or name in IDLE:
+            continue  # the ones with arguments want a name that somebody has to think of
+        family = name.rpartition("_")[0] if "BinaryOperator" in name else name  # an operator's places are its own
+        if family not in found:
+            found[family] = [span for node in nodes for span in kind().mutation_positions(node)]
+        for occurrence, (start, end) in enumerate(found[family]):
             if not any(first <= start and end <= last for first, last in inert):
                 yield Mutant(room, str(path.relative_to(root)), name, occurrence, start[0])
 
 
-def inert_spans(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+def inert_spans(source: str) -> list[Span]:
     """Where annotations, docstrings and imports for types are: (line, column) from the first to behind the last."""
     found: list[ast.AST] = []
     for node in ast.walk(ast.parse(source)):
@@ -87,7 +94,7 @@ def inert_spans(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     return [span_of(node) for node in found]
 
 
-def span_of(node: Any) -> tuple[tuple[int, int], tuple[int, int]]:
+def span_of(node: Any) -> Span:
     """Where a node is."""
     return (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)
 

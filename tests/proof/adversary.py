@@ -33,7 +33,7 @@ def actions(world: World) -> list[Action]:
     if world.held is not None and (arbiter._wire.output.held or not setup.assumptions.held_until_asked):
         possible.append(("leaves",))
     on_wire = world.on_wire
-    if setup.may(setups.CANCELS) and world.cancels and on_wire is not None and on_wire.heard and on_wire.waiter:
+    if setup.may(setups.CANCELS) and world.cancels and on_wire is not None and on_wire.wanted and on_wire.tag:
         possible.append(("cancel",))
     up = arbiter.state is not OFFLINE
     if setup.may(setups.URGENT) and world.urgent and up:

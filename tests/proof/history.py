@@ -106,7 +106,7 @@ def as_test(setup: Setup, calls: Sequence[Call], problem: str) -> str:
     calls = [call for call in calls if call[1] not in UNSEEN]
     lines = [
         "from busmaster.arbiter.arbiter import Arbiter",
-        "from busmaster.arbiter.events import Mark",
+        "from busmaster.arbiter.mark import Mark",
         "from busmaster.arbiter.transaction import URGENT, Transaction",
         f"from busmaster.protocols.{kind} import codec as {kind}",
         "from tests.proof.kinds import KINDS",

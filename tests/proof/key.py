@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import pickle
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable
 from itertools import count
 from math import inf
@@ -18,8 +18,8 @@ from busmaster.arbiter import in_step
 from busmaster.arbiter.health import SILENT, Health, NodeRecord
 from busmaster.arbiter.schedule import Schedule
 from busmaster.arbiter.state import EXCHANGE, SETTLING, LineState
-from busmaster.arbiter.strays import QUIET, STRAGGLER_MEMORY
 from busmaster.arbiter.transaction import BACKGROUND, COMMAND, Phase, Priority, Transaction
+from busmaster.arbiter.unasked import QUIET, STRAGGLER_MEMORY
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import LineNoisy
@@ -64,7 +64,7 @@ class View:
 def transactions(world: World) -> list[Transaction]:
     arbiter = world.arbiter
     every = [t for queue in arbiter.dispatcher.backlog.queues for t in queue]
-    every += [t for node in world.nodes for t in node.writes]
+    every += [t for node in world.nodes for t in arbiter.dispatcher.writes.queues[node]]
     return every if arbiter._wire.transaction is None else [arbiter._wire.transaction, *every]
 
 
@@ -114,7 +114,7 @@ def past_legs(view: View) -> None:
 def past_silences(view: View) -> None:
     """Of the last byte is asked whether it is a silence ago, or a window; of the noise, whether it lasts too long,
     while the line is not NOISY already; of the quarantine, whether it is over; of the settle, nothing once it is."""
-    world, strays = view.world, view.world.arbiter._strays
+    world, strays = view.world, view.world.arbiter._unasked
     asked = max(longest_quiet(world), longest_window(world) if world.setup.in_step else 0.0)
     if view.past(strays.last_byte, asked, strictly=True):
         strays.last_byte = -inf
@@ -131,7 +131,7 @@ def past_silences(view: View) -> None:
 
 def past_stragglers(view: View) -> None:
     """Who was not answered is blamed within STRAGGLER_MEMORY; where nobody's lateness is raised, never."""
-    strays = view.world.arbiter._strays
+    strays = view.world.arbiter._unasked
     if not view.world.setup.in_step:
         strays.run.clear()  # `InStep.heard` alone reads it
     one = strays.unanswered_one
@@ -217,6 +217,8 @@ def past_waiting(view: View) -> None:
     world = view.world
     arbiter, dispatcher = world.arbiter, world.arbiter.dispatcher
     arbiter._cause = ""
+    queues = dispatcher.writes.queues
+    dispatcher.writes.queues = defaultdict(deque, {node: queues[node] for node in world.nodes})
     if arbiter.noisy:
         dispatcher.fault = noisy
     urgent, command, *by_deadline = dispatcher.backlog.queues
@@ -254,7 +256,7 @@ def past_wire(view: View) -> None:
         world.forged = False
         world.cancels = 1
     for ticket in world.live:
-        if (on_wire is None or ticket is not on_wire.waiter) and not world.frozen:
+        if (on_wire is None or ticket is not on_wire.tag) and not world.frozen:
             ticket.place = -1
             ticket.before = False
     world.said = b""

@@ -22,8 +22,8 @@ from busmaster.arbiter import alike, health, in_step
 from busmaster.arbiter.choice import Choice, Chosen
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import DOWN, SUSPECT, UP, NodeRecord
-from busmaster.arbiter.strays import LONGEST_LATENESS, STRAGGLER_MEMORY, STRAGGLER_SHARE, Strays
 from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.unasked import LONGEST_LATENESS, STRAGGLER_MEMORY, STRAGGLER_SHARE, UnaskedBytes
 from busmaster.contract.exchange import Command
 from tests.proof.setups import HEALTH, HOLDS, NOISE, RAISED, Setup
 from tests.proof.wire import choose
@@ -166,7 +166,7 @@ def set_aside(setup: Setup) -> Iterator[None]:
     put(Dispatcher, "refused", _deciding(Dispatcher.refused))
     if not setup.in_step:
         put(Choice, "next", _any_of_all)
-        put(Strays, "babbling", _may_be_noisy if setup.may(NOISE) else _is_never_noisy)
+        put(UnaskedBytes, "babbling", _may_be_noisy if setup.may(NOISE) else _is_never_noisy)
         AnyStep.holds[0] = setup.may(HOLDS)
     put(in_step, "LAPSE", setup.lapse)
     put(in_step, "DOUBT_PERIOD", setup.doubt)
@@ -176,9 +176,9 @@ def set_aside(setup: Setup) -> Iterator[None]:
     put(alike.Alike, "_was_untimely", _may_be_untimely)
     put(NodeRecord, "note_reply", _untimed(NodeRecord.note_reply) if setup.in_step else _notes_nothing)
     put(NodeRecord, "latest", _as_learned(NodeRecord.latest, setup.slowest))
-    put(Strays, "blame", _may_raise if setup.may(RAISED) else _raises_nothing)
+    put(UnaskedBytes, "blame", _may_raise if setup.may(RAISED) else _raises_nothing)
     if not setup.may(RAISED):
-        put(Strays, "unanswered", _blames_nobody)
+        put(UnaskedBytes, "unanswered", _blames_nobody)
     put(health, "note_failure", _may_fail if setup.may(HEALTH) else _fails_nothing)
     if setup.may(HEALTH):
         put(health, "note_success", _may_be_up)
@@ -274,7 +274,7 @@ def _as_learned(right: Callable[[NodeRecord, float], float], slowest: tuple[floa
     return latest
 
 
-def _may_raise(strays: Strays, first_byte: float) -> None:
+def _may_raise(strays: UnaskedBytes, first_byte: float) -> None:
     if strays.unanswered_one is None:
         return
     node, asked, lateness = strays.unanswered_one
@@ -287,19 +287,19 @@ def _may_raise(strays: Strays, first_byte: float) -> None:
             node.raise_lateness(higher[choose(len(higher))], first_byte)
 
 
-def _may_be_noisy(strays: Strays, now: float) -> bool:
+def _may_be_noisy(strays: UnaskedBytes, now: float) -> bool:
     return bool(choose(2))
 
 
-def _is_never_noisy(strays: Strays, now: float) -> bool:
+def _is_never_noisy(strays: UnaskedBytes, now: float) -> bool:
     return False
 
 
-def _blames_nobody(strays: Strays, node: NodeRecord, asked: float, lateness: float) -> None:
+def _blames_nobody(strays: UnaskedBytes, node: NodeRecord, asked: float, lateness: float) -> None:
     """The line is not looked at while it settles, either: a look changes nothing else."""
 
 
-def _raises_nothing(strays: Strays, first_byte: float) -> None:
+def _raises_nothing(strays: UnaskedBytes, first_byte: float) -> None:
     pass
 
 

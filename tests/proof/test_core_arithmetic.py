@@ -14,7 +14,10 @@ import pytest
 CORE = Path(__file__).parent.parent.parent / "busmaster"
 ROOMS = (
     *(f"arbiter/{name}.py" for name in ("arbiter", "backlog", "choice", "deadlines", "dispatcher", "echo", "in_step")),
-    *(f"arbiter/{name}.py" for name in ("leg", "line_machine", "on_wire", "output", "probes", "strays", "trust")),
+    *(
+        f"arbiter/{name}.py"
+        for name in ("leg", "line_machine", "on_wire", "output", "probes", "trust", "unasked", "writes")
+    ),
     "contract/driver.py",
 )
 """What runs as it ships. Not here: counters and their histograms, the budget of probes and what is learned of a node

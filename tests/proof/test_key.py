@@ -39,6 +39,7 @@ MSC = replace(HCP2, kind="msc", lapse=2.5, adversary=(STRAYS, FLIPS), lost_ackno
 OWES = replace(HCP2, in_step=True, adversary=(BEYOND, NAKS), beyond=0.3)
 EVERY = {"hcp2": HCP2, "paced": PACED, "echo": ECHOES, "late": LATE, "queues": QUEUES, "held": HOLDS, "msc": MSC}
 WALKS = 40
+pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.mark.parametrize("setup", [*EVERY.values(), OWES], ids=[*EVERY, "owes"])
@@ -51,7 +52,7 @@ def without_quarantine(view: View) -> None:
 
 
 def without_last_byte(view: View) -> None:
-    view.world.arbiter._strays.last_byte = -inf
+    view.world.arbiter._unasked.last_byte = -inf
 
 
 def without_end(view: View) -> None:

@@ -15,8 +15,8 @@ from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.output import Output
-from busmaster.arbiter.strays import QUIET
 from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.unasked import QUIET
 from busmaster.contract.exchange import FrameError
 from busmaster.wire import readers
 from tests.proof.explore import Explorer
@@ -37,7 +37,9 @@ from tests.proof.setups import (
     Setup,
 )
 
-LIMIT = 40.0
+LIMIT = 300.0
+"""Seconds: a few of an idle core, and a busy one is ten times slower."""
+pytestmark = pytest.mark.timeout(LIMIT + 30)
 LINE = Setup(commands=(READ, WRITE))
 MSC = Setup(kind="msc", commands=(READ,), lapse=2.5)
 LATE = replace(LINE, receive_latency=0.016)
@@ -76,7 +78,7 @@ def with_a_silence_a_tick_short(patch: Any) -> None:
 
 
 def without_settling_after_strays(patch: Any) -> None:
-    patch.setattr(LineMachine, "_stray", lambda line, data, now: line._strays.note(data, now, 0.0))
+    patch.setattr(LineMachine, "_take_unasked", lambda line, data, now: line._unasked.note(data, now, 0.0))
 
 
 def with_a_refused_read_that_releases(patch: Any) -> None:
@@ -132,7 +134,7 @@ def with_a_stray_that_uses_up_the_packet(patch: Any) -> None:
     def strayed(leg: Leg, now: float) -> None:
         leg._follows = None
 
-    patch.setattr(Leg, "strayed", strayed)
+    patch.setattr(Leg, "came_unasked", strayed)
 
 
 def without_the_packet_behind_an_ack(patch: Any) -> None:
@@ -141,16 +143,16 @@ def without_the_packet_behind_an_ack(patch: Any) -> None:
 
 def with_a_damaged_ack_that_is_none(patch: Any) -> None:
     """As it was: what came in place of the ACK was not thought to be it."""
-    right = Leg.strayed
-    strayed = LineMachine._stray
+    right = Leg.came_unasked
+    strayed = LineMachine._take_unasked
 
     def in_settling(line: LineMachine, data: bytes, now: float) -> None:
-        patch.setattr(Leg, "strayed", right)
+        patch.setattr(Leg, "came_unasked", right)
         strayed(line, data, now)
-        patch.setattr(Leg, "strayed", lambda leg, now: None)
+        patch.setattr(Leg, "came_unasked", lambda leg, now: None)
 
-    patch.setattr(Leg, "strayed", lambda leg, now: None)
-    patch.setattr(LineMachine, "_stray", in_settling)
+    patch.setattr(Leg, "came_unasked", lambda leg, now: None)
+    patch.setattr(LineMachine, "_take_unasked", in_settling)
 
 
 def with_an_end_that_any_answer_moves(patch: Any) -> None:

@@ -7,10 +7,10 @@ from math import inf
 from typing import Any, ClassVar, TypeAlias
 
 from busmaster.arbiter.arbiter import Arbiter
-from busmaster.arbiter.events import Mark
+from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import EXCHANGE, OFFLINE
-from busmaster.arbiter.strays import QUIET
 from busmaster.arbiter.transaction import PARKED, URGENT, Transaction
+from busmaster.arbiter.unasked import QUIET
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import LineDown, WriteUnconfirmed
 from tests.proof import setups
@@ -60,7 +60,7 @@ class World:
             jitter=no_jitter,
             strict=setup.strict,
         )
-        arbiter._counters = arbiter._strays._counters = arbiter.dispatcher.counters = NO_COUNTERS  # type: ignore[assignment]
+        arbiter._counters = arbiter._unasked._counters = arbiter.dispatcher.counters = NO_COUNTERS  # type: ignore[assignment]
         arbiter.dispatcher.probes.budget = BUDGET  # type: ignore[assignment]
         if not setup.in_step:
             arbiter._in_step = arbiter._choice._in_step = arbiter._trust._in_step = ANY_STEP  # type: ignore[assignment]
@@ -113,7 +113,7 @@ class World:
         self.note("asks urgently" if urgent else "asks", place)
         node, command = self.kind.commands[place]
         ticket = Ticket(node, command.writes)
-        transaction = Transaction(self.nodes[node], command, waiter=ticket)
+        transaction = Transaction(self.nodes[node], command, tag=ticket)
         if urgent:
             transaction.priority = URGENT
         self.live.append(ticket)
@@ -132,7 +132,7 @@ class World:
             self.note("asks", place)
             node, command = self.kind.commands[place]
             self.live.append(Ticket(node, command.writes))
-            self.arbiter.dispatcher.submit(Transaction(self.nodes[node], command, waiter=self.live[-1]), self.now)
+            self.arbiter.dispatcher.submit(Transaction(self.nodes[node], command, tag=self.live[-1]), self.now)
 
     def pump(self) -> None:
         """Hand over what is to be sent, hear what has happened, ask anew: until nothing is left."""
@@ -172,10 +172,10 @@ class World:
         """R8 and progress: nobody is forgotten, and the line's state has an end."""
         arbiter = self.arbiter
         wire = arbiter._wire
-        held = [w for node in self.nodes for w in node.writes if w.phase is PARKED]
+        held = [w for node in self.nodes for w in arbiter.dispatcher.writes.queues[node] if w.phase is PARKED]
         held += [transaction for queue in arbiter.dispatcher.backlog.queues for transaction in queue]
         held += [wire.transaction] if wire.transaction is not None else []
-        if len(self.live) > sum(transaction.heard and transaction.waiter is not None for transaction in held):
+        if len(self.live) > sum(transaction.wanted and transaction.tag is not None for transaction in held):
             raise Violation("R8: a request is forgotten")
         if arbiter.state.name in ("EXCHANGE", "SETTLING", "HOLDOFF") and not self.frozen:
             due: Time = arbiter._deadlines.line
@@ -201,7 +201,7 @@ class World:
     # what is promised
 
     def _judge(self, transaction: Transaction, by: str | None) -> None:
-        ticket = transaction.waiter
+        ticket = transaction.tag
         if ticket is None:  # a probe's, or a check's
             return
         if ticket not in self.live:
@@ -259,7 +259,7 @@ class World:
         """The port is handed these bytes."""
         self.said += out
         transaction = self.arbiter._wire.transaction
-        ticket = None if transaction is None else transaction.waiter
+        ticket = None if transaction is None else transaction.tag
         if ticket is not None and self.is_request(out):
             self._judge_order(ticket)
             ticket.sent = True
@@ -367,7 +367,7 @@ class World:
         """
         arbiter, setup = self.arbiter, self.setup
         unsaid = self.held is not None or bool(self.frozen) or setup.beyond
-        listens = arbiter._echo.owed or arbiter._strays.listener is not None or setup.in_step
+        listens = arbiter._echo.owed or arbiter._unasked.listener is not None or setup.in_step
         return bool(arbiter.state is EXCHANGE or unsaid or listens)
 
     @property
@@ -382,7 +382,7 @@ class World:
         self.cancels = 0
         transaction = self.arbiter._wire.transaction
         assert transaction is not None
-        self.live.remove(transaction.waiter)
+        self.live.remove(transaction.tag)
         self.note("cancels")
         self.arbiter.cancel(transaction, self.now)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -297,6 +298,55 @@ def test_reads_may_be_repeated_and_writes_only_if_the_caller_says_so() -> None:
     for read in (Read(1, 17), ReadRun(1, 17, 2)):
         assert (read.writes, read.idempotent) == (False, True)
     assert (Write(1, 17, 5).writes, Write(1, 17, 5).idempotent) == (True, False)
+
+
+@pytest.mark.parametrize(
+    "fits",
+    [
+        lambda: Read(0, 0),
+        lambda: Read(99, 99),
+        lambda: Write(1, 17, -9999),
+        lambda: Write(1, 17, 9999),
+        lambda: Write(1, 17, 0, wide=True),
+        lambda: Write(1, 17, 65535, wide=True),
+        lambda: Write(1, 17, -99999, high_resolution=True),
+        lambda: Write(1, 17, 99999, high_resolution=True),
+        lambda: ReadRun(1, 0, 100),
+        lambda: ReadRun(1, 99, 100, -1),
+        lambda: ReadRun(1, 5, 100, 0),
+    ],
+)
+def test_the_least_and_the_most_can_be_sent(fits: Callable[[], Any]) -> None:
+    assert fits().open(99, TIMINGS).request
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        lambda: Read(-1, 0),
+        lambda: Read(0, -1),
+        lambda: Read(100, 0),
+        lambda: Read(0, 100),
+        lambda: Write(-1, 0, 1),
+        lambda: Write(0, 100, 1),
+        lambda: Write(1, 17, -10000),
+        lambda: Write(1, 17, 10000),
+        lambda: Write(1, 17, -1, wide=True),
+        lambda: Write(1, 17, 65536, wide=True),
+        lambda: Write(1, 17, -100000, high_resolution=True),
+        lambda: Write(1, 17, 100000, high_resolution=True),
+        lambda: ReadRun(1, 0, 0),
+        lambda: ReadRun(1, 0, 101),
+        lambda: ReadRun(1, 5, 101, 0),
+        lambda: ReadRun(1, 1, 100),
+        lambda: ReadRun(1, 98, 100, -1),
+        lambda: ReadRun(1, 5, 2, 2),
+        lambda: ReadRun(1, 5, 2, -2),
+    ],
+)
+def test_one_less_and_one_more_cannot(mistake: Callable[[], Any]) -> None:
+    with pytest.raises(InvalidCommand):
+        mistake()
 
 
 def test_the_profile_is_the_designs_table() -> None:

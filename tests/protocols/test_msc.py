@@ -230,6 +230,14 @@ def test_no_block_runs_beyond_the_last_address() -> None:
     assert merge([DataRead(65535), DataRead(65534)], address_step=1) == []
 
 
+def test_an_address_step_leaves_room_for_a_block() -> None:
+    assert Merging(1).address_step == 1
+    assert Merging(2047).address_step == 2047
+    for step in (-1, 0, 2048):
+        with pytest.raises(InvalidCommand, match="address_step"):
+            Merging(step)
+
+
 def test_values_are_not_merged_while_the_address_step_is_unknown() -> None:
     assert merge([DataRead(2000), DataRead(2004)]) == []
     with pytest.raises(InvalidCommand):

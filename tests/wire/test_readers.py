@@ -104,6 +104,42 @@ def test_20_characters_of_data_are_read() -> None:
     assert reader().feed(b"\x02" + body + bytes([xor(body)])) == Done(b"1" * 20)
 
 
+@pytest.mark.parametrize("character", [0x20, 0x7E])
+def test_data_are_made_of_printable_characters_to_the_first_and_the_last(character: int) -> None:
+    body = b"01" + bytes([character]) + b"\x03"
+    assert reader().feed(b"\x02" + body + bytes([xor(body)])) == Done(bytes([character]))
+
+
+@pytest.mark.parametrize("character", [0x1F, 0x7F, 0x00, 0x80, 0xFF])
+def test_what_lies_just_beside_them_is_no_data(character: int) -> None:
+    with pytest.raises(FrameError, match="control character"):
+        reader().feed(HEADER + bytes([character]))
+
+
+def test_a_telegram_has_three_bytes_around_its_echo_and_data() -> None:
+    sizes = telegram_sizes(echo=2, typical=7, longest=20)
+    assert (sizes.typical, sizes.longest) == (12, 25)
+
+
+def test_a_reader_says_what_it_heard_in_place_of_its_reply() -> None:
+    for heard in (b"\x0202", b"\x06"):
+        with pytest.raises(FrameError) as failure:
+            reader().feed(heard)
+        assert failure.value.heard == heard
+    with pytest.raises(FrameError, match="cannot begin with 78"):
+        reader().feed(b"x1")
+    with pytest.raises(FrameError) as failure:
+        AcknowledgeReader(b"", TIMING).feed(b"x1")
+    assert failure.value.heard == b"x1"
+
+
+def test_a_reader_names_what_it_may_still_be_owed() -> None:
+    assert (reader().answers, reader().owed) == ((HEADER,), (HEADER,))
+    acknowledge = AcknowledgeReader(b"", TIMING)
+    assert (acknowledge.answers, acknowledge.owed, acknowledge.starts) == ((b"\x06",), (b"\x06",), b"\x06\x15")
+    assert (reader().answered, reader().closing, reader().later) == (True, 0, ())
+
+
 def test_silence_and_a_cut_frame_are_told_apart() -> None:
     with pytest.raises(FrameError, match="no reply"):
         reader().expired(started=False)
