@@ -141,7 +141,7 @@ class VerifyFailed(BusError):
 class Superseded(BusError):
     """A queued write was dropped because an urgent write to the same node overtook it."""
 
-    hint = "decide again after the urgent command"
+    hint = "decide again after what overtook it"
 
 
 class NodeDown(BusError):
@@ -178,3 +178,23 @@ class BusClosed(BusError):
     """The bus was closed."""
 
     hint = "use the bus inside `async with`"
+
+
+__all__ = [
+    "Addressed",
+    "BacklogFull",
+    "BusClosed",
+    "BusError",
+    "GarbledReply",
+    "InvalidCommand",
+    "LineDown",
+    "LineNoisy",
+    "NoReply",
+    "NoSuchParameter",
+    "NodeDown",
+    "NotStarted",
+    "Refused",
+    "Superseded",
+    "VerifyFailed",
+    "WriteUnconfirmed",
+]

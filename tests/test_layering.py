@@ -40,6 +40,43 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cli.demo": ALL,
     "cli.demo_line": ALL,
 }
+OPEN: dict[str, set[str]] = {
+    "arbiter": {
+        *(
+            "arbiter",
+            "backlog",
+            "choice",
+            "counters",
+            "echo",
+            "events",
+            "health",
+            "histogram",
+            "mark",
+            "schedule",
+            "state",
+        ),
+        *("tap", "transaction", "unasked"),
+    },
+    "bus": {"bus", "handle", "node", "points", "polling", "requester", "suitability"},
+    "capture": {"decode", "frames", "pcapng", "recorder", "replay", "telegrams"},
+    "cli": {""},
+    "config": {""},
+    "contract": {"arguments", "driver", "exchange", "items", "profile", "timing"},
+    "doctor": {"adapters", "examination", "uart"},
+    "emulator": {"chance", "device", "faults", "line", "memory", "motion", "serve", "traceable"},
+    "errors": {""},
+    "outputs": {"base", "distributor", "settings", "values"},
+    "planning": {"", "merging"},
+    "registry": {""},
+    "transport": {
+        *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "serial_port", "tcp"),
+    },
+    "wire": {"characters", "checks", "numbers", "readers"},
+}
+"""The modules of each room that other rooms may import; "" is the room itself. The others are its own affair.
+
+A protocol's folder is open to its own, to those that build on it, and to the root, which offers its handles.
+"""
 LISTENING = {"capture.decode", "capture.frames", "capture.telegrams"}
 PARTS: dict[str, set[str]] = {
     "codec": {"wire"} | BASE,
@@ -161,6 +198,15 @@ def test_a_module_imports_only_the_layers_below_it(module: str) -> None:
             assert module.split(".")[0] in ("cli", "__main__"), f"{module} imports the package's root, a cycle"
         elif name.startswith("busmaster."):
             assert allows(module, name.removeprefix("busmaster.")), f"{module} may not import {name}"
+
+
+@pytest.mark.parametrize("module", [name for name in modules() if name not in ("__init__", "protocols")])
+def test_no_room_reaches_into_another(module: str) -> None:
+    """What a room keeps to itself can be changed without a look at the others."""
+    for name in imports(module, types=True):
+        room, _, inner = name.removeprefix("busmaster.").partition(".")
+        if name.startswith("busmaster.") and room not in ("protocols", module.split(".")[0]):
+            assert inner in OPEN.get(room, ()), f"{module} imports {name}, which {room} keeps to itself"
 
 
 def circles() -> list[set[str]]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import inspect
+import re
 import subprocess
 import sys
 import typing
+from collections.abc import Iterator
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -16,9 +21,10 @@ from busmaster import errors
 OPTIONAL = ("click", "rich", "msgspec", "textual", "aiomqtt", "prometheus_client", "matplotlib")
 
 
-def order(name: str) -> tuple[bool, bool, str]:
-    """Constants, then classes, then functions, as the linter sorts them."""
-    return not name.isupper(), not name[0].isupper(), name
+def order(name: str) -> tuple[object, ...]:
+    """Constants, then classes, then functions, as the linter sorts them: sum8 before sum16."""
+    parts = [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
+    return not name.isupper(), not name[0].isupper(), *parts
 
 
 def test_the_public_names_are_sorted_and_each_once() -> None:
@@ -79,3 +85,40 @@ def test_the_command_line_without_its_extra_says_which_one_to_install() -> None:
         "busmaster: the command line needs click, rich, msgspec, which the extra named cli brings: "
         "pip install 'busmaster[cli]'\n"
     )
+
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "public-api.md"
+PUBLIC = re.findall(r"^\| `(busmaster\.[\w.]+)` \|", PAGE.read_text(), re.MULTILINE)
+OUTSIDERS = sorted(
+    path
+    for folder in ("busmaster/protocols", "examples", "tests/registry/installed")
+    for path in (ROOT / folder).rglob("*.py")
+)
+"""What an author outside could have written: it gets along with what is public."""
+
+
+def imported(path: Path) -> Iterator[tuple[str, str]]:
+    """The modules of the package that a file imports names from, and these names; not those of protocols."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        module = node.module or "" if isinstance(node, ast.ImportFrom) else ""
+        if isinstance(node, ast.ImportFrom) and module.startswith("busmaster") and ".protocols" not in module:
+            yield from ((module, alias.name) for alias in node.names)
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_a_public_module_says_what_it_offers(name: str) -> None:
+    module = importlib.import_module(name)
+    assert module.__doc__
+    assert list(module.__all__) == sorted(set(module.__all__), key=order)
+    assert all(hasattr(module, offered) for offered in module.__all__)
+    assert not any(offered.startswith("_") for offered in module.__all__)
+
+
+@pytest.mark.parametrize("path", OUTSIDERS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_protocols_and_examples_use_only_what_is_public(path: Path) -> None:
+    for module, name in imported(path):
+        assert module in ("busmaster", *PUBLIC), f"{path.name} imports from {module}, which is not public"
+        assert name in importlib.import_module(module).__all__, (
+            f"{path.name} imports {module}.{name}, which is not public"
+        )

@@ -99,6 +99,10 @@ class Arbiter(LineMachine):
         """Synchronous; never touches the line (R6)."""
         self.dispatcher.cancel(transaction, now)
 
+    def supersede_writes(self, now: float) -> None:
+        """Whatever waits to be written is not: the line is taken to its safe state."""
+        self.dispatcher.supersede_writes(now)
+
     def add_poll(self, poll: Poll, now: float) -> None:
         """Its first cycle waits until a line that has just been opened can be used."""
         self.dispatcher.add_poll(poll, max(now, self._quarantine))

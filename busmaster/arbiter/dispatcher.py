@@ -35,6 +35,7 @@ from busmaster.arbiter.transaction import (
     QUEUED,
     URGENT,
     Poll,
+    Priority,
     Transaction,
 )
 from busmaster.arbiter.writes import Writes
@@ -55,6 +56,7 @@ REFUSED_POLL_PAUSE = 10.0
 RETRY_PATIENCE = 1.0
 """Seconds after which a request in POLL or BACKGROUND wants to be answered; the period, for a poll."""
 SUSPENDED = "suspended for maintenance"
+LEFT = "the line is being left: only its safe state is still written"
 NOT_DONE = (Refused, Superseded)
 """Errors that say of a write that it was not carried out, unless an attempt before them may have been."""
 
@@ -97,7 +99,7 @@ class Dispatcher:
             self._end(transaction, now, name_error(self.fault(), transaction))
             return False
         if transaction.writes and transaction.priority is URGENT:
-            self._supersede(node, now)
+            self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
         waiting = self.backlog.queues[transaction.priority].live
         if transaction.writes:
             waiting = max(waiting, len(self.writes.queues[node]))
@@ -273,6 +275,11 @@ class Dispatcher:
 
     # everything at once
 
+    def supersede_writes(self, now: float) -> None:
+        """End every write that waits, of whatever class, as Superseded."""
+        for node in self.nodes:
+            self._supersede(node, LEFT, now)
+
     def fail_all(self, now: float) -> None:
         """Take out whatever waits, to end with the current fault: the first few now, the others with `fail_more`."""
         assert self.fault is not None
@@ -442,15 +449,18 @@ class Dispatcher:
         transaction.deadline = now + (poll.patience if poll is not None else RETRY_PATIENCE)
         self.backlog.push(transaction)
 
-    def _supersede(self, node: NodeRecord, now: float) -> None:
-        """An urgent write overtakes: what it overtakes is never sent after it, nor if it cannot be sent itself (R7)."""
+    def _supersede(self, node: NodeRecord, why: str, now: float, above: Priority | None = None) -> None:
+        """What is overtaken is never sent after what overtakes it, nor if that cannot be sent itself (R7).
+
+        `above`: only what is of a lower class than this one.
+        """
         for write in list(self.writes.queues[node]):
             if write.phase is ON_WIRE:
                 write.superseded = True
-            elif write.priority > URGENT:
+            elif above is None or write.priority > above:
                 if write.phase is QUEUED:
                     self.backlog.discard(write, PARKED)
-                self._end(write, now, make_error(Superseded, "overtaken by an urgent write to the same node", write))
+                self._end(write, now, make_error(Superseded, why, write))
 
     def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:
         """Exactly once (R8). A write that was on the wire before something else ended it may have been carried out."""

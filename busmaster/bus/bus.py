@@ -49,8 +49,9 @@ class Bus:
     `capacity` bounds the requests that may wait in each priority class (R12). `seed` makes the jitter of probes and
     reconnects repeatable. `tap` sees every byte (see busmaster.capture). `strict`: an answer that could be another
     request's is held until that one would have come (R15), at the line time that the README gives. Entering raises
-    LineDown if the port cannot be opened; once open, a lost port fails its callers at once and is opened again by
-    itself, as soon as the same device is back (R13); `events` tells of attempts that fail.
+    LineDown if the port cannot be opened, or, with `wait_for_port`, goes on as after a loss; once open, a lost port
+    fails its callers at once and is opened again by itself, as soon as the same device is back (R13); `events` tells
+    of attempts that fail.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class Bus:
         seed: int | None = None,
         tap: Tap | None = None,
         strict: bool = False,
+        wait_for_port: bool = False,
     ) -> None:
         capacity = whole_number(capacity, 1, MOST_CAPACITY, "a bus's capacity")
         if isinstance(endpoint, str):
@@ -68,6 +70,7 @@ class Bus:
                 f"a bus needs an endpoint, not text: Bus(endpoint({endpoint!r})), or SerialPort, TcpPort"
             )
         self.endpoint = endpoint
+        self._wait_for_port = wait_for_port
         self._random = random.Random(seed)
         settings = endpoint.settings
         self._byte_time_known = settings is not None
@@ -117,7 +120,7 @@ class Bus:
         connection = Connection(self.endpoint, self.pump, on_failed=self._on_failed, jitter=self._random)
         self._connection = connection
         try:
-            await connection.open()
+            await (connection.try_open() if self._wait_for_port else connection.open())
         except BaseException as error:
             self._line.unbind()
             await connection.close()
@@ -166,6 +169,17 @@ class Bus:
         """
         if self._connection is not None:
             self._connection.accept_device()
+
+    def take_only_safe_writes(self) -> None:
+        """End every write that waits as Superseded, and accept none from now on but those that say `safe=True`.
+
+        A write that is on the wire runs out, and is not repeated. Reads and polls go on. There is no way back: the line
+        is about to be left.
+        """
+        self.check_loop()
+        self._line.only_safe = True
+        self._arbiter.supersede_writes(self.now())
+        self.pump.turn()
 
     # nodes and groups
 

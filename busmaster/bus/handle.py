@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, TypeAlias, Unpack
 
 from busmaster.bus.points import Point
-from busmaster.bus.requester import NodeSource, ReadOptions, WriteOptions
+from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import guess, is_decimal
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
@@ -69,22 +69,24 @@ class Handle(ABC):
         """Read what ITEM names on the command line, in the way that is best for a single reading."""
         return await self.point(item).read()
 
-    def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
+    def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Return what writes the values to ITEM and those after it, once it is sure that all of them can be sent.
 
-        With `verify` they are read back, and VerifyFailed is raised where they differ. Raises InvalidCommand.
+        `RequestOptions` says what the options are. Raises InvalidCommand.
         """
         names = self.run_items(item, len(values)) if len(values) > 1 else (item,)
-        return [self.prepare_one(name, value, verify) for name, value in zip(names, values, strict=True)]
+        return [self.prepare_one(name, value, **options) for name, value in zip(names, values, strict=True)]
 
-    def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
+    def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
         """Return what writes one value to ITEM. Raises InvalidCommand for one that cannot be sent."""
         point = self.point(item)
-        self.node.check(encoder(point)(value))
+        command = encoder(point)(value)
+        self.node.check(command, stop=bool(options.get("safe")))
 
         async def send() -> None:
-            await point.write(value)
-            if verify and (found := await point.read()) != value:
+            requests = SeveralRequests(self.node, options)
+            await requests.request(command, touches=point.command)
+            if requests.verify and (found := point.value_of(await requests.read_back(point.command))) != value:
                 raise VerifyFailed(f"{item} reads {found!r} after {value!r} was written", node=self.node)
 
         return send
@@ -119,3 +121,12 @@ def item_text(item: str) -> str:
 def unknown_item(item: str, known: Iterable[str], form: str) -> InvalidCommand:
     """Return the error for an item that does not exist: it says what would do, and the nearest name."""
     return InvalidCommand(f"no such item {item!r}: use {form}{guess(str(item), known)}")
+
+
+__all__ = [
+    "Handle",
+    "Send",
+    "encoder",
+    "item_text",
+    "unknown_item",
+]

@@ -52,7 +52,7 @@ class Logbook:
             )
             self._write((event.node, LatenessLowered), logging.INFO, text, now)
         elif isinstance(event, PortFailed):
-            text = f"cannot reconnect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
+            text = f"cannot connect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
             self._write((PortFailed, event.cause), logging.WARNING, text, now, event.bug)
         elif isinstance(event, CameUnasked) and event.collision:
             text = f"the echo differs from what was sent: a collision ({event.data.hex(' ')})"

@@ -10,6 +10,7 @@ from threading import get_ident
 from typing import Any, Protocol, TypeVar, Unpack
 
 from busmaster.arbiter.counters import NodeStatistics
+from busmaster.arbiter.dispatcher import LEFT
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import Priority, Timeline, Transaction
 from busmaster.bus.limiter import Limiter
@@ -259,6 +260,8 @@ class Node:
             self.kinds[type(command)] = command
         if stops_seen is not None and stops_seen != record.stops:
             raise Superseded("the node was told to stop since this was decided", node=record, command=str(command))
+        if line.only_safe and command.writes and not options.safe:
+            raise Superseded(LEFT, node=record, command=str(command), hint="")
         transaction = Transaction(
             record,
             command,

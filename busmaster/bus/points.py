@@ -106,3 +106,8 @@ class Point(Generic[T]):
         if self.encode is None:
             raise InvalidCommand(f"{self.node.label}: {self.item} is read-only")
         await self.node.request(self.encode(value), touches=self.command, **options)
+
+
+__all__ = [
+    "Point",
+]

@@ -57,6 +57,7 @@ class CommandOptions(ReadOptions, total=False):
     """The keyword arguments of what runs one command."""
 
     idempotent: bool | None
+    safe: bool | None
 
 
 class WriteOptions(CommandOptions, total=False):
@@ -75,7 +76,8 @@ class RequestOptions:
     sent, and how it ended is not known. NoReply: a read was sent, and not answered yet. What is on the wire by then
     runs out unheard, and is not repeated. `retries`, 0 to 100, in place of the node's. `idempotent`: whether a write
     may be repeated after an unknown outcome (R7), in place of what its command says. `verify`: a handle's `write`
-    reads back what it wrote, and raises VerifyFailed if that differs.
+    reads back what it wrote, and raises VerifyFailed if that differs. `safe`: this write is of the safe state in which
+    a line is left, and accepted when no other is (`Bus.take_only_safe_writes`).
     """
 
     priority: Priority = COMMAND
@@ -84,6 +86,7 @@ class RequestOptions:
     retries: int | None = None
     idempotent: bool | None = None
     verify: bool = False
+    safe: bool = False
 
     def __post_init__(self) -> None:
         if type(self.priority) is not Priority:
@@ -202,9 +205,9 @@ class SeveralRequests:
         self._reading: CommandOptions = {"priority": chosen.priority} if given else {}
         self._written = False
 
-    async def request(self, command: Command[T]) -> T:
+    async def request(self, command: Command[T], *, touches: Command[Any] | None = None) -> T:
         """Run one more command. Raises as `Requester.request`."""
-        value = await self._in_time(command, self._options, "only a part of it was written")
+        value = await self._in_time(command, self._options, "only a part of it was written", touches)
         self._written = self._written or command.writes
         return value
 
@@ -212,11 +215,13 @@ class SeveralRequests:
         """Read what was written, by the call's priority and within its time."""
         return await self._in_time(command, self._reading, "acknowledged, but not read back")
 
-    async def _in_time(self, command: Command[T], options: CommandOptions, so_far: str) -> T:
+    async def _in_time(
+        self, command: Command[T], options: CommandOptions, so_far: str, touches: Command[Any] | None = None
+    ) -> T:
         if self._finish_by is not None:
             options = {**options, "finish_within": max(0.0, self._finish_by - self._node.now())}
         try:
-            return await self._node.request(command, **options)
+            return await self._node.request(command, touches=touches, **options)
         except (NotStarted, NoReply) as error:
             in_time = self._finish_by is None or self._node.now() < self._finish_by
             if not self._written or (in_time and isinstance(error, NoReply)):

@@ -35,6 +35,8 @@ class SharedLine:
         self.limiter: Limiter | None = None
         """None while nothing is limited."""
         self.closed = False
+        self.only_safe = False
+        """Whether no write is accepted any more but those of the safe state."""
         self.thread = 0
         """In which its loop runs; 0 while the bus is not open."""
         self.loop_runs: Callable[[], bool] = lambda: False

@@ -125,3 +125,11 @@ class Decoder:
         frames.append(
             Frame(Kind.NOISE, self._sender, raw, fault=fault, joined=self._rejected_joined, time=self._rejected_at)
         )
+
+
+__all__ = [
+    "DEFAULT_GAP",
+    "LONGEST_FRAME",
+    "Decoder",
+    "Dialect",
+]

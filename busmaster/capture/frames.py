@@ -74,3 +74,12 @@ class Frame:
                 return f"{len(self.raw)} byte{'' if len(self.raw) == 1 else 's'}"
             case _:
                 return self.kind.upper()
+
+
+__all__ = [
+    "UNACKED",
+    "UNASKED",
+    "Direction",
+    "Frame",
+    "Kind",
+]

@@ -29,7 +29,7 @@ import enum
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, Protocol
 
 from busmaster.capture.frames import Direction
 from busmaster.registry import find, kinds
@@ -50,6 +50,10 @@ _LONGEST_BLOCK = 1 << 20
 
 class CaptureError(ValueError):
     """The file is no capture, or not one of ours."""
+
+
+class CutOff(CaptureError):
+    """The file ends in the midst of a block, as one does whose recorder was killed or whose disk was full."""
 
 
 class Outcome(enum.IntEnum):
@@ -91,10 +95,16 @@ class Packet:
     """It came in one piece with the end of the frame before."""
 
 
+class Writable(Protocol):
+    """What bytes can be written to."""
+
+    def write(self, data: bytes, /) -> int: ...
+
+
 class PcapngWriter:
     """Writes packets to a binary file, which it does not own. The head of the file is written at once."""
 
-    def __init__(self, file: BinaryIO, *, port: str = "") -> None:
+    def __init__(self, file: Writable, *, port: str = "") -> None:
         self._file = file
         self._port = port
         self._interfaces: dict[str, int] = {}
@@ -140,7 +150,8 @@ class PcapngWriter:
 
 
 def read_packets(file: BinaryIO) -> Iterator[Packet]:
-    """The packets of a capture of ours, in order. Raises CaptureError for any other file, or one cut in mid-block."""
+    """The packets of a capture of ours, in order. Raises CaptureError for any other file, and CutOff, behind all
+    that is whole, for one that ends in mid-block."""
     interfaces: list[_Interface] = []
     for kind, body, order in _blocks(file):
         if kind == _SECTION:
@@ -212,7 +223,9 @@ def _blocks(file: BinaryIO) -> Iterator[tuple[int, bytes, str]]:
     first = True
     while head := file.read(8):
         if len(head) < 8 or (first and head[:4] != struct.pack("<I", _SECTION)):
-            raise CaptureError("not a pcapng file" if first else "the file is cut in mid-block")
+            raise CaptureError("not a pcapng file") if first else CutOff("the file is cut in mid-block")
+        if not any(head):
+            raise CutOff("the file is cut in mid-block")  # a loss of power may leave zeros
         mark = b""
         if head[:4] == struct.pack("<I", _SECTION):
             mark = file.read(4)
@@ -222,7 +235,7 @@ def _blocks(file: BinaryIO) -> Iterator[tuple[int, bytes, str]]:
             raise CaptureError(f"a block of {length} bytes: the file is damaged")
         rest = mark + file.read(length - 8 - len(mark))
         if len(rest) != length - 8:
-            raise CaptureError("the file is cut in mid-block")
+            raise CutOff("the file is cut in mid-block")
         first = False
         yield kind, rest[:-4], order
     if first:

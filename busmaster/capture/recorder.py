@@ -9,11 +9,12 @@ import os
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from types import TracebackType
-from typing import BinaryIO
 
 from busmaster.arbiter.tap import Attempt
 from busmaster.capture.assemble import Assembler
+from busmaster.capture.files import COUNT, SIZE, CaptureFiles
 from busmaster.capture.frames import Direction
 from busmaster.capture.pcapng import Packet, PcapngWriter
 
@@ -24,6 +25,10 @@ TICK = 0.05
 SLICE = 10
 """Events handled before the thread lets go of the interpreter."""
 PAUSE = 0.0002
+RETRY = 1.0
+"""Seconds from a failure to write to the next try."""
+AT_ONCE = 1 << 16
+"""Bytes that are written at once."""
 IDLE = 3.0
 """Seconds without an event after which nothing is held back that is over: longer than any node needs to go on."""
 
@@ -41,7 +46,11 @@ class _Passed:
 
 
 class Recorder:
-    """A tap that writes a capture. Raises OSError if `path` cannot be written; later errors are kept in `error`.
+    """A tap that writes a capture. Raises OSError if `path` cannot be written.
+
+    A file that is there is never overwritten: `path` gets a number then, and so do those that follow when `size` bytes
+    are in one; of its own the last `count` are kept (see `CaptureFiles`). While the disk is full, up to `capacity`
+    events wait for it. `say` is told, from a thread, when that begins and when it is over.
 
     `port` names the line in the file; `protocol` is needed where nobody tells it (see `Assembler`); `echo` says that
     what is sent is received too. Close it off the loop: closing waits for the disk.
@@ -55,20 +64,33 @@ class Recorder:
         protocol: str = "",
         echo: bool = False,
         capacity: int = CAPACITY,
+        size: int = SIZE,
+        count: int = COUNT,
+        say: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.dropped = 0
-        """Events that came while `capacity` of them waited for the disk, or after it had failed."""
+        """Events that came while `capacity` of them waited, and those that the disk would not take to the end."""
         self.error: OSError | None = None
+        """Why nothing can be written, while that is so."""
         self._capacity = capacity
+        self._say = say
         self._events: deque[_Passed | Attempt] = deque()
         self._stop = threading.Event()
-        self._file: BinaryIO = open(path, "wb")  # noqa: SIM115  # held open until close()
-        self._writer = PcapngWriter(self._file, port=port)
+        self._port = port
+        self._files = CaptureFiles(path, size=size, count=count)
+        self._writer = PcapngWriter(self._files, port=port)
+        self._unwritten = 0
+        """Events that are made into packets, but not yet written."""
         self._reported = 0
         offset = time.time() - time.monotonic()
         self._assembler = Assembler(self._write, protocol=protocol, echo=echo, offset=offset)
         self._thread = threading.Thread(target=self._run, name="busmaster capture", daemon=True)
         self._thread.start()
+
+    @property
+    def path(self) -> str:
+        """That of the file which is written now."""
+        return self._files.path
 
     # on the loop that owns the line
 
@@ -89,7 +111,7 @@ class Recorder:
         self._note(_Passed(now, data, Direction.UNKNOWN))
 
     def _note(self, event: _Passed | Attempt) -> None:
-        if len(self._events) < self._capacity and self.error is None:
+        if len(self._events) < self._capacity:
             self._events.append(event)
         else:
             self.dropped += 1
@@ -112,34 +134,72 @@ class Recorder:
     # on the thread
 
     def _run(self) -> None:
-        try:
-            with self._file:
+        busy = time.monotonic()
+        while not self._stop.wait(TICK if self.error is None else RETRY):
+            if self.error is not None:
+                self._flush()
+            elif self._events:
                 busy = time.monotonic()
-                while not self._stop.wait(TICK):
-                    if self._events:
-                        busy = time.monotonic()
-                        self._drain()
-                        self._file.flush()
-                    elif time.monotonic() - busy > IDLE:
-                        busy = time.monotonic()
-                        self._assembler.idle(busy)
-                        self._file.flush()
                 self._drain()
-                self._assembler.finish(time.monotonic())
-                self._writer.finish(round(time.time() * 1e6), self.dropped)
+            elif time.monotonic() - busy > IDLE:
+                busy = time.monotonic()
+                self._assembler.idle(busy)
+                self._flush()
+        self._end()
+
+    def _end(self) -> None:
+        """Write the rest, if the disk takes it."""
+        self._flush()
+        self._drain()
+        self._assembler.finish(time.monotonic())
+        self._writer.finish(round(time.time() * 1e6), self.dropped)
+        try:
+            self._files.close()
         except OSError as error:
             self.error = error
-            self.dropped += len(self._events)
-            self._events.clear()
+            self.dropped += self._unwritten
+        self.dropped += len(self._events)
+        self._events.clear()
 
     def _drain(self) -> None:
         """In small helpings, so that the loop never waits long for the interpreter."""
         handled = 0
-        while self._events:
+        while self._events and self.error is None:
             self._handle(self._events.popleft())
+            self._unwritten += 1
             handled += 1
             if handled % SLICE == 0 and not self._stop.is_set():
                 time.sleep(PAUSE)
+            if self._files.full:
+                self._begin_next()
+            elif self._files.pending > AT_ONCE:
+                self._flush()
+        self._flush()
+
+    def _flush(self) -> None:
+        self._try(self._files.flush)
+
+    def _begin_next(self) -> None:
+        """Between two events: those of one exchange that is not over yet are all in the next file."""
+        self._writer.finish(round(time.time() * 1e6), self.dropped)
+        if self._try(self._files.begin_next):
+            self._writer = PcapngWriter(self._files, port=self._port)
+
+    def _try(self, work: Callable[[], None]) -> bool:
+        """Return whether it could be written; say it when that changes."""
+        try:
+            work()
+        except OSError as error:
+            if self.error is None:
+                self._say(f"the capture rests: {self.path}: {error.strerror}")
+            self.error = error
+            return False
+        self._unwritten = 0
+        if self.error is not None:
+            self.error = None
+            lost = f"{self.dropped} events are lost" if self.dropped else "nothing is lost"
+            self._say(f"the capture goes on: {self.path}; {lost}")
+        return True
 
     def _handle(self, event: _Passed | Attempt) -> None:
         if isinstance(event, Attempt):

@@ -52,3 +52,25 @@ def came_back(raw: bytes) -> Frame:
 def number(field: bytes, base: int, digits: bytes) -> int | None:
     """The number that these characters spell, or None if one is none of `digits` (a table of `made_of`)."""
     return int(field, base) if field.translate(digits) == field else None
+
+
+__all__ = [
+    "ACK",
+    "ANSWERS",
+    "BEL",
+    "BS",
+    "DECIMAL",
+    "ENQ",
+    "EOT",
+    "ETX",
+    "HEXADECIMAL",
+    "NAK",
+    "SPACE",
+    "STX",
+    "came_back",
+    "characters",
+    "checked",
+    "closed_size",
+    "field_end",
+    "number",
+]

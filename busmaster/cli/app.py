@@ -15,6 +15,8 @@ from typing import Any, TextIO
 import click
 
 from busmaster.cli.ending import Ending
+from busmaster.cli.output import Level, note
+from busmaster.cli.terminal import printable
 from busmaster.contract.arguments import meant
 from busmaster.errors import BusError, InvalidCommand, NoReply
 
@@ -27,6 +29,7 @@ COMMANDS = (
     "scan",
     "emulate",
     "run",
+    "safe",
     "plan",
     "monitor",
     "doctor",
@@ -131,7 +134,7 @@ def show_warning(
     line: str | None = None,
 ) -> None:
     if issubclass(category, UserWarning):
-        print(f"busmaster: warning: {message}", file=file or sys.stderr, flush=True)
+        print(f"busmaster: warning: {printable(str(message))}", file=file or sys.stderr, flush=True)
 
 
 def usage_text(error: click.UsageError) -> str:
@@ -142,7 +145,7 @@ def usage_text(error: click.UsageError) -> str:
 
 
 def complain(text: str, status: int) -> int:
-    print("busmaster: " + " ".join(text.split()), file=sys.stderr, flush=True)
+    note(" ".join(text.split()), Level.ERROR)
     return status
 
 

@@ -36,7 +36,8 @@ class AskValue(ModalScreen[str | None]):
 
     def compose(self) -> ComposeResult:
         with Vertical():
-            yield Label(f"write {self.asked}{f' in {self.unit}' if self.unit else ''}  (Enter; Esc leaves it)")
+            unit = f" in {self.unit}" if self.unit else ""
+            yield Label(f"write {self.asked}{unit}  (Enter; Esc leaves it)", markup=False)
             yield Input(placeholder="value")
 
     def on_input_submitted(self, event: Input.Submitted) -> None:

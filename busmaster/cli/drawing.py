@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import socket
 import subprocess
 import sys
+import termios
 from collections.abc import Callable
+from typing import Any
 
 import anyio
 
@@ -16,6 +19,8 @@ from busmaster.cli.messages import Action, Frame, decode_action, encode
 INTERVAL = 0.2
 """Seconds between frames: values that move, at a cost of well under 1 % of a processor here."""
 ENDINGS = {"quit": OK, "interrupt": INTERRUPTED}
+LEAVE_SCREEN = b"\x1b[?1000l\x1b[?1003l\x1b[?1006l\x1b[?2004l\x1b[?25h\x1b[?1049l"
+"""No mouse, no bracketed paste, a cursor, and the page of before."""
 FAREWELL = 3.0
 """Seconds in which the screen gives the terminal back."""
 
@@ -25,6 +30,7 @@ async def draw(picture: Callable[[], Frame], act: Callable[[Action], object]) ->
 
     Cancelling it gives the terminal back.
     """
+    before = terminal_state()
     ours, theirs = socket.socketpair()
     with theirs:
         command = [sys.executable, "-m", "busmaster.cli.live", str(theirs.fileno())]
@@ -33,6 +39,7 @@ async def draw(picture: Callable[[], Frame], act: Callable[[Action], object]) ->
         )
     ours.setblocking(False)
     reader, writer = await asyncio.open_connection(sock=ours)
+    status = FAILED
     try:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(feed, writer, picture)
@@ -42,6 +49,8 @@ async def draw(picture: Callable[[], Frame], act: Callable[[Action], object]) ->
         writer.close()
         with anyio.CancelScope(shield=True):
             await anyio.to_thread.run_sync(see_off, process)
+        if process.returncode:
+            restore_terminal(before)
     return status
 
 
@@ -64,6 +73,24 @@ async def hear(reader: asyncio.StreamReader, act: Callable[[Action], object]) ->
     except ConnectionError:
         pass
     return FAILED
+
+
+def terminal_state() -> list[Any] | None:
+    """How the terminal is set, None without one."""
+    try:
+        return termios.tcgetattr(sys.stdin.fileno())
+    except (termios.error, OSError, ValueError):
+        return None
+
+
+def restore_terminal(before: list[Any] | None) -> None:
+    """Give back a terminal that a screen left as it was drawing on it: Ctrl-C means something again."""
+    if before is not None:
+        try:
+            termios.tcsetattr(sys.stdin.fileno(), termios.TCSANOW, before)
+            os.write(sys.stdout.fileno(), LEAVE_SCREEN)
+        except (termios.error, OSError):
+            pass  # the terminal is gone, too
 
 
 def see_off(process: subprocess.Popen[bytes]) -> None:

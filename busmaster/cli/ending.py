@@ -17,17 +17,18 @@ import click
 T = TypeVar("T")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 PATIENCE = 2.0
-"""Seconds in which the same wish said again is not heard."""
 
 
 class Ending:
     """The first signal cancels what `run` runs, or unwinds whatever the thread does.
 
     Terminals, shells and supervisors often send a second one at once: it must not break the unwinding. One that comes
-    PATIENCE later ends the process where it stands.
+    `patience` later ends the process where it stands.
     """
 
     def __init__(self) -> None:
+        self.patience = PATIENCE
+        """Seconds in which the same wish said again is not heard: what must be done first may need longer."""
         self.number = 0
         """The signal that was heard; 0 before."""
         self._since = 0.0
@@ -52,7 +53,7 @@ class Ending:
     def _heard(self, number: int, _frame: object) -> None:
         now = time.monotonic()
         if self.number:
-            if now >= self._since + PATIENCE:
+            if now >= self._since + self.patience:
                 os._exit(128 + number)
             return
         self.number, self._since = number, now

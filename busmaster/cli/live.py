@@ -228,7 +228,7 @@ class Screen(App[None]):
         if row is None or self.frame is None:
             return
         if self.frame.read_only or not row.writable:
-            self.notify(f"{row.node} {row.item} is read-only")
+            self.notify(f"{row.node} {row.item} is read-only", markup=False)
             return
 
         def send(value: str | None) -> None:

@@ -6,9 +6,11 @@ missed; an action is a key that the person pressed.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
+
+from busmaster.cli.terminal import printable
 
 
 class Row(msgspec.Struct, array_like=True, frozen=True):
@@ -83,5 +85,15 @@ def encode(message: Frame | Action) -> bytes:
     return msgspec.json.encode(message) + b"\n"
 
 
-decode_frame = msgspec.json.Decoder(Frame).decode
+def decode_frame(line: bytes) -> Frame:
+    """Return the frame, without anything in its texts that a terminal would obey."""
+    return msgspec.convert(_printable(msgspec.json.decode(line)), Frame)
+
+
+def _printable(told: Any) -> Any:
+    if isinstance(told, str):
+        return printable(told)
+    return list(map(_printable, told)) if isinstance(told, list) else told
+
+
 decode_action = msgspec.json.Decoder(Action).decode

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import time
 from collections.abc import Callable, Mapping
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
+import anyio
 import click
 
+from busmaster.bus.snapshots import Snapshot
 from busmaster.bus.suitability import check_settings
 from busmaster.capture.decode import DEFAULT_GAP, Decoder
 from busmaster.capture.frames import Direction, Frame, Kind
@@ -18,27 +21,42 @@ from busmaster.capture.recorder import Recorder
 from busmaster.cli.arguments import Connection
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
-from busmaster.cli.output import emit
+from busmaster.cli.lines import load
+from busmaster.cli.output import emit, emit_all, json_line, note, value_text
+from busmaster.cli.overheard import Overheard, feed, only_protocol, silent
 from busmaster.cli.parsing import Whole
 from busmaster.cli.protocols import protocol_option
+from busmaster.cli.run import output_text
+from busmaster.config import ConfiguredLine, LineFile
 from busmaster.errors import BusError, LineDown
+from busmaster.outputs.values import cycle_fields
 from busmaster.registry import find
 
 ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 
 
 @click.command(short_help="Listen only; decode what passes.")
-@click.argument("port")
-@protocol_option()
+@click.argument("port", metavar="PORT|LINE.toml")
+@protocol_option(required=False)
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
 @capture_option
-def command(port: str, protocol: str, baud: int | None, as_json: bool, capture: str | None) -> None:
+def command(port: str, protocol: str | None, baud: int | None, as_json: bool, capture: str | None) -> None:
     """Decode what passes on PORT, a line a frame, until Ctrl-C. Nothing is ever sent.
 
     An arrow tells who spoke, the host (->) or a node (<-); the time behind a reply is its delay. Frames are told
     apart by what they say: a silence only ends one that was cut short.
+
+    With a LINE.toml, its points and outputs are fed from what its line's own master asks: a line a value that passed,
+    or, with --json, a line a group and period.
     """
+    if is_line_file(port):
+        if protocol is not None or baud is not None:
+            raise click.UsageError("LINE.toml says which protocol and rate it is: leave out --protocol and --baud")
+        monitor_file(load(port), as_json, capture)
+        return
+    if protocol is None:
+        raise click.UsageError("say what is spoken there: --protocol P, or a LINE.toml in place of the port")
     endpoint = Connection(port, protocol, baud).endpoint()
     kind = find(protocol)
     check_settings(kind.profile, endpoint)
@@ -47,6 +65,43 @@ def command(port: str, protocol: str, baud: int | None, as_json: bool, capture: 
     with capturing(capture, port=endpoint.name, protocol=protocol) as recorder:
         decoder = Decoder(kind.protocol.dialect())
         until_ended(listen, endpoint, decoder, lambda frame: emit(write(frame, names)), recorder)
+
+
+def is_line_file(port: str) -> bool:
+    return port.endswith(".toml") and os.path.isfile(port)
+
+
+def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
+    """Listen to the line of a file until Ctrl-C. Nothing is ever sent, whoever asks for it."""
+    protocol = only_protocol(file)
+    kind = find(protocol)
+    line = ConfiguredLine(silent(file), tell=note)
+    points = {point for group in file.groups for point in line.members(group)}
+    overheard = Overheard(kind.protocol, points)
+
+    def show(snapshot: Snapshot) -> None:
+        emit_all([json_line(**cycle_fields(snapshot, snapshot.wall_at))] if as_json else plain_values(snapshot))
+
+    async def run(recorder: Recorder | None) -> None:
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(feed, line, overheard, show)
+            await listen(file.port, Decoder(kind.protocol.dialect()), overheard.heard, recorder)
+
+    with capturing(capture, port=file.port.name, protocol=protocol) as recorder:
+        try:
+            until_ended(run, recorder)
+        finally:
+            for counts in line.outputs.statistics():
+                note(output_text(counts))
+
+
+def plain_values(snapshot: Snapshot) -> list[str]:
+    """`2026-11-22T14:02:11.485+00:00 winder/position 12.5`."""
+    return [
+        f"{datetime.fromtimestamp(sample.wall, UTC).isoformat(timespec='milliseconds')} "
+        f"{point.key} {value_text(sample.value)}"
+        for point, sample in snapshot.samples.items()
+    ]
 
 
 class Listener(asyncio.Protocol):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from datetime import datetime
+from typing import BinaryIO
 
 import click
 
-from busmaster.capture.pcapng import CaptureError, read_packets
+from busmaster.capture.pcapng import CaptureError, CutOff, Packet, read_packets
 from busmaster.capture.replay import Replayed, replay
-from busmaster.cli.output import emit
+from busmaster.cli.output import emit, note
 
 CHANGED = 1
 
@@ -21,11 +23,12 @@ def command(capture: str) -> int:
 
     A line for each exchange that has changed, then how many there were. The exit status is 1 if any has. What no
     reader was asked about is not judged: bytes that the port called damaged, say, or an exchange that was cut off.
+    A file that is cut off, as its recorder was killed, is read up to there, and that is said on standard error.
     """
     counts: Counter[str] = Counter()
     try:
         with open(capture, "rb") as file:
-            for one in replay(read_packets(file)):
+            for one in replay(whole_packets(file)):
                 counts["changed" if one.changed else "same" if one.judged else "unjudged"] += 1
                 if one.changed:
                     emit(changed_text(one))
@@ -33,6 +36,17 @@ def command(capture: str) -> int:
         raise click.UsageError(f"{capture}: {error}") from None
     emit(summary_text(counts))
     return CHANGED if counts["changed"] else 0
+
+
+def whole_packets(file: BinaryIO) -> Iterator[Packet]:
+    """Up to where the file is cut off, if it is. Raises CaptureError for one that is no capture."""
+    packets = 0
+    try:
+        for packet in read_packets(file):
+            packets += 1
+            yield packet
+    except CutOff as error:
+        note(f"{file.name}: {error}, behind packet {packets}: what is before is replayed")
 
 
 def changed_text(one: Replayed) -> str:

@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+import asyncio
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
+import anyio
 import click
+from anyio.streams.memory import MemoryObjectReceiveStream
 
+from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import View, viewed
 from busmaster.cli.capturing import capture_option, capturing
-from busmaster.cli.ending import until_ended
+from busmaster.cli.ending import Ending, until_ended
 from busmaster.cli.lines import file_argument, load, other_port, port_option
-from busmaster.cli.output import note
+from busmaster.cli.output import Level, note, number_text
+from busmaster.cli.safe import tell_unsafe
+from busmaster.cli.systemd import ServiceManager
 from busmaster.cli.watching import Watch, follow
-from busmaster.config import ConfiguredLine
+from busmaster.config import ConfiguredLine, LineFile
+from busmaster.errors import InvalidCommand
 from busmaster.outputs.base import OutputStatistics
 
 SWITCH_INTERVAL = 0.0005
 """Seconds for which an output's thread may keep the interpreter from the loop that owns the line; else it is 5 ms."""
+FAREWELL = 2.0
+"""Seconds, beyond those of the safe state, in which a second signal does not end the process where it stands."""
 
 
 @click.command(short_help="Poll what a file says, with its outputs.")
@@ -25,11 +38,14 @@ SWITCH_INTERVAL = 0.0005
 @capture_option
 @viewed
 def command(path: str, port: str | None, capture: str | None, view: View) -> int:
-    """Poll the groups of LINE.toml until Ctrl-C, and feed the outputs that it enables.
+    """Poll the groups of LINE.toml until Ctrl-C or SIGTERM, and feed the outputs that it enables.
 
     On a terminal a live table; else, or with --plain, a line a value; with --json a line a cycle. A summary on
     standard error ends it: of groups, of nodes, and of what each output has written and dropped. An output that is
-    slow or down never holds up the line.
+    slow or down never holds up the line. A port that is missing is waited for. SIGHUP has the file read again.
+
+    When it ends, however it ends, the writes of the file's [safe] are sent first. The exit status is 1 if one was not
+    confirmed; else 0 after SIGTERM, 130 after Ctrl-C.
     """
     file = load(path)
     endpoint = other_port(file, port)
@@ -37,29 +53,147 @@ def command(path: str, port: str | None, capture: str | None, view: View) -> int
     protocols = {node.protocol for node in file.nodes.values()}
     only = protocols.pop() if len(protocols) == 1 else ""
     usual = sys.getswitchinterval()
-    click.get_current_context().call_on_close(lambda: sys.setswitchinterval(usual))
+    context = click.get_current_context()
+    context.call_on_close(lambda: sys.setswitchinterval(usual))
     sys.setswitchinterval(SWITCH_INTERVAL)
     with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
-        return until_ended(run, ConfiguredLine(file, port=endpoint, tap=recorder, read_only=view.read_only), view)
+        running = Running(ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only), path, view)
+        ending = context.find_object(Ending)
+        if ending is not None:
+            ending.patience = running.line.safe_state.within + FAREWELL
+        try:
+            status = until_ended(running.run)
+        except KeyboardInterrupt:
+            if running.left_safely:
+                raise
+            return FAILED
+        except SystemExit as ended:
+            if ended.code != 128 + signal.SIGTERM:
+                raise
+            status = OK
+        return status if running.left_safely else FAILED
 
 
-async def run(line: ConfiguredLine, view: View) -> int:
-    entered = False
-    try:
-        async with line:
-            entered = True
-            watch = Watch(line.bus, line.file.title, view, gate=line.gate)
-            if not line.groups:
-                note("nothing is polled: the file has no [groups.NAME]")
-            for group in line.groups.values():
-                watch.add(group)
-            line.outputs.tell = watch.announce
-            return await follow(watch)
-    finally:
-        for counts in line.outputs.statistics() if entered else ():
-            note(output_text(counts))
+class Running:
+    """One line that runs as a file says, until it is told to end. `left_safely` says whether its safe state holds."""
+
+    def __init__(self, line: ConfiguredLine, path: str, view: View) -> None:
+        self.line = line
+        self.left_safely = True
+        self._leaving = False
+        self._path = path
+        self._watch = Watch(line.bus, line.file.title, view, gate=line.gate, steady=True)
+        self._manager = ServiceManager()
+
+    async def run(self) -> int:
+        entered = False
+        self.line.outputs.tell = self._tell_of_output
+        try:
+            with hangups() as heard:
+                async with self.line:
+                    entered = True
+                    try:
+                        return await self._poll(heard)
+                    finally:
+                        await self._leave()
+        finally:
+            for counts in self.line.outputs.statistics() if entered else ():
+                note(output_text(counts))
+            self._manager.close()
+
+    async def _poll(self, hangups: MemoryObjectReceiveStream[None]) -> int:
+        for group in self.line.groups.values():
+            self._watch.add(group)
+        self._say_what_is_polled()
+        self._manager.ready()
+
+        async def beside() -> None:
+            try:
+                async with anyio.create_task_group() as tasks:
+                    tasks.start_soon(self._manager.show_life, self.line.bus)
+                    async for _ in hangups:
+                        await self._read_again()
+            finally:
+                await self._leave()  # at once: what is shown may take its time to end
+
+        return await follow(self._watch, beside)
+
+    def _say_what_is_polled(self) -> None:
+        if not self.line.groups:
+            note("nothing is polled: the file has no [groups.NAME]", Level.WARNING)
+        if self.line.safe_state:
+            writes = (f"{write.point.key} = {number_text(write.value)}" for write in self.line.safe_state.writes)
+            note(f"safe state: when this ends, {', '.join(writes)} within {self.line.safe_state.within:g} s")
+        else:
+            note("no safe state: when this ends, nodes keep what was written to them last (see [safe])")
+
+    async def _read_again(self) -> None:
+        """Go on as the file says now, and with whatever device has the port's name.
+
+        A file that is wrong is told, and the line goes on as it was.
+        """
+        self._manager.reloading()
+        self.line.bus.accept_device()
+        try:
+            file = await anyio.to_thread.run_sync(self._checked_file)
+            await self.line.take(file)
+        except (InvalidCommand, OSError) as error:
+            note(f"the file was read again, and nothing of it taken: {error}", Level.ERROR)
+        else:
+            self._watch.title = file.title
+            self._watch.replace_groups(self.line.groups.values())
+            note(f"{self._path} was read again", Level.NOTICE)
+            self._say_what_is_polled()
+        self._manager.ready()
+
+    def _checked_file(self) -> LineFile:
+        """Raises OSError, and InvalidCommand, naming line and key, for what is wrong with the file."""
+        file = load(self._path)
+        ConfiguredLine(file, port=self.line.bus.endpoint)
+        return file
+
+    def _tell_of_output(self, text: str) -> None:
+        down = any(counts.error for counts in self.line.outputs.statistics())
+        self._watch.announce(text, Level.WARNING if down else Level.NOTICE)
+
+    async def _leave(self) -> None:
+        """Send the safe state, once: nothing else is written any more."""
+        if self._leaving:
+            return
+        self._leaving = True
+        self._manager.stopping()
+        if self.line.safe_state:
+            outcomes = await self.line.safe_state.enter(self.line.bus)
+            self.left_safely = tell_unsafe(outcomes) == OK
+            if self.left_safely:
+                note(f"the safe state is confirmed: {', '.join(outcomes)}", Level.NOTICE)
+
+
+@contextmanager
+def hangups() -> Iterator[MemoryObjectReceiveStream[None]]:
+    """What SIGHUP brings, from now on; several that come while one is served are one more."""
+    send, receive = anyio.create_memory_object_stream[None](1)
+
+    def heard() -> None:
+        try:
+            send.send_nowait(None)
+        except anyio.WouldBlock:
+            pass
+
+    ours = threading.current_thread() is threading.main_thread()
+    loop = asyncio.get_running_loop()
+    with send, receive:
+        if ours:
+            loop.add_signal_handler(signal.SIGHUP, heard)
+        try:
+            yield receive
+        finally:
+            if ours:
+                loop.remove_signal_handler(signal.SIGHUP)
 
 
 def output_text(counts: OutputStatistics) -> str:
     text = f"{counts.kind}: {counts.written} {counts.what}, {counts.dropped} dropped"
+    if counts.spilled:
+        text += f", {counts.spilled} kept on disk for the next time"
     return f"{text}, down: {counts.error}" if counts.error else text

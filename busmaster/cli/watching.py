@@ -6,22 +6,25 @@ import math
 import sys
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from statistics import fmean
 from typing import Any
 
 import anyio
+from anyio.abc import TaskGroup
 
-from busmaster.arbiter.events import Event, LineChange, LineChanged, PortFailed
+from busmaster.arbiter.events import Event, LineChange, LineChanged, NodeChanged, PortFailed
+from busmaster.arbiter.health import Health
 from busmaster.arbiter.state import LineState
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup, Quality, Sample, Snapshot
-from busmaster.cli.app import OK
+from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import View
 from busmaster.cli.drawing import draw
 from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row
-from busmaster.cli.output import emit_all, json_line, note, value_text
+from busmaster.cli.output import Level, SteadyOutput, emit_all, json_line, note, value_text
 from busmaster.cli.parsing import parse_value
 from busmaster.doctor import uart
 from busmaster.errors import BusError, InvalidCommand
@@ -30,6 +33,8 @@ from busmaster.outputs.values import cycle_fields, event_text
 
 KEPT_PERIODS = 1_000
 KEPT_EVENTS = 8
+LINE = ""
+"""Stands for the line itself among what is in trouble."""
 SUSPENDED_FOR = 60.0
 UTILISATION_WINDOW = 1.0
 COUNTED_EVERY = 0.5
@@ -41,17 +46,22 @@ STATES = {LineState.OFFLINE: "offline", LineState.SETTLING: "settling"}
 class Watch:
     """What a person sees of a bus while its groups are polled. Times are in seconds since it was made.
 
-    `view` says how it is shown, `gate` is what the writes of the screen pass.
+    `view` says how it is shown, `gate` is what the writes of the screen pass. `steady`: that nobody can print any more
+    does not end it. It hears what happens to the bus from the start on, before that is entered too.
     """
 
-    def __init__(self, bus: Bus, title: str, view: View, *, gate: Gate | None = None) -> None:
+    def __init__(self, bus: Bus, title: str, view: View, *, gate: Gate | None = None, steady: bool = False) -> None:
         self.bus = bus
+        self.output = SteadyOutput(note) if steady else None
         self.title = title
         self.view = view
         self.gate = gate or Gate(bus, read_only=view.read_only)
         self.start = bus.now()
         self.groups: list[PollGroup] = []
         self.events: deque[str] = deque(maxlen=KEPT_EVENTS)
+        self._heard = bus.events()
+        self._troubles: set[str] = set()
+        self._tasks: TaskGroup | None = None
         self._periods: dict[str, deque[float]] = {}
         self._started: dict[str, float] = {}
         self._good: dict[Point[Any], Sample[Any]] = {}
@@ -64,8 +74,32 @@ class Watch:
         return round(time - self.start, 6)
 
     def add(self, group: PollGroup) -> None:
+        """Show this one too, from now on."""
         self.groups.append(group)
         self._periods[group.name] = deque(maxlen=KEPT_PERIODS)
+        if self._tasks is not None:
+            self._begin(self._tasks, group)
+
+    def replace_groups(self, groups: Iterable[PollGroup]) -> None:
+        """Show these from now on; one that is shown already goes on."""
+        wanted = list(groups)
+        for gone in [group for group in self.groups if group not in wanted]:
+            self.groups.remove(gone)
+            self._started.pop(gone.name, None)
+        for group in wanted:
+            if group not in self.groups:
+                self.add(group)
+        self.groups.sort(key=wanted.index)
+        self._counted = -math.inf
+
+    def show_groups(self, tasks: TaskGroup) -> None:
+        """Take in the cycles of all groups, those that are added later too, and print them unless there is a screen."""
+        self._tasks = tasks
+        for group in self.groups:
+            self._begin(tasks, group)
+
+    def _begin(self, tasks: TaskGroup, group: PollGroup) -> None:
+        tasks.start_soon(count_cycles if shown_on_screen(self.view) else print_cycles, self, group)
 
     def saw(self, snapshot: Snapshot) -> None:
         """Count one cycle, and keep the good values: a point that fails shows its last one, growing old."""
@@ -79,22 +113,48 @@ class Watch:
 
     async def listen(self) -> None:
         """Keep the last events, as text, until cancelled."""
-        async for event in self.bus.events():
+        async for event in self._heard:
             text = event_text(event)
-            if text and is_of_port(event):
-                self.announce(text)
+            level = self._level(event)
+            if text and level is not None:
+                self.announce(text, level)
             elif text:
                 self.tell(text)
+
+    def _level(self, event: Event) -> Level | None:
+        """How much it matters to whoever is not looking: a loss, and its end, once each. None for the rest."""
+        match event:
+            case PortFailed():
+                self._troubles.add(LINE)
+                return Level.ERROR
+            case LineChanged():
+                lost = event.change in (LineChange.DOWN, LineChange.NOISY)
+                return self._turn(LINE, Level.ERROR if lost else None)
+            case NodeChanged() if event.after in (Health.DOWN, Health.UP):
+                return self._turn(event.node.label, Level.WARNING if event.after is Health.DOWN else None)
+            case _:
+                return None
+
+    def _turn(self, what: str, trouble: Level | None) -> Level | None:
+        """It is in trouble, or no longer: how much that matters if it is new."""
+        if trouble is None:
+            known = what in self._troubles
+            self._troubles.discard(what)
+            return Level.NOTICE if known else None
+        if what in self._troubles:
+            return None
+        self._troubles.add(what)
+        return trouble
 
     def tell(self, text: str) -> None:
         """Add to the last events."""
         self.events.append(f"{self.bus.now() - self.start:7.1f} s  {text}")
 
-    def announce(self, text: str) -> None:
-        """Add to the last events; without a screen to show them, print a line on standard error."""
+    def announce(self, text: str, level: Level = Level.NOTICE) -> None:
+        """Add to the last events; print a line on standard error, unless the screen that shows them is there."""
         self.tell(text)
-        if not shown_on_screen(self.view):
-            note(text)
+        if not (shown_on_screen(self.view) and sys.stderr.isatty()):
+            note(text, level)
 
     def picture(self) -> Frame:
         """For the screen. Cheap: it is taken on the loop that owns the line."""
@@ -220,13 +280,6 @@ class Watch:
             note(f"uart: {text}; `busmaster doctor` says what to look for")
 
 
-def is_of_port(event: Event) -> bool:
-    """Whether it is about the port, on which everything hangs."""
-    return isinstance(event, PortFailed) or (
-        isinstance(event, LineChanged) and event.change in (LineChange.UP, LineChange.DOWN)
-    )
-
-
 def p99_of(periods: Iterable[float]) -> float | None:
     ordered = sorted(periods)
     return ordered[math.ceil(0.99 * len(ordered)) - 1] if ordered else None
@@ -253,7 +306,8 @@ def error_text(error: BusError) -> str:
 
 
 def print_cycle(watch: Watch, snapshot: Snapshot) -> None:
-    emit_all([json_cycle(watch, snapshot)] if watch.view.as_json else plain_cycle(watch, snapshot))
+    lines = [json_cycle(watch, snapshot)] if watch.view.as_json else plain_cycle(watch, snapshot)
+    emit_all(lines) if watch.output is None else watch.output.print(lines)
 
 
 async def print_cycles(watch: Watch, group: PollGroup) -> None:
@@ -278,20 +332,27 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
     if not on_screen and wants_screen(view):
         note("the live view needs the extra named tui (pip install 'busmaster[tui]'); plain lines instead")
     status = OK
+
+    async def show(tasks: TaskGroup) -> None:
+        """Beside the others: a screen that takes its time to end holds up nothing else that is to be done then."""
+        nonlocal status
+        status = await draw(watch.picture, lambda action: tasks.start_soon(watch.act, action))
+        if status == FAILED and watch.output is not None:
+            status = OK
+            watch.view = replace(view, plain=True)
+            note("the screen is gone; polling goes on without it", Level.WARNING)
+        else:
+            tasks.cancel_scope.cancel()
+
     try:
         with anyio.move_on_after(view.seconds):
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(watch.listen)
                 if beside is not None:
                     tasks.start_soon(beside)
-                for group in watch.groups:
-                    if on_screen:
-                        tasks.start_soon(count_cycles, watch, group)
-                    else:
-                        tasks.start_soon(print_cycles, watch, group)
+                watch.show_groups(tasks)
                 if on_screen:
-                    status = await draw(watch.picture, lambda action: tasks.start_soon(watch.act, action))
-                    tasks.cancel_scope.cancel()
+                    tasks.start_soon(show, tasks)
     finally:
         watch.summarise()
     return status

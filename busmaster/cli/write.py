@@ -34,7 +34,7 @@ async def write(
 ) -> None:
     bus = connection.open_bus()
     handle = connection.open_handle(bus, address)
-    prepared = [(item, handle.prepare_write(item, values, verify)) for item, values in pairs]
+    prepared = [(item, handle.prepare_write(item, values, verify=verify)) for item, values in pairs]
     async with bus:
         for item, sends in prepared:
             for send in sends:

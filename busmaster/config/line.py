@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator
+from operator import is_
 from types import TracebackType
 from typing import Any
 
@@ -15,11 +16,12 @@ from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.config.names import expanded, listed
 from busmaster.config.points import NamedPoint, Scale
-from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
+from busmaster.config.safe import SafeState, SafeWrite
+from busmaster.config.sections import GroupSection, LineFile, NodeSection, PointSection, load
 from busmaster.contract.arguments import guess, is_decimal, meant
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
-from busmaster.outputs.distributor import Distributor
+from busmaster.outputs.distributor import Distributor, Wanted
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
 from busmaster.transport.endpoints import Endpoint
@@ -31,8 +33,8 @@ class ConfiguredLine:
     `nodes` are the handles by the file's names; `groups` the poll groups, once it is entered. Raises FileError, which
     names line and key, for what the protocols or the outputs cannot do. `port` is used instead of the file's. `tap`
     sees every byte. Without `outputs` nothing is recorded or published. `tell` is called, on the loop, with what
-    happens to the outputs. `read_only` lets nothing from outside be written: `gate` is what all of that
-    passes.
+    happens to the outputs. `read_only` lets nothing from outside be written: `gate` is what all of that passes. With
+    `wait_for_port` a port that cannot be opened yet is no error.
     """
 
     def __init__(
@@ -44,15 +46,17 @@ class ConfiguredLine:
         tap: Tap | None = None,
         tell: Callable[[str], None] = lambda _: None,
         read_only: bool = False,
+        wait_for_port: bool = False,
     ) -> None:
         self.file = file
-        self.bus = Bus(port or file.port, tap=tap, strict=file.strict)
+        self.bus = Bus(port or file.port, tap=tap, strict=file.strict, wait_for_port=wait_for_port)
         self.nodes: dict[str, Handle] = {name: self._handle(node) for name, node in file.nodes.items()}
         self.groups: dict[str, PollGroup] = {}
         self._points: dict[str, NamedPoint] = {}
         for node in file.nodes.values():
             self._limit(node)
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
+        self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         self.gate = Gate(self.bus, read_only=read_only)
         self.outputs = Distributor(self.bus, tell, gate=self.gate)
         self.gate.record = self.outputs.record
@@ -63,15 +67,7 @@ class ConfiguredLine:
         """Raises LineDown if the port cannot be opened."""
         await self.bus.__aenter__()
         try:
-            for group in self.file.groups.values():
-                with group.table.at():
-                    self.groups[group.name] = self.bus.poll_group(
-                        group.name,
-                        period=group.period,
-                        phase=group.phase,
-                        priority=group.priority,
-                        points=self._wanted[group.name],
-                    )
+            self._start_groups()
             self.outputs.start(self.groups.values())
         except BaseException:
             await self.__aexit__(None, None, None)
@@ -87,12 +83,39 @@ class ConfiguredLine:
         finally:
             await self.outputs.close()
 
-    def point(self, name: str) -> Point[Any]:
+    async def take(self, file: LineFile) -> None:
+        """Go on as another reading of the file says: what did not change keeps its grid and streams.
+
+        Groups whose section or points changed are closed and made anew; so are outputs, and the others are reopened.
+        Raises InvalidCommand, having changed nothing, for what needs a new start: another port, other settings of a
+        node. The file is to be one of which a line can be made.
+        """
+        check_same_line(self.file, file)
+        fresh = {name: self._handle(node) for name, node in file.nodes.items() if name not in self.nodes}
+        before, points, wanted = self.file, self._points, self._wanted
+        self.nodes = {name: self.nodes.get(name) or fresh[name] for name in file.nodes}
+        self.file = file
+        self._points = {name: point for name, point in points.items() if _section(before, name) == _section(file, name)}
+        self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
+        self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
+        for name, group in list(self.groups.items()):
+            same = before.groups[name] == file.groups.get(name) and wanted[name] == self._wanted[name]
+            if not (same and all(map(is_, wanted[name], self._wanted[name]))):
+                del self.groups[name]
+                group.close()
+        self._start_groups()
+        await self.outputs.replace(dict(self._wanted_outputs()), self.groups.values())
+
+    def point(self, name: str) -> NamedPoint:
         """The point that the file calls so: "winder/position", "press/2008:32". Raises InvalidCommand."""
         node, slash, item = name.partition("/")
         if not slash or node not in self.nodes:
             raise InvalidCommand(f"no such point {name!r}: use NODE/ITEM with one of {', '.join(self.nodes)}")
         return self._point(node, item)
+
+    def members(self, group: str) -> tuple[Point[Any], ...]:
+        """Return the points of a poll group of the file."""
+        return self._wanted[group]
 
     def plan(self) -> Plan:
         """Whether the file's poll groups fit its line. Pure arithmetic: nothing is opened."""
@@ -110,6 +133,20 @@ class ConfiguredLine:
         return self.bus.plan(*planned)
 
     # inside
+
+    def _start_groups(self) -> None:
+        """Start those that do not run."""
+        for group in self.file.groups.values():
+            if group.name not in self.groups:
+                with group.table.at():
+                    self.groups[group.name] = self.bus.poll_group(
+                        group.name,
+                        period=group.period,
+                        phase=group.phase,
+                        priority=group.priority,
+                        points=self._wanted[group.name],
+                    )
+        self.groups = {name: self.groups[name] for name in self.file.groups}
 
     def _handle(self, node: NodeSection) -> Handle:
         options = dict(node.options)
@@ -180,7 +217,29 @@ class ConfiguredLine:
         source = handle.point(section.item)
         return NamedPoint.of(source, where=where, name=name, unit=section.unit, scale=scale, declared=section.writable)
 
+    def _safe_writes(self) -> Iterator[SafeWrite]:
+        """The writes of `[safe]`, as they stand there."""
+        section = self.file.safe
+        table = section.table.table("writes")
+        known: dict[object, str] = {}
+        for name in section.repeatable:
+            if name not in section.writes:
+                raise section.table.error(f"{name} is not among the writes", "repeatable")
+        for name, value in section.writes.items():
+            with table.at(name):
+                point = self.point(name)
+                other = known.setdefault(point.quantity, name)
+                if other != name:
+                    raise InvalidCommand(f"{other} is the same quantity: write it once")
+                handle = self.nodes[name.partition("/")[0]]
+                yield SafeWrite.of(point, handle, value, repeatable=name in section.repeatable)
+
     def _add_outputs(self) -> None:
+        for kind, wanted in self._wanted_outputs():
+            with self.file.table.table("outputs").table(kind).at():
+                self.outputs.add(kind, wanted.settings, commands=wanted.commands)
+
+    def _wanted_outputs(self) -> Iterator[tuple[str, Wanted]]:
         for kind, settings in self.file.outputs.items():
             table = self.file.table.table("outputs").table(kind)
             writable: dict[str, Point[Any]] = {}
@@ -188,14 +247,39 @@ class ConfiguredLine:
                 for number, text in enumerate(settings.allow_commands):
                     with table.at("allow_commands", number):
                         writable |= {point.key: point for point in map(self._writable, self._names(text))}
-            with table.at():
-                self.outputs.add(kind, settings, commands=writable)
+            yield kind, Wanted(settings, writable)
 
     def _writable(self, name: tuple[str, str]) -> Point[Any]:
         point = self._point(*name)
         if not point.writable:
             raise InvalidCommand(f"{point.key} is read-only")
         return point
+
+
+def check_same_line(before: LineFile, after: LineFile) -> None:
+    """Raise InvalidCommand where a file says of the port, or of a node, what a line that runs cannot change."""
+    if (before.port, before.strict) != (after.port, after.strict):
+        raise InvalidCommand("other settings of the port need a restart: nothing of the file was taken")
+    own = {_address(node): node for node in before.nodes.values()}
+    for node in after.nodes.values():
+        known = before.nodes.get(node.name) or own.get(_address(node))
+        if known is not None and _settings(known) != _settings(node):
+            raise InvalidCommand(f"other settings of node {node.name!r} need a restart: nothing of the file was taken")
+
+
+def _address(node: NodeSection) -> tuple[str, int]:
+    return node.profile.name, node.address
+
+
+def _settings(node: NodeSection) -> tuple[object, ...]:
+    decimals = decimals_of(node) if node.kind.takes_decimals else None
+    return node.name, node.protocol, node.address, node.timings, node.retries, node.options, decimals
+
+
+def _section(file: LineFile, name: str) -> PointSection | None:
+    """What a file says of the point that it calls so; None for one that goes by its item, and of a node it has not."""
+    node, _, point = name.partition("/")
+    return file.nodes[node].points.get(point) if node in file.nodes else None
 
 
 def _known(handle: Handle, item: str, points: Iterable[str]) -> Point[Any]:

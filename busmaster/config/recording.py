@@ -82,5 +82,5 @@ READERS: Readers = {
     "prefix": _topic,
 }
 """What is more than its type."""
-WITHOUT = {"metrics": ("groups", "buffer")}
+WITHOUT = {"metrics": ("buffer",)}
 """What an output that is asked for its values cannot be told."""

@@ -14,6 +14,7 @@ from busmaster.config.names import NODE_NAME, POINT_NAME, expanded
 from busmaster.config.options import check_keys, read_options
 from busmaster.config.ports import read_port
 from busmaster.config.recording import Outputs, read_outputs
+from busmaster.config.safe import SafeSection, read_safe
 from busmaster.config.source import Source
 from busmaster.config.table import Table
 from busmaster.config.timing import read_timings
@@ -100,6 +101,7 @@ class LineFile:
     nodes: Mapping[str, NodeSection]
     groups: Mapping[str, GroupSection]
     outputs: Outputs
+    safe: SafeSection
     emulator: EmulatorSection
     table: Table = field(compare=False, repr=False)
 
@@ -112,7 +114,7 @@ def load(path: str | os.PathLike[str]) -> LineFile:
 def read(source: Source) -> LineFile:
     """Raises FileError, naming line and key."""
     top = Table(source)
-    top.only("title", "port", "strict", "protocols", "nodes", "groups", "outputs", "emulator")
+    top.only("title", "port", "strict", "protocols", "nodes", "groups", "outputs", "safe", "emulator")
     nodes = {node.name: node for node in _nodes(top, _defaults(top))}
     groups = {table.name: _group(table) for table in top.tables("groups")}
     file = LineFile(
@@ -123,6 +125,7 @@ def read(source: Source) -> LineFile:
         nodes=nodes,
         groups=groups,
         outputs=read_outputs(top.table("outputs"), groups),
+        safe=read_safe(top.table("safe")),
         emulator=read_emulator(top.table("emulator"), {node.name: node.kind for node in nodes.values()}),
         table=top,
     )

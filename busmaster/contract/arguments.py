@@ -66,3 +66,14 @@ def meant(name: str, known: Iterable[str]) -> str:
     if near is not None:
         return f"did you mean {near!r}?"
     return f"there are {', '.join(known)}" if known else "there are none"
+
+
+__all__ = [
+    "Between",
+    "guess",
+    "is_decimal",
+    "meant",
+    "nearest",
+    "seconds",
+    "whole_number",
+]

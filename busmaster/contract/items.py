@@ -54,3 +54,12 @@ def bits_of(
     return tuple(
         Bit(flag.bit_length() - 1, str(flag.name), meaning, severity(flag)) for flag, meaning in meanings.items()
     )
+
+
+__all__ = [
+    "Access",
+    "Bit",
+    "Item",
+    "Severity",
+    "bits_of",
+]

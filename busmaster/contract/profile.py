@@ -111,3 +111,11 @@ class Profile:
             + (f" without {', '.join(gaps)}" if gaps else "")
             + ("" if self.broadcast is None else f", or {self.broadcast} to write to all")
         )
+
+
+__all__ = [
+    "START_BIT",
+    "Batch",
+    "LineSettings",
+    "Profile",
+]

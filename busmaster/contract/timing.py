@@ -67,3 +67,9 @@ class Timings:
         return Timings(
             self.read.with_lateness(lateness), self.write.with_lateness(lateness), self.packet.with_lateness(lateness)
         )
+
+
+__all__ = [
+    "ReplyTiming",
+    "Timings",
+]

@@ -28,3 +28,9 @@ class NoChance:
 
     def getrandbits(self, k: int) -> int:
         return int(self.random())
+
+
+__all__ = [
+    "Chance",
+    "NoChance",
+]

@@ -182,3 +182,12 @@ class Device(ABC):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.address}>"
+
+
+__all__ = [
+    "NAK",
+    "NEVER",
+    "Delay",
+    "Device",
+    "held",
+]

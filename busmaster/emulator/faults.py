@@ -132,3 +132,17 @@ class Faults:
 
 NAMES = tuple(sorted({*HEARING, *SPEAKING, *SECONDS}))
 CALM = Faults()
+
+
+__all__ = [
+    "BEYOND",
+    "CALM",
+    "FORGED",
+    "HEARING",
+    "NAMES",
+    "NO_NOISE",
+    "SECONDS",
+    "SPEAKING",
+    "WITHIN",
+    "Faults",
+]

@@ -353,3 +353,12 @@ class Line:
         else:
             self._inbox += data
             self._arrived = when
+
+
+__all__ = [
+    "PIECE",
+    "ROUNDING",
+    "Echo",
+    "Line",
+    "Talk",
+]

@@ -139,3 +139,9 @@ class MemoryTransport(asyncio.Transport):
         if data:
             self._protocol.data_received(data)
         self._arm(self._line.next_event())
+
+
+__all__ = [
+    "MemoryPort",
+    "MemoryTransport",
+]

@@ -133,3 +133,10 @@ class Axis:
         self._arrives = NEVER
         self._ramp.target = speed
         self.motion = motion
+
+
+__all__ = [
+    "Axis",
+    "Motion",
+    "Ramp",
+]

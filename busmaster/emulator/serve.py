@@ -255,3 +255,14 @@ def serve_pty(line: Line, link: str | os.PathLike[str] | None = None) -> PtyServ
 def serve_tcp(line: Line, host: str = "127.0.0.1", port: int = 0) -> TcpServer:
     """Serves `line` on a TCP port until closed."""
     return TcpServer(line, host, port)
+
+
+__all__ = [
+    "CHUNK",
+    "SPIN",
+    "LineServer",
+    "PtyServer",
+    "TcpServer",
+    "serve_pty",
+    "serve_tcp",
+]

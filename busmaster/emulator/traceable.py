@@ -46,3 +46,10 @@ class TraceableMemory:
         sent = (round(value) - base) % self.modulus
         if abs(sent - count) > slack:
             self.foreign_writes += 1
+
+
+__all__ = [
+    "SPREAD",
+    "TraceableMemory",
+    "traceable_value",
+]

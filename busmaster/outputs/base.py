@@ -5,7 +5,7 @@ into the queue every TICK, so that it is never woken by the line, takes what is 
 the interpreter after each piece. What it holds is bounded: when it cannot get rid of it, the oldest is dropped.
 
 Each count has one writer, the loop or the thread, so that they are exact without a lock:
-`offered` = `written` + `dropped` + what waits.
+`offered` = `written` + `dropped` + `lost` + `spilled` + what waits in memory.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ def size_of(item: Item) -> int:
 class OutputStatistics:
     """Counts of values and events; of answers where it only answers (`what`: "answered").
 
-    `error` is why it is down, "" while it is not.
+    `error` is why it is down, "" while it is not. `spilled` is how many of those that wait do so on disk, where they
+    survive the end of the process.
     """
 
     kind: str
@@ -70,6 +71,7 @@ class OutputStatistics:
     dropped: int
     waiting: int
     error: str
+    spilled: int = 0
 
 
 def reason(error: BaseException) -> str:
@@ -117,10 +119,13 @@ class Output(ABC):
         self.groups = settings.groups
         self.error = ""
         self.offered = self.dropped = self.written = 0
+        self.spilled = self.lost = 0
+        """Values that wait on disk, and those that the thread had to drop from there."""
         self._capacity = settings.buffer
         self._say = say
         self._waiting: deque[Item] = deque()
         self._stop = threading.Event()
+        self._reopen = threading.Event()
         self._retry = FIRST_RETRY
         self._thread = threading.Thread(target=self._run, name=f"busmaster {kind}", daemon=True)
 
@@ -133,7 +138,7 @@ class Output(ABC):
         """Never waits. Drops the oldest where the output does not keep up."""
         self._waiting.append(item)
         self.offered += size_of(item)
-        while self.offered - self.dropped - self.written > self._capacity:
+        while self.offered - self.dropped - self.written - self.spilled - self.lost > self._capacity:
             try:
                 oldest = self._waiting.popleft()
             except IndexError:
@@ -145,18 +150,32 @@ class Output(ABC):
         self.offered += values
         self.dropped += values
 
+    def reopen(self) -> None:
+        """Have it let go of the file that is open, if there is one, and open it anew: it may have been moved away."""
+        self._reopen.set()
+
+    def succeed(self, before: Output) -> None:
+        """Count on from the one that it replaces, which is closed. Called before it is started."""
+        self.offered += before.offered
+        self.dropped += before.dropped
+        self.written += before.written
+
     def statistics(self) -> OutputStatistics:
-        waiting = self.offered - self.written - self.dropped
-        return OutputStatistics(self.kind, self.what, self.written, self.dropped, waiting, self.error)
+        dropped = self.dropped + self.lost
+        waiting = self.offered - self.written - dropped
+        return OutputStatistics(self.kind, self.what, self.written, dropped, waiting, self.error, self.spilled)
 
     # off the loop
 
     def close(self, within: float) -> None:
-        """Let it write what waits, for so many seconds; what is left is dropped. Nothing is offered any more."""
+        """Let it write what waits, for so many seconds; what is left, and not on disk, is dropped.
+
+        Nothing is offered any more.
+        """
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(within)
-        self.dropped = self.offered - self.written
+        self.dropped = self.offered - self.written - self.spilled - self.lost
 
     # on the thread
 
@@ -184,6 +203,10 @@ class Output(ABC):
             self.error = text
             self._say(f"{self.kind} is down: {text}")
 
+    def rest(self, seconds: float) -> None:
+        """Wait for the next try, or until it is stopped."""
+        self._stop.wait(seconds)
+
     def _run(self) -> None:
         """Whatever goes wrong is told and tried again: it must not end the thread."""
         while True:
@@ -195,7 +218,7 @@ class Output(ABC):
                 self.down(error)
             if last:
                 return
-            self._stop.wait(self._retry)
+            self.rest(self._retry)
             self._retry = min(2 * self._retry, LAST_RETRY)
 
 
@@ -229,6 +252,9 @@ class BatchOutput(Output, Generic[Formatted]):
             stopped = False
             while not stopped:
                 stopped = self._stop.wait(TICK)
+                if self._reopen.is_set():
+                    self._reopen.clear()
+                    self.shut()
                 while self._fill():
                     self.commit(self._batch)
                     self._batch = []

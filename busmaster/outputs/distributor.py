@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import Any, NamedTuple, Protocol
 
 import anyio
 
 from busmaster.arbiter.events import LatenessRaised, NodeChanged
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
-from busmaster.bus.polling import PollGroup, Snapshot, Stream
+from busmaster.bus.polling import Snapshot, Stream
 from busmaster.gate.gate import Gate
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Happening, Output, OutputStatistics
@@ -26,6 +27,34 @@ FAREWELL = 5.0
 """Seconds in which the outputs write what they still hold, when the line is closed."""
 
 
+class Source(Protocol):
+    """Where cycles come from: a poll group, or what is heard of one."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def points(self) -> tuple[Point[Any], ...]: ...
+
+    def subscribe(self, buffer: int, /) -> Stream[Snapshot]: ...
+
+
+class Wanted(NamedTuple):
+    """What one output is told. `commands`: the points, by their key, that it lets others write."""
+
+    settings: Settings
+    commands: Mapping[str, Point[Any]]
+
+    def same(self, other: Wanted | None) -> bool:
+        """Whether the other is the same output: points that are equal may have another scale."""
+        return (
+            other is not None
+            and self.settings == other.settings
+            and self.commands.keys() == other.commands.keys()
+            and all(point is other.commands[key] for key, point in self.commands.items())
+        )
+
+
 class Distributor:
     """The outputs of one bus. `tell` is called, on the loop, with what happens to them.
 
@@ -37,24 +66,44 @@ class Distributor:
         self.gate = gate or Gate(bus)
         self._bus = bus
         self._outputs: list[Output] = []
-        self._tasks: list[asyncio.Task[None]] = []
+        self._feeding: dict[Source, asyncio.Task[None]] = {}
+        self._watching: asyncio.Task[None] | None = None
+        self._wanted: dict[str, Wanted] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def add(self, kind: str, settings: Settings, *, commands: Mapping[str, Point[Any]] | None = None) -> None:
         """One more. `commands`: the points that it lets others write. Raises InvalidCommand if an extra is missing."""
-        self._outputs.append(self._make(kind, settings, commands or {}))
+        self._wanted[kind] = wanted = Wanted(settings, commands or {})
+        self._outputs.append(self._make(kind, *wanted))
 
-    def start(self, groups: Iterable[PollGroup]) -> None:
+    def start(self, groups: Iterable[Source]) -> None:
         """From now on, until `close`."""
         self._loop = asyncio.get_running_loop()
-        if not self._outputs:
-            return
         for output in self._outputs:
             output.start()
-        for group in groups:
-            takers = [output for output in self._outputs if not output.groups or group.name in output.groups]
-            self._begin(self._feed(group.subscribe(WAITING), group, takers))
-        self._begin(self._watch())
+        self._take_in(groups)
+
+    async def replace(self, wanted: Mapping[str, Wanted], groups: Iterable[Source]) -> None:
+        """Run these outputs, and feed them from these groups, from now on.
+
+        One that is wanted as it was is reopened, and goes on with what it holds. Another is closed, within FAREWELL
+        seconds, and what comes meanwhile waits for its successor. Raises InvalidCommand, having changed nothing, if an
+        extra is missing.
+        """
+        fresh = {kind: self._make(kind, *one) for kind, one in wanted.items() if not one.same(self._wanted.get(kind))}
+        kept = [output for output in self._outputs if output.kind in wanted and output.kind not in fresh]
+        leaving = {output.kind: output for output in self._outputs if output not in kept}
+        self._outputs = [*kept, *fresh.values()]
+        self._wanted = dict(wanted)
+        for output in kept:
+            output.reopen()
+        self._take_in(groups)
+        with anyio.CancelScope(shield=True):
+            await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in leaving.values()))
+            for kind, output in fresh.items():
+                if kind in leaving:
+                    output.succeed(leaving[kind])
+                output.start()
 
     def record(self, write: WriteRecord) -> None:
         """Hand a write to all of them."""
@@ -64,27 +113,38 @@ class Distributor:
     async def close(self) -> None:
         """When the bus is closed: what was polled is still handed on, and written within FAREWELL seconds."""
         with anyio.CancelScope(shield=True):
-            if self._tasks:
-                *feeding, watching = self._tasks
-                await asyncio.gather(*feeding, return_exceptions=True)
-                watching.cancel()
-                await asyncio.gather(watching, return_exceptions=True)
+            await asyncio.gather(*self._feeding.values(), return_exceptions=True)
+            if self._watching is not None:
+                self._watching.cancel()
+                await asyncio.gather(self._watching, return_exceptions=True)
             await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in self._outputs))
-        self._tasks.clear()
+        self._feeding.clear()
+        self._watching = None
 
     def statistics(self) -> tuple[OutputStatistics, ...]:
         return tuple(output.statistics() for output in self._outputs)
 
-    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
-        """Tasks of their own: a task group would tie entering and leaving the line to one task."""
-        self._tasks.append(asyncio.ensure_future(work))
+    def _take_in(self, groups: Iterable[Source]) -> None:
+        """In tasks of their own: a task group would tie entering and leaving the line to one task."""
+        if not self._outputs:
+            return
+        for group in groups:
+            if group not in self._feeding:
+                self._feeding[group] = task = asyncio.ensure_future(self._feed(group.subscribe(WAITING), group))
+                task.add_done_callback(partial(self._fed, group))
+        if self._watching is None:
+            self._watching = asyncio.ensure_future(self._watch())
 
-    async def _feed(self, cycles: Stream[Snapshot], group: PollGroup, takers: list[Output]) -> None:
+    def _fed(self, group: Source, _: asyncio.Task[None]) -> None:
+        self._feeding.pop(group, None)
+
+    async def _feed(self, cycles: Stream[Snapshot], group: Source) -> None:
         lost = 0
         async for snapshot in cycles:
-            for output in takers:
-                output.offer(snapshot)
-                output.miss((cycles.dropped - lost) * len(group.points))
+            for output in self._outputs:
+                if not output.groups or group.name in output.groups:
+                    output.offer(snapshot)
+                    output.miss((cycles.dropped - lost) * len(group.points))
             lost = cycles.dropped
 
     async def _watch(self) -> None:

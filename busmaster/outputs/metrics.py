@@ -1,12 +1,13 @@
 """OpenMetrics: the counts of line, nodes, groups and outputs, for a Prometheus that comes and asks.
 
-A scrape is served by a thread. Each number is read on the loop that owns the line, a node at a time, so that no scrape
-keeps it for more than some ten microseconds.
+With `groups`, their values too. Scrapes are served by one thread, one after the other. Each number is read on the loop
+that owns the line, a node at a time, so that no scrape keeps it for more than some ten microseconds.
 """
 
 from __future__ import annotations
 
 import asyncio
+import enum
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
@@ -19,7 +20,9 @@ from busmaster.arbiter.transaction import Priority
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.outputs.base import Output, OutputStatistics, check_extra
+from busmaster.outputs.scrapes import listening, page, serve
 from busmaster.outputs.settings import MetricsSettings
+from busmaster.outputs.values import micros
 
 if TYPE_CHECKING:
     from prometheus_client.core import HistogramMetricFamily, Metric
@@ -98,20 +101,14 @@ class MetricsOutput(Output):
     # on threads
 
     def work(self) -> None:
-        from prometheus_client import start_http_server
         from prometheus_client.core import CollectorRegistry
 
         registry = CollectorRegistry()
         registry.register(self)
-        server, thread = start_http_server(self.port, self._host, registry)
-        self.port = server.server_port
-        self.up()
-        try:
-            self._stop.wait()
-        finally:
-            server.shutdown()
-            thread.join()
-            server.server_close()
+        with listening(self._host, self.port) as listener:
+            self.port = listener.getsockname()[1]
+            self.up()
+            asyncio.run(serve(listener, partial(page, registry), self._stop))
 
     def describe(self) -> Iterable[Metric]:
         """Nothing: so that registering does not ask the line."""
@@ -122,6 +119,7 @@ class MetricsOutput(Output):
         yield from self._of_line()
         yield from self._of_nodes()
         yield from self._of_groups()
+        yield from self._of_points()
         yield from self._of_outputs()
         self.offered += 1
         self.written = self.offered
@@ -194,19 +192,44 @@ class MetricsOutput(Output):
             achieved.add_metric([group.name], counts.achieved)
         yield from (cycles, missed, wanted, achieved)
 
+    def _of_points(self) -> Iterator[Metric]:
+        """The last values of the groups that are to be told: what is no number, or was not read, is left out."""
+        from prometheus_client.core import GaugeMetricFamily
+
+        labels = ["group", "node", "item", "unit"]
+        values = GaugeMetricFamily("busmaster_value", "The value that was read last", labels=labels)
+        times = GaugeMetricFamily("busmaster_value_time_seconds", "When it was read, since 1970", labels=labels)
+        for group in self._bus.groups:
+            latest = group.latest if group.name in self.groups else None
+            for point, sample in latest.samples.items() if latest is not None else ():
+                number = number_of(sample.value)
+                if sample.error is None and number is not None:
+                    node, _, item = point.key.partition("/")
+                    values.add_metric([group.name, node, item, point.unit], number)
+                    times.add_metric([group.name, node, item, point.unit], micros(sample.wall))
+        yield from (values, times)
+
     def _of_outputs(self) -> Iterator[Metric]:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         written = CounterMetricFamily("busmaster_output_written", "Values and events written", labels=["output"])
         dropped = CounterMetricFamily("busmaster_output_dropped", "Values and events dropped", labels=["output"])
         waiting = GaugeMetricFamily("busmaster_output_waiting", "Values and events that wait", labels=["output"])
+        spilled = GaugeMetricFamily("busmaster_output_spilled", "Of those, on disk", labels=["output"])
         up = GaugeMetricFamily("busmaster_output_up", "1 while the output works", labels=["output"])
         for counts in self._others():
             written.add_metric([counts.kind], counts.written)
             dropped.add_metric([counts.kind], counts.dropped)
             waiting.add_metric([counts.kind], counts.waiting)
+            spilled.add_metric([counts.kind], counts.spilled)
             up.add_metric([counts.kind], float(not counts.error))
-        yield from (written, dropped, waiting, up)
+        yield from (written, dropped, waiting, spilled, up)
+
+
+def number_of(value: object) -> float | None:
+    """As a gauge has it: words and flags by their number, None for what is not one number."""
+    number = value.value if isinstance(value, enum.Enum) else value
+    return float(number) if isinstance(number, int | float) else None
 
 
 def read_node(node: Node) -> tuple[NodeStatistics, list[tuple[float, int]], float]:

@@ -13,14 +13,16 @@
     PREFIX/audit              each write, by whatever door: who, what, when, what became of it
 
 In names +, # and % are written %2B, %23 and %25. A command is written within a second of its arrival, or by `expires`
-or the message's own expiry where it has one; an older one is refused. Times are seconds since
-1970. What was not acknowledged when the broker went away is sent again when it is back.
+or the message's own expiry where it has one; an older one is refused. Times are seconds since 1970. What was not
+acknowledged when the broker went away is sent again when it is back. With `spill`, what waits for it does so on disk,
+and is sent by the next process if this one ends before.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import sqlite3
 import ssl
 import time
 from collections import deque
@@ -37,9 +39,10 @@ from busmaster.bus.polling import Snapshot
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate, Wish
 from busmaster.gate.record import WriteRecord
-from busmaster.outputs.base import TICK, Item, Output, check_extra, reason, size_of
+from busmaster.outputs.base import BATCH, PAUSE, TICK, Item, Output, check_extra, reason, size_of
 from busmaster.outputs.mqtt_commands import Answer, Commands, Inbox
 from busmaster.outputs.settings import MqttSettings
+from busmaster.outputs.spool import Record, Spool
 from busmaster.outputs.values import cycle_fields, json_line, micros, sample_fields, write_fields
 
 if TYPE_CHECKING:
@@ -53,6 +56,10 @@ BREATH = 0.002
 TIMEOUT = 5.0
 """Seconds in which a broker must answer."""
 KEEP_ALIVE = 15
+SPILL_EVERY = 0.2
+"""Seconds between two movings of what waits to disk, while the broker is away."""
+HURRY = 2.0
+"""Seconds from the wish to end until what could not be sent goes to disk."""
 
 
 class Outgoing(NamedTuple):
@@ -84,6 +91,11 @@ class MqttOutput(Output):
         self._arriving: Commands
         self._owner: asyncio.AbstractEventLoop | None = None
         self._held: list[Item] = []
+        self._spool: Spool | None = None
+        if settings.spill is not None:
+            self._spool = Spool(settings.spill, settings.spill_values, say)
+            self.offered = self.spilled = self._spool.values  # of the last time
+        self._spool_error = ""
         self._published: dict[str, str] = {}
         self._quiet = logging.getLogger("busmaster.mqtt")
         self._quiet.addHandler(logging.NullHandler())
@@ -93,10 +105,75 @@ class MqttOutput(Output):
         self._owner = asyncio.get_running_loop()
         super().start()
 
+    def close(self, within: float) -> None:
+        super().close(within)
+        if self._spool is not None and not self._thread.is_alive():
+            self._spool.close()
+
     # on the thread
 
     def work(self) -> None:
-        asyncio.run(self._connected())
+        asyncio.run(self._in_time())
+
+    def rest(self, seconds: float) -> None:
+        """What comes while the broker is away goes to disk, if it may."""
+        over = time.monotonic() + seconds
+        while not self._stop.is_set() and time.monotonic() < over:
+            self._put_by()
+            self._stop.wait(min(SPILL_EVERY, seconds))
+
+    async def _in_time(self) -> None:
+        """Whatever happens, what is left in memory is on disk when this ends, if it may: before the process does."""
+        try:
+            async with anyio.create_task_group() as tasks:
+                if self._spool is not None:
+                    tasks.start_soon(self._hurry, tasks.cancel_scope)
+                await self._connected()
+                tasks.cancel_scope.cancel()
+        finally:
+            self._put_by()
+
+    async def _hurry(self, scope: anyio.CancelScope) -> None:
+        """A broker that does not answer when all is to end is not waited for to the last moment."""
+        while not self._stop.is_set():  # noqa: ASYNC110  # another thread sets it
+            await anyio.sleep(TICK)
+        await anyio.sleep(HURRY)
+        scope.cancel()
+
+    def _put_by(self) -> None:
+        """Move what waits from memory to disk. What the disk does not take stays where it is, which is told once."""
+        while self._spool is not None and self._fill(BATCH):
+            values = sum(map(size_of, self._held))
+            try:
+                lost = self._spool.put(self._records())
+            except sqlite3.Error as error:
+                if str(error) != self._spool_error:
+                    self._spool_error = str(error)
+                    self._say(f"{self.kind}: {self._spool.path}: {error}")
+                return
+            self._held.clear()
+            self.spilled += values - lost
+            self.lost += lost
+            self._spool_error = ""
+
+    def _records(self) -> Iterator[Record]:
+        for item in self._held:
+            by_cycle = isinstance(item, Snapshot) and self._settings.messages == "cycle"
+            for topic, payload, retain in self._messages(item):
+                yield Record(topic, payload, retain, size_of(item) if by_cycle else 1)
+            if not self._stop.is_set():
+                time.sleep(PAUSE)
+
+    async def _send_spilled(self, client: Client) -> None:
+        """All that is on disk; what comes meanwhile goes behind it. When all is to end the rest stays there."""
+        while self._spool is not None and self.spilled and not self._stop.is_set():
+            up_to, records = self._spool.oldest(AT_ONCE)
+            await self._send(client, (Outgoing(topic, payload, retain) for topic, payload, retain, _ in records))
+            values = sum(record.values for record in records)
+            self._spool.remove(up_to, values)
+            self.written += values
+            self.spilled = self._spool.values
+            self._put_by()
 
     async def _connected(self) -> None:
         async with self._client() as client, anyio.create_task_group() as tasks:
@@ -111,7 +188,8 @@ class MqttOutput(Output):
             while not stopped:
                 stopped = self._stop.is_set()
                 await self._send(client, list(self._changes()))
-                while self._fill():
+                await self._send_spilled(client)
+                while not self.spilled and self._fill(AT_ONCE):
                     await self._send(client, (message for item in self._held for message in self._messages(item)))
                     self.written += sum(map(size_of, self._held))
                     self._held.clear()
@@ -160,10 +238,10 @@ class MqttOutput(Output):
                 task.cancel()
             await asyncio.gather(*under_way, return_exceptions=True)
 
-    def _fill(self) -> bool:
+    def _fill(self, most: int) -> bool:
         """What was not acknowledged comes first."""
         size = sum(map(size_of, self._held))
-        while size < AT_ONCE and (item := self.take()) is not None:
+        while size < most and (item := self.take()) is not None:
             self._held.append(item)
             size += size_of(item)
         return bool(self._held)

@@ -12,6 +12,7 @@ from busmaster.errors import InvalidCommand
 BUFFER = 50_000
 """Values that may wait, some 500 bytes each: ten minutes of 80 a second."""
 MOST_BUFFERED = 1_000_000
+MOST_SPILLED = 100_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +64,7 @@ class MqttSettings(Settings):
     """`messages`: one for each "point", or one for each "cycle". `qos` 0 may lose values unseen, 1 does not.
 
     `allow_commands` names the points ("winder/1") that commands may write; without any, no command is listened to.
+    `spill` is a file for what waits while the broker is away, which then survives a restart: `spill_values` at most.
     """
 
     host: str = "127.0.0.1"
@@ -75,12 +77,14 @@ class MqttSettings(Settings):
     password_file: str | None = None
     tls: bool = False
     ca_file: str | None = None
+    spill: str | None = None
+    spill_values: Annotated[int, Between(1, MOST_SPILLED)] = 1_000_000
     allow_commands: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MetricsSettings(Settings):
-    """Where it is served: only there."""
+    """Where it is served: only there. The values of `groups` are served too; without any, only counts are."""
 
     host: str = "127.0.0.1"
     port: Annotated[int, Between(0, 65535)] = 9464

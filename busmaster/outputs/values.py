@@ -142,6 +142,6 @@ def event_text(event: Event) -> str:
         case LineChanged():
             return f"the line is {event.change.value}" + (f": {event.cause}" if event.cause else "")
         case PortFailed():
-            return f"cannot reconnect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
+            return f"cannot connect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
         case _:
             return ""

@@ -67,6 +67,13 @@ class Connection:
         if self._closing.is_set():
             await self.close()
 
+    async def try_open(self) -> None:
+        """Open it once, now, and tell why where that fails: `run` goes on trying."""
+        try:
+            await self.open()
+        except Exception as error:
+            self._tell("open", error)
+
     def accept_device(self) -> None:
         """Take whatever device has the port's name at the next opening, which comes soon."""
         self._device = self._seen = None
@@ -105,10 +112,7 @@ class Connection:
         loop = asyncio.get_running_loop()
         since = loop.time()
         if self._link is None:
-            try:
-                await self.open()
-            except Exception as error:
-                self._tell("open", error)
+            await self.try_open()
         if self._link is None:
             return 0.0
         await self._link.lost.wait()

@@ -27,3 +27,12 @@ def sum16(data: bytes) -> int:
 def sum8(data: bytes) -> int:
     """DC104: sum of all bytes modulo 256."""
     return sum(data) & 0xFF
+
+
+__all__ = [
+    "FIRST_PRINTABLE",
+    "bcc",
+    "sum8",
+    "sum16",
+    "xor",
+]

@@ -72,3 +72,12 @@ def parse_number(field: bytes) -> float:
             if math.isfinite(value):
                 return value
     raise FrameError(f"{field!r} is not a number")
+
+
+__all__ = [
+    "LONGEST_LIST",
+    "LONGEST_NUMBER",
+    "format_list",
+    "format_number",
+    "parse_number",
+]

@@ -147,3 +147,19 @@ class AcknowledgeReader(SingleLeg):
 
     def expired(self, started: bool) -> NoReturn:
         raise no_reply()
+
+
+__all__ = [
+    "ACK",
+    "BEL",
+    "ENQ",
+    "EOT",
+    "ETX",
+    "NAK",
+    "STX",
+    "AcknowledgeReader",
+    "SingleLeg",
+    "TelegramReader",
+    "find_etx",
+    "telegram_sizes",
+]

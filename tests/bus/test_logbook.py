@@ -69,7 +69,7 @@ def test_r13_a_failed_attempt_is_logged_with_what_to_try_and_a_bug_with_where(li
     logbook.note(PortFailed("line is in use by gpsd", "end that first"), 1.0)
     logbook.note(PortFailed("cannot open line: ValueError: odd", bug=ValueError("odd")), 2.0)
     assert lines.messages == [
-        "line: cannot reconnect: line is in use by gpsd; end that first",
-        "line: cannot reconnect: cannot open line: ValueError: odd",
+        "line: cannot connect: line is in use by gpsd; end that first",
+        "line: cannot connect: cannot open line: ValueError: odd",
     ]
     assert [record.exc_info is None for record in lines.records] == [True, False]

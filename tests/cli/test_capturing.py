@@ -16,14 +16,14 @@ def test_without_a_file_there_is_no_recorder() -> None:
         assert recorder is None
 
 
-def test_the_file_is_complete_when_the_command_is_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_file_is_complete_when_the_command_is_over(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "line.pcapng"
     with capturing(str(path), port="COM1", protocol="hcp2") as recorder:
         assert recorder is not None
         recorder.overheard(1.0, bytes.fromhex("07 30 32 02 30 31 05 04"))
     with path.open("rb") as file:
         assert len(list(read_packets(file))) == 2
-    assert capsys.readouterr().err == ""
+    assert capfd.readouterr().err == ""
 
 
 def test_a_file_that_cannot_be_made_is_wrong_usage(tmp_path: Path) -> None:
@@ -34,8 +34,8 @@ def test_a_file_that_cannot_be_made_is_wrong_usage(tmp_path: Path) -> None:
         pass
 
 
-def test_a_full_disk_is_said_at_the_end(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_full_disk_is_said_at_the_end(capfd: pytest.CaptureFixture[str]) -> None:
     with capturing("/dev/full", port="COM1") as recorder:
         assert recorder is not None
         recorder.overheard(1.0, bytes.fromhex("07 30 32 02 30 31 05 04"))
-    assert "the capture ends early: /dev/full: No space left on device" in capsys.readouterr().err
+    assert "the capture ends early: /dev/full: No space left on device" in capfd.readouterr().err

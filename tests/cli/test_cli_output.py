@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from busmaster.cli.output import json_value, number_text, value_text
+from busmaster.cli.app import complain, show_warning
+from busmaster.cli.output import emit, json_line, json_value, note, number_text, value_text
 
 
 class Status(enum.IntFlag):
@@ -66,3 +67,26 @@ def test_a_printed_number_reads_back_as_itself_and_has_no_exponent(number: float
 )
 def test_json_has_words_as_numbers_and_sets_and_runs_as_lists(value: Any, text: str) -> None:
     assert json.dumps(json_value(value)) == text
+
+
+EVIL = "winder\x1b]0;owned\x07\x1b[2J\x9b31m\x7f\u202e\r\n"
+
+
+def test_escape_sequences_never_reach_a_terminal_raw(capsys: pytest.CaptureFixture[str]) -> None:
+    """Neither on standard output nor on standard error; what stands in JSON is the same text still."""
+    emit(f"a name {EVIL}", json_line(node=EVIL))
+    note(EVIL)
+    complain(f"{EVIL} is down", 1)
+    show_warning(UserWarning(EVIL), UserWarning, "", 0)
+    said = capsys.readouterr()
+    assert all(line.isprintable() for line in (said.out + said.err).split("\n"))
+    assert len(said.out.splitlines()) == 2
+    assert json.loads(said.out.splitlines()[1]) == {"node": EVIL}
+    assert said.err.startswith(r"busmaster: winder\u001b]0;owned\u0007\u001b[2J")
+
+
+def test_letters_of_any_language_and_spaces_of_any_width_are_printed_as_they_are(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    emit("Wickler №\u202f2  Ø 12\u00a0mm")
+    assert capsys.readouterr().out == "Wickler №\u202f2  Ø 12\u00a0mm\n"

@@ -189,3 +189,15 @@ def test_ages_and_clocks_fit_their_columns() -> None:
         "100m",
     ]
     assert clock_text(3661.9) == "1:01:01"
+
+
+def test_nothing_that_a_frame_says_is_obeyed_by_a_terminal() -> None:
+    """A title, an error or a device's text with escape sequences in it is shown as text."""
+    evil = "\x1b[2J\x9b31m\x07"
+    told = msgspec.structs.replace(
+        frame(), title=evil, line=evil, events=(evil,), rows=(Row(evil, evil, evil, evil, error=evil),)
+    )
+    drawn = decode_frame(encode(told))
+    shown = [drawn.title, drawn.line, *drawn.events, *(text for row in drawn.rows for text in (row.node, row.item))]
+    assert set(shown) == {r"\u001b[2J\u009b31m\u0007"}
+    assert all(str(field).isprintable() for row in drawn.rows for field in msgspec.structs.astuple(row))

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import importlib
+import os
 import socket
+import threading
+import time
 import urllib.request
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from importlib.util import find_spec
+from typing import Any
 
 import pytest
 
 from busmaster.arbiter.counters import DriverErrors
+from busmaster.arbiter.health import Health
 from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import NoReply
 from busmaster.outputs.base import OutputStatistics
-from busmaster.outputs.metrics import MetricsOutput
+from busmaster.outputs.metrics import MetricsOutput, number_of
 from busmaster.outputs.settings import MetricsSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
@@ -74,7 +81,7 @@ async def test_a_scrape_has_the_counts_of_nodes_groups_line_and_outputs() -> Non
     assert of(metrics, "node_latency_seconds_bucket", node="node 5", le="0.5") == 3
     assert 0.001 < of(metrics, "node_latency_seconds_sum", node="node 5") < 1
     assert of(metrics, "group_cycles_total", group="axes") == 3
-    assert of(metrics, "group_missed_total", group="axes") == 0
+    assert of(metrics, "group_missed_total", group="axes") == group.statistics().missed
     assert of(metrics, "group_period_seconds", group="axes") == 0.02
     assert of(metrics, "group_achieved_period_seconds", group="axes") > 0.019
     assert 0 < of(metrics, "line_utilisation_ratio") <= 1
@@ -113,4 +120,106 @@ async def test_a_port_that_is_taken_is_told_and_tried_again() -> None:
     await asyncio.to_thread(until, lambda: said[-1] == "metrics is up again")
     await asyncio.to_thread(scraped, port)
     await asyncio.to_thread(output.close, 5)
-    assert said == ["metrics is down: Address already in use", "metrics is up again"]
+    down, up = said
+    assert down.startswith("metrics is down: Address already in use")
+    assert up == "metrics is up again"
+
+
+@asynccontextmanager
+async def served(**options: Any) -> AsyncIterator[MetricsOutput]:
+    """A line with one node, polled three times, and its metrics."""
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
+    controller = Hcp2Controller(bus, 5)
+    output = MetricsOutput("metrics", MetricsSettings(port=0, **options), bus)
+    async with bus:
+        await controller.write(1, 12.5)
+        group = bus.poll_group("axes", period=0.02, points=[controller.point("1")])
+        async for snapshot in group:
+            if snapshot.cycle == 3:
+                break
+        group.pause()
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        try:
+            yield output
+        finally:
+            await asyncio.to_thread(output.close, 5)
+    assert not output._thread.is_alive()
+
+
+@pytest.mark.asyncio
+async def test_values_are_gauges_where_their_group_is_named() -> None:
+    async with served(groups=("axes",)) as output:
+        metrics = await asyncio.to_thread(scraped, output.port)
+    labels = {"group": "axes", "node": "5", "item": "1", "unit": ""}
+    assert of(metrics, "value", **labels) == 12.5
+    assert of(metrics, "value_time_seconds", **labels) == pytest.approx(time.time(), abs=60)
+    async with served() as output:
+        metrics = await asyncio.to_thread(scraped, output.port)
+    assert not any(name.startswith("busmaster_value") for name, _ in metrics)
+
+
+@pytest.mark.parametrize(("value", "number"), [(3, 3.0), (2.5, 2.5), (Health.UP, None), ((1, 2), None), ("on", None)])
+def test_what_is_no_number_is_no_gauge(value: object, number: float | None) -> None:
+    assert number_of(value) == number
+
+
+@pytest.mark.asyncio
+async def test_a_thousand_half_open_connections_cost_no_threads_and_keep_no_scrape_out(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    async with served() as output:
+        await asyncio.to_thread(scraped, output.port)
+        threads = threading.active_count()
+        half_open = []
+        try:
+            for _ in range(700):
+                half_open.append(socket.create_connection(("127.0.0.1", output.port), 5))
+                half_open[-1].sendall(b"GET /metrics HT")
+            await asyncio.to_thread(scraped, output.port)
+            assert threading.active_count() <= threads + 2
+            assert len(os.listdir("/proc/self/fd")) < 700 + 256 + 100
+        finally:
+            for connection in half_open:
+                connection.close()
+        await asyncio.to_thread(scraped, output.port)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.asyncio
+async def test_two_hundred_scrapes_at_once_are_all_answered_by_a_few_threads(capfd: pytest.CaptureFixture[str]) -> None:
+    async def scrape(port: int) -> bytes:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")
+        answer = await reader.read()
+        writer.close()
+        return answer
+
+    async with served() as output:
+        threads = threading.active_count()
+        async with asyncio.timeout(20):
+            answers = await asyncio.gather(*(scrape(output.port) for _ in range(200)))
+        assert threading.active_count() <= threads + 2
+    assert all(answer.startswith(b"HTTP/1.1 200 OK") and b"busmaster_line_busy" in answer for answer in answers)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("asked", "answered"),
+    [
+        (b"POST /metrics HTTP/1.1\r\n\r\n", b"HTTP/1.1 405"),
+        (b"what is this\r\n\r\n", b"HTTP/1.1 400"),
+        (b"x" * 100_000, b""),
+        (b"", b""),
+    ],
+)
+async def test_what_is_no_scrape_is_refused_and_the_next_one_answered(asked: bytes, answered: bytes) -> None:
+    async with served() as output:
+        reader, writer = await asyncio.open_connection("127.0.0.1", output.port)
+        with suppress(ConnectionError):
+            writer.write(asked)
+            writer.write_eof()
+            assert (await reader.read()).startswith(answered)
+        writer.close()
+        await asyncio.to_thread(scraped, output.port)

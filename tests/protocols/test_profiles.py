@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -162,3 +163,9 @@ def test_an_exchange_says_how_its_reply_begins_and_how_long_it_is(
     assert (exchange.starts, (exchange.sizes.typical, exchange.sizes.longest)) == (starts, sizes)
     assert (exchange.answered, bool(exchange.answers)) == (bool(starts), bool(starts))
     assert (exchange.closing, tuple(exchange.later)) == (0, ())
+
+
+def test_what_a_line_may_merge_or_hear_makes_no_other_protocol() -> None:
+    assert mentor.CHAINED == mentor.PROFILE
+    assert replace(msc.PROFILE, listen=None) == msc.PROFILE
+    assert replace(msc.PROFILE, exchange_limit=None) != msc.PROFILE

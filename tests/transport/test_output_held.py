@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from busmaster import Bus, Hcp2Controller, LineDown, MemoryPort, NoReply, SerialPort, TcpPort, WriteUnconfirmed
+from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import LineChange, LineChanged
 from busmaster.bus.node import Node
 from busmaster.emulator.device import Delay
@@ -21,6 +22,7 @@ from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport import pump as pump_module
 from busmaster.transport.pump import STUCK_AFTER, Pump
+from tests.arbiter.bench import TAU
 from tests.transport.fakes import PtyMaster, plugged, standing_still
 from tests.transport.test_marks import reply
 
@@ -367,3 +369,25 @@ async def test_a_network_that_stands_still_for_good_takes_the_line_down_in_words
         ):
             await axis.read(1, retries=0)
     serving.cancel()
+
+
+@pytest.mark.parametrize(
+    ("cause", "said"),
+    [
+        (None, "it was closed"),
+        (OSError("gone"), "gone"),
+        (LineDown("the adapter is gone"), "the adapter is gone"),
+    ],
+)
+def test_a_lost_port_is_told_with_its_cause(cause: Exception | None, said: str) -> None:
+    async def story() -> None:
+        events: list[Any] = []
+        arbiter = Arbiter(TAU)
+        pump = Pump(arbiter, on_sample=lambda *_: None, on_cycle=lambda _: None, on_event=events.append)
+        pump.clock = asyncio.get_running_loop().time
+        arbiter.line_up(pump.clock())
+        pump.connection_lost(cause)
+        downs = [event for event in events if isinstance(event, LineChanged) and event.change is LineChange.DOWN]
+        assert [event.cause for event in downs] == [said]
+
+    run_in_virtual_time(story())

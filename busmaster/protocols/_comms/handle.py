@@ -104,11 +104,11 @@ class CommsHandle(Handle):
         self.node.check(*commands)
         return commands
 
-    def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
+    def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Consecutive elements, in as many telegrams as it takes."""
         element = int(item) if is_decimal(item) else item
         self.writes(element, values)
-        return [lambda: self.write(element, *values, verify=verify)]
+        return [lambda: self.write(element, *values, **options)]
 
     async def _verify(self, requests: SeveralRequests, number: int, written: float) -> None:
         command = self.read_command(number)

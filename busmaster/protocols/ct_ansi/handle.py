@@ -105,9 +105,9 @@ class CtAnsiDrive(Handle):
             return await self.read_run(parameter, int(count))
         return await self.point(item).read()
 
-    def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
-        self.node.check(encoder(self.point(item))(value))
-        return lambda: self.write(item, value, verify=verify)
+    def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
+        self.node.check(encoder(self.point(item))(value), stop=bool(options.get("safe")))
+        return lambda: self.write(item, value, **options)
 
     def _write(self, menu: int, number: int, value: float) -> Write:
         digits = self._decimals.get((menu, number))

@@ -81,9 +81,9 @@ class Dc104Drive(Handle):
                     f"parameter {parameter} reads {found} after {command.value} was written", node=self.node
                 )
 
-    def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
-        self.node.check(encoder(self.point(item))(value))
-        return lambda: self.write(int(item), value, verify=verify)
+    def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
+        self.node.check(encoder(self.point(item))(value), stop=bool(options.get("safe")))
+        return lambda: self.write(int(item), value, **options)
 
     def _read(self, parameter: int) -> Read:
         return Read(parameter, self._maximum, self._minimum)

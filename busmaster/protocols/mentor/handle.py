@@ -197,10 +197,10 @@ class MentorDrive(Handle):
             return await self.read_run(parameter, int(count))
         return await self.point(item).read()
 
-    def prepare_one(self, item: str, value: Any, verify: bool = False) -> Send:
-        self.node.check(encoder(self.point(item))(value))
+    def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
+        self.node.check(encoder(self.point(item))(value), stop=bool(options.get("safe")))
         parameter, _, kind = item.partition(":")
-        return lambda: self.write(parameter, value, wide=kind == "wide", high_resolution=kind == "hires", verify=verify)
+        return lambda: self.write(parameter, value, wide=kind == "wide", high_resolution=kind == "hires", **options)
 
     def _check_readable(self) -> None:
         if self.node.address == self.profile.broadcast:

@@ -151,10 +151,10 @@ class ModbusUnit(Handle):
         for command in commands if requests.verify else ():
             await self._verify(requests, command)
 
-    def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
+    def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Consecutive places, in as few exchanges as they fit."""
         self._writes(item, values)
-        return [lambda: self.write(item, *values, verify=verify)]
+        return [lambda: self.write(item, *values, **options)]
 
     def run_items(self, item: str, count: int) -> tuple[str, ...]:
         """What each value from an item on is called, each at its own address."""

@@ -132,16 +132,17 @@ class MscController(Handle):
                 raise
             return await self.flags()
 
-    def prepare_write(self, item: str, values: Sequence[Any], verify: bool = False) -> list[Send]:
+    def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Consecutive data addresses, in blocks and one by one."""
         if len(values) == 1:
-            return super().prepare_write(item, values, verify)
+            return super().prepare_write(item, values, **options)
         name, _, count = item.partition(":")
         if count and count != str(len(values)):
             raise InvalidCommand(f"{item} takes {count} values, not {len(values)}")
         encoder(self.point(name))
-        self.node.check(*(command for command, _ in writes(self.address_of(name), values, self.address_step)))
-        return [lambda: self.write_block(name, values, verify=verify)]
+        parts = writes(self.address_of(name), values, self.address_step)
+        self.node.check(*(command for command, _ in parts), stop=bool(options.get("safe")))
+        return [lambda: self.write_block(name, values, **options)]
 
     def address_of(self, where: int | str) -> int:
         """The data address of a symbol; an address is returned as it is. Raises InvalidCommand for no such symbol."""

@@ -1,0 +1,173 @@
+"""The points of a file, fed from what its line's own master asks and its nodes answer, without a word of ours."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import anyio
+
+from busmaster.arbiter.transaction import Timeline
+from busmaster.bus.node import Node
+from busmaster.bus.points import Point
+from busmaster.bus.samples import Quality, Sample
+from busmaster.bus.snapshots import Snapshot, Stream
+from busmaster.capture.frames import Direction, Frame, Kind
+from busmaster.config import ConfiguredLine, LineFile
+from busmaster.contract.driver import Driver
+from busmaster.contract.exchange import Command
+from busmaster.contract.timing import ReplyTiming
+from busmaster.errors import BusError, InvalidCommand
+from busmaster.outputs.settings import MqttSettings
+from busmaster.registry import Protocol, find
+
+Question = tuple[int, Command[Any]]
+"""The address of a node, and what it is asked."""
+
+
+def silent(file: LineFile) -> LineFile:
+    """Return it with outputs that take no commands: nothing may be sent."""
+    outputs = {
+        kind: replace(settings, allow_commands=()) if isinstance(settings, MqttSettings) else settings
+        for kind, settings in file.outputs.items()
+    }
+    return replace(file, outputs=outputs)
+
+
+def only_protocol(file: LineFile) -> str:
+    """Raises InvalidCommand for a file with several kinds of nodes: a listener reads one."""
+    names = {node.protocol for node in file.nodes.values()}
+    spoken = {find(name).protocol.name for name in names}
+    if len(spoken) > 1:
+        raise InvalidCommand(f"one line is listened to in one protocol, and the file has {', '.join(sorted(spoken))}")
+    return names.pop() if len(names) == 1 else spoken.pop()
+
+
+class HeardGroup:
+    """A poll group of the file: in each period, those of its points whose values passed."""
+
+    def __init__(self, name: str, period: float, points: Sequence[Point[Any]], now: float) -> None:
+        self.name = name
+        self.period = period
+        self.points = tuple(points)
+        self.due = now + period
+        self._cycle = 0
+        self._heard: dict[Point[Any], Sample[Any]] = {}
+        self._consumers: list[Stream[Snapshot]] = []
+
+    def subscribe(self, buffer: int) -> Stream[Snapshot]:
+        return Stream(self._consumers, buffer)
+
+    def take(self, point: Point[Any], sample: Sample[Any]) -> None:
+        if point in self.points:
+            self._heard[point] = sample
+
+    def turn(self, now: float, wall: float) -> Snapshot | None:
+        """Hand on what was heard since the last time; None where nothing was."""
+        due, self.due = self.due, self.due + self.period * max(1, (now - self.due) // self.period)
+        if not self._heard:
+            return None
+        self._cycle += 1
+        started = min(sample.finished for sample in self._heard.values())
+        snapshot = Snapshot(self.name, self._cycle, due, started, now, 0, wall, self._heard)
+        self._heard = {}
+        for consumer in list(self._consumers):
+            consumer.put(snapshot)
+        return snapshot
+
+    def close(self) -> None:
+        for consumer in list(self._consumers):
+            consumer.close()
+
+
+class Overheard:
+    """Makes samples of frames. An answer counts only where the reader of its request takes it, as in a master."""
+
+    def __init__(self, protocol: Protocol, points: Iterable[Point[Any]]) -> None:
+        self.groups: list[HeardGroup] = []
+        self._protocol = protocol
+        self._profile = protocol.profile
+        self._dialect = protocol.dialect()
+        self._points: dict[Question, list[Point[Any]]] = {}
+        for point in points:
+            assert isinstance(point.node, Node)
+            self._points.setdefault((point.node.address, point.command), []).append(point)
+        self._asked: list[Point[Any]] = []
+        self._driver: Driver | None = None
+        self._timing: ReplyTiming | None = None
+
+    def heard(self, frame: Frame) -> None:
+        """Take the next frame that passed."""
+        from_host = frame.sender is Direction.HOST
+        if from_host and frame.kind in (Kind.READ, Kind.WRITE) and not frame.continues:
+            self._ask(frame)
+        elif self._driver is not None and from_host:
+            self._go_on(self._driver)
+        elif self._driver is not None:
+            self._answer(self._driver, frame)
+
+    def _ask(self, frame: Frame) -> None:
+        """A new request ends the exchange before."""
+        self._driver = None
+        if frame.fault or frame.node is None or frame.kind is not Kind.READ:
+            return
+        with suppress(InvalidCommand, KeyError, ValueError):
+            command = self._dialect.command(frame, ())
+            self._asked = self._points.get((frame.node, command), [])
+            if self._asked:
+                exchange = command.open(frame.node, Node.of(self._asked[0]).timings)
+                self._timing = exchange.timing
+                self._driver = Driver(exchange, noise_tolerant=self._profile.noise_tolerant)
+
+    def _go_on(self, driver: Driver) -> None:
+        """The host says something in the midst: what the reader wants to say, or else it has given up."""
+        if not driver.said:
+            driver.expire()
+        driver.said.clear()
+
+    def _answer(self, driver: Driver, frame: Frame) -> None:
+        timing, delay = self._timing, frame.delay or 0.0
+        if timing is None or frame.fault or frame.sender is not Direction.NODE or delay > timing.lateness:
+            self._driver = None  # whatever still comes may be anybody's
+            return
+        driver.feed(frame.raw)
+        if driver.ending is None:
+            return
+        self._driver = None
+        if driver.ending.delivered:
+            self._deliver(driver.ending.value, Quality.LATE if delay > timing.nominal else Quality.GOOD)
+
+    def _deliver(self, raw: Any, quality: Quality) -> None:
+        now = time.monotonic()
+        timeline = Timeline(now, now, now, now, 1, 0, 0.0)
+        for point in self._asked:
+            with suppress(BusError):  # it stands for no value of the point
+                sample = Sample(point.value_of(raw), None, now, now, now, quality, timeline, time.time())
+                for group in self.groups:
+                    group.take(point, sample)
+
+
+async def feed(line: ConfiguredLine, overheard: Overheard, show: Callable[[Snapshot], None]) -> None:
+    """Hand on what is heard, each group at its period, until cancelled; the outputs then write what they hold."""
+    now = asyncio.get_running_loop().time
+    for section in line.file.groups.values():
+        overheard.groups.append(HeardGroup(section.name, section.period, line.members(section.name), now()))
+    line.outputs.start(overheard.groups)
+    try:
+        while True:
+            due = min((group.due for group in overheard.groups), default=now() + 1.0)
+            await anyio.sleep(max(0.0, due - now()))
+            for group in overheard.groups:
+                if group.due <= now():
+                    snapshot = group.turn(time.monotonic(), time.time())
+                    if snapshot is not None:
+                        show(snapshot)
+    finally:
+        for group in overheard.groups:
+            group.turn(time.monotonic(), time.time())
+            group.close()
+        await line.outputs.close()

@@ -1,0 +1,47 @@
+"""`busmaster safe`: send a file's safe state alone, as after a crash."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import click
+
+from busmaster.cli.app import FAILED, OK
+from busmaster.cli.ending import until_ended
+from busmaster.cli.lines import file_argument, load, other_port, port_option
+from busmaster.cli.output import Level, emit, note
+from busmaster.config import ConfiguredLine
+from busmaster.errors import BusError
+
+
+@click.command(short_help="Send the safe state of a file, and verify it.")
+@file_argument()
+@port_option
+def command(path: str, port: str | None) -> int:
+    """Send the writes that [safe] in LINE.toml lists, urgently, read each back, and print `POINT ok`.
+
+    Nothing is polled, and no output runs. What was not confirmed in the file's time is named on standard error, and
+    the exit status is 1. A port that is missing is waited for in that time.
+    """
+    file = load(path)
+    line = ConfiguredLine(file, port=other_port(file, port), outputs=False, wait_for_port=True)
+    if not line.safe_state:
+        raise click.UsageError(f"{path} has no safe state: its writes stand in [safe]")
+    return until_ended(leave, line)
+
+
+async def leave(line: ConfiguredLine) -> int:
+    async with line.bus:
+        outcomes = await line.safe_state.enter(line.bus)
+    for name, error in outcomes.items():
+        if error is None:
+            emit(f"{name} ok")
+    return tell_unsafe(outcomes)
+
+
+def tell_unsafe(outcomes: Mapping[str, BusError | None]) -> int:
+    """Name each point that was not confirmed on standard error: the exit status."""
+    unsafe = {name: error for name, error in outcomes.items() if error is not None}
+    for name, error in unsafe.items():
+        note(f"the safe state of {name} is not confirmed: {error}", Level.CRITICAL)
+    return FAILED if unsafe else OK

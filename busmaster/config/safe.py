@@ -1,0 +1,164 @@
+"""The safe state of a file: writes that are sent, urgently and verified, when the line is left.
+
+[safe]
+within = 2.0                                 # seconds for all of it
+repeatable = ["press/setpoint"]              # those that the protocol does not call so, and that harm nobody twice
+writes = { "drive4/speed_reference" = 0, "press/setpoint" = 0 }
+
+Nothing is sent unless it stands there. What is sent may arrive more than once, and is repeated until it reads back as
+it was written or the time is over: so only a write that may be repeated can be of it, and one that can be read back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import anyio
+
+from busmaster.bus.bus import Bus
+from busmaster.bus.handle import Handle, Send
+from busmaster.bus.node import Node
+from busmaster.bus.requester import Priority
+from busmaster.config.points import NamedPoint
+from busmaster.config.table import Table
+from busmaster.errors import BusClosed, BusError, InvalidCommand, NotStarted
+
+WITHIN = 2.0
+LONGEST = 60.0
+LOOK_AGAIN = 0.05
+"""Seconds from a failure to the next try at the same node."""
+
+
+@dataclass(frozen=True, slots=True)
+class SafeSection:
+    """What `[safe]` says: values by point, in their order. Without writes there is no safe state."""
+
+    within: float
+    repeatable: tuple[str, ...]
+    writes: Mapping[str, float]
+    table: Table = field(compare=False, repr=False)
+
+
+def read_safe(table: Table) -> SafeSection:
+    """Raises FileError, naming line and key."""
+    table.only("within", "repeatable", "writes")
+    within = table.number("within", WITHIN)
+    if not 0 < within <= LONGEST:
+        raise table.error(f"must be more than 0 and at most {LONGEST:g} seconds, not {within}", "within")
+    values = table.table("writes")
+    writes = {name: _one(values, name) for name in values.data}
+    if table.data and not writes:
+        raise table.error('a safe state is of writes: writes = { "NODE/ITEM" = VALUE }')
+    return SafeSection(within, table.texts("repeatable", ()), writes, table)
+
+
+def _one(table: Table, name: str) -> float:
+    numbers = table.numbers(name)
+    if len(numbers) != 1:
+        raise table.error("is one value: write the others as points of their own", name)
+    return numbers[0]
+
+
+@dataclass(frozen=True, slots=True)
+class SafeWrite:
+    """One write of the safe state: a point, and the value that it is left at."""
+
+    point: NamedPoint
+    value: float
+    node: Node
+    prepare: Callable[[float], Send]
+    """Makes what writes it and reads it back, in so many seconds."""
+
+    @classmethod
+    def of(cls, point: NamedPoint, handle: Handle, value: float, *, repeatable: bool) -> SafeWrite:
+        """Raises InvalidCommand for what cannot be sent, may not be repeated, or cannot be read back."""
+        if not point.writable:
+            raise InvalidCommand(f"{point.key} is read-only")
+        if point.encode is None:
+            raise InvalidCommand(f"{point.key} is a run of values: write them one by one, each is verified")
+        command = point.encode(value)
+        if not (repeatable or command.idempotent):
+            raise InvalidCommand(
+                f"{point.key} may not be repeated as far as its protocol knows: if writing it twice harms nobody, "
+                f'say so: repeatable = ["{point.key}"]'
+            )
+        node = Node.of(point)
+        if node.address == node.profile.broadcast:
+            raise InvalidCommand(f"{point.key} is for all nodes: nobody confirms it; write each node's own")
+        item, number = point.source.item, point.scale.write(value)
+
+        def prepare(within: float) -> Send:
+            [send] = handle.prepare_write(
+                item,
+                [number],
+                priority=Priority.URGENT,
+                idempotent=True,
+                verify=True,
+                safe=True,
+                finish_within=within,
+            )
+            return send
+
+        prepare(LONGEST)
+        return cls(point, value, node, prepare)
+
+
+@dataclass(frozen=True, slots=True)
+class SafeState:
+    """The writes of one file, and the seconds in which all of them are to be confirmed."""
+
+    within: float
+    writes: Sequence[SafeWrite]
+
+    def __bool__(self) -> bool:
+        return bool(self.writes)
+
+    async def enter(self, bus: Bus) -> dict[str, BusError | None]:
+        """Send all, urgently, and read them back: of each point why it was not confirmed, None if it was.
+
+        From now on the bus takes no other write. Nodes are served at the same time, each in the file's order; what
+        fails is tried again until the time is over.
+        """
+        outcomes: dict[str, BusError | None] = {
+            write.point.key: NotStarted("not sent in time", node=write.node) for write in self.writes
+        }
+        if not self.writes:
+            return outcomes
+        bus.take_only_safe_writes()
+        deadline = bus.now() + self.within
+        by_node: dict[Node, list[SafeWrite]] = {}
+        for write in self.writes:
+            by_node.setdefault(write.node, []).append(write)
+        with anyio.CancelScope(shield=True):
+            async with anyio.create_task_group() as tasks:
+                for node, writes in by_node.items():
+                    node.note_stop()
+                    node.suspend(0.0)
+                    tasks.start_soon(_leave, bus, writes, deadline, outcomes)
+        return outcomes
+
+
+async def _leave(bus: Bus, writes: Sequence[SafeWrite], deadline: float, outcomes: dict[str, BusError | None]) -> None:
+    """Write what is left of one node's, round by round: one that fails does not keep the others from being sent."""
+    waiting = list(writes)
+    while waiting and bus.now() < deadline:
+        waiting = [write for write in waiting if not await _confirmed(bus, write, deadline, outcomes)]
+        if waiting:
+            await anyio.sleep(min(LOOK_AGAIN, max(0.0, deadline - bus.now())))
+
+
+async def _confirmed(bus: Bus, write: SafeWrite, deadline: float, outcomes: dict[str, BusError | None]) -> bool:
+    left = deadline - bus.now()
+    if left <= 0:
+        return False
+    try:
+        await write.prepare(left)()
+    except BusClosed as error:
+        outcomes[write.point.key] = error
+        return True  # nothing can be sent any more
+    except BusError as error:
+        outcomes[write.point.key] = error
+        return False
+    outcomes[write.point.key] = None
+    return True

@@ -1,0 +1,168 @@
+"""`busmaster monitor LINE.toml`: points and outputs fed from what another master asks, without a byte of ours."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from socket import create_server
+
+import pytest
+
+from busmaster.capture.decode import Decoder
+from busmaster.capture.frames import Direction
+from busmaster.cli import main
+from busmaster.cli.overheard import HeardGroup, Overheard
+from busmaster.config import ConfiguredLine, load
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.registry import find
+from tests.outputs.cycles import until
+
+FILE = """
+port = "socket://127.0.0.1:{port}?baudrate=57600"
+[nodes.winder]
+protocol = "hcp2"
+address = 2
+[nodes.winder.points]
+tension = {{ item = "1", unit = "N", factor = 0.1 }}
+[groups.fast]
+period = 0.1
+points = ["winder/tension"]
+[outputs.sqlite]
+path = "{folder}/line.sqlite"
+"""
+REQUEST = hcp2.Read(1).open(2, hcp2.PROFILE.timings).request
+REPLY = bytes.fromhex("02 30 31 35 03 37")
+"""Element 1 is 5."""
+
+
+class Tapped:
+    """A serial device server on somebody else's line."""
+
+    def __init__(self) -> None:
+        self.heard = b""
+        self.over = threading.Event()
+        self._server = create_server(("127.0.0.1", 0))
+        self.port: int = self._server.getsockname()[1]
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        connection, _ = self._server.accept()
+        with connection:
+            connection.settimeout(0.02)
+            while not self.over.is_set():
+                try:
+                    connection.sendall(REQUEST + REPLY)
+                    self.heard += connection.recv(100)
+                except TimeoutError:
+                    continue
+                except OSError:
+                    break
+
+    def close(self) -> None:
+        self.over.set()
+        self._server.close()
+        self._thread.join()
+
+
+@contextmanager
+def tapped() -> Iterator[Tapped]:
+    line = Tapped()
+    try:
+        yield line
+    finally:
+        line.close()
+
+
+def written(folder: Path, port: int = 1) -> Path:
+    path = folder / "line.toml"
+    path.write_text(FILE.format(port=port, folder=folder))
+    return path
+
+
+def rows(path: Path) -> list[tuple[str, str, float, str]]:
+    if not path.exists():
+        return []
+    database = sqlite3.connect(path, timeout=5)
+    try:
+        return database.execute("select node, item, value, unit from history").fetchall()
+    except sqlite3.OperationalError:
+        return []  # it is just being made
+    finally:
+        database.close()
+
+
+def test_points_and_outputs_are_fed_and_not_a_byte_is_sent(tmp_path: Path) -> None:
+    with tapped() as line:
+        command = [sys.executable, "-m", "busmaster", "monitor", str(written(tmp_path, line.port)), "--json"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            cycle = json.loads(process.stdout.readline())
+            until(lambda: len(rows(tmp_path / "line.sqlite")) > 2)
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=20)
+        assert line.heard == b""
+    assert cycle["group"] == "fast"
+    assert cycle["samples"]["winder/tension"] == {"value": 0.5, "error": None, "late": False}
+    assert set(rows(tmp_path / "line.sqlite")) == {("winder", "tension", 0.5, "N")}
+    assert "sqlite: " in said
+    assert "0 dropped" in said
+    assert process.returncode == 130
+
+
+def heard(folder: Path, *pieces: bytes, apart: float = 0.03) -> list[object]:
+    """The values of the point that these pieces of the line, each some seconds behind the one before, stand for."""
+    line = ConfiguredLine(load(written(folder)), outputs=False)
+    points = line.members("fast")
+    overheard = Overheard(find("hcp2").protocol, points)
+    overheard.groups.append(HeardGroup("fast", 0.1, points, 0.0))
+    decoder = Decoder(find("hcp2").protocol.dialect())
+    found: list[object] = []
+    for number, piece in enumerate(pieces):
+        for frame in decoder.feed(piece, number * apart, Direction.UNKNOWN) + decoder.quiet():
+            overheard.heard(frame)
+            snapshot = overheard.groups[0].turn(number * apart, 0.0)
+            found += [sample.value for sample in snapshot.samples.values()] if snapshot else []
+    return found
+
+
+OTHER = hcp2.Read(2).open(2, hcp2.PROFILE.timings).request
+OTHER_NODE = hcp2.Read(1).open(3, hcp2.PROFILE.timings).request
+
+
+@pytest.mark.parametrize(
+    ("pieces", "values"),
+    [
+        ([REQUEST + REPLY], [0.5]),
+        ([REQUEST, REPLY], [0.5]),
+        ([REPLY], []),
+        ([OTHER + REPLY], []),
+        ([OTHER_NODE + REPLY], []),
+        ([REQUEST + REPLY[:-1] + b"\0"], []),
+        ([REQUEST, REPLY[:3], REPLY], []),
+        ([REQUEST + REPLY + REPLY], [0.5]),
+        ([REQUEST, REQUEST + REPLY], [0.5]),
+    ],
+)
+def test_only_the_answer_to_its_own_request_is_a_value(
+    tmp_path: Path, pieces: list[bytes], values: list[object]
+) -> None:
+    assert heard(tmp_path, *pieces) == values
+
+
+def test_an_answer_that_is_later_than_lateness_may_be_another_requests(tmp_path: Path) -> None:
+    assert heard(tmp_path, REQUEST, REPLY, apart=1.0) == []
+
+
+def test_what_is_missing_or_too_much_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["monitor", str(written(tmp_path)), "--protocol", "hcp2"]) == 2
+    assert "leave out --protocol" in capsys.readouterr().err
+    assert main(["monitor", "/dev/null"]) == 2
+    assert "--protocol P, or a LINE.toml" in capsys.readouterr().err
