@@ -8,7 +8,7 @@ that is not known. Nothing waits for that in an urgent write, whose step is not 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Hashable, Iterator, Mapping
+from collections.abc import AsyncIterator, Hashable, Iterable, Iterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import replace
 from typing import Any
@@ -48,6 +48,12 @@ class Limiter:
         """Hold a further limit: what is already limited stays so."""
         self._of.setdefault(node, NodeLimits(node)).limits.append(limit)
 
+    def drop(self, node: Requester, limit: Limit) -> None:
+        """Hold it no longer; the others stay."""
+        if node in self._of and limit in self._of[node].limits:
+            self._of[node].limits.remove(limit)
+            self._of[node].known.pop(limit, None)
+
     def forget(self, node: Requester) -> None:
         """What the node held may not be what it holds: it was away."""
         if node in self._of:
@@ -67,14 +73,15 @@ class Limiter:
         """Let a write pass, or raise InvalidCommand before anything is sent. Yields the options that are left for it.
 
         Raises NotStarted where the value before it is needed and cannot be read, Superseded where an urgent write came
-        first. A `stop` passes whatever the limits.
+        first. A `stop` passes whatever the limits, and what the node holds after it is not known.
         """
+        urgent = options.priority is Priority.URGENT
+        reached = list(self._reached(node))
+        for one in reached:
+            one.urgent += urgent
         if not stop:
             self.check(node, command)
-        urgent = options.priority is Priority.URGENT
-        reached = [one for one in self._reached(node) if one.touched_by(_changes(node, command))]
-        for one in self._reached(node):
-            one.urgent += urgent
+            reached = [one for one in reached if one.touched_by(_changes(node, command))]
         async with AsyncExitStack() as held:
             if not (urgent or stop) and any(limit.max_step for one in reached for limit in one.limits):
                 options = await self._step_by_step(held, node, reached, command, options)
@@ -85,7 +92,10 @@ class Limiter:
                     one.known.clear()
                 raise
             for one in reached:
-                _remember(one, node, command)
+                if stop:
+                    one.known.clear()
+                else:
+                    _remember(one, node, command)
 
     async def _step_by_step(
         self,
@@ -96,26 +106,25 @@ class Limiter:
         options: RequestOptions,
     ) -> RequestOptions:
         """Wait for the writes before this one, then look how far it goes."""
-        began = node.now()
+        began, changes = node.now(), _changes(node, command)
         seen = [one.urgent for one in reached]
         patience = [limit for limit in (options.start_within, options.finish_within) if limit is not None]
         try:
             async with asyncio.timeout(min(patience, default=None)):
                 for one in reached:
                     await held.enter_async_context(one.writing)
-                    for limit in one.touched_by(_changes(node, command)):
-                        if limit.max_step is not None and limit not in one.known:
-                            one.known[limit] = await _value_now(one.node, limit, command, options)
+                while unknown := _first_unknown(reached, changes):
+                    one, limit = unknown
+                    one.known[limit] = await _value_now(one.node, limit, command, options)
         except TimeoutError as late:
             if isinstance(late, NotStarted):
                 raise
             raise NotStarted("its value before it was not known in time", node=node, command=str(command)) from None
         if seen != [one.urgent for one in reached]:
             raise Superseded("overtaken by an urgent write to the same node", node=node, command=str(command))
-        for one in reached:
-            for limit in one.touched_by(_changes(node, command)):
-                if limit.max_step is not None:
-                    _check_step(one, limit, _changes(node, command))
+        self.check(node, command)  # other limits may be held by now
+        for one, limit in _steps(reached, changes):
+            _check_step(one, limit, changes)
         return _shortened(options, node.now() - began)
 
     def _reached(self, node: Requester) -> Iterator[NodeLimits]:
@@ -127,6 +136,15 @@ class Limiter:
             return
         heard_by = {profile.name, *profile.shares_line_with}
         yield from (one for one in self._of.values() if one.node.profile.name in heard_by)
+
+
+def _steps(reached: Iterable[NodeLimits], changes: Mapping[Hashable, Any]) -> Iterator[tuple[NodeLimits, Limit]]:
+    """The limits to the step of what a write changes."""
+    return ((one, limit) for one in reached for limit in one.touched_by(changes) if limit.max_step is not None)
+
+
+def _first_unknown(reached: Iterable[NodeLimits], changes: Mapping[Hashable, Any]) -> tuple[NodeLimits, Limit] | None:
+    return next((step for step in _steps(reached, changes) if step[1] not in step[0].known), None)
 
 
 def _changes(node: Requester, command: Command[Any]) -> Mapping[Hashable, Any]:

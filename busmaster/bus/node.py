@@ -171,9 +171,17 @@ class Node:
         line.limiter = line.limiter or Limiter()
         line.limiter.add(self, limit)
 
-    def check(self, *commands: Command[Any]) -> None:
-        """Raise InvalidCommand if one of these writes is beyond a limit: before the first of several is sent."""
+    def lift(self, limit: Limit) -> None:
+        """Hold a limit no longer; the others stay."""
         if self.shared.limiter is not None:
+            self.shared.limiter.drop(self, limit)
+
+    def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
+        """Raise InvalidCommand if one of these writes is beyond a limit: before the first of several is sent.
+
+        A `stop` is held by no limit.
+        """
+        if self.shared.limiter is not None and not stop:
             for command in commands:
                 self.shared.limiter.check(self, command)
 
@@ -188,7 +196,8 @@ class Node:
     ) -> T:
         """Run one command and return its value. `RequestOptions` says what the options are.
 
-        A write beyond a limit of the node raises InvalidCommand; but for a `stop`, which is held by none.
+        A write beyond a limit of the node raises InvalidCommand; but for a `stop`, and for a write of the safe state,
+        which are held by none.
 
         `touches` is the command that reads what a write changes: samples of that which are older than the write are
         marked stale; without it, all of the node's. With `stops_seen` it raises Superseded, and sends nothing, if the
@@ -199,7 +208,7 @@ class Node:
         chosen = self._options(options) if options else ORDINARY
         limiter = self.shared.limiter
         if limiter is not None and getattr(command, "writes", False):
-            async with limiter.passing(self, command, chosen, stop) as left:
+            async with limiter.passing(self, command, chosen, stop or chosen.safe) as left:
                 return (await self._timed(command, left, touches, stops_seen))[0]
         transaction, future = self._start(command, chosen, False, touches, stops_seen)
         try:
@@ -214,7 +223,7 @@ class Node:
         chosen, limiter = self._options(options), self.shared.limiter
         if limiter is None or not getattr(command, "writes", False):
             return await self._timed(command, chosen)
-        async with limiter.passing(self, command, chosen) as left:
+        async with limiter.passing(self, command, chosen, chosen.safe) as left:
             return await self._timed(command, left)
 
     async def _timed(

@@ -77,7 +77,7 @@ class RequestOptions:
     runs out unheard, and is not repeated. `retries`, 0 to 100, in place of the node's. `idempotent`: whether a write
     may be repeated after an unknown outcome (R7), in place of what its command says. `verify`: a handle's `write`
     reads back what it wrote, and raises VerifyFailed if that differs. `safe`: this write is of the safe state in which
-    a line is left, and accepted when no other is (`Bus.take_only_safe_writes`).
+    a line is left, and accepted when no other is (`Bus.take_only_safe_writes`); no limit of its point holds it.
     """
 
     priority: Priority = COMMAND
@@ -156,8 +156,11 @@ class Requester(Protocol):
         """Refuse, from now on, every write beyond a limit, whatever names what it writes."""
         ...
 
-    def check(self, *commands: Command[Any]) -> None:
-        """Raise InvalidCommand if one of these writes is beyond a limit: before the first of several is sent."""
+    def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
+        """Raise InvalidCommand if one of these writes is beyond a limit: before the first of several is sent.
+
+        A `stop` is held by no limit.
+        """
         ...
 
     async def request(

@@ -11,6 +11,7 @@ from typing import Any
 from busmaster.arbiter.tap import Tap
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
+from busmaster.bus.limits import Limit
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
@@ -53,8 +54,7 @@ class ConfiguredLine:
         self.nodes: dict[str, Handle] = {name: self._handle(node) for name, node in file.nodes.items()}
         self.groups: dict[str, PollGroup] = {}
         self._points: dict[str, NamedPoint] = {}
-        for node in file.nodes.values():
-            self._limit(node)
+        self._limits = list(self._held_limits())
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         self.gate = Gate(self.bus, read_only=read_only)
@@ -96,6 +96,9 @@ class ConfiguredLine:
         self.nodes = {name: self.nodes.get(name) or fresh[name] for name in file.nodes}
         self.file = file
         self._points = {name: point for name, point in points.items() if _section(before, name) == _section(file, name)}
+        held, self._limits = self._limits, list(self._held_limits())
+        for node, limit in held:
+            node.lift(limit)
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         for name, group in list(self.groups.items()):
@@ -165,17 +168,20 @@ class ConfiguredLine:
                 handle.point(point.item)
         return handle
 
-    def _limit(self, node: NodeSection) -> None:
-        """Hold what the file says of its points, by whatever name they are written."""
-        for name, point in node.points.items():
-            if point.limited:
-                with point.table.at():
-                    self._point(node.name, name).limit(
-                        minimum=point.minimum,
-                        maximum=point.maximum,
-                        max_step=point.max_step,
-                        writable=point.writable,
-                    )
+    def _held_limits(self) -> Iterator[tuple[Node, Limit]]:
+        """Hold what the file says of its points, by whatever name they are written, and say what is held."""
+        for node in self.file.nodes.values():
+            for name, section in node.points.items():
+                if section.limited:
+                    with section.table.at():
+                        point = self._point(node.name, name)
+                        limit = point.limit(
+                            minimum=section.minimum,
+                            maximum=section.maximum,
+                            max_step=section.max_step,
+                            writable=section.writable,
+                        )
+                        yield Node.of(point), limit
 
     def _members(self, group: GroupSection) -> Iterator[NamedPoint]:
         for number, text in enumerate(group.points):

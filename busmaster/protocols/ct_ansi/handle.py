@@ -106,7 +106,7 @@ class CtAnsiDrive(Handle):
         return await self.point(item).read()
 
     def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
-        self.node.check(encoder(self.point(item))(value), stop=bool(options.get("safe")))
+        self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
         return lambda: self.write(item, value, **options)
 
     def _write(self, menu: int, number: int, value: float) -> Write:

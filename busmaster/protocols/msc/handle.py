@@ -141,7 +141,7 @@ class MscController(Handle):
             raise InvalidCommand(f"{item} takes {count} values, not {len(values)}")
         encoder(self.point(name))
         parts = writes(self.address_of(name), values, self.address_step)
-        self.node.check(*(command for command, _ in parts), stop=bool(options.get("safe")))
+        self.node.check(*(command for command, _ in parts), stop=options.get("safe"))
         return [lambda: self.write_block(name, values, **options)]
 
     def address_of(self, where: int | str) -> int:
@@ -202,7 +202,7 @@ class MscController(Handle):
         requests = SeveralRequests(self.node, options)
         done = Count(progress, len(wanted) * (1 + requests.verify))
         parts = writes(address, wanted, self.address_step)
-        self.node.check(*(command for command, _ in parts))
+        self.node.check(*(command for command, _ in parts), stop=options.get("safe"))
         for command, size in parts:
             await requests.request(command)
             done.add(size)
