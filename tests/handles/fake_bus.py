@@ -46,7 +46,7 @@ class FakeNode:
     def limit(self, limit: Limit) -> None:
         """Nothing is limited."""
 
-    def check(self, *commands: Command[Any]) -> None:
+    def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
         """Nothing is limited."""
 
     async def request(
