@@ -18,6 +18,7 @@ SCENARIOS = (
     "utilisation",
     "dead_node",
     "late_replies",
+    "lossy_line",
     "cancellation",
     "urgent",
     "jitter",

@@ -18,6 +18,7 @@ from typing import Any, Protocol, TypeVar
 from benchmarks.harness import Options, installed
 from benchmarks.served_line import SETTINGS
 from busmaster import Bus, BusError, Node, Priority, ReplyTiming, SerialPort, Timings
+from busmaster.contract.learning import Learned
 from busmaster.planning import longest_hold
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.modbus.codec import SILENCE, ReadRegisters, WriteRegisters
@@ -55,11 +56,14 @@ class Busmaster:
     name = "busmaster"
     settings = f"window {WINDOW * 1000:g} ms, lateness {LATENESS * 1000:g} ms, {RETRIES} retries"
 
-    def __init__(self, timings: Timings = TIMINGS) -> None:
+    def __init__(self, timings: Timings = TIMINGS, learned: bool = False) -> None:
         self.bus: Bus | None = None
         self.waits: list[float] = []
         """Of each write: seconds until it was sent."""
         self._timings = timings
+        self._learned = learned
+        if learned:
+            self.name = "busmaster, learned times"
         self._nodes: dict[int, Node] = {}
 
     async def open(self, path: str) -> None:
@@ -72,7 +76,8 @@ class Busmaster:
     def node(self, unit: int) -> Node:
         assert self.bus is not None
         if unit not in self._nodes:
-            self._nodes[unit] = self.bus.node(PROFILE, unit, timings=self._timings, retries=RETRIES)
+            timings = Learned(self._timings) if self._learned else self._timings
+            self._nodes[unit] = self.bus.node(PROFILE, unit, timings=timings, retries=RETRIES)
         return self._nodes[unit]
 
     async def read(self, unit: int, register: int) -> int:

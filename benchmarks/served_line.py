@@ -2,7 +2,7 @@
 
 `python -m benchmarks.served_line` is told what to serve in a line of JSON, and prints the path. Each further line there
 is an order: {"unit": 3, "dead": true} takes a unit off the line, {"log": true} asks for what passed on the line since
-the last time: (seconds, "host" or "line", bytes, seconds taken).
+the last time: (seconds, "host" or "line", bytes, seconds taken), {"faults": {"lost": 0.01}} sets the faults of frames.
 """
 
 from __future__ import annotations
@@ -94,6 +94,10 @@ class ServedLine:
         """Take a unit off the line, or bring it back."""
         self._ask({"unit": unit, "dead": dead})
 
+    def spoil(self, **faults: float) -> None:
+        """Have these faults strike each frame from now on: shares of them."""
+        self._ask({"faults": faults})
+
     def log(self) -> list[tuple[float, str, int, float]]:
         """What passed since the last time."""
         return [(start, who, length, taken) for start, who, length, taken in self._ask({"log": True})]
@@ -115,6 +119,8 @@ def _obey(order: dict[str, Any], line: Line, now: float) -> Any:
             line.cut(now, unit)
         else:
             line.restore(now)
+    for name, share in order.get("faults", {}).items():
+        setattr(line.faults, name, share)
     if "log" in order:
         log, line.log = line.log, []
         return log

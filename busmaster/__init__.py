@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
 from busmaster.arbiter.events import LatenessLowered, LatenessRaised, LineChange, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health
+from busmaster.arbiter.learned import LearnedTimes
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Timeline
 from busmaster.bus.bus import Bus
@@ -15,6 +16,7 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import GroupStatistics, PollGroup, Quality, Sample, Snapshot, Stream
 from busmaster.bus.requester import Requester, RequestOptions
+from busmaster.contract.learning import LEARNED, Learned
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import (
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
     from busmaster.protocols.msc.status import ProgramStatus
 
 __all__ = [
+    "LEARNED",
     "BacklogFull",
     "Bus",
     "BusClosed",
@@ -72,6 +75,8 @@ __all__ = [
     "InvalidCommand",
     "LatenessLowered",
     "LatenessRaised",
+    "Learned",
+    "LearnedTimes",
     "LineChange",
     "LineChanged",
     "LineDown",

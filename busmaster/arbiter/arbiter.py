@@ -14,10 +14,12 @@ from math import inf
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import Event
 from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.learned import Learning
 from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.state import EXCHANGE, READY
 from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import Poll, Transaction
+from busmaster.contract.learning import Learned, documented
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed
@@ -50,17 +52,24 @@ class Arbiter(LineMachine):
         return self.dispatcher.attempt
 
     def add_node(
-        self, profile: Profile, address: int, now: float, timings: Timings | None = None, retries: int | None = None
+        self,
+        profile: Profile,
+        address: int,
+        now: float,
+        timings: Timings | Learned | None = None,
+        retries: int | None = None,
     ) -> NodeRecord:
         """Raises InvalidCommand for an address that the protocol does not have."""
         profile.check_address(address)
         node = NodeRecord(
             profile,
             address,
-            profile.timings if timings is None else timings,
+            documented(timings) or profile.timings,
             profile.retries if retries is None else retries,
             self.name,
         )
+        if isinstance(timings, Learned):
+            node.learning = Learning()
         self.dispatcher.nodes.append(node)
         if profile.listen is not None and self._unasked.listener is None:
             self._unasked.listener = profile.listen()

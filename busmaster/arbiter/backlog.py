@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Callable, Iterator
-from itertools import count
+from itertools import count, islice
 
 from busmaster.arbiter.transaction import BACKGROUND, POLL, QUEUED, Phase, Priority, Transaction
 
@@ -13,6 +13,8 @@ SHARE = 7
 """Consecutive exchanges of higher classes after which a waiting lower class gets one slot."""
 SLACK = 64
 """Entries of ended transactions that a queue may hold beside as many live ones."""
+SEARCHED = 256
+"""Entries of a class among which one is searched that serves as a check (R15)."""
 LOOKED_AT = 8
 """Waiting transactions of a class among which one is picked that may go before the first (R15)."""
 
@@ -68,6 +70,10 @@ class _Fifo:
     def remove(self, transaction: Transaction) -> None:
         self._entries.remove(transaction)
         self.live -= 1
+
+    def entries(self) -> Iterator[Transaction]:
+        """All that is in it, ended ones too, in no order."""
+        return iter(self._entries)
 
     def __iter__(self) -> Iterator[Transaction]:
         return (t for t in self._entries if t.phase is QUEUED)
@@ -129,6 +135,10 @@ class _EarliestDeadlineFirst:
         heapq.heapify(self._entries)
         self.live -= 1
 
+    def entries(self) -> Iterator[Transaction]:
+        """All that is in it, ended ones too, in no order."""
+        return (transaction for _, _, transaction in self._entries)
+
     def __iter__(self) -> Iterator[Transaction]:
         return (t for _, _, t in sorted(self._entries, key=lambda e: e[:2]) if t.phase is QUEUED)
 
@@ -174,6 +184,15 @@ class Backlog:
     def pick(self, priority: Priority, suits: Callable[[Transaction], bool]) -> Transaction | None:
         """Take out the first of the first few of a class that suits; the others keep their places."""
         return self.queues[priority].pick(suits)
+
+    def take(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
+        """Take out one that suits, of whatever class: for what has to be asked now in any case."""
+        for queue in self.queues:
+            found = next((t for t in islice(queue.entries(), SEARCHED) if t.phase is QUEUED and suits(t)), None)
+            if found is not None:
+                queue.remove(found)
+                return found
+        return None
 
     def promote(self, transaction: Transaction, priority: Priority) -> None:
         """To the front of a higher class: a write that a write of that class must not overtake."""

@@ -7,7 +7,7 @@ line is in step. An urgent write is never held back; its answer may then be doub
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from math import inf
 from typing import Any, TypeAlias
 
@@ -36,6 +36,7 @@ class Choice:
         self._in_step = in_step
         self._alike = Alike(wire)
         self._gone_before = 0
+        self._last_byte = -inf
 
     def next(self, now: float, last_byte: float) -> Chosen | float | None:
         """The transaction to be sent now, with its exchange. None if none waits; a time if none may go before it.
@@ -43,10 +44,12 @@ class Choice:
         `last_byte`: when the last one came.
         """
         dispatcher, in_step, alike = self._dispatcher, self._in_step, self._alike
+        self._last_byte = last_byte
         while (transaction := dispatcher.next(now)) is not None:
             node = transaction.node
             try:
-                exchange = transaction.command.open(node.address, node.timings)
+                timings = node.timings if node.learning is None else transaction.timings()
+                exchange = transaction.command.open(node.address, timings)
                 answers = exchange.answers  # a protocol may lack it: found out here, it fails this one alone
             except Exception as bug:
                 dispatcher.unsendable(transaction, bug, now)
@@ -79,6 +82,8 @@ class Choice:
 
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
+        elif _is_decisive(first) and now < in_step.awaited_until(self._last_byte):
+            chosen = self._while_awaited(first, now) or in_step.awaited_until(self._last_byte)
         elif transaction.probe and in_step.clashes(answers, now, transaction.node):
             chosen = self._other_probe(transaction, now) or self._instead_of(first, now)
         elif in_step.clashes(answers, now):
@@ -107,11 +112,15 @@ class Choice:
     def _instead_of(self, first: Chosen, now: float) -> Chosen | float:
         """What goes in place of one whose answer could be one that is owed."""
         in_step, answers = self._in_step, first[1].answers
-        if self._gone_before >= MOST_BEFORE:
-            return first
 
         def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
             return in_step.clashes(answers, now, node)
+
+        awaited = in_step.awaited_until(self._last_byte, answers)
+        if now < awaited:
+            return self._while_awaited(first, now, answers) or awaited
+        if self._gone_before >= MOST_BEFORE:
+            return first
 
         def proves_nothing(answers: Sequence[bytes], node: NodeRecord) -> bool:
             return in_step.clashes(answers, now)
@@ -140,6 +149,43 @@ class Choice:
         self._gone_before += 1
         return other
 
+    def _while_awaited(self, first: Chosen, now: float, answers: Sequence[bytes] | None = None) -> Chosen | None:
+        """What goes while an owed answer (that could look so) may still be on time, though the line went on: a check
+        of the node that owes it, which shows that it is not to come; else another. None once two were in vain."""
+        if self._gone_before >= MOST_BEFORE - 1:
+            return None
+
+        def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
+            return self._in_step.clashes(answers, now, node)
+
+        owing = dict.fromkeys(self._in_step.owing(answers, now))
+        other = (
+            self._of_these(owing, now, clashes)
+            or self._ask_check(owing, now, clashes)
+            or self._another(first, now, clashes)
+        )
+        self._gone_before += other is not None
+        return other
+
+    def _of_these(self, nodes: Container[NodeRecord], now: float, unfit: Unfit) -> Chosen | None:
+        """A read of one of these nodes that waits anyway, of whatever class: it costs nothing, as a check does."""
+        opened: list[Exchange[Any]] = []
+
+        def suits(other: Transaction) -> bool:
+            node = other.node
+            if other.writes or node not in nodes or not self._dispatcher.may_go(other, now):
+                return False
+            if self._dispatcher.writes.queues.get(node):  # no read overtakes a write to its node
+                return False
+            exchange = _opened(other)
+            if exchange is None or _is_decisive((other, exchange)) or unfit(exchange.answers, node):
+                return False
+            opened.append(exchange)
+            return True
+
+        transaction = self._dispatcher.backlog.take(suits)
+        return None if transaction is None else (transaction, opened[0])
+
     def _ask_itself(self, first: Chosen, now: float) -> Chosen | None:
         """A check of a node that owes what it is to be asked for: its answer would not be believed. None for one that
         is likely to be dead."""
@@ -165,14 +211,18 @@ class Choice:
         opened: list[Exchange[Any]] = []
         passed = {first[0].node}
         written = {first[0].node} if first[0].writes else set()
+        in_step = self._in_step
+        awaited = now < in_step.awaited_until(self._last_byte)
 
         def suits(other: Transaction) -> bool:
             in_order = other.node not in (passed if other.writes else written)
             if in_order and of in (None, other.node) and self._dispatcher.may_go(other, now):
                 exchange = _opened(other)
                 if exchange is not None and exchange.answered and not unfit(exchange.answers, other.node):
-                    opened.append(exchange)
-                    return True
+                    spoilt = awaited and (_is_decisive((other, exchange)) or in_step.clashes(exchange.answers, now))
+                    if not spoilt:
+                        opened.append(exchange)
+                        return True
             passed.add(other.node)
             if other.writes:
                 written.add(other.node)
@@ -184,7 +234,10 @@ class Choice:
     def _ask_check(self, nodes: Iterable[NodeRecord], now: float, unfit: Unfit) -> Chosen | None:
         """A read of the first of these nodes that has one whose answer is fit to prove something."""
         for node, command, exchange in _fit_checks(nodes, unfit):
-            return self._dispatcher.check(node, command, now), exchange
+            check = self._dispatcher.check(node, command, now)
+            if node.learning is not None:
+                exchange = command.open(node.address, check.timings())
+            return check, exchange
         return None
 
     def _whom_to_ask(self, now: float) -> tuple[list[NodeRecord], list[NodeRecord]]:
@@ -209,6 +262,13 @@ def _fit_checks(nodes: Iterable[NodeRecord], unfit: Unfit) -> Iterator[tuple[Nod
                 yield node, command, exchange
 
 
+def _is_decisive(chosen: Chosen) -> bool:
+    """It is a write, or the last attempt of a read: nothing that could have been waited for may spoil it."""
+    transaction, exchange = chosen
+    last = transaction.retried >= transaction.retries and not transaction.probe
+    return transaction.writes or not exchange.answered or last
+
+
 def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:
     """Cheap reads of a node: those that it has answered, then those of its protocol that it has not refused."""
     yield from node.answered.values()
@@ -220,6 +280,6 @@ def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:
 def _opened(transaction: Transaction) -> Exchange[Any] | None:
     """None where its protocol cannot encode it: that is told when its turn has come."""
     try:
-        return transaction.command.open(transaction.node.address, transaction.node.timings)
+        return transaction.command.open(transaction.node.address, transaction.timings())
     except Exception:
         return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from busmaster.arbiter.histogram import Histogram
+from busmaster.arbiter.learned import LearnedTimes
 from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, SETTLING, LineState
 
@@ -45,6 +46,8 @@ class NodeStatistics:
     lateness: float
     latency: Quantiles
     """From the start of the request to the end of its reply, of attempts that succeeded."""
+    learned: tuple[LearnedTimes, ...] = ()
+    """Of each kind of command that it was asked, where its reply times are learned."""
 
 
 @dataclass(frozen=True, slots=True)

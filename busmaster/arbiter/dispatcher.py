@@ -30,6 +30,7 @@ from busmaster.arbiter.transaction import (
     ENDED,
     FAILING,
     IDLE,
+    LEFT,
     ON_WIRE,
     PARKED,
     QUEUED,
@@ -56,7 +57,6 @@ REFUSED_POLL_PAUSE = 10.0
 RETRY_PATIENCE = 1.0
 """Seconds after which a request in POLL or BACKGROUND wants to be answered; the period, for a poll."""
 SUSPENDED = "suspended for maintenance"
-LEFT = "the line is being left: only its safe state is still written"
 NOT_DONE = (Refused, Superseded)
 """Errors that say of a write that it was not carried out, unless an attempt before them may have been."""
 

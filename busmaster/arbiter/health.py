@@ -8,6 +8,7 @@ from math import inf
 from typing import Any
 
 from busmaster.arbiter.counters import NodeCounters
+from busmaster.arbiter.learned import Learning
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
@@ -71,6 +72,7 @@ class NodeRecord:
         "label",
         "last_reply",
         "lateness_until",
+        "learning",
         "line",
         "probe_at",
         "probe_delay",
@@ -96,6 +98,8 @@ class NodeRecord:
         self.label = profile.label(address)
         self.timings = timings
         self.retries = retries
+        self.learning: Learning | None = None
+        """What is learned of its reply times, where that is wished for."""
         self.health = UNKNOWN
         self.failures = 0
         """Transactions in a row that failed without a valid reply."""
@@ -240,6 +244,8 @@ def flaps(node: NodeRecord, now: float) -> bool:
 def note_success(node: NodeRecord, now: float) -> None:
     """A reply came. The caller reports the change of health."""
     node.failures = 0
+    if node.health is DOWN and node.learning is not None:
+        node.learning.doubt()  # it may have come back as another device
     if node.health is SUSPECT:
         node.replies += 1
         if node.replies < UP_AFTER_REPLIES or now - node.failed_at < UP_AFTER_CALM:

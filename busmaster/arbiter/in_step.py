@@ -7,7 +7,8 @@ A *debt* is one such reply: what it would begin with (its key), whose it is, and
 came in place of a whole reply leaves one with the key ANY_BYTE: its tail, a lone byte, could look like an ACK.
 
 A debt is paid
-- by its own reply, heard while nothing was asked or in place of another;
+- by its own reply, heard while nothing was asked or in place of another (by a whole one, where the line went on after a
+  learned window: talkers may have met on it, and what is left of two can begin like anything);
 - by a right answer of the same node to something else: a node answers in the order in which it was asked;
 - once its lateness is over, and where its node has been silent since, by a right answer of any node to something else:
   a channel keeps the order. It stays for as long as its node could still take: what was held up together is let go
@@ -25,8 +26,10 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
+from typing import Any
 
 from busmaster.arbiter.health import NodeRecord
+from busmaster.contract.exchange import Command, Done
 
 ANY_BYTE = b""
 """The key of a debt that any lone byte could pay."""
@@ -38,8 +41,20 @@ DOUBT_PERIOD = 30.0
 """Seconds after something was said twice in which answers like those heard lately are doubted."""
 SAID_MEMORY = 0.5
 """Seconds for which what was said may be said again."""
+MOST_UNHEARD = 4
+"""Learned windows in a row that may bring nothing before a node is taken to be silent."""
 MOST_DEBTS = 400
 """More unheard replies than fit into LAPSE at any window that is in use; the oldest goes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Awaited:
+    """Of a reply that may still be on time: what it answers, the learned `window` after which the line went on, and the
+    `silence` after which it is over, as the document says; in seconds."""
+
+    command: Command[Any]
+    window: float
+    silence: float
 
 
 @dataclass(slots=True)
@@ -53,6 +68,8 @@ class Debt:
     """From then on, it is later than its node's lateness allows."""
     until: float = inf
     """From then on, only its own node's answers can be it: a right answer of another node was heard."""
+    awaited: Awaited | None = None
+    """Where the line went on after a learned window: it may still come, and meet with what is said."""
 
     def of(self, node: NodeRecord | None, now: float) -> bool:
         """It could be the answer of this node (None: of any) to a request that is made now."""
@@ -79,9 +96,16 @@ class InStep:
 
     # what is owed
 
-    def owe(self, keys: Iterable[bytes], node: NodeRecord | None, asked: float, over: float) -> None:
-        """Replies that begin with these keys were not heard."""
-        self.debts += [Debt(key, node, asked, over) for key in keys]
+    def owe(
+        self,
+        keys: Iterable[bytes],
+        node: NodeRecord | None,
+        asked: float,
+        over: float,
+        awaited: Awaited | None = None,
+    ) -> None:
+        """Replies that begin with these keys were not heard, see `Debt`."""
+        self.debts += [Debt(key, node, asked, over, inf, awaited) for key in keys]
         del self.debts[:-MOST_DEBTS]
         self.alert = True
 
@@ -99,10 +123,23 @@ class InStep:
         """When all that is owed and could look so is later than its node's lateness allows."""
         return max((debt.over for debt in self.debts if _could_be(debt, answers)), default=-inf)
 
-    def owing(self, answers: Sequence[bytes], now: float) -> Iterator[NodeRecord]:
-        """The nodes that owe what could look so, and answer, as far as is known."""
+    def awaited_until(self, last_byte: float, answers: Sequence[bytes] | None = None) -> float:
+        """Until when something may come (that could look so), though the line went on. `last_byte`: when one came."""
+        until = -inf
         for debt in self.debts:
-            if debt.node is not None and now < debt.until and not _is_silent(debt) and _could_be(debt, answers):
+            if debt.awaited is not None and (answers is None or _could_be(debt, answers)):
+                over = debt.over
+                until = max(until, over, last_byte + debt.awaited.silence if last_byte < over else over)
+        return until
+
+    def owing(self, answers: Sequence[bytes] | None, now: float) -> Iterator[NodeRecord]:
+        """The nodes that owe what could look so (None: anything), and answer, as far as is known."""
+        for debt in self.debts:
+            if debt.node is None or now >= debt.until or not (answers is None or _could_be(debt, answers)):
+                continue
+            if not _is_silent(debt) or (
+                debt.awaited is not None and now < debt.over and debt.node.unheard <= MOST_UNHEARD
+            ):
                 yield debt.node
 
     def ends(self, answers: Sequence[bytes], now: float) -> float:
@@ -118,7 +155,7 @@ class InStep:
     def doubtful_answer(self, answers: Sequence[bytes]) -> None:
         """An answer came that was the oldest debt of its kind, or the answer: one of the two is still owed."""
         for place, debt in enumerate(self.debts):
-            if _could_be(debt, answers):
+            if debt.awaited is None and _could_be(debt, answers):
                 del self.debts[place]
                 return
 
@@ -133,12 +170,15 @@ class InStep:
                 debt.until = now + (0.0 if debt.node is None else debt.node.latest(patience))
                 self._doubted.append((debt.key, debt.until + DOUBTED_LATENESSES * (debt.over - debt.asked)))
 
-    def heard(self, run: bytes, now: float) -> NodeRecord | None:
-        """Take all that came up to a silence, unasked or in place of a reply. Returns who owed it, if that is known.
+    def heard(self, run: bytes, now: float) -> Debt | None:
+        """Take all that came up to a silence, unasked or in place of a reply. Returns whose it is, as far as is known.
 
         What nobody owed, though it is like the last answers, was said twice. Of what is no lone answer, a part may
         be still to come: a byte of any kind.
         """
+        awaited = [debt for debt in self.debts if debt.awaited is not None]
+        if awaited:
+            return self._heard_late(awaited, run, now)
         payers: list[Debt] = []
         rest = run
         while (debt := self._owed_byte(rest)) is not None:
@@ -152,14 +192,28 @@ class InStep:
                 self._pay(debt)
                 rest = rest[:place] + rest[place + len(debt.key) :]
         if payers and not rest:
-            return payers[0].node
+            return payers[0]
         if not payers and any(until > now and _is(run, key) for key, until in self._doubted):
             self._doubted = [entry for entry in self._doubted if not _is(run, entry[0])]
         elif not payers and any(_is(run, key) for key in (*self.last, *self.before)):
             self.said_twice(now)
         else:
             self.owe((ANY_BYTE,), None, now, now)
-        return payers[0].node if payers else None
+        return payers[0] if payers else None
+
+    def _heard_late(self, awaited: list[Debt], run: bytes, now: float) -> Debt | None:
+        """As `heard`, where the line went on before a reply was over. Talkers may have met, and what is left of two can
+        begin like anything: only whole replies pay, and where it is certain who owed them."""
+        first = None
+        while found := next(((debt, rest) for debt in awaited if (rest := _behind(debt, run)) is not None), None):
+            debt, run = found
+            first = first or debt
+            awaited.remove(debt)
+            if all(other.node is debt.node for other in self.debts if other.key == debt.key):
+                self.debts = [other for other in self.debts if (other.node, other.asked) != (debt.node, debt.asked)]
+        if run:
+            self.owe((ANY_BYTE,), None, now, now)
+        return first
 
     def _owed_byte(self, run: bytes) -> Debt | None:
         """The debt that the first byte pays: one that is alone, or before more of its kind, or before an owed reply."""
@@ -207,6 +261,17 @@ class InStep:
             if any(key in answers for key in said):
                 return True
         return False
+
+
+def _behind(debt: Debt, run: bytes) -> bytes | None:
+    """What comes behind this debt's reply where the run begins with all of it, and it is right; else None."""
+    if debt.awaited is None or debt.node is None or len(debt.key) < 2 or not run.startswith(debt.key):
+        return None
+    try:
+        step = debt.awaited.command.open(debt.node.address, debt.node.timings).feed(run)
+    except Exception:
+        return None
+    return step.rest if type(step) is Done else None
 
 
 def _could_be(debt: Debt, answers: Sequence[bytes]) -> bool:

@@ -29,6 +29,8 @@ from busmaster.arbiter.unasked import QUIET
 from busmaster.contract.exchange import LaterLeg
 from busmaster.contract.timing import ReplyTiming
 
+UNKNOWN_LATENESS = 0.150
+"""Assumed of an earlier master's nodes while none is known."""
 TAINT_SHARE = 0.9
 """A reply cannot begin before this share of its request's own wire time (R4)."""
 
@@ -46,12 +48,15 @@ class Leg:
         "begun_at",
         "byte_time",
         "end",
+        "first_bytes",
         "latency",
         "longest",
         "out",
         "paced",
+        "pause",
         "taint_until",
         "timing",
+        "went_on_at",
     )
 
     def __init__(self, timing: ReplyTiming, latency: float, byte_time: float) -> None:
@@ -59,6 +64,12 @@ class Leg:
         self.begun = False
         self.begun_at = -inf
         """When the first byte of its reply was received."""
+        self.first_bytes = b""
+        """What came then, at once."""
+        self.pause = 0.0
+        """The longest pause, in seconds, between two arrivals of its bytes."""
+        self.went_on_at = -inf
+        """When bytes of it came that did not complete it."""
         self.end = -inf
         """When the last byte of the request is on the wire: lateness counts from there."""
         self.out = -inf
@@ -83,6 +94,7 @@ class Leg:
         self.timing = timing
         self.longest = longest
         self.begun = False
+        self.pause = 0.0
         self._follows = None
         out = self.out
         self.out = self.end = end = (out if out > now else now) + said * self.byte_time
@@ -93,6 +105,9 @@ class Leg:
     def gap_over(self, now: float) -> float:
         """When the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
         timing, latency, byte_time = self.timing, self.latency, self.byte_time
+        if self.went_on_at >= self.begun_at and now - self.went_on_at > self.pause:
+            self.pause = now - self.went_on_at
+        self.went_on_at = now
         due = now + timing.byte_gap + latency + byte_time
         limit = self.end + timing.window + latency + self.longest * byte_time + timing.byte_gap
         return due if due < limit else limit
@@ -109,8 +124,11 @@ class Leg:
         self.taint_until += seconds
 
     def quiet(self) -> float:
-        """The silence, in seconds, after which nothing more of a frame can come."""
-        return max(QUIET, self.timing.byte_gap) + self.latency + self.byte_time
+        """The silence, in seconds, after which nothing more of a frame can come, or is awaited."""
+        silence = self.timing.silence
+        if silence is None:
+            silence = max(QUIET, self.timing.byte_gap)
+        return silence + self.latency + self.byte_time
 
     def give_up(self, later: Sequence[LaterLeg]) -> None:
         """Its reply may still come; then its node goes on by itself with those of the `later` legs that need no word

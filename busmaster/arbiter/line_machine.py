@@ -3,9 +3,11 @@
 Theory of operation
 -------------------
 One half-duplex line, many nodes, anonymous replies: at most one exchange is on the line (R1), and no byte of an earlier
-one can come when the next begins (R3). It is told the time with every call and sends nothing itself: its owner pumps
-`poll_transmit`, then `poll_event`, then arms a timer for `poll_timeout`. Early or repeated calls change nothing.
-What ends each of the five states by itself is its deadline.
+one can come when the next begins (R3), unless its window was learned (R15). It is told the time and sends nothing: its
+owner pumps `poll_transmit`, then `poll_event`, and arms a timer for `poll_timeout`. Calls too early change nothing.
+
+The line is in one of five states; `_line_due` is when the state ends by itself.
+from busmaster.arbiter.mark import Mark
 
 =========  =====================  =======================  ==========================  ====================
 state      data received          its deadline             line_up / line_down         submit, poll due
@@ -39,7 +41,7 @@ from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import CameUnasked, LineChange, LineChanged
 from busmaster.arbiter.health import DOWN
 from busmaster.arbiter.in_step import InStep
-from busmaster.arbiter.leg import Leg
+from busmaster.arbiter.leg import UNKNOWN_LATENESS, Leg
 from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
@@ -49,9 +51,6 @@ from busmaster.arbiter.unasked import LOOK_SLACK, QUIET, UnaskedBytes
 from busmaster.contract.exchange import NO_REPLY, Done, Expect, FrameError
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import BusError, LineDown, LineNoisy, Refused
-
-UNKNOWN_LATENESS = 0.150
-"""Assumed of an earlier master's nodes while none is known."""
 
 
 class LineMachine:
@@ -252,6 +251,7 @@ class LineMachine:
                 return b""
         leg.begun = True
         leg.begun_at = now
+        leg.first_bytes = data
         if transaction.first_byte == -inf:
             transaction.first_byte = now
         if now > leg.end + leg.timing.nominal + leg.latency:
@@ -298,6 +298,8 @@ class LineMachine:
             if leg.end > leg.begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
                 leg.end = leg.out = leg.begun_at
             transaction.node.note_reply(exchange.answers, transaction.command, leg.begun_at - leg.end)
+            if transaction.node.learning is not None:
+                wire.learn(now)
         if step.send:
             wire.say(step.send, now)
         wire.transaction = wire.exchange = self._trust.held = None
@@ -393,10 +395,7 @@ class LineMachine:
             self._deadlines.line = free if free > now else inf
 
     def _settle(self, now: float, begun: bool = False) -> None:
-        """Discard until it has been silent long enough, and nothing can come any more (R3).
-
-        `begun`: the reply to the last request is known to have begun, so that silence is enough.
-        """
+        """Discard until it has been silent long enough, and nothing can come any more (R3) unless it has `begun`."""
         if self._closed:
             self._go_offline(now)
             return
@@ -406,7 +405,8 @@ class LineMachine:
         self._echo.forget()
         last = max(self._unasked.last_byte, self._leg.out)  # ours, too: who speaks on two wires does not hear
         silent = max(last + self._leg.quiet(), self._quarantine, now)
-        self._silent_at = silent if begun else max(silent, self._leg.past())
+        goes_on = begun or self._leg.timing.silence is not None  # learned: what may still come is owed (R15)
+        self._silent_at = silent if goes_on else max(silent, self._leg.past())
         self._deadlines.line = self._unasked.look_before(self._silent_at, now)
 
     def _free(self, now: float) -> None:
@@ -443,7 +443,7 @@ class LineMachine:
 
     def _hear_out(self, run: bytes, now: float) -> None:
         """The line is silent, and this came before: whoever said it, and owed it, is alive (R11, R15)."""
-        node = self._in_step.heard(run, now) if run else None
+        node = self._trust.hear(self._wire, run, self._unasked, now) if run else None
         if node is not None and node.health is DOWN:
             self.dispatcher.probes.alive(node, now)
 

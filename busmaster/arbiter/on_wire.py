@@ -7,6 +7,7 @@ from typing import Any, cast
 
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.echo import Echo
+from busmaster.arbiter.learned import LATE_SHARE
 from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.output import Output
 from busmaster.arbiter.transaction import Transaction
@@ -44,6 +45,22 @@ class OnWire:
         if self._echo.declared:
             self._echo.sent(request)
 
+    def learn(self, now: float) -> None:
+        """Let its node's times be learned from the reply to this leg, which is over."""
+        transaction, exchange, leg = self.transaction, self.exchange, self.leg
+        assert transaction is not None
+        assert exchange is not None
+        learning = transaction.node.learning
+        if learning is None or not leg.begun:
+            return
+        heard = max(0.0, leg.begun_at - leg.end - leg.latency)
+        begun = max(0.0, heard - (len(leg.first_bytes) - 1) * leg.byte_time)
+        pause = leg.pause if leg.went_on_at < leg.begun_at else max(leg.pause, now - leg.went_on_at)
+        packet = leg.timing is not exchange.timing
+        learning.note(transaction.command, packet, begun, heard, max(0.0, pause - leg.latency), leg.byte_time)
+        if leg.timing.silence is not None and heard > LATE_SHARE * leg.timing.window:
+            learning.doubt()
+
     def without_noise(self, data: bytes) -> bytes:
         """Return what is left of the first bytes of a reply where the profile tolerates noise before it."""
         assert self.exchange is not None
@@ -72,6 +89,7 @@ class OnWire:
         transaction = self.transaction
         assert transaction is not None
         limit = transaction.node.profile.exchange_limit
+        self.learn(now)
         if step.send and limit is not None and (now - transaction.started > limit or self._urgent_waits()):
             raise cast("Abandonable", self.exchange).abandon()
         self._deadlines.line = self.leg.begin(step.timing, len(step.send), step.sizes.longest, now)

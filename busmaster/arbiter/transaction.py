@@ -7,9 +7,11 @@ from collections.abc import Iterator, Sequence
 from math import inf, nextafter
 from typing import Any, NamedTuple
 
-from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.health import DOWN, UNKNOWN, NodeRecord
 from busmaster.arbiter.histogram import Histogram
+from busmaster.arbiter.learned import AGAIN, AT_FIRST, AT_LAST, NEVER
 from busmaster.contract.exchange import Command
+from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, InvalidCommand
 
 LONGEST_PATIENCE = 10.0
@@ -43,6 +45,8 @@ class Phase(enum.Enum):
 
 
 IDLE, QUEUED, PARKED, ON_WIRE, FAILING, ENDED = Phase
+LEFT = "the line is being left: only its safe state is still written"
+"""Why a write is superseded that is not of the safe state, once that is being sent."""
 
 
 class Timeline(NamedTuple):
@@ -158,6 +162,17 @@ class Transaction:
         self.started = self.first_byte = self.last_byte = self.ended_at = -inf
         self.exchanges_ahead = 0
         self.settling_ahead = 0.0
+
+    def timings(self) -> Timings:
+        """Return the times of the next attempt: a learned window only for a read that is repeated if it is over."""
+        node, hurry = self.node, AT_LAST
+        if node.learning is None:
+            return node.timings
+        if node.failures or node.health is UNKNOWN or node.health is DOWN or self.probe != self.check:
+            hurry = NEVER
+        elif self.check or (self.retried < self.retries and not self.writes and self.retried < 2):
+            hurry = AGAIN if self.retried else AT_FIRST
+        return node.learning.timings(self.command, node.timings, hurry)
 
     def timeline(self) -> Timeline:
         def known(time: float) -> float | None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from busmaster.arbiter.in_step import ANY_BYTE, InStep
+from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.in_step import ANY_BYTE, Awaited, InStep
+from busmaster.arbiter.learned import LATE_SHARE
 from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.on_wire import OnWire
+from busmaster.arbiter.unasked import QUIET, UnaskedBytes
 from busmaster.contract.exchange import Done
 
 TWO_ANSWERS = "two answers came where one was due"
@@ -64,8 +67,25 @@ class Trust:
         assert transaction is not None
         assert exchange is not None
         keys = () if whole else tuple(exchange.owed)
-        if heard:
+        leg, awaited = wire.leg, None
+        over = leg.past()
+        if leg.timing.silence is not None:  # it may meet with what is said then, and only a part of it be heard
+            over += sum(later.timing.lateness for later in exchange.later if not later.sent)
+            silence = max(QUIET, transaction.node.timings.read.byte_gap) + leg.latency + leg.byte_time
+            awaited = Awaited(transaction.command, leg.timing.window, silence)
+        if heard or (awaited is not None and keys):
             keys += (ANY_BYTE,)
         if exchange.answered:
             transaction.node.unheard += not heard
-            self._in_step.owe(keys, transaction.node, wire.leg.end, wire.leg.past())
+            self._in_step.owe(keys, transaction.node, leg.end, over, awaited)
+
+    def hear(self, wire: OnWire, run: bytes, unasked: UnaskedBytes, now: float) -> NodeRecord | None:
+        """The line is silent, and this came before. Returns who owed it, if that is known."""
+        paid = self._in_step.heard(run, now)
+        node = None if paid is None else paid.node
+        if paid is not None and node is not None and node.learning is not None and paid.awaited is not None:
+            first_byte = unasked.last_byte - (len(run) - 1) * wire.leg.byte_time - wire.leg.latency
+            if first_byte - paid.asked > LATE_SHARE * paid.awaited.window:
+                node.learning.doubt()
+                unasked.blame_for(node, paid.asked, first_byte)
+        return node

@@ -104,6 +104,12 @@ class UnaskedBytes:
             node.raise_lateness(raised, first_byte)
             self._events.append(LatenessRaised(node, age, raised))
 
+    def blame_for(self, node: NodeRecord, asked: float, first_byte: float) -> None:
+        """The reply to an earlier request came, though the line had gone on."""
+        self.unanswered(node, asked, node.timings.read.lateness)
+        self.looked(first_byte, first_byte)
+        self.blame(first_byte)
+
     # what may be owed an answer: MSC sends a packet again until it is ACKed
 
     def reply_to(self, data: bytes) -> bytes:

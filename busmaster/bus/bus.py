@@ -27,6 +27,7 @@ from busmaster.bus.requester import checked_priority, checked_retries
 from busmaster.bus.shared_line import SharedLine, running_loop
 from busmaster.bus.suitability import check_company, check_settings
 from busmaster.contract.arguments import seconds, whole_number
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, InvalidCommand, LineDown
@@ -184,7 +185,7 @@ class Bus:
     # nodes and groups
 
     def node(
-        self, profile: Profile, address: int, *, timings: Timings | None = None, retries: int | None = None
+        self, profile: Profile, address: int, *, timings: Timings | Learned | None = None, retries: int | None = None
     ) -> Node:
         """Return the node at this address: a protocol and an address are one node, however often it is asked for.
 
@@ -194,8 +195,8 @@ class Bus:
         """
         self.check_loop()
         profile.check_address(address)
-        if timings is not None and not isinstance(timings, Timings):
-            raise InvalidCommand(f"{profile.label(address)}: timings are a Timings, not {timings!r}")
+        if timings is not None and not isinstance(timings, Timings | Learned):
+            raise InvalidCommand(f"{profile.label(address)}: timings are a Timings or LEARNED, not {timings!r}")
         if retries is not None:
             try:
                 retries = checked_retries(retries)
@@ -211,7 +212,7 @@ class Bus:
         if not self._byte_time_known:
             self._arbiter.byte_time = profile.line.byte_time
             self._byte_time_known = True
-        node = Node(self._line, self._arbiter.add_node(profile, address, self.now(), timings, retries))
+        node = Node(self._line, self._arbiter.add_node(profile, address, self.now(), timings, retries), timings)
         self._nodes[profile.name, address] = node
         self._profiles.setdefault(profile.name, profile)
         return node

@@ -10,6 +10,7 @@ from busmaster.bus.points import Point
 from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import guess, is_decimal
 from busmaster.contract.exchange import Command
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
@@ -34,7 +35,7 @@ class Handle(ABC):
         bus: NodeSource,
         address: int,
         *,
-        timings: Timings | None = None,
+        timings: Timings | Learned | None = None,
         retries: int | None = None,
         profile: Profile | None = None,
     ) -> None:

@@ -10,9 +10,8 @@ from threading import get_ident
 from typing import Any, Protocol, TypeVar, Unpack
 
 from busmaster.arbiter.counters import NodeStatistics
-from busmaster.arbiter.dispatcher import LEFT
 from busmaster.arbiter.health import Health, NodeRecord
-from busmaster.arbiter.transaction import Priority, Timeline, Transaction
+from busmaster.arbiter.transaction import LEFT, Priority, Timeline, Transaction
 from busmaster.bus.limiter import Limiter
 from busmaster.bus.limits import Limit
 from busmaster.bus.requester import ORDINARY, CommandOptions, Requester, RequestOptions
@@ -20,6 +19,7 @@ from busmaster.bus.samples import Sample
 from busmaster.bus.shared_line import SharedLine
 from busmaster.contract.arguments import seconds
 from busmaster.contract.exchange import Command
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, InvalidCommand, Refused, Superseded
@@ -43,11 +43,12 @@ class HasNode(Protocol):
 class Node:
     """One node, made by `Bus.node` or by a handle. Everything that is asked of it goes through `request`."""
 
-    def __init__(self, line: SharedLine, record: NodeRecord) -> None:
+    def __init__(self, line: SharedLine, record: NodeRecord, asked: Timings | Learned | None = None) -> None:
         self.shared = line
         self.record = record
         self.timings = record.timings
         """As they were asked for: its record's lateness may have been raised since."""
+        self._asked = Learned(record.timings) if isinstance(asked, Learned) else record.timings
         self.kinds: dict[Hashable, Command[Any]] = {}
         """Of each kind of command that was asked of it, the first: the worst case reckons with them."""
         self.reply_time: float | None = None
@@ -138,7 +139,7 @@ class Node:
         self._on_return = hook
         self.shared.arbiter.expect_hook(self.record, hook is not None)
 
-    def check_shared(self, profile: Profile, timings: Timings | None, retries: int | None) -> None:
+    def check_shared(self, profile: Profile, timings: Timings | Learned | None, retries: int | None) -> None:
         """Raise InvalidCommand where somebody asks for this node with anything else than it was first asked with.
 
         What is None was left open: a profile's `merge` too.
@@ -146,8 +147,10 @@ class Node:
         own = self.profile
         if profile is own and timings is None and retries is None:
             return
+        if isinstance(timings, Learned):
+            timings = timings.of(profile.timings)
         wanted = {
-            "other timings": timings not in (None, self.timings),
+            "other timings": timings not in (None, self._asked),
             "other retries": retries not in (None, self.record.retries),
             "another profile": profile != own or profile.merge not in (None, own.merge),
         }
@@ -318,4 +321,7 @@ class Node:
     def statistics(self) -> NodeStatistics:
         """Return counts and latencies since the bus was opened or its statistics were reset."""
         self.shared.check_loop()
-        return self.record.counters.snapshot(self.record.lateness)
+        record = self.record
+        learning = record.learning
+        learned = () if learning is None else learning.times(record.timings)
+        return replace(record.counters.snapshot(record.lateness), learned=learned)

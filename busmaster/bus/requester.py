@@ -11,6 +11,7 @@ from busmaster.bus.limits import Limit
 from busmaster.bus.samples import Sample
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.contract.exchange import Command
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, NoReply, NotStarted, WriteUnconfirmed
@@ -187,7 +188,7 @@ class NodeSource(Protocol):
     """What has nodes: a bus, wherever its line is."""
 
     def node(
-        self, profile: Profile, address: int, /, *, timings: Timings | None = None, retries: int | None = None
+        self, profile: Profile, address: int, /, *, timings: Timings | Learned | None = None, retries: int | None = None
     ) -> Requester: ...
 
 

@@ -14,6 +14,7 @@ from busmaster.bus.handle import Handle
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.parsing import Whole, option_type, parse_nodes, parse_seconds, parse_window, parsed
 from busmaster.cli.protocols import handle_options, protocol_option, take_options
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings
 from busmaster.registry import find
@@ -32,7 +33,7 @@ class Connection:
     protocol: str
     baud: int | None = None
     echo: bool = False
-    timeout: float | None = None
+    timeout: float | Learned | None = None
     retries: int | None = None
     capture: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -47,8 +48,10 @@ class Connection:
         return line_settings(self.profile, self.baud)
 
     @property
-    def timings(self) -> Timings | None:
-        return None if self.timeout is None else self.profile.timings.with_window(self.timeout)
+    def timings(self) -> Timings | Learned | None:
+        if self.timeout is None or isinstance(self.timeout, Learned):
+            return self.timeout
+        return self.profile.timings.with_window(self.timeout)
 
     def endpoint(self) -> SerialPort | TcpPort:
         """Raises InvalidCommand for a PORT that is none."""
@@ -134,7 +137,7 @@ def connected(command: F) -> F:
         protocol: str,
         baud: int | None,
         echo: bool,
-        timeout: float | None,
+        timeout: float | Learned | None,
         retries: int | None,
         capture: str | None,
         **options: Any,
@@ -149,7 +152,10 @@ def connected(command: F) -> F:
         click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default."),
         click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire)."),
         click.option(
-            "--timeout", type=option_type(parse_window), metavar="MS", help="The reply window, in milliseconds."
+            "--timeout",
+            type=option_type(parse_window),
+            metavar="MS",
+            help="The reply window, in milliseconds; or the word learned: from the replies.",
         ),
         click.option("--retries", type=Whole(min=0), metavar="N", help="How often a read is tried again."),
         capture_option,

@@ -14,6 +14,7 @@ from busmaster.cli.output import emit_all, note
 from busmaster.cli.parsing import Whole, option_type, parse_window, parsed
 from busmaster.cli.progress import Bar
 from busmaster.cli.protocols import protocol_option
+from busmaster.contract.learning import documented
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.doctor.adapters import Finding
 from busmaster.doctor.examination import Patient, examine
@@ -70,7 +71,7 @@ def patient_of(connection: Connection, nodes: Sequence[int] | None) -> Patient:
     if connection.protocol:
         where = parsed(lambda _: connection.endpoint(), connection.port)
         addresses = nodes_to_ask(connection.profile, nodes)
-        return Patient(where, connection.protocol, connection.timings, addresses, nodes is not None, Bar)
+        return Patient(where, connection.protocol, documented(connection.timings), addresses, nodes is not None, Bar)
     if nodes is not None:
         raise click.UsageError("--nodes needs a --protocol, to ask them in")
     settings = USUAL if connection.baud is None else replace(USUAL, baudrate=connection.baud)

@@ -8,6 +8,7 @@ from typing import TypeVar
 import click
 
 from busmaster.contract.arguments import is_decimal
+from busmaster.contract.learning import LEARNED, Learned
 from busmaster.errors import InvalidCommand
 from busmaster.registry import kinds
 
@@ -61,8 +62,10 @@ def parse_seconds(text: str) -> float:
     return seconds
 
 
-def parse_window(text: str) -> float:
-    """A reply window in milliseconds, in seconds. Raises InvalidCommand for one that nobody would wait for."""
+def parse_window(text: str) -> float | Learned:
+    """A reply window in milliseconds, in seconds, or `learned`. Raises InvalidCommand for one that is far too long."""
+    if text == "learned":
+        return LEARNED
     seconds = parse_seconds(text) / 1000
     if seconds > LONGEST_WINDOW:
         raise InvalidCommand(f"a reply window is at most {LONGEST_WINDOW * 1000:.0f} ms, not {text}")

@@ -17,8 +17,9 @@ from busmaster.config.recording import Outputs, read_outputs
 from busmaster.config.safe import SafeSection, read_safe
 from busmaster.config.source import Source
 from busmaster.config.table import Table
-from busmaster.config.timing import read_timings
+from busmaster.config.timing import LEARNED_WORD, read_timings, reads_learned
 from busmaster.contract.arguments import is_decimal
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand
@@ -62,7 +63,7 @@ class NodeSection:
     name: str
     protocol: str
     address: int
-    timings: Timings | None
+    timings: Timings | Learned | None
     retries: int | None
     reply_time: float | None
     options: Mapping[str, Any]
@@ -114,7 +115,7 @@ def load(path: str | os.PathLike[str]) -> LineFile:
 def read(source: Source) -> LineFile:
     """Raises FileError, naming line and key."""
     top = Table(source)
-    top.only("title", "port", "strict", "protocols", "nodes", "groups", "outputs", "safe", "emulator")
+    top.only("title", "port", "strict", "timing", "protocols", "nodes", "groups", "outputs", "safe", "emulator")
     nodes = {node.name: node for node in _nodes(top, _defaults(top))}
     groups = {table.name: _group(table) for table in top.tables("groups")}
     file = LineFile(
@@ -151,8 +152,9 @@ def _nodes(top: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSection]:
     taken: dict[tuple[str, int], str] = {}
     names: set[str] = set()
     profiles: dict[str, Profile] = {}
+    learned = top.choice("timing", (LEARNED_WORD,), None) is not None
     for table in top.tables("nodes"):
-        for node in _several(table, defaults):
+        for node in _several(table, defaults, learned):
             with table.at("protocol"):
                 check_company(node.profile, profiles.values())
             profiles.setdefault(node.profile.name, node.profile)
@@ -165,8 +167,8 @@ def _nodes(top: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSection]:
             yield node
 
 
-def _several(table: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSection]:
-    """The nodes of one table: several where its name is a range."""
+def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iterator[NodeSection]:
+    """The nodes of one table: several where its name is a range. `learned`: the line's reply times are."""
     protocol = table.choice("protocol", kinds())
     own = find(protocol).options
     check_keys(table, find(protocol), NODE_KEYS, lambda kind: kind.options)
@@ -178,7 +180,9 @@ def _several(table: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSectio
         raise table.error(f"{len(names)} names need as many addresses, not {len(addresses)}", "address")
     default = defaults.get(protocol, Table(table.source, ("protocols", protocol), {}))
     base = read_timings(default, profile.timings)
-    timings = read_timings(table, base)
+    document = read_timings(table, base)
+    is_learned = reads_learned(table, reads_learned(default, learned))
+    timings = Learned(document) if is_learned else None if document == profile.timings else document
     retries = table.whole("retries", default.whole("retries", None, most=100), most=100)
     reply_time = table.seconds("reply_time", default.seconds("reply_time", None))
     options = {**read_options(default, own), **read_options(table, own)}
@@ -190,7 +194,7 @@ def _several(table: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSectio
             name=name,
             protocol=protocol,
             address=address,
-            timings=None if timings == profile.timings else timings,
+            timings=timings,
             retries=retries,
             reply_time=reply_time,
             options=options,

@@ -2,6 +2,7 @@
 
 timing = { window = 0.2, lateness = 0.3 }          # of reads and writes
 timing = { write = { window = 0.8 } }              # of writes alone; so too read and packet (msc)
+timing = "learned"                                 # from the replies; { learned = true, ... } with other times, too
 """
 
 from __future__ import annotations
@@ -14,18 +15,30 @@ from busmaster.contract.timing import ReplyTiming, Timings
 LONGEST = 10.0
 """Seconds: whoever writes more means milliseconds."""
 TIMES = ("nominal", "window", "lateness", "byte_gap", "turnaround")
+LEARNED_WORD = "learned"
 
 
 def read_timings(table: Table, base: Timings) -> Timings:
     """`base` with what the table's `timing` changes. Nominal and lateness move with the window where they must."""
+    if isinstance(table.data.get("timing"), str):
+        table.choice("timing", (LEARNED_WORD,))
+        return base
     timing = table.table("timing")
-    timing.only(*TIMES, "read", "write", "packet")
+    timing.only(*TIMES, "read", "write", "packet", LEARNED_WORD)
     read, write = _changed(timing, base.read), _changed(timing, base.write)
     return Timings(
         read=_changed(timing.table("read"), read, leg=True),
         write=_changed(timing.table("write"), write, leg=True),
         packet=_changed(timing.table("packet"), base.packet, leg=True),
     )
+
+
+def reads_learned(table: Table, base: bool) -> bool:
+    """Return whether the table's `timing` says that reply times are to be learned; `base` where it says nothing."""
+    timing = table.data.get("timing")
+    if isinstance(timing, str):
+        return timing == LEARNED_WORD
+    return table.table("timing").flag(LEARNED_WORD, base)
 
 
 def _changed(table: Table, timing: ReplyTiming, leg: bool = False) -> ReplyTiming:

@@ -13,6 +13,9 @@ class ReplyTiming:
     """When a reply is awaited, in seconds from the request's last byte on the wire.
 
     Raises `InvalidCommand` unless 0 <= nominal <= window <= lateness and byte_gap > 0, turnaround >= 0.
+
+    `silence` is set where the window is learned: after so many seconds without a byte the line goes on, though the
+    lateness is not over; what may still come is owed until it is (R15). None: the line waits for the lateness (R3).
     """
 
     nominal: float
@@ -25,6 +28,8 @@ class ReplyTiming:
     """The longest pause between two bytes of one frame."""
     turnaround: float = 0.0
     """The node's driver holds the line this long after its reply."""
+    silence: float | None = None
+    """Where the window is learned, the silence that ends a settle by itself."""
 
     def __post_init__(self) -> None:
         for name in ("nominal", "window", "lateness", "byte_gap", "turnaround"):

@@ -17,6 +17,7 @@ from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.exchange import Command
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.emulator.line import Line
@@ -74,7 +75,7 @@ class World:
     # What is done to it
 
     def node(
-        self, profile: Profile, address: int, *, timings: Timings | None = None, retries: int | None = None
+        self, profile: Profile, address: int, *, timings: Timings | Learned | None = None, retries: int | None = None
     ) -> NodeRecord:
         """Makes the arbiter know a node. Once each."""
         return self.arbiter.add_node(profile, address, self.now, timings, retries)

@@ -35,19 +35,21 @@ def main() -> int:
     """Exit status 1 if a promise was broken."""
     arguments = _parse()
     if arguments.replay is not None:
-        return _replay(arguments.replay, arguments.each, arguments.strict)
+        return _replay(arguments.replay, arguments.each, arguments.strict, arguments.learned)
     pairs = [(protocol, mix) for protocol in arguments.protocol for mix in arguments.mix]
     found: defaultdict[Pair, Totals] = defaultdict(Totals)
     begun, done = time.perf_counter(), 0
     with Pool(arguments.jobs) if arguments.jobs > 1 else nullcontext() as pool:
         for seed in count(arguments.seed):
-            hunts = [(protocol, mix, seed, arguments.each, arguments.strict) for protocol, mix in pairs]
+            how = (arguments.each, arguments.strict, arguments.learned)
+            hunts = [(protocol, mix, seed, *how) for protocol, mix in pairs]
             for (protocol, mix), totals in map(_hunt, hunts) if pool is None else pool.imap_unordered(_hunt, hunts):
                 found[protocol, mix].add(totals)
                 done += totals.transactions
                 if totals.problems:
                     _say(f"{protocol}/{mix}/{seed}: {totals.problems[0]}")
                     options = f"--each {arguments.each}{' --strict' * arguments.strict}"
+                    options += " --learned" * arguments.learned
                     _say(f"  python -m tests.campaigns --replay '{protocol}/{mix}/{seed}' {options}")
             sys.stderr.write(f"seed {seed}: {done:,} transactions, {time.perf_counter() - begun:.0f} s\n")
             if seed - arguments.seed + 1 == arguments.seeds or (not arguments.seeds and done >= arguments.transactions):
@@ -67,6 +69,7 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--mix", action="append", choices=list(MIXES), help="again for several")
     parser.add_argument("--beyond", action="store_true", help="the mixes beyond R3's assumption, not those inside it")
     parser.add_argument("--strict", action="store_true", help="the strict level of R15")
+    parser.add_argument("--learned", action="store_true", help="reply times are learned, and trusted at once")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
     parser.add_argument("--each", type=int, default=EACH, metavar="N", help="transactions of one hunt")
     parser.add_argument("--replay", metavar="PROTOCOL/MIX/SEED", help="one hunt again, with its transcript")
@@ -76,14 +79,14 @@ def _parse() -> argparse.Namespace:
     return arguments
 
 
-def _hunt(what: tuple[str, str, int, int, bool]) -> tuple[Pair, Totals]:
-    protocol, mix, seed, transactions, strict = what
-    return (protocol, mix), Hunt(protocol, mix, seed, strict=strict).run(transactions)
+def _hunt(what: tuple[str, str, int, int, bool, bool]) -> tuple[Pair, Totals]:
+    protocol, mix, seed, transactions, strict, learned = what
+    return (protocol, mix), Hunt(protocol, mix, seed, strict=strict, learned=learned).run(transactions)
 
 
-def _replay(name: str, transactions: int, strict: bool) -> int:
+def _replay(name: str, transactions: int, strict: bool, learned: bool) -> int:
     protocol, mix, seed = name.split("/")
-    totals = Hunt(protocol, mix, int(seed), _say, strict=strict).run(transactions)
+    totals = Hunt(protocol, mix, int(seed), _say, strict=strict, learned=learned).run(transactions)
     return 1 if totals.problems else 0
 
 

@@ -12,6 +12,7 @@ from itertools import count
 from random import Random
 from typing import Any
 
+from busmaster.arbiter import learned as learning
 from busmaster.arbiter.events import Event, LatenessRaised, NodeChanged, Polled
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import line_time, set_members
@@ -19,6 +20,7 @@ from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Tap
 from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.contract.exchange import Command
+from busmaster.contract.learning import LEARNED
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import Faults
 from busmaster.emulator.line import Echo
@@ -43,8 +45,16 @@ SHORT = 10**8
 """Numbers below it have eight digits as a rule: an even number of them, as a control character needs (HCP)."""
 
 
+def be_hasty() -> None:
+    """Learn from a few replies, and forget soon: what is learned is often wrong, and must not matter."""
+    learning.TRUSTED_AFTER, learning.EPOCH = 3, 10
+
+
 class Hunt:
-    """One seed of one protocol and mix: `run` it once. `record` gets the transcript, line by line."""
+    """One seed of one protocol and mix: `run` it once. `record` gets the transcript, line by line.
+
+    `learned`: the nodes' reply times are learned.
+    """
 
     def __init__(
         self,
@@ -55,6 +65,7 @@ class Hunt:
         *,
         strict: bool = False,
         tap: Tap | None = None,
+        learned: bool = False,
     ) -> None:
         self.kind = KINDS[protocol]
         self.mix: Mix = MIXES[mix]
@@ -73,7 +84,10 @@ class Hunt:
         ledger.now = lambda: self.world.now
         self.judge = Judge(self.kind, self.mix, ledger, self.line, self.world.arbiter)
         self.ledger = ledger
-        self.nodes = [self.world.node(self.kind.profile, address) for address in addresses]
+        timings = LEARNED if learned else None
+        if learned:
+            be_hasty()
+        self.nodes = [self.world.node(self.kind.profile, address, timings=timings) for address in addresses]
         broadcast = self.kind.profile.broadcast
         self.everybody = None if broadcast is None else self.world.node(self.kind.profile, broadcast)
         self.reads = [*self.kind.reads, *(self.kind.runs if self.mix.runs else ())]

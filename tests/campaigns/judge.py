@@ -8,6 +8,7 @@ an EOT, a read of HCP or Mentor II); else it is *confused*: the master took one 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
@@ -20,7 +21,7 @@ from busmaster.errors import BacklogFull, NotStarted, Refused, WriteUnconfirmed
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import AUTO_START, RAM_NOT_RELIABLE, RUNNING, SYSTEM_RESET
 from tests.campaigns.kinds import Kind, echoed, elements_of
-from tests.campaigns.ledger import RECENT, ROUNDING, Ledger, WatchedLine, Written
+from tests.campaigns.ledger import RECENT, ROUNDING, Frame, Ledger, WatchedLine, Written
 from tests.campaigns.mixes import AT_MOST, Mix
 
 STATES = (RUNNING | AUTO_START, SYSTEM_RESET | RAM_NOT_RELIABLE)
@@ -134,6 +135,8 @@ class Judge:
         last = self.ledger.last
         if self.mix.beyond or self.line.repeats or self.ledger.broken():
             return
+        if self._goes_on(last, now):
+            return
         if self.mix.edges is not None and self.line.echo is None and self.line.held_back(now):
             self.problem("R3: a request leaves while bytes of a reply lie in the adapter")
         if last.start > now + ROUNDING:
@@ -141,6 +144,15 @@ class Judge:
         calm = self.mix.edges is not None and not self.mix.device  # then whatever noise did to it, its end is known
         if last.end > now + ROUNDING and (calm or not self.ledger.damaged(last.start, now)):
             self.problem(f"R1: a request leaves into a reply that lasts until {last.end:.6f}")
+
+    def _goes_on(self, last: Frame, now: float) -> bool:
+        """Whether a learned window was over, and so the line need not wait (R15): but a write has to."""
+        awaited = self.arbiter._in_step.awaited_until(-inf) > -inf
+        asked = self.arbiter._wire.transaction
+        still_comes = last.end > now + ROUNDING and not self.ledger.damaged(last.start, now)
+        if awaited and still_comes and asked is not None and asked.writes and asked.priority is not Priority.URGENT:
+            self.problem(f"R15: a write leaves while a reply is awaited, until {last.end:.6f}")
+        return awaited
 
     # transactions
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from busmaster.arbiter import learned as learning
 from busmaster.arbiter.in_step import InStep
 from tests.campaigns.__main__ import main
 from tests.campaigns.hunt import Hunt
@@ -141,3 +142,17 @@ def test_the_command_adds_up_and_says_how_to_replay(
     *transcript, last = capfd.readouterr().out.splitlines()
     assert "BROKEN: " in last
     assert len(transcript) > 10
+
+
+@EVERY_PROTOCOL
+@pytest.mark.parametrize("mix", ["calm", "lost", "late", "garbled", "everything", "edges", "edges, all"])
+def test_r15_with_learned_times_nothing_is_wrong_or_lost_and_everything_heals(
+    protocol: str, mix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learning, "TRUSTED_AFTER", 3)
+    monkeypatch.setattr(learning, "EPOCH", 10)
+    hunt = Hunt(protocol, mix, 1, learned=True)
+    totals = hunt.run(EACH)
+    check(totals, hunt)
+    assert totals.confused == totals.lost == 0
+    assert totals.transactions >= EACH

@@ -72,13 +72,13 @@ def test_json_has_words_as_numbers_and_sets_and_runs_as_lists(value: Any, text: 
 EVIL = "winder\x1b]0;owned\x07\x1b[2J\x9b31m\x7f\u202e\r\n"
 
 
-def test_escape_sequences_never_reach_a_terminal_raw(capsys: pytest.CaptureFixture[str]) -> None:
+def test_escape_sequences_never_reach_a_terminal_raw(capfd: pytest.CaptureFixture[str]) -> None:
     """Neither on standard output nor on standard error; what stands in JSON is the same text still."""
     emit(f"a name {EVIL}", json_line(node=EVIL))
     note(EVIL)
     complain(f"{EVIL} is down", 1)
     show_warning(UserWarning(EVIL), UserWarning, "", 0)
-    said = capsys.readouterr()
+    said = capfd.readouterr()
     assert all(line.isprintable() for line in (said.out + said.err).split("\n"))
     assert len(said.out.splitlines()) == 2
     assert json.loads(said.out.splitlines()[1]) == {"node": EVIL}

@@ -11,6 +11,7 @@ from busmaster.bus.node import Node
 from busmaster.config import ConfiguredLine, FileError, LineFile, emulated_line, load
 from busmaster.config.sections import read
 from busmaster.config.source import Source
+from busmaster.contract.learning import Learned, documented
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.outputs.settings import FileSettings, MqttSettings, SqliteSettings
@@ -101,7 +102,7 @@ def test_a_node_overrides_its_protocol_and_the_protocol_its_document() -> None:
         "timing = { nominal = 0.08, write = { window = 0.3, lateness = 0.4 } }\n"
     )
     nodes = parse(text).nodes
-    first, second = nodes["winder"].timings, nodes["other"].timings
+    first, second = documented(nodes["winder"].timings), documented(nodes["other"].timings)
     assert first is not None
     assert second is not None
     assert (nodes["winder"].retries, nodes["other"].retries) == (1, 0)
@@ -326,3 +327,31 @@ def test_a_command_may_only_be_allowed_for_what_can_be_written() -> None:
     text = f'{HEAD}{NODE}[outputs.mqtt]\nallow_commands = ["winder/1", "winder/axis0.position"]\n'
     with pytest.raises(FileError, match=r"line\.toml:6: outputs\.mqtt\.allow_commands\[2\]: .* is read-only"):
         ConfiguredLine(parse(text))
+
+
+@pytest.mark.parametrize(
+    ("line", "protocol", "node", "learned"),
+    [
+        ("", "", "", False),
+        ('timing = "learned"\n', "", "", True),
+        ("", '[protocols.hcp2]\ntiming = "learned"\n', "", True),
+        ("", "", 'timing = "learned"\n', True),
+        ('timing = "learned"\n', "", "timing = { learned = false }\n", False),
+        ("", "", "timing = { learned = true, window = 0.2 }\n", True),
+    ],
+)
+def test_reply_times_are_learned_where_the_line_its_protocol_or_the_node_says_so(
+    line: str, protocol: str, node: str, learned: bool
+) -> None:
+    text = f'{line}port = "/dev/null"\n{protocol}[nodes.winder]\nprotocol = "hcp2"\naddress = 5\n{node}'
+    timings = parse(text).nodes["winder"].timings
+    assert isinstance(timings, Learned) == learned
+    document = documented(timings)
+    if "window" in node:
+        assert document is not None
+        assert document.read.window == 0.2
+
+
+def test_a_timing_that_is_neither_a_table_nor_learned_is_refused() -> None:
+    with pytest.raises(FileError, match="timing"):
+        parse('port = "/dev/null"\n[nodes.winder]\nprotocol = "hcp2"\naddress = 5\ntiming = "fast"\n')

@@ -12,6 +12,7 @@ import anyio.lowlevel
 from busmaster.bus.limits import Limit
 from busmaster.bus.requester import CommandOptions, Priority
 from busmaster.contract.exchange import Command
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import Superseded
@@ -80,7 +81,7 @@ class FakeBus:
         self.nodes: dict[tuple[str, int], FakeNode] = {}
 
     def node(
-        self, profile: Profile, address: int, *, timings: Timings | None = None, retries: int | None = None
+        self, profile: Profile, address: int, *, timings: Timings | Learned | None = None, retries: int | None = None
     ) -> FakeNode:
         profile.check_address(address)
         return self.nodes.setdefault((profile.name, address), FakeNode(self, profile, address))

@@ -11,6 +11,7 @@ from busmaster.bus.handle import Handle, Send, encoder, item_text, unknown_item
 from busmaster.bus.points import Point
 from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
@@ -39,7 +40,7 @@ class CtAnsiDrive(Handle):
         address: int,
         *,
         decimals: Mapping[str, int] | None = None,
-        timings: Timings | None = None,
+        timings: Timings | Learned | None = None,
         retries: int | None = None,
     ) -> None:
         super().__init__(bus, address, timings=timings, retries=retries)

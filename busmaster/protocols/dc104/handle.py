@@ -9,6 +9,7 @@ from busmaster.bus.points import Point
 from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
 from busmaster.contract.exchange import Command
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import VerifyFailed
@@ -35,7 +36,7 @@ class Dc104Drive(Handle):
         *,
         maximum: int = dc104.HIGHEST_PARAMETER,
         allow_zero: bool = False,
-        timings: Timings | None = None,
+        timings: Timings | Learned | None = None,
         retries: int | None = None,
     ) -> None:
         super().__init__(bus, address, timings=timings, retries=retries)

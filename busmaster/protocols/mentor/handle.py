@@ -13,6 +13,7 @@ from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions, NodeSource, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal, whole_number
 from busmaster.contract.exchange import Command
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, VerifyFailed
@@ -64,7 +65,7 @@ class MentorDrive(Handle):
         *,
         decimals: Mapping[str, int] | None = None,
         chained: bool = False,
-        timings: Timings | None = None,
+        timings: Timings | Learned | None = None,
         retries: int | None = None,
     ) -> None:
         profile = mentor.CHAINED if chained else mentor.PROFILE

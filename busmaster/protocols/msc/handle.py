@@ -11,6 +11,7 @@ from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions, NodeSource, Priority, ReadOptions, SeveralRequests, WriteOptions
 from busmaster.contract.arguments import is_decimal
 from busmaster.contract.exchange import Command
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand, Refused, VerifyFailed
@@ -61,7 +62,7 @@ class MscController(Handle):
         symbols: Mapping[str, int] | None = None,
         address_step: int | None = None,
         model: str | None = None,
-        timings: Timings | None = None,
+        timings: Timings | Learned | None = None,
         retries: int | None = None,
     ) -> None:
         self.model = model

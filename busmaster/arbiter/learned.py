@@ -1,0 +1,232 @@
+"""Reply windows that are learned from a node's own replies.
+
+The documents' windows are made for the slowest node that there may be: a reply that is lost costs a node which answers
+in 2 ms as much as one which takes 100 ms. Where learning is asked for, a read that will be repeated is awaited for only
+as long as this node has needed of late, with a good margin; then the line goes on, though the reply may still come.
+
+What makes that safe is R15, not the window: the reply is *owed* from then on, for as long as the document's lateness
+and beyond it, and nothing that it could counterfeit is believed, no write and no broadcast is sent, until the node has
+answered something else. Nothing that is told to a caller rests on a learned time, either: writes and the last attempt
+of a read have the document's window, and go only when nothing is awaited any more; probes and all that is asked of a
+node that has failed, and not answered since, have the document's times altogether.
+
+The rule, for each kind of command (its type) and each of the node's two legs (the answer; MSC's packet after its
+ACK) on its own: the window is twice the largest reply time of the last 500 to 1000 replies, or the largest until the
+first bytes were handed over if that is more (an adapter may hand over a whole reply at once), plus 2 ms; at least 5 ms,
+at most the document's. It is trusted after 200 replies.
+The second attempt of a read has four times that. The silence after which a reply is over is twice the longest pause
+within one of those replies, but 17 bytes at least. (A smoothed mean and deviation, as TCP has it, follows the usual
+reply too closely: of 76,000 replies it missed 1236, the largest none.)
+
+A node that was later than three quarters of a learned window, or whose reply came after it, has the document's times
+again for 200 replies.
+
+Of times nothing is done here but to add, subtract, compare and multiply by a constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from math import inf
+
+from busmaster.contract.timing import ReplyTiming, Timings
+
+TRUSTED_AFTER = 200
+"""Replies of a kind after which its times are trusted, and once more after each that was late."""
+TRUSTED_AGAIN_AFTER = 20
+"""As many where times of an earlier run are known."""
+EPOCH = 500
+"""Replies after which an epoch ends: the largest of this one and the last count."""
+MARGIN = 0.002
+"""Seconds added to what was ever needed."""
+SLOWER = 2
+"""How many times its slowest reply is awaited of a node."""
+LEAST = 0.005
+"""The shortest window, in seconds: less than a process is held up for."""
+AT_FIRST, AGAIN, AT_LAST, NEVER = 1, 4, 10**9, 0
+"""How many times the learned window an attempt is awaited, but no longer than the document says. AT_LAST is the attempt
+on which an outcome rests: the document's window. NEVER: neither its window nor its silence is learned."""
+LATE_SHARE = 0.75
+"""The share of a learned window after which a reply says that the node has become slower."""
+LEAST_SILENCE = 17
+"""The shortest silence that ends a reply, in bytes: a UART hands over up to 16 at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedTimes:
+    """What is known of the replies of one node to one kind of command; in seconds.
+
+    `slowest` is the largest reply time of the last 500 to 1000 replies, to the first byte; `heard` the largest until
+    the first bytes were handed over; `pause` the longest within a reply. `window` is what is awaited, once `trusted`.
+    """
+
+    kind: str
+    packet: bool
+    slowest: float
+    heard: float
+    pause: float
+    window: float
+    trusted: bool
+
+
+class _Largest:
+    """The largest of the last one or two epochs."""
+
+    __slots__ = ("before", "now")
+
+    def __init__(self) -> None:
+        self.now = self.before = 0.0
+
+    @property
+    def value(self) -> float:
+        return max(self.now, self.before)
+
+    def turn(self) -> None:
+        self.before, self.now = self.now, 0.0
+
+
+class LegTimes:
+    """The reply times of one leg of one kind of command."""
+
+    __slots__ = ("_left", "doubts", "heard", "pause", "slowest")
+
+    def __init__(self) -> None:
+        self.slowest = _Largest()
+        self.heard = _Largest()
+        self.pause = _Largest()
+        self._left = EPOCH
+        self.doubts = TRUSTED_AFTER
+        """Replies until it is trusted."""
+
+    def note(self, begun: float, heard: float, pause: float) -> bool:
+        """Note one reply. Returns whether what is known has changed."""
+        slowest, whole, pauses = self.slowest, self.heard, self.pause
+        changed = False
+        if begun > slowest.now:
+            changed = begun > slowest.before
+            slowest.now = begun
+        if heard > whole.now:
+            changed = changed or heard > whole.before
+            whole.now = heard
+        if pause > pauses.now:
+            changed = changed or pause > pauses.before
+            pauses.now = pause
+        if self.doubts:
+            self.doubts -= 1
+            changed = changed or not self.doubts
+        self._left -= 1
+        if not self._left:
+            self._left = EPOCH
+            for largest in (slowest, whole, pauses):
+                largest.turn()
+            changed = True
+        return changed
+
+    @property
+    def window(self) -> float:
+        """Seconds in which a reply begins, by all that is known."""
+        return max(LEAST, max(SLOWER * self.slowest.value, self.heard.value) + MARGIN)
+
+    def timing(self, document: ReplyTiming, byte_time: float, patience: int) -> ReplyTiming:
+        """Return what is awaited: the document's while too little is known."""
+        window = min(patience * self.window, document.window)
+        if self.doubts:
+            return document
+        gap = min(document.byte_gap, max(LEAST_SILENCE * byte_time, 2 * self.pause.value))
+        return replace(document, nominal=min(document.nominal, window), window=window, byte_gap=gap, silence=gap)
+
+
+class Kind:
+    """One kind of command of one node, and the times that its next exchange is opened with."""
+
+    __slots__ = ("_byte_time", "_document", "_given", "first", "packet")
+
+    def __init__(self) -> None:
+        self.first = LegTimes()
+        self.packet = LegTimes()
+        self._byte_time = 0.0
+        self._document: Timings | None = None
+        self._given: dict[int, Timings] | None = None
+
+    def timings(self, document: Timings, hurry: int) -> Timings:
+        """Return what an exchange is to be opened with: AT_FIRST, AGAIN, AT_LAST or NEVER."""
+        if self._given is None or document is not self._document:
+            self._document = document
+            own = replace(document, packet=replace(document.packet))  # so that a packet's leg can be told by its timing
+            self._given = {patience: self._learned(own, patience) for patience in (AT_FIRST, AGAIN, AT_LAST)}
+            self._given[NEVER] = own
+        return self._given[hurry]
+
+    def note(self, packet: bool, begun: float, heard: float, pause: float, byte_time: float) -> None:
+        """Note the reply to one of its legs."""
+        leg = self.packet if packet else self.first
+        if leg.note(begun, heard, pause) or byte_time != self._byte_time:
+            self._byte_time = byte_time
+            self._given = None
+
+    def doubt(self) -> None:
+        """Go back to the document's times for a while."""
+        self.first.doubts = self.packet.doubts = TRUSTED_AFTER
+        self._given = None
+
+    def _learned(self, own: Timings, patience: int) -> Timings:
+        first = self.first.timing(own.read, self._byte_time, patience)
+        write = self.first.timing(own.write, self._byte_time, AT_LAST)
+        return Timings(first, write, self.packet.timing(own.packet, self._byte_time, patience))
+
+
+class Learning:
+    """What is learned of one node."""
+
+    __slots__ = ("_known", "kinds", "returns")
+
+    def __init__(self) -> None:
+        self.kinds: dict[type, Kind] = {}
+        self._known: dict[tuple[str, bool], LearnedTimes] = {}
+        self.returns = 0
+        """How often the document's times were gone back to."""
+
+    def timings(self, command: object, document: Timings, hurry: int) -> Timings:
+        """Return the times with which `command` is to be opened, see `Kind.timings`."""
+        kind = self.kinds.get(type(command))
+        if kind is None:
+            kind = self.kinds[type(command)] = self._begin(type(command).__name__)
+        return kind.timings(document, hurry)
+
+    def note(self, command: object, packet: bool, begun: float, heard: float, pause: float, byte_time: float) -> None:
+        """A reply came: begun after so many seconds, its first bytes handed over after `heard`, with that `pause`."""
+        kind = self.kinds.get(type(command))
+        if kind is not None:
+            kind.note(packet, begun, heard, pause, byte_time)
+
+    def doubt(self) -> None:
+        """It was late, or has been away: the document's times, until enough replies have come."""
+        self.returns += 1
+        for kind in self.kinds.values():
+            kind.doubt()
+
+    def times(self, document: Timings) -> tuple[LearnedTimes, ...]:
+        """Return what is known, a leg at a time."""
+        found = []
+        for command, kind in self.kinds.items():
+            for leg, limit, packet in ((kind.first, document.read, False), (kind.packet, document.packet, True)):
+                if leg.heard.value:
+                    slowest, heard, pause = leg.slowest.value, leg.heard.value, leg.pause.value
+                    window = min(leg.window, limit.window)
+                    trusted = not leg.doubts
+                    found.append(LearnedTimes(command.__name__, packet, slowest, heard, pause, window, trusted))
+        return tuple(found)
+
+    def begin_with(self, known: Iterable[LearnedTimes]) -> None:
+        """Start from what an earlier run has learned: it is trusted after fewer replies."""
+        self._known = {(times.kind, times.packet): times for times in known}
+
+    def _begin(self, name: str) -> Kind:
+        kind = Kind()
+        for leg, packet in ((kind.first, False), (kind.packet, True)):
+            times = self._known.get((name, packet))
+            if times is not None and times.trusted and max(times.slowest, times.heard, times.pause) < inf:
+                leg.slowest.before, leg.heard.before, leg.pause.before = times.slowest, times.heard, times.pause
+                leg.doubts = TRUSTED_AGAIN_AFTER
+        return kind

@@ -1,0 +1,318 @@
+"""Windows that are learned from a node's replies: how long is waited, and what keeps that safe (R15)."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.arbiter.events import LatenessRaised
+from busmaster.arbiter.health import Health, NodeRecord
+from busmaster.arbiter.learned import (
+    AT_FIRST,
+    EPOCH,
+    LEAST,
+    LEAST_SILENCE,
+    MARGIN,
+    NEVER,
+    SLOWER,
+    TRUSTED_AFTER,
+    TRUSTED_AGAIN_AFTER,
+    LearnedTimes,
+    Learning,
+    LegTimes,
+)
+from busmaster.arbiter.transaction import Priority
+from busmaster.contract.learning import LEARNED, Learned
+from busmaster.errors import NoReply, WriteUnconfirmed
+from busmaster.protocols.hcp2 import codec as hcp2
+from tests.arbiter.bench import ACK, LATENESS, TAU, Bench, reply_of, request_of, up
+
+REQUEST = 8 * TAU
+TOOK = 0.004
+"""Seconds from the end of a request to its reply, which is handed over at once."""
+WINDOW = SLOWER * (TOOK - 5 * TAU) + MARGIN
+"""What is learned from that: a reply of six bytes began five bytes before it was handed over."""
+TIMINGS = hcp2.PROFILE.timings
+WRITE_7 = hcp2.Write(1, (7,)).open(1, TIMINGS).request.hex(" ").upper()
+
+
+def trained(bench: Bench, address: int = 1, replies: int = TRUSTED_AFTER + 1) -> NodeRecord:
+    """A node whose times have been learned; its last read was of an element of its own."""
+    node = bench.arbiter.add_node(hcp2.PROFILE, address, bench.now, LEARNED)
+    for number in range(replies):
+        bench.served(bench.ask(node, hcp2.Read(10 + number % 2)), after=REQUEST + TOOK)
+    bench.until_ready()
+    assert node.health is Health.UP
+    return node
+
+
+def learning(node: NodeRecord) -> Learning:
+    assert node.learning is not None
+    return node.learning
+
+
+def trusted(node: NodeRecord) -> bool:
+    return all(times.trusted for times in learning(node).times(node.timings))
+
+
+# how long
+
+
+def test_the_window_is_twice_the_largest_reply_time_of_the_last_epochs_and_at_least_the_least() -> None:
+    times = LegTimes()
+    for place in range(TRUSTED_AFTER):
+        assert times.timing(TIMINGS.read, TAU, AT_FIRST) is TIMINGS.read, f"{place} replies are too few"
+        times.note(0.001, 0.002, 0.0)
+    assert times.timing(TIMINGS.read, TAU, AT_FIRST).window == LEAST
+    times.note(0.010, 0.012, 0.0)
+    learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
+    assert learned.window == pytest.approx(2 * 0.010 + 0.002)
+    assert learned.lateness == TIMINGS.read.lateness, "what is owed is owed for as long as the document says"
+    assert learned.silence == learned.byte_gap == pytest.approx(LEAST_SILENCE * TAU)
+    for _ in range(2 * EPOCH):
+        times.note(0.001, 0.002, 0.0)
+    assert times.window == LEAST
+
+
+def test_what_an_adapter_hands_over_late_or_in_pieces_is_waited_for() -> None:
+    times = LegTimes()
+    for _ in range(TRUSTED_AFTER):
+        times.note(0.001, 0.018, 0.004)
+    learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
+    assert learned.window == pytest.approx(0.018 + MARGIN)
+    assert learned.byte_gap == pytest.approx(0.008)
+
+
+def test_no_learned_time_exceeds_the_documents() -> None:
+    times = LegTimes()
+    for _ in range(TRUSTED_AFTER):
+        times.note(0.080, 0.080, 0.015)
+    learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
+    assert (learned.window, learned.byte_gap) == (TIMINGS.read.window, TIMINGS.read.byte_gap)
+
+
+def test_reads_and_writes_and_packets_are_kept_apart() -> None:
+    node = Learning()
+    for _ in range(TRUSTED_AFTER):
+        for command, took in ((hcp2.Read(1), 0.002), (hcp2.Write(1, (1,)), 0.04)):
+            node.timings(command, TIMINGS, AT_FIRST)
+            node.note(command, False, took, took, 0.0, TAU)
+        node.note(hcp2.Read(1), True, 0.02, 0.02, 0.0, TAU)
+    timings = node.timings(hcp2.Read(2), TIMINGS, AT_FIRST)
+    assert timings.read.window == pytest.approx(0.006)
+    assert timings.packet.window == pytest.approx(0.042)
+    assert node.timings(hcp2.Write(1, (1,)), TIMINGS, AT_FIRST).write.window == TIMINGS.write.window
+    assert node.timings(hcp2.Read(2), TIMINGS, NEVER) == TIMINGS
+
+
+def test_what_an_earlier_run_has_learned_is_trusted_after_fewer_replies() -> None:
+    node = Learning()
+    node.begin_with([LearnedTimes("Read", False, 0.003, 0.004, 0.0, 0.008, True)])
+    for _ in range(TRUSTED_AGAIN_AFTER):
+        assert node.timings(hcp2.Read(1), TIMINGS, AT_FIRST).read.window == TIMINGS.read.window
+        node.note(hcp2.Read(1), False, 0.001, 0.001, 0.0, TAU)
+    assert node.timings(hcp2.Read(1), TIMINGS, AT_FIRST).read.window == pytest.approx(0.008)
+
+
+def test_nothing_is_learned_unless_it_is_asked_for() -> None:
+    bench = Bench()
+    assert bench.node().learning is None
+    own = TIMINGS.with_window(0.2)
+    node = bench.arbiter.add_node(hcp2.PROFILE, 2, bench.now, Learned(own))
+    assert node.learning is not None
+    assert node.timings is own
+
+
+# what is lost costs the learned window
+
+
+def test_a_lost_reply_costs_its_learned_window_and_a_check_of_its_node() -> None:
+    bench = Bench()
+    node = trained(bench)
+    asked = bench.ask(node)
+    assert bench.sent() == request_of(1)
+    assert bench.until_sent() == pytest.approx(REQUEST + WINDOW)
+    assert bench.sent() == request_of(10), "a check: the lost reply could be the second attempt's"
+    bench.answer(after=REQUEST + TOOK)
+    assert bench.sent() == request_of(1)
+    bench.answer(7, after=REQUEST + TOOK)
+    assert asked.value == 7.0
+    assert trusted(node)
+
+
+def test_another_node_that_answers_with_another_echo_is_asked_at_once() -> None:
+    bench = Bench()
+    node, other = trained(bench, 1), trained(bench, 2)
+    bench.ask(node)
+    unlike = bench.ask(other, hcp2.Read(3))
+    bench.until_sent()
+    assert bench.sent() == request_of(1)
+    bench.until_sent()
+    assert bench.sent() == request_of(3, 2)
+    bench.answer(9, after=REQUEST + TOOK)
+    assert unlike.value == 9.0
+
+
+def test_a_second_attempt_is_awaited_four_times_as_long_and_the_last_as_long_as_the_document_says() -> None:
+    bench = Bench()
+    node = trained(bench)
+    asked = bench.ask(node, retries=2)
+    sent_at = []
+    while not bench.ended(asked):
+        bench.until_sent()
+        if bench.sent() == request_of(1):
+            sent_at.append(bench.now)
+        else:
+            bench.answer(after=REQUEST + TOOK)
+            continue
+        bench.to(bench.arbiter.poll_timeout())
+        sent_at.append(bench.now)
+    waited = [end - begin for begin, end in zip(sent_at[::2], sent_at[1::2], strict=True)]
+    assert waited == pytest.approx([REQUEST + WINDOW, REQUEST + 4 * WINDOW, REQUEST + TIMINGS.read.window])
+    assert isinstance(asked.error, NoReply)
+
+
+# what is late is never believed
+
+
+def test_r15_a_reply_later_than_its_learned_window_is_never_another_nodes() -> None:
+    bench = Bench()
+    node, other = trained(bench, 1), trained(bench, 2)
+    bench.ask(node)
+    alike = bench.ask(other)
+    bench.sent()
+    bench.until_sent()
+    assert bench.sent() == request_of(10), "not the same element of another node"
+    bench.hear(reply_of(1, 55), after=REQUEST + 0.002)
+    assert alike.value is None
+    while not bench.ended(alike):
+        bench.until_sent()
+        bench.answer(7 if bench.sent() == request_of(1, 2) else 5, after=REQUEST + TOOK)
+    assert alike.value == 7.0
+
+
+def test_r15_no_write_leaves_while_a_reply_may_still_come() -> None:
+    bench = Bench()
+    node, other = trained(bench, 1), trained(bench, 2)
+    bench.ask(node, retries=1)
+    write = bench.ask(other, hcp2.Write(1, (7,)))
+    bench.sent()
+    bench.until_sent()
+    assert bench.sent() == request_of(10), "its answer shows that nothing is to come"
+    bench.answer(after=REQUEST + TOOK)
+    bench.until_sent()
+    request = bench.sent()
+    assert request == hcp2.Write(1, (7,)).open(2, TIMINGS).request.hex(" ").upper()
+    bench.hear(ACK, after=REQUEST + TOOK)
+    assert bench.ended(write)
+    assert write.error is None
+
+
+def test_r15_where_checks_are_in_vain_a_write_waits_for_the_documents_lateness() -> None:
+    bench = Bench()
+    node, other = trained(bench, 1), trained(bench, 2)
+    bench.ask(node, retries=1)
+    write = bench.ask(other, hcp2.Write(1, (7,)))
+    asked: list[tuple[str, float]] = []
+    while not write.attempts:
+        bench.until_sent()
+        asked.append((bench.sent(), bench.now))
+    assert [request for request, _ in asked[:3]] == [request_of(1), request_of(10), request_of(11)]
+    assert asked[3][1] - (asked[2][1] + REQUEST) >= LATENESS - 1e-9
+
+
+def test_r9_an_urgent_write_is_never_held_back_and_its_ack_is_not_believed() -> None:
+    bench = Bench()
+    node = trained(bench)
+    bench.ask(node, retries=1)
+    bench.sent()
+    urgent = bench.ask(node, hcp2.Write(1, (7,)), priority=Priority.URGENT)
+    bench.until_sent()
+    assert bench.sent() == WRITE_7
+    bench.hear(ACK, after=REQUEST + TOOK)
+    assert isinstance(urgent.error, WriteUnconfirmed)
+
+
+def test_r7_a_write_is_awaited_for_as_long_as_the_document_says() -> None:
+    bench = Bench()
+    node = trained(bench)
+    for value in range(TRUSTED_AFTER + 1):
+        bench.served(bench.ask(node, hcp2.Write(2, (value,))), after=REQUEST + TOOK)
+    write = bench.ask(node, hcp2.Write(1, (7,), idempotent=True), retries=2)
+    bench.until_sent()
+    bench.sent()
+    length = len(bytes.fromhex(WRITE_7)) * TAU
+    assert bench.until_sent() == pytest.approx(length + TIMINGS.write.window)
+    assert write.attempts == 1
+
+
+# back to the document's times
+
+
+def test_a_straggler_brings_the_documents_times_back_until_enough_replies_have_come() -> None:
+    bench = Bench()
+    node = trained(bench)
+    asked = bench.ask(node)
+    bench.sent()
+    bench.until_sent()
+    bench.sent()
+    bench.hear(reply_of(1, 5), after=0.030)
+    bench.served(asked, after=REQUEST + TOOK)
+    assert learning(node).returns == 1
+    assert not trusted(node)
+    bench.until_ready()
+    for _ in range(TRUSTED_AFTER):
+        bench.served(bench.ask(node, hcp2.Read(12)), after=REQUEST + TOOK)
+    assert trusted(node)
+
+
+def test_a_reply_later_than_three_quarters_of_its_window_does_so_too() -> None:
+    bench = Bench()
+    node = trained(bench)
+    bench.served(bench.ask(node), after=REQUEST + 0.8 * WINDOW)
+    assert not trusted(node)
+
+
+def test_a_node_that_was_away_begins_again() -> None:
+    bench = Bench()
+    node = trained(bench)
+    returns = learning(node).returns
+    bench.wait(2.0)
+    for _ in range(3):
+        bench.ask(node, retries=0)
+        bench.sent()
+        bench.until_ready()
+    assert node.health is Health.DOWN
+    bench.served(bench.ask(node), after=REQUEST + TOOK)
+    assert learning(node).returns == returns + 1
+    assert not trusted(node)
+
+
+def test_a_node_that_has_failed_is_awaited_for_as_long_as_the_document_says() -> None:
+    bench = Bench()
+    node = trained(bench)
+    bench.ask(node, retries=0)
+    bench.sent()
+    bench.until_ready()
+    assert node.health is Health.SUSPECT
+    bench.ask(node, hcp2.Read(5), retries=2)
+    assert bench.sent() == request_of(5)
+    bench.to(bench.arbiter.poll_timeout())
+    assert node.counters.no_reply == 2
+    asked = bench.now
+    bench.until_ready()
+    assert bench.now - asked == pytest.approx(LATENESS - TIMINGS.read.window), "it settles"
+
+
+def test_r3_a_straggler_near_its_lateness_raises_it_though_the_line_had_gone_on() -> None:
+    bench = Bench()
+    node, other = trained(bench, 1), up(bench, 2)
+    asked = bench.ask(node)
+    bench.sent()
+    out = bench.now + REQUEST
+    bench.arbiter.cancel(asked, bench.now)
+    while bench.now < out + 0.12:
+        bench.served(bench.ask(other, hcp2.Read(6 + int(bench.now * 1000) % 2)), after=REQUEST + TOOK)
+    bench.hear(reply_of(1, 5), after=0.005)
+    bench.until_ready()
+    raised = [event for event in bench.events if isinstance(event, LatenessRaised)]
+    assert [event.node for event in raised] == [node]

@@ -1,0 +1,144 @@
+"""Modbus RTU: what the emulated unit and a listener make of frames."""
+
+from __future__ import annotations
+
+import math
+import struct
+from itertools import combinations
+
+import pytest
+
+from busmaster.protocols.modbus.codec import (
+    PROFILE,
+    WriteRegisters,
+    with_crc,
+)
+from busmaster.protocols.modbus.device import EmulatedModbus
+from tests.capture.hearing import hear, said
+
+UNIT = 0x11
+
+
+def frame(text: str) -> bytes:
+    return with_crc(bytes.fromhex(text))
+
+
+REQUEST = frame("11 03 0007 0001")
+
+
+def heard_by(unit: EmulatedModbus, *chunks: tuple[float, bytes]) -> list[bytes]:
+    for start, chunk in chunks:
+        if unit.wakeup <= start:
+            unit.wake(unit.wakeup)
+        unit.hear(chunk, start)
+    if unit.wakeup < math.inf:
+        unit.wake(unit.wakeup)
+    return [said for _, said in unit.outbox]
+
+
+@pytest.mark.parametrize("cut", range(1, len(REQUEST)))
+def test_a_request_in_two_pieces_is_one_and_a_cut_one_is_forgotten_after_a_silence(cut: int) -> None:
+    whole = heard_by(EmulatedModbus(UNIT), (0.0, REQUEST[:cut]), (0.0005, REQUEST[cut:]))
+    assert whole == heard_by(EmulatedModbus(UNIT), (0.0, REQUEST)) != []
+    assert heard_by(EmulatedModbus(UNIT), (0.0, REQUEST[:cut]), (0.1, REQUEST)) == whole
+
+
+def test_a_unit_lets_pass_what_is_for_others_even_where_its_own_address_stands_in_it() -> None:
+    reply_of_another = with_crc(b"\x12\x03\x08" + REQUEST)
+    assert heard_by(EmulatedModbus(UNIT), (1.0, reply_of_another)) == []
+    assert len(heard_by(EmulatedModbus(UNIT), (1.0, reply_of_another), (1.01, REQUEST))) == 1
+
+
+@pytest.mark.parametrize("bits", list(combinations(range(8), 2)))
+def test_damaged_requests_are_not_answered(bits: tuple[int, int]) -> None:
+    damaged = bytearray(REQUEST)
+    for bit in bits:
+        damaged[3] ^= 1 << bit
+    assert heard_by(EmulatedModbus(UNIT), (0.0, bytes(damaged))) == []
+
+
+@pytest.mark.parametrize(
+    ("request_", "answer"),
+    [
+        ("11 2b 0e 01 00", "11 ab 01"),  # a function that it does not have, of another length
+        ("11 07", "11 87 01"),
+        ("11 03 0000 0000", "11 83 03"),
+        ("11 03 0000 007e", "11 83 03"),
+        ("11 01 0000 07d1", "11 81 03"),
+        ("11 03 03e7 0002", "11 83 02"),
+        ("11 05 0000 0001", "11 85 03"),
+        ("11 05 03e8 ff00", "11 85 02"),
+        ("11 06 03e8 0000", "11 86 02"),
+        ("11 0f 0000 0009 01 ff", "11 8f 03"),
+        ("11 10 0000 0002 02 0001", "11 90 03"),
+        ("11 10 03e7 0002 04 0001 0002", "11 90 02"),
+    ],
+)
+def test_what_a_unit_lacks_or_cannot_take_is_an_exception(request_: str, answer: str) -> None:
+    assert heard_by(EmulatedModbus(UNIT), (0.0, frame(request_))) == [frame(answer)]
+
+
+def test_what_goes_to_all_is_done_and_not_answered() -> None:
+    unit = EmulatedModbus(UNIT)
+    assert heard_by(unit, (0.0, WriteRegisters(2, (7, 8)).open(0, PROFILE.timings).request)) == []
+    assert unit.registers[2:4] == [7, 8]
+
+
+def test_taken_whole_or_heard_byte_by_byte_a_request_gets_the_same_answer() -> None:
+    requests = [REQUEST, frame("11 04 0000 0001"), with_crc(struct.pack(">BBHH", UNIT, 3, 990, 11))]
+    for request in requests:
+        taking, hearing = EmulatedModbus(UNIT), EmulatedModbus(UNIT)
+        assert taking.take(request, 1.0)
+        hearing.hear(request, 1.0)
+        assert taking.outbox == hearing.outbox != []
+
+
+def test_a_request_that_only_silence_ends_is_heard_and_not_taken() -> None:
+    assert not EmulatedModbus(UNIT).take(frame("11 2b 0e 01 00"), 1.0)
+
+
+# a listener
+
+
+def test_a_listener_tells_requests_from_replies() -> None:
+    frames = hear(
+        "modbus",
+        frame("11 03 0064 0002").hex(),
+        frame("11 03 04 0001 ffff").hex(),
+        frame("11 06 0001 0003").hex(),
+        frame("11 06 0001 0003").hex(),
+        frame("11 0f 0013 000a 02 cd 01").hex(),
+        frame("11 8f 02").hex(),
+        frame("00 05 0001 ff00").hex(),
+        frame("11 01 0000 0018").hex(),
+        frame("11 01 03 05 00 80").hex(),  # eight bytes, as a request has
+        frame("11 04 0005 0001").hex(),
+        frame("11 04 0005 0001").hex(),  # asked again
+        frame("11 04 02 0007").hex(),
+    )
+    bits = ",".join("101" + "0" * 20 + "1")
+    assert said(frames) == [
+        "host 17 read holding:100:2",
+        "node 17 holding:100:2 = 1,65535",
+        "host 17 write holding:1 = 3",
+        "node 17 ACK",
+        "host 17 write coil:19:10 = 1,0,1,1,0,0,1,1,1,0",
+        "node 17 NAK",
+        "host 0 write coil:1 = 1",
+        "host 17 read coil:0:24",
+        f"node 17 coil:0:24 = {bits}",
+        "host 17 read input:5",
+        "host 17 read input:5",
+        "node 17 input:5 = 7",
+    ]
+
+
+def test_a_listener_says_what_is_wrong_with_a_frame() -> None:
+    request = "11 03 0064 0001"
+    assert said(hear("modbus", frame(request).hex(), "11 03 02 00 01 00 00", "|"))[1].endswith("[bad CRC]")
+    assert said(hear("modbus", frame("11 03 02 0001").hex(), "|"))[0].endswith("no frame]") is False
+    assert (
+        "it repeats another write"
+        in said(hear("modbus", frame("11 06 0001 0003").hex(), frame("11 06 0001 0004").hex()))[1]
+    )
+    assert "4 bytes of data, not 2" in said(hear("modbus", frame(request).hex(), frame("11 03 04 0001 0002").hex()))[1]
