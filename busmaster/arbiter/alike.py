@@ -47,9 +47,9 @@ class Alike:
         self.node: NodeRecord | None = None
 
     def another(self, exchange: Exchange[Any], last_byte: float, now: float) -> bool:
-        """Count one more exchange. Returns whether one that is unlike is to go first.
+        """Count one more exchange, and return whether one that is unlike is to go first.
 
-        `last_byte`: when that of the last answer came.
+        `last_byte` is when the last byte of the last answer came, in seconds.
         """
         leg = self._wire.leg
         if now - last_byte - leg.latency > exchange.timing.window:  # in this pause an answer too many would have come
@@ -66,8 +66,8 @@ class Alike:
         return self.count >= (LONGEST_ALIKE if self._untimely else LONGEST_STEADY)
 
     def _was_untimely(self, took: float, asking: float) -> bool:
-        """Whether times fail to show that the last answer was its own. It came `took` seconds after its request, which
-        needed `asking` on the wire."""
+        """Return whether times fail to show that the last answer was its own request's. It came `took` seconds after
+        that request, which needed `asking` seconds on the wire."""
         node = self.node
         if node is None or took < 0:  # below 0: there was none
             return True

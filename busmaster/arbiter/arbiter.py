@@ -59,7 +59,7 @@ class Arbiter(LineMachine):
         timings: Timings | Learned | None = None,
         retries: int | None = None,
     ) -> NodeRecord:
-        """Raises InvalidCommand for an address that the protocol does not have."""
+        """Add a node and return its record. Raises InvalidCommand for an address that the protocol does not have."""
         profile.check_address(address)
         node = NodeRecord(
             profile,
@@ -77,27 +77,30 @@ class Arbiter(LineMachine):
         return node
 
     def name_node(self, node: NodeRecord, label: str) -> None:
-        """Have messages call it so."""
+        """Have messages call the node by this label."""
         node.label = label
 
     def change_profile(self, node: NodeRecord, profile: Profile) -> None:
-        """Go by another profile of its protocol from now on: one that merges otherwise."""
+        """Go by another profile of the node's protocol from now on: one that merges otherwise."""
         node.profile = profile
 
     def expect_hook(self, node: NodeRecord, expected: bool) -> None:
-        """Hold its polls when it comes back until `Dispatcher.release_node`, or do not."""
+        """Hold the node's polls when it comes back until `Dispatcher.release_node`, or do not, as `expected` says."""
         node.has_hook = expected
 
     def note_stop(self, node: NodeRecord) -> None:
-        """It is told to stop."""
+        """Count that the node is told to stop."""
         node.stops += 1
 
     def answer_counts(self, now: float) -> bool:
-        """A caller's time is over while something is on the wire: what has come is to be handed over first."""
+        """Return whether a caller's time is over while something is on the wire: what has come is handed over first."""
         return self.state is EXCHANGE and now >= self._deadlines.expiry
 
     def submit(self, transaction: Transaction, now: float) -> bool:
-        """False if it waits and nothing else has changed: then there is nothing to pump."""
+        """Queue a transaction, or end it at once.
+
+        Returns False if it waits and nothing else has changed: then there is nothing to pump.
+        """
         waits = self.dispatcher.submit(transaction, now)
         if self.state is READY:
             self._advance(now)
@@ -105,22 +108,23 @@ class Arbiter(LineMachine):
         return not waits or transaction.writes or transaction.start_by < inf
 
     def cancel(self, transaction: Transaction, now: float) -> None:
-        """Synchronous; never touches the line (R6)."""
+        """Cancel a transaction, synchronously and without ever touching the line (R6)."""
         self.dispatcher.cancel(transaction, now)
 
     def supersede_writes(self, now: float) -> None:
-        """Whatever waits to be written is not: the line is taken to its safe state."""
+        """End whatever waits to be written as Superseded: the line is taken to its safe state."""
         self.dispatcher.supersede_writes(now)
 
     def add_poll(self, poll: Poll, now: float) -> None:
-        """Its first cycle waits until a line that has just been opened can be used."""
+        """Run a poll from now on; its first cycle waits until a line that has just been opened can be used."""
         self.dispatcher.add_poll(poll, max(now, self._quarantine))
 
     def remove_poll(self, poll: Poll, now: float) -> None:
+        """End a poll: what it has queued is never sent, and what it has on the wire goes unheard."""
         self.dispatcher.remove_poll(poll, now)
 
     def demand(self, poll: Poll, now: float) -> None:
-        """One cycle now, off the grid."""
+        """Run one cycle of a poll now, off the grid."""
         self.dispatcher.demand(poll, now)
         if self.state is READY:
             self._advance(now)
@@ -148,16 +152,19 @@ class Arbiter(LineMachine):
     # outputs, pumped in this order
 
     def poll_transmit(self) -> bytes | None:
+        """Return the bytes that are to be sent now, which are handed over once, or None."""
         output = self._wire.output
         data, output.waiting = output.waiting, b""
         return data or None
 
     def poll_event(self) -> Event | None:
+        """Take out the next event, in the order of `events`, or return None."""
         if self.dispatcher.unnoted is not None:
             self.dispatcher.note_success()
         return self.events.popleft() if self.events else None
 
     def poll_timeout(self) -> float:
+        """Return when `handle_timeout` is to be called, in seconds on the caller's clock; inf if nothing is due."""
         deadlines = self._deadlines
         earliest = deadlines.line
         if deadlines.schedule < earliest:
@@ -171,9 +178,11 @@ class Arbiter(LineMachine):
         return earliest
 
     def reset_statistics(self, now: float) -> None:
+        """Begin the counts of the line and of its nodes anew."""
         self._counters.reset(self.state, now)
         for node in self.dispatcher.nodes:
             node.counters.reset()
 
     def statistics(self, now: float) -> LineStatistics:
+        """Return an immutable snapshot of the line's counts since the last reset; its times are in seconds."""
         return self._counters.snapshot(self.state, now, len(self.dispatcher.backlog))

@@ -29,14 +29,17 @@ class _Fifo:
         self.live = 0
 
     def push(self, transaction: Transaction) -> None:
+        """Add a transaction at the back."""
         self._entries.append(transaction)
         self.live += 1
 
     def push_front(self, transaction: Transaction) -> None:
+        """Add a transaction at the front."""
         self._entries.appendleft(transaction)
         self.live += 1
 
     def pop(self) -> Transaction:
+        """Take out the first that waits. Raises IndexError if none does."""
         while True:
             transaction = self._entries.popleft()
             if transaction.phase is QUEUED:
@@ -44,7 +47,7 @@ class _Fifo:
                 return transaction
 
     def pick(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out the first of the first few that suits."""
+        """Take out the first of the first few that suits, or return None."""
         passed: list[Transaction] = []
         found = None
         while self.live > len(passed) and len(passed) < LOOKED_AT and found is None:
@@ -60,6 +63,7 @@ class _Fifo:
         return found
 
     def discard(self) -> None:
+        """Give up the place of one that waits no longer; it is swept out later."""
         # A caller that gives up must be free at once, however long the queue is, so its place is only given up, and
         # swept later. Without the sweep, callers that always give up would fill the memory of a line that never gets
         # to them.
@@ -68,11 +72,12 @@ class _Fifo:
             self._entries = deque(self)
 
     def remove(self, transaction: Transaction) -> None:
+        """Take out this transaction at once, wherever in the queue it is."""
         self._entries.remove(transaction)
         self.live -= 1
 
     def entries(self) -> Iterator[Transaction]:
-        """All that is in it, ended ones too, in no order."""
+        """Return all that is in the queue, ended ones too, in no order."""
         return iter(self._entries)
 
     def __iter__(self) -> Iterator[Transaction]:
@@ -90,10 +95,12 @@ class _EarliestDeadlineFirst:
         self.live = 0
 
     def push(self, transaction: Transaction) -> None:
+        """Add a transaction at its deadline, behind those that have the same one."""
         heapq.heappush(self._entries, (transaction.deadline, next(self._order), transaction))
         self.live += 1
 
     def push_front(self, transaction: Transaction) -> None:
+        """Add a transaction before all others, and give it the deadline of the first."""
         # The first of all whatever its deadline, or a write would go behind what it had its turn before. The negative
         # number puts it before the one that has the same deadline, and the last one put back before the others.
         transaction.deadline = self._entries[0][0] if self._entries else transaction.deadline
@@ -101,7 +108,7 @@ class _EarliestDeadlineFirst:
         self.live += 1
 
     def pick(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out the first of the first few that suits."""
+        """Take out the first of the first few that suits, or return None."""
         passed: list[tuple[float, int, Transaction]] = []
         found = None
         while self.live > len(passed) and len(passed) < LOOKED_AT and found is None:
@@ -118,6 +125,7 @@ class _EarliestDeadlineFirst:
         return found
 
     def pop(self) -> Transaction:
+        """Take out the one with the earliest deadline. Raises IndexError if none waits."""
         while True:
             transaction = heapq.heappop(self._entries)[2]
             if transaction.phase is QUEUED:
@@ -125,18 +133,20 @@ class _EarliestDeadlineFirst:
                 return transaction
 
     def discard(self) -> None:
+        """Give up the place of one that waits no longer; it is swept out later."""
         self.live -= 1
         if len(self._entries) > 2 * self.live + SLACK:
             self._entries = [entry for entry in self._entries if entry[2].phase is QUEUED]
             heapq.heapify(self._entries)
 
     def remove(self, transaction: Transaction) -> None:
+        """Take out this transaction at once, wherever in the queue it is."""
         self._entries = [entry for entry in self._entries if entry[2] is not transaction]
         heapq.heapify(self._entries)
         self.live -= 1
 
     def entries(self) -> Iterator[Transaction]:
-        """All that is in it, ended ones too, in no order."""
+        """Return all that is in the queue, ended ones too, in no order."""
         return (transaction for _, _, transaction in self._entries)
 
     def __iter__(self) -> Iterator[Transaction]:
@@ -159,15 +169,16 @@ class Backlog:
         return urgent.live + command.live + poll.live + background.live
 
     def waiting(self, priority: Priority) -> int:
+        """Return how many transactions of this class wait."""
         return self.queues[priority].live
 
     def push(self, transaction: Transaction) -> None:
-        """At the back of its class (of its deadline, in POLL and BACKGROUND)."""
+        """Put a transaction at the back of its class (of its deadline, in POLL and BACKGROUND)."""
         transaction.phase = QUEUED
         self.queues[transaction.priority].push(transaction)
 
     def push_front(self, transaction: Transaction) -> None:
-        """At the front of its class: for a write whose turn had come while an earlier one was not over."""
+        """Put a transaction at the front of its class, as a write whose turn came while an earlier one was not over."""
         transaction.phase = QUEUED
         self.queues[transaction.priority].push_front(transaction)
 
@@ -182,11 +193,11 @@ class Backlog:
         self.push_front(transaction)
 
     def pick(self, priority: Priority, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out the first of the first few of a class that suits; the others keep their places."""
+        """Take out the first of the first few of a class that suits, or return None; the others keep their places."""
         return self.queues[priority].pick(suits)
 
     def take(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
-        """Take out one that suits, of whatever class: for what has to be asked now in any case."""
+        """Take out one that suits, of whatever class, or return None: for what has to be asked now in any case."""
         for queue in self.queues:
             found = next((t for t in islice(queue.entries(), SEARCHED) if t.phase is QUEUED and suits(t)), None)
             if found is not None:
@@ -195,13 +206,16 @@ class Backlog:
         return None
 
     def promote(self, transaction: Transaction, priority: Priority) -> None:
-        """To the front of a higher class: a write that a write of that class must not overtake."""
+        """Move a transaction to the front of a higher class: a write that a write of that class must not overtake."""
         self.queues[transaction.priority].remove(transaction)
         transaction.priority = priority
         self.push_front(transaction)
 
     def pop(self) -> Transaction | None:
-        """The next to go, or None. URGENT first, always; below it a waiting lower class gets every eighth slot."""
+        """Take out the next to go, or return None.
+
+        URGENT goes first, always; below it a waiting lower class gets every eighth slot.
+        """
         urgent, command, poll, background = self.queues
         self._streak_before = self._streak
         self._rotated_before = self._rotated
@@ -230,7 +244,7 @@ class Backlog:
         return background.pop() if background.live else None
 
     def _lower_slot(self) -> Transaction:
-        """POLL and BACKGROUND in turn, if both wait."""
+        """Take out the next of POLL and BACKGROUND, which have turns if both wait."""
         self._streak = 0
         _, _, poll, background = self.queues
         if poll.live and (self._rotated is BACKGROUND or not background.live):
@@ -240,7 +254,7 @@ class Backlog:
         return background.pop()
 
     def drain(self) -> list[Transaction]:
-        """Everything that waits, in order of class; the backlog is empty afterwards."""
+        """Take out everything that waits, in order of class; the backlog is empty afterwards."""
         drained = [transaction for queue in self.queues for transaction in queue]
         self.queues = (_Fifo(), _Fifo(), _EarliestDeadlineFirst(), _EarliestDeadlineFirst())
         return drained

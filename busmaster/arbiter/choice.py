@@ -39,9 +39,9 @@ class Choice:
         self._last_byte = -inf
 
     def next(self, now: float, last_byte: float) -> Chosen | float | None:
-        """The transaction to be sent now, with its exchange. None if none waits; a time if none may go before it.
+        """Return the transaction to be sent now and its exchange; None if none waits; a time if none may go before it.
 
-        `last_byte`: when the last one came.
+        `last_byte` is when the last byte came, in seconds.
         """
         dispatcher, in_step, alike = self._dispatcher, self._in_step, self._alike
         self._last_byte = last_byte
@@ -70,7 +70,7 @@ class Choice:
         return transaction, exchange
 
     def _carefully(self, first: Chosen, now: float, too_many: bool = False) -> Chosen | float:
-        """As `next`, where something is owed or doubted, or `too_many` answers were alike."""
+        """Choose as `next` does, where something is owed or doubted, or `too_many` answers were alike."""
         in_step = self._in_step
         in_step.lapse(now)
         chosen: Chosen | float = first
@@ -110,7 +110,7 @@ class Choice:
         return chosen
 
     def _instead_of(self, first: Chosen, now: float) -> Chosen | float:
-        """What goes in place of one whose answer could be one that is owed."""
+        """Return what goes in place of one whose answer could be one that is owed; a time if none may go before it."""
         in_step, answers = self._in_step, first[1].answers
 
         def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
@@ -150,8 +150,9 @@ class Choice:
         return other
 
     def _while_awaited(self, first: Chosen, now: float, answers: Sequence[bytes] | None = None) -> Chosen | None:
-        """What goes while an owed answer (that could look so) may still be on time, though the line went on: a check
-        of the node that owes it, which shows that it is not to come; else another. None once two were in vain."""
+        """Return what goes while an owed answer (that could look so) may still be on time, though the line went on: a
+        check of the node that owes it, which shows that it is not to come; else another. Returns None once two were in
+        vain."""
         if self._gone_before >= MOST_BEFORE - 1:
             return None
 
@@ -168,7 +169,7 @@ class Choice:
         return other
 
     def _of_these(self, nodes: Container[NodeRecord], now: float, unfit: Unfit) -> Chosen | None:
-        """A read of one of these nodes that waits anyway, of whatever class: it costs nothing, as a check does."""
+        """Take out a read of one of these nodes that waits anyway, of whatever class: unlike a check, it is free."""
         opened: list[Exchange[Any]] = []
 
         def suits(other: Transaction) -> bool:
@@ -187,8 +188,8 @@ class Choice:
         return None if transaction is None else (transaction, opened[0])
 
     def _ask_itself(self, first: Chosen, now: float) -> Chosen | None:
-        """A check of a node that owes what it is to be asked for: its answer would not be believed. None for one that
-        is likely to be dead."""
+        """Return a check of a node that owes what it is to be asked for: its answer would not be believed. Returns None
+        for a node that is likely to be dead."""
         node = first[0].node
         if node.silent or self._gone_before >= MOST_BEFORE:
             return None
@@ -196,7 +197,7 @@ class Choice:
         return self._ask_check([node], now, lambda answers, node: self._in_step.clashes(answers, now, node))
 
     def _other_probe(self, probe: Transaction, now: float) -> Chosen | None:
-        """The same dead node asked for something that is not owed."""
+        """Have a probe ask the same dead node for something that is not owed. Returns None where there is nothing."""
         node = probe.node
         for command in checks_of(node):
             exchange = command.open(node.address, node.timings)
@@ -206,8 +207,8 @@ class Choice:
         return None
 
     def _another(self, first: Chosen, now: float, unfit: Unfit, of: NodeRecord | None = None) -> Chosen | None:
-        """One of the same class, `of` this node if one is given. No read overtakes a write to its node, and no write
-        anything that is for its node."""
+        """Take out one of the same class, `of` this node if one is given, or return None. No read overtakes a write to
+        its node, and no write anything that is for its node."""
         opened: list[Exchange[Any]] = []
         passed = {first[0].node}
         written = {first[0].node} if first[0].writes else set()
@@ -232,7 +233,7 @@ class Choice:
         return None if transaction is None else (transaction, opened[0])
 
     def _ask_check(self, nodes: Iterable[NodeRecord], now: float, unfit: Unfit) -> Chosen | None:
-        """A read of the first of these nodes that has one whose answer is fit to prove something."""
+        """Return a read of the first of these nodes that has one whose answer is fit to prove something, or None."""
         for node, command, exchange in _fit_checks(nodes, unfit):
             check = self._dispatcher.check(node, command, now)
             if node.learning is not None:
@@ -241,7 +242,7 @@ class Choice:
         return None
 
     def _whom_to_ask(self, now: float) -> tuple[list[NodeRecord], list[NodeRecord]]:
-        """The nodes that answer, as far as is known, the one that did so last first; and those that are silent."""
+        """Return the nodes that answer, as far as is known, the last one to do so first; and those that are silent."""
         nodes = [
             node
             for node in self._dispatcher.nodes
@@ -254,7 +255,7 @@ class Choice:
 
 
 def _fit_checks(nodes: Iterable[NodeRecord], unfit: Unfit) -> Iterator[tuple[NodeRecord, Command[Any], Exchange[Any]]]:
-    """The reads of these nodes whose answers are fit to prove something."""
+    """Yield the reads of these nodes whose answers are fit to prove something."""
     for node in nodes:
         for command in checks_of(node):
             exchange = command.open(node.address, node.timings)
@@ -263,14 +264,14 @@ def _fit_checks(nodes: Iterable[NodeRecord], unfit: Unfit) -> Iterator[tuple[Nod
 
 
 def _is_decisive(chosen: Chosen) -> bool:
-    """It is a write, or the last attempt of a read: nothing that could have been waited for may spoil it."""
+    """Return whether this is a write, or a read's last attempt: nothing that could be waited for may spoil it."""
     transaction, exchange = chosen
     last = transaction.retried >= transaction.retries and not transaction.probe
     return transaction.writes or not exchange.answered or last
 
 
 def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:
-    """Cheap reads of a node: those that it has answered, then those of its protocol that it has not refused."""
+    """Yield cheap reads of a node: those that it has answered, then those of its protocol that it has not refused."""
     yield from node.answered.values()
     for command in node.profile.checks:
         if command not in node.refused:
@@ -278,7 +279,7 @@ def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:
 
 
 def _opened(transaction: Transaction) -> Exchange[Any] | None:
-    """None where its protocol cannot encode it: that is told when its turn has come."""
+    """Return an exchange, or None where the protocol cannot encode it: that is told when its turn has come."""
     try:
         return transaction.command.open(transaction.node.address, transaction.timings())
     except Exception:

@@ -22,7 +22,7 @@ class Quantiles:
 
     @classmethod
     def of(cls, histogram: Histogram) -> Quantiles:
-        """What a histogram holds now."""
+        """Return the quantiles of what a histogram holds now."""
         return cls(
             histogram.count, histogram.mean, histogram.quantile(0.5), histogram.quantile(0.99), histogram.highest
         )
@@ -120,11 +120,13 @@ class NodeCounters:
         self.reset()
 
     def reset(self) -> None:
+        """Begin all counts anew."""
         self.attempts = self.ok = self.late = self.no_reply = self.garbled = self.refused = 0
         self.retries = self.unheard = self.failed = self.probes = 0
         self.latency = Histogram()
 
     def snapshot(self, lateness: float) -> NodeStatistics:
+        """Return an immutable snapshot of the counts; `lateness` is the node's, in seconds."""
         return NodeStatistics(
             self.attempts,
             self.ok,
@@ -173,6 +175,7 @@ class LineCounters:
         self.reset(OFFLINE, since)
 
     def reset(self, state: LineState, since: float) -> None:
+        """Begin all counts anew at the time `since`, in seconds, when the line is in this state."""
         self.since = since
         self.completed = self.cancelled = self.unasked_bytes = self.noise_bytes = 0
         self.tainted = self.collisions = self.settles = self.noisy = self.losses = 0
@@ -181,27 +184,30 @@ class LineCounters:
         self.waits = (Histogram(), Histogram(), Histogram(), Histogram())
 
     def mark(self, mark: Mark) -> None:
-        """The UART marked a byte."""
+        """Count a byte that the UART marked."""
         if mark is Mark.BREAK:
             self.breaks += 1
         else:
             self.damaged += 1
 
     def spend(self, state: LineState, now: float) -> float:
-        """The time since the last call went by in this state; returns it."""
+        """Count the time since the last call as spent in this state, and return it, in seconds."""
         spent = now - self._entered
         self.spent[state] += spent
         self._entered = now
         return spent
 
     def _times(self, state: LineState, now: float) -> list[float]:
-        """Seconds ever spent in each state, up to now."""
+        """Return the seconds ever spent in each state, up to now."""
         times = self.spent.copy()
         times[state] += now - self._entered
         return times
 
     def snapshot(self, state: LineState, now: float, backlog: int) -> LineStatistics:
-        """Changes nothing: whoever looks does not cut the pauses, from which probes are paid, into pieces."""
+        """Return an immutable snapshot of the counts since the last reset.
+
+        Nothing changes: whoever looks does not cut the pauses, from which probes are paid, into pieces.
+        """
         first, second, third, fourth = self.waits
         exchanges, times = self._before
         spent = [time - before for time, before in zip(self._times(state, now), times, strict=True)]

@@ -90,7 +90,7 @@ class Dispatcher:
     # requests
 
     def submit(self, transaction: Transaction, now: float) -> bool:
-        """Queue it, or end it at once with the reason why not: then False."""
+        """Queue a transaction, or end it at once with the reason why not: then return False."""
         node, counters = transaction.node, self.counters
         transaction.queued = now
         transaction.exchanges_ahead = counters.exchanges  # as _waits does: this is done for every request
@@ -118,7 +118,7 @@ class Dispatcher:
         return True
 
     def cancel(self, transaction: Transaction, now: float) -> None:
-        """Its caller has gone: never sent if still queued, unheard if on the wire (R6)."""
+        """Note that a caller has gone: its transaction is not sent if still queued, unheard if on the wire (R6)."""
         if not transaction.wanted or transaction.phase in (ENDED, IDLE):
             return
         transaction.wanted = False
@@ -130,7 +130,7 @@ class Dispatcher:
             self._end(transaction, now)
 
     def next(self, now: float) -> Transaction | None:
-        """The transaction that may be sent now, or None."""
+        """Take out the transaction that may be sent now, or return None."""
         while (transaction := self.backlog.pop()) is not None:
             node = transaction.node
             if transaction.start_by < now and (
@@ -146,10 +146,11 @@ class Dispatcher:
         return None
 
     def urgent_waits(self) -> bool:
+        """Return whether something of the class URGENT waits."""
         return self.backlog.waiting(URGENT) > 0
 
     def may_go(self, transaction: Transaction, now: float) -> bool:
-        """Whether a transaction that waits may be sent before the first one; nothing is changed."""
+        """Return whether a transaction that waits may be sent before the first one; nothing is changed."""
         node = transaction.node
         if node.health is DOWN or node.holds or node.suspended_until > now:
             return False
@@ -157,7 +158,7 @@ class Dispatcher:
         return in_time and not (transaction.writes and not self.writes.is_first(transaction))
 
     def started(self, transaction: Transaction, now: float) -> None:
-        """Its next attempt goes out now."""
+        """Note that the next attempt of a transaction goes out now."""
         counters = self.counters
         if transaction.attempts == 0 and not transaction.check:
             counters.waits[transaction.priority].record(now - transaction.queued)
@@ -177,7 +178,7 @@ class Dispatcher:
     # what came of an attempt
 
     def succeeded(self, transaction: Transaction, value: Any, now: float) -> None:
-        """Noted at once where it bears on what goes next; else with the events, when the next request has left."""
+        """Note a success at once where it bears on what goes next; else with the events, when the next request left."""
         if self.unnoted is not None:
             self.note_success()
         transaction.value = value
@@ -187,6 +188,7 @@ class Dispatcher:
             self.note_success()
 
     def note_success(self) -> None:
+        """End the transaction that has succeeded and is not noted yet, if there is one."""
         transaction = self.unnoted
         if transaction is None:
             return
@@ -210,7 +212,7 @@ class Dispatcher:
     def attempt_failed(
         self, transaction: Transaction, no_reply: bool, what: str, now: float, doubted: bool = False
     ) -> None:
-        """`doubted`: an answer came and was not believed, which says nothing of the node (R15)."""
+        """Ask again or fail. A `doubted` answer came and was not believed, which says nothing of the node (R15)."""
         node = transaction.node
         transaction.unsure = True
         if no_reply:
@@ -233,7 +235,7 @@ class Dispatcher:
         self._end(transaction, now, make_error(kind, what, transaction))
 
     def broken(self, transaction: Transaction, bug: Exception, now: float) -> None:
-        """The protocol's reader failed on what came: a bug there. To ask again would meet it again."""
+        """Fail a transaction over which the protocol's reader failed: a bug there. To ask again would meet it again."""
         what = f"a bug in the {transaction.node.profile.name} reader: {bug!r}"
         transaction.node.counters.garbled += 1
         kind = WriteUnconfirmed if transaction.writes else BusError
@@ -243,10 +245,8 @@ class Dispatcher:
         self._end(transaction, now, error)
 
     def refused(self, transaction: Transaction, refusal: Refused, certain: bool, now: float) -> None:
-        """A NAK or EOT: asked once more where that can tell something new, then final (R7).
-
-        Not `certain`: it may be an earlier request's (R15). A read is asked once more; a write was perhaps carried out.
-        """
+        """Ask once more after a NAK or EOT where that can tell something new; then it is final (R7). Where it is not
+        `certain`, it may be an earlier request's (R15): a read is asked once more; a write was perhaps carried out."""
         node = transaction.node
         node.counters.refused += 1
         if not transaction.writes:
@@ -266,11 +266,11 @@ class Dispatcher:
         self._end(transaction, now, name_error(refusal, transaction))
 
     def unsendable(self, transaction: Transaction, bug: Exception, now: float) -> None:
-        """Its protocol cannot encode it: a bug there, but nobody may wait for ever."""
+        """Fail a transaction that its protocol cannot encode: a bug there, but nobody may wait for ever."""
         self._end(transaction, now, make_error(BusError, f"its protocol could not encode it: {bug!r}", transaction))
 
     def cut_off(self, transaction: Transaction, error: BusError, now: float) -> None:
-        """The line was lost under it: a write may have been carried out."""
+        """Fail a transaction under which the line was lost: a write may have been carried out."""
         self._end(transaction, now, name_error(error, transaction))
 
     # everything at once
@@ -292,10 +292,8 @@ class Dispatcher:
             self._end(transaction, now, error)
 
     def expire(self, now: float) -> None:
-        """Tell callers whose time is over: nothing was sent, or it was, and how it ends is not known (R12).
-
-        What is on the wire runs out unheard, as when its caller is cancelled; what has come by now has come in time.
-        """
+        """Tell callers whose time is over: nothing was sent, or it was, and how it ends is not known (R12). What is on
+        the wire runs out unheard, as when its caller is cancelled; what has come by now has come in time."""
         self.note_success()
         for transaction in self._expiries.due(now):
             if not transaction.wanted or (transaction.attempts and transaction.finish_by >= now):
@@ -314,22 +312,24 @@ class Dispatcher:
     # polls
 
     def add_poll(self, poll: Poll, now: float) -> None:
+        """Run a poll from now on."""
         self.schedule.add(poll, now)
         self._deadlines.schedule = self.schedule.next_due()
 
     def remove_poll(self, poll: Poll, now: float) -> None:
+        """End a poll: what it has queued is never sent, and what it has on the wire goes unheard."""
         self.schedule.remove(poll)
         self._deadlines.schedule = self.schedule.next_due()
         for transaction in poll.results:
             self.cancel(transaction, now)
 
     def prepare_poll(self, poll: Poll, now: float) -> None:
-        """Do its new `preparation`, a slice at a time."""
+        """Do the new `preparation` of a poll, a slice at a time."""
         self.schedule.prepare(poll, now)
         self._deadlines.schedule = self.schedule.next_due()
 
     def demand(self, poll: Poll, now: float) -> None:
-        """Run one cycle now, off the grid. The running one serves, if there is one."""
+        """Run one cycle of a poll now, off the grid. The running one serves, if there is one."""
         self.schedule.demand(poll)
         self.release_polls(now)
 
@@ -361,15 +361,16 @@ class Dispatcher:
     # dead nodes
 
     def suspend(self, node: NodeRecord, until: float) -> None:
+        """Send a node nothing until this time, in seconds: what is asked of it fails with NodeDown."""
         node.suspended_until = until
         self.probes.plan()
 
     def release_node(self, node: NodeRecord) -> None:
-        """Its hook has run: its polls resume with their next cycle, unless it has died and come back meanwhile."""
+        """Resume a node's polls with their next cycle, as its hook has run, unless it has died and come back since."""
         node.holds = max(0, node.holds - 1)
 
     def probe(self, now: float, idle: bool) -> None:
-        """Ask the dead node whose turn it is, if the budget allows. `idle`: the line has nothing else to do."""
+        """Ask the dead node whose turn it is, if the budget allows. If `idle`, the line has nothing else to do."""
         probe = self.probes.next(now, self.fault is None, idle)
         if probe is not None:
             self._waits(probe)
@@ -377,7 +378,7 @@ class Dispatcher:
             self.backlog.push(probe)
 
     def check(self, node: NodeRecord, command: Command[Any], now: float) -> Transaction:
-        """A read by which the line proves that it is in step (R15). It goes at once; nobody waits for it."""
+        """Make a read by which the line proves that it is in step (R15). It goes at once; nobody waits for it."""
         self.counters.checks += 1
         check = Transaction(node, command, priority=BACKGROUND, retries=0, probe=True)
         check.check = True
@@ -387,7 +388,7 @@ class Dispatcher:
         return check
 
     def _may_ask(self, transaction: Transaction, now: float) -> bool:
-        """Whether a node that is down, back or suspended is worth this request's line time; if not, it is ended."""
+        """Return whether a node that is down, back or suspended is worth this request's line time; if not, end it."""
         node = transaction.node
         error: BusError | None = None
         if transaction.poll is not None:
@@ -405,7 +406,7 @@ class Dispatcher:
         return error is None
 
     def _lower_lateness(self, transaction: Transaction, now: float) -> None:
-        """Back to what it was, when an hour of prompt replies has passed since its lateness was raised."""
+        """Put a node's lateness back to what it was, when an hour of prompt replies has passed since it was raised."""
         node = transaction.node
         if transaction.late:
             node.lateness_until = now + health.CALM_LATENESS
@@ -434,7 +435,7 @@ class Dispatcher:
     # the ways of one transaction
 
     def _worth_a_retry(self, transaction: Transaction) -> bool:
-        """Not while its node fails; nor may the polls of nodes that were never heard hold up the start of a line."""
+        """Return False while the node fails, or for a poll of one never heard, which may not hold up a line's start."""
         node = transaction.node
         if node.health is UNKNOWN:
             return transaction.poll is None
@@ -444,16 +445,14 @@ class Dispatcher:
         return transaction.wanted and not transaction.superseded and self.fault is None
 
     def _requeue(self, transaction: Transaction, now: float) -> None:
-        """At the back of its class; a poll's key becomes failure time + period (R7)."""
+        """Put a transaction at the back of its class; a poll's key becomes failure time + period (R7)."""
         poll = transaction.poll
         transaction.deadline = now + (poll.patience if poll is not None else RETRY_PATIENCE)
         self.backlog.push(transaction)
 
     def _supersede(self, node: NodeRecord, why: str, now: float, above: Priority | None = None) -> None:
-        """What is overtaken is never sent after what overtakes it, nor if that cannot be sent itself (R7).
-
-        `above`: only what is of a lower class than this one.
-        """
+        """End a node's writes, those below the class `above` if one is given: what is overtaken is never sent after
+        what overtakes it, nor if that cannot be sent itself (R7)."""
         for write in list(self.writes.queues[node]):
             if write.phase is ON_WIRE:
                 write.superseded = True
@@ -463,7 +462,7 @@ class Dispatcher:
                 self._end(write, now, make_error(Superseded, why, write))
 
     def _end(self, transaction: Transaction, now: float, error: BusError | None = None) -> None:
-        """Exactly once (R8). A write that was on the wire before something else ended it may have been carried out."""
+        """End it exactly once (R8). A write sent before something else ended it may have been carried out."""
         if transaction.writes:
             unsure = transaction.unsure or (transaction.attempts > 0 and not isinstance(error, NOT_DONE))
             if unsure and error is not None and not isinstance(error, WriteUnconfirmed):
@@ -494,6 +493,6 @@ class Dispatcher:
             self.events.append(transaction)
 
     def _waits(self, transaction: Transaction) -> None:
-        """What the line has counted so far is not what it waits for: it is taken off when it has waited."""
+        """Note what the line has counted so far, for which it does not wait: it is taken off when it has waited."""
         transaction.exchanges_ahead = self.counters.exchanges
         transaction.settling_ahead = self.counters.spent[SETTLING]

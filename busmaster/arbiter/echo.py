@@ -16,11 +16,12 @@ class Echo:
         self.owed = b""
 
     def sent(self, data: bytes) -> None:
+        """Expect what was sent to come back, if the line is `declared` to echo."""
         if self.declared:
             self.owed += data
 
     def strip(self, data: bytes) -> bytes | None:
-        """What came after the echo; None where the echo differs from what was sent: a collision."""
+        """Return what came after the echo; None where the echo differs from what was sent: a collision."""
         owed = self.owed
         length = min(len(owed), len(data))
         if data[:length] != owed[:length]:
@@ -32,5 +33,5 @@ class Echo:
         return data[length:]
 
     def forget(self) -> None:
-        """The line settles: what is still owed would be discarded anyway."""
+        """Expect no more echo: the line settles, and what is still owed would be discarded anyway."""
         self.owed = b""

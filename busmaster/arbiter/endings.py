@@ -14,7 +14,7 @@ def make_error(kind: type[BusError], what: str, transaction: Transaction) -> Bus
 
 
 def name_error(error: BusError, transaction: Transaction) -> BusError:
-    """Say which node, which command and how often."""
+    """Say in an error which node, which command and how often, and return it."""
     error.name(transaction.node)
     error.command = str(transaction.command)
     error.attempts = transaction.attempts

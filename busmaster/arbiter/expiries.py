@@ -25,7 +25,7 @@ class Expiries:
         self._order = count()
 
     def expect(self, transaction: Transaction, waiting: int) -> None:
-        """Remember when its caller gives up. `waiting`: how many transactions wait."""
+        """Remember when the caller of a transaction gives up; `waiting` is how many transactions wait."""
         if len(self._heap) > 2 * waiting + SLACK:
             self._heap = [entry for entry in self._heap if entry[2].phase is not ENDED]
             heapq.heapify(self._heap)
@@ -34,7 +34,7 @@ class Expiries:
         self._set_deadline()
 
     def due(self, now: float) -> Iterator[Transaction]:
-        """Take out those that have not ended and whose time, one of the two, is over."""
+        """Take out the transactions that have not ended and whose time, one of the two, is over."""
         heap = self._heap
         while heap and (heap[0][0] < now or heap[0][2].phase is ENDED):
             transaction = heapq.heappop(heap)[2]

@@ -34,15 +34,15 @@ class FailingTransactions:
         return len(self._left)
 
     def add(self, transactions: Iterable[Transaction], fault: BusError) -> None:
-        """Have `next` hand them out, behind those that are there."""
+        """Have `next` hand these transactions out with `fault`, behind those that are there."""
         for transaction in transactions:
             transaction.phase = FAILING
             self._left.append((transaction, fault))
 
     def next(self, now: float) -> Iterator[tuple[Transaction, BusError]]:
-        """Hand out a few, each with an error of its own, and set the deadline of the others.
+        """Hand out at most AT_ONCE transactions, each with an error of its own, and set the deadline of the others.
 
-        One that has ended meanwhile, since its caller has gone, is left out.
+        A transaction that has ended meanwhile, since its caller has gone, is left out.
         """
         left = self._left
         piece = [left.popleft() for _ in range(min(AT_ONCE, len(left)))]
@@ -53,7 +53,7 @@ class FailingTransactions:
 
 
 def take_out(queues: Iterable[deque[Transaction]], backlog: Backlog) -> list[Transaction]:
-    """Empty the backlog and each node's queue of writes, except for what is on the wire."""
+    """Empty the backlog and each node's queue of writes, except for what is on the wire. Returns what was taken out."""
     taken: list[Transaction] = []
     for writes in queues:
         if writes:

@@ -134,7 +134,7 @@ class NodeRecord:
         self._before_raised: Timings | None = None
 
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
-        """It has answered rightly, after so many seconds."""
+        """Note that the node has answered this command rightly, after `took` seconds."""
         self.unheard = 0
         # Up at once, down slowly: it decides which answers are believed (R15), and one slow reply among many fast ones
         # is what it must not forget.
@@ -145,16 +145,16 @@ class NodeRecord:
 
     @property
     def silent(self) -> bool:
-        """It does not answer, as far as is known."""
+        """Whether the node does not answer, as far as is known."""
         return self.unheard >= SILENT
 
     def latest(self, unknown: float) -> float:
-        """Seconds to the first byte of its replies that are no later than usual; `unknown` if none was timed."""
+        """Return the seconds to the first byte of a reply that is no later than usual; `unknown` if none was timed."""
         return SLOWER * self.slowest + SLOWER_BY if self.slowest else unknown
 
     def note_refused(self, command: Command[Any]) -> None:
-        """It has refused this read: it is no check, unless it has refused them all. Then one of them may have been
-        refused by mistake."""
+        """Note that the node has refused this read: it is no check, unless the node has refused them all. Then one of
+        them may have been refused by mistake, and all are checks again."""
         if command in self.profile.checks:
             self.refused.add(command)
         if len(self.refused) >= len(self.profile.checks):
@@ -162,14 +162,14 @@ class NodeRecord:
         self.answered = {key: read for key, read in self.answered.items() if read != command}
 
     def raise_lateness(self, lateness: float, now: float) -> None:
-        """It was slower than was believed."""
+        """Raise the node's lateness to at least `lateness` seconds: it was slower than was believed."""
         if self._before_raised is None:
             self._before_raised = self.timings
         self.timings = self.timings.with_lateness(lateness)
         self.lateness_until = now + CALM_LATENESS
 
     def restore_lateness(self) -> None:
-        """Back to what it was before it was raised."""
+        """Set the lateness back to what it was before it was raised."""
         if self._before_raised is not None:
             self.timings = self._before_raised
         self._before_raised = None
@@ -195,9 +195,9 @@ class ProbeBudget:
         self._pause = 0.0
 
     def idle(self, seconds: float, over: bool) -> None:
-        """The line had a pause for so long (more), which is over or goes on.
+        """Earn from a pause of the line, which took so many seconds (more) and is `over` or goes on.
 
-        One too short for a probe earns nothing: there a probe would delay what comes next.
+        A pause too short for a probe earns nothing: there a probe would delay what comes next.
         """
         before, probe = self._pause, self.probe
         pause = before + seconds
@@ -208,11 +208,12 @@ class ProbeBudget:
         self._pause = 0.0 if over else pause
 
     def node_returned(self, now: float) -> None:
+        """Note that a node has come back: the bucket fills faster for BUDGET_RETURN_PERIOD seconds."""
         self._earn(now)
         self._generous_until = now + BUDGET_RETURN_PERIOD
 
     def take(self, cost: float, now: float) -> bool:
-        """Pay for a probe, if the bucket holds it (a full bucket pays for anything)."""
+        """Pay for a probe, if the bucket holds it (a full bucket pays for anything). Returns whether it did."""
         self._earn(now)
         if self.tokens < min(cost, BUDGET_CAPACITY):
             return False
@@ -220,10 +221,11 @@ class ProbeBudget:
         return True
 
     def refund(self, seconds: float) -> None:
+        """Put so many seconds back into the bucket, as far as they fit."""
         self.tokens = min(BUDGET_CAPACITY, self.tokens + seconds)
 
     def wait_for(self, cost: float, now: float) -> float:
-        """Seconds until the bucket will hold `cost` at the current share; asked again by then at the latest."""
+        """Return the seconds until the bucket holds `cost` at the current share; asked again by then at the latest."""
         share = BUDGET_SHARE_AFTER_RETURN if now < self._generous_until else BUDGET_SHARE
         missing = min(cost, BUDGET_CAPACITY) - self.tokens
         return min(max(missing / share, 0.001), LONGEST_BUDGET_WAIT)
@@ -237,12 +239,12 @@ class ProbeBudget:
 
 
 def flaps(node: NodeRecord, now: float) -> bool:
-    """It has come back a short while ago: its next death or return tells nothing about others."""
+    """Return whether the node came back a short while ago: its next death or return tells nothing about others."""
     return now - node.up_since < STEADY
 
 
 def note_success(node: NodeRecord, now: float) -> None:
-    """A reply came. The caller reports the change of health."""
+    """Note that a reply of the node came. The caller reports the change of health."""
     node.failures = 0
     if node.health is DOWN and node.learning is not None:
         node.learning.doubt()  # it may have come back as another device
@@ -257,7 +259,7 @@ def note_success(node: NodeRecord, now: float) -> None:
 
 
 def note_failure(node: NodeRecord, now: float, jitter: Callable[[], float]) -> None:
-    """A transaction failed without a valid reply. The caller reports the change of health.
+    """Note that a transaction failed without a valid reply. The caller reports the change of health.
 
     A broadcast fails for what its echo was: that says nothing of a node, and there is none to be probed.
     """

@@ -29,6 +29,7 @@ class Histogram:
         self._highest = 0.0
 
     def record(self, seconds: float) -> None:
+        """Record one time, in seconds; a negative one counts as 0."""
         new = self._new
         new.append(seconds)
         if len(new) >= BATCH:
@@ -36,25 +37,29 @@ class Histogram:
 
     @property
     def count(self) -> int:
+        """How many times were recorded."""
         return sum(self._sorted().values())
 
     @property
     def total(self) -> float:
+        """The sum of all times, in seconds."""
         self._sorted()
         return self._total
 
     @property
     def highest(self) -> float:
+        """The longest time, in seconds; 0 when nothing was recorded."""
         self._sorted()
         return self._highest
 
     @property
     def mean(self) -> float:
+        """The mean time, in seconds; 0 when nothing was recorded."""
         count = self.count
         return self._total / count if count else 0.0
 
     def quantile(self, q: float) -> float:
-        """The upper edge of the bucket in which the q-quantile lies, in seconds; 0 when nothing was recorded."""
+        """Return the upper edge, in seconds, of the bucket of the q-quantile, q from 0 to 1; 0 if none was recorded."""
         wanted = q * self.count
         seen = 0
         for edge, count in self.buckets():
@@ -64,7 +69,7 @@ class Histogram:
         return self._highest
 
     def buckets(self) -> list[tuple[float, int]]:
-        """(upper edge in seconds, count) of every bucket in use, ascending."""
+        """Return (upper edge in seconds, count) of every bucket in use, ascending."""
         return [(_upper_edge(bucket), count) for bucket, count in sorted(self._sorted().items())]
 
     def _sorted(self) -> dict[int, int]:

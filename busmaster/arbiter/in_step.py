@@ -72,7 +72,7 @@ class Debt:
     """Where the line went on after a learned window: it may still come, and meet with what is said."""
 
     def of(self, node: NodeRecord | None, now: float) -> bool:
-        """It could be the answer of this node (None: of any) to a request that is made now."""
+        """Return whether it could be the answer of this node (None: of any) to a request that is made now."""
         return now < self.until or (node is not None and self.node is node)
 
 
@@ -82,7 +82,7 @@ class InStep:
     __slots__ = ("_doubt_until", "_doubted", "_said", "alert", "before", "debts", "last")
 
     def __init__(self, strict: bool = False) -> None:
-        """`strict`: as if something had been said twice a moment ago, always."""
+        """Begin with nothing owed. If `strict`, it is always as if something had been said twice a moment ago."""
         self.alert = strict
         """There is something to be careful of: nothing else here matters while this is False."""
         self.debts: list[Debt] = []
@@ -104,7 +104,7 @@ class InStep:
         over: float,
         awaited: Awaited | None = None,
     ) -> None:
-        """Replies that begin with these keys were not heard, see `Debt`."""
+        """Note that replies that begin with these keys were not heard, see `Debt`."""
         self.debts += [Debt(key, node, asked, over, inf, awaited) for key in keys]
         del self.debts[:-MOST_DEBTS]
         self.alert = True
@@ -116,15 +116,16 @@ class InStep:
         self.alert = bool(self.debts or self._doubted or self._doubt_until > now)
 
     def clashes(self, answers: Sequence[bytes], now: float, node: NodeRecord | None = None) -> bool:
-        """Whether an answer that begins with one of these keys, of this node if one is given, could be one owed."""
+        """Return whether an answer beginning with one of these keys, of this node if given, could be one owed."""
         return any(debt.of(node, now) and _could_be(debt, answers) for debt in self.debts)
 
     def over(self, answers: Sequence[bytes]) -> float:
-        """When all that is owed and could look so is later than its node's lateness allows."""
+        """Return when all that is owed and could look so is later than its node's lateness allows."""
         return max((debt.over for debt in self.debts if _could_be(debt, answers)), default=-inf)
 
     def awaited_until(self, last_byte: float, answers: Sequence[bytes] | None = None) -> float:
-        """Until when something may come (that could look so), though the line went on. `last_byte`: when one came."""
+        """Return until when something may come (that could look so), though the line went on; -inf if nothing may.
+        `last_byte` is when a byte came last."""
         until = -inf
         for debt in self.debts:
             if debt.awaited is not None and (answers is None or _could_be(debt, answers)):
@@ -133,7 +134,7 @@ class InStep:
         return until
 
     def owing(self, answers: Sequence[bytes] | None, now: float) -> Iterator[NodeRecord]:
-        """The nodes that owe what could look so (None: anything), and answer, as far as is known."""
+        """Yield the nodes that owe what could look so (None: anything), and answer, as far as is known."""
         for debt in self.debts:
             if debt.node is None or now >= debt.until or not (answers is None or _could_be(debt, answers)):
                 continue
@@ -143,24 +144,24 @@ class InStep:
                 yield debt.node
 
     def ends(self, answers: Sequence[bytes], now: float) -> float:
-        """When what is owed and could look so can be no other node's any more; inf if that is not known."""
+        """Return when what is owed and could look so can be no other node's any more; inf if that is not known."""
         return max((d.until for d in self.debts if now < d.until and _could_be(d, answers)), default=inf)
 
     def forgive(self, answers: Sequence[bytes]) -> None:
-        """There is no unlike exchange to ask: R3's assumption must do, and doubt."""
+        """Forgive what is owed and could look so: nothing unlike can be asked, R3's assumption must do, and doubt."""
         forgiven = [debt for debt in self.debts if _could_be(debt, answers)]
         self._doubted += [(debt.key, debt.asked + LAPSE) for debt in forgiven]
         self.debts = [debt for debt in self.debts if not _could_be(debt, answers)]
 
     def doubtful_answer(self, answers: Sequence[bytes]) -> None:
-        """An answer came that was the oldest debt of its kind, or the answer: one of the two is still owed."""
+        """Pay the oldest debt of this kind: its reply came, or the right answer, and one of the two is still owed."""
         for place, debt in enumerate(self.debts):
             if debt.awaited is None and _could_be(debt, answers):
                 del self.debts[place]
                 return
 
     def answered(self, node: NodeRecord, asked: float, now: float, patience: float) -> None:
-        """A right answer came that could be nobody else's, to what `node` was asked at `asked`.
+        """Note a right answer that could be nobody else's, to what `node` was asked at `asked`.
 
         `patience` is how long a reply is taken to need, in seconds, of a node whose replies were never timed.
         """
@@ -202,8 +203,8 @@ class InStep:
         return payers[0] if payers else None
 
     def _heard_late(self, awaited: list[Debt], run: bytes, now: float) -> Debt | None:
-        """As `heard`, where the line went on before a reply was over. Talkers may have met, and what is left of two can
-        begin like anything: only whole replies pay, and where it is certain who owed them."""
+        """Do as `heard` does, where the line went on before a reply was over. Talkers may have met, and what is left of
+        two can begin like anything: only whole replies pay, and where it is certain who owed them."""
         first = None
         while found := next(((debt, rest) for debt in awaited if (rest := _behind(debt, run)) is not None), None):
             debt, run = found
@@ -216,7 +217,7 @@ class InStep:
         return first
 
     def _owed_byte(self, run: bytes) -> Debt | None:
-        """The debt that the first byte pays: one that is alone, or before more of its kind, or before an owed reply."""
+        """Find the debt that the first byte pays: one alone, or before more of its kind, or before an owed reply."""
         more = run[1:]
         if (
             more
@@ -227,7 +228,8 @@ class InStep:
         return next((debt for debt in self.debts if debt.key and debt.key == run[:1]), None)
 
     def _pay(self, paid: Debt) -> None:
-        """One of several nodes may have paid with the same words: which is not known, so the rest are nobody's."""
+        """Strike the debt off. Where several nodes may have paid with the same words, it is not known which: the rest
+        are nobody's."""
         self.debts.remove(paid)
         for debt in self.debts:
             if debt.key == paid.key and debt.node is not paid.node:
@@ -236,21 +238,21 @@ class InStep:
     # how far an answer can be trusted
 
     def said_twice(self, now: float) -> None:
-        """More was answered than was asked."""
+        """Note that more was answered than was asked: for DOUBT_PERIOD, answers like those heard lately are doubted."""
         self._doubt_until = max(self._doubt_until, now + DOUBT_PERIOD)
         self.alert = True
 
     def said(self, answers: Sequence[bytes], now: float) -> None:
-        """A right answer was delivered; in case it is said again."""
+        """Note that a right answer was delivered, in case it is said again."""
         if now < self._doubt_until:
             self._said.append((answers, now))
 
     def doubts(self, now: float) -> bool:
-        """Something was said twice lately."""
+        """Return whether something was said twice lately."""
         return now < self._doubt_until
 
     def is_doubtful(self, answers: Sequence[bytes], now: float) -> bool:
-        """An answer like this may be one that was overtaken, or one that is said twice."""
+        """Return whether an answer like this may be one that was overtaken, or one that is said twice."""
         if any(until > now and key in answers for key, until in self._doubted):
             return True
         if now >= self._doubt_until:
@@ -264,7 +266,7 @@ class InStep:
 
 
 def _behind(debt: Debt, run: bytes) -> bytes | None:
-    """What comes behind this debt's reply where the run begins with all of it, and it is right; else None."""
+    """Return what comes behind this debt's reply where the run begins with all of it, and it is right; else None."""
     if debt.awaited is None or debt.node is None or len(debt.key) < 2 or not run.startswith(debt.key):
         return None
     try:
@@ -275,15 +277,16 @@ def _behind(debt: Debt, run: bytes) -> bytes | None:
 
 
 def _could_be(debt: Debt, answers: Sequence[bytes]) -> bool:
-    """The reply that is owed could be taken for one of these answers."""
+    """Return whether the reply that is owed could be taken for one of these answers."""
     return debt.key in answers if debt.key else any(len(key) == 1 for key in answers)
 
 
 def _is_silent(debt: Debt) -> bool:
-    """Its node does not answer, as far as is known: another's answer must do. One that does is asked itself."""
+    """Return whether the debt's node does not answer, as far as is known: another's answer must do. A node that does
+    answer is asked itself."""
     return debt.node is None or debt.node.silent or debt.node.last_reply == -inf
 
 
 def _is(run: bytes, key: bytes) -> bool:
-    """These bytes are replies of that key: they begin with it, or are nothing else, where it is one byte."""
+    """Return whether these bytes are replies of that key: begin with it, or are nothing else, where it is one byte."""
     return run == key * len(run) if len(key) == 1 else bool(key) and run.startswith(key)

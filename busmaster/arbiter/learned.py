@@ -80,9 +80,11 @@ class _Largest:
 
     @property
     def value(self) -> float:
+        """The largest of both epochs."""
         return max(self.now, self.before)
 
     def turn(self) -> None:
+        """Begin the next epoch."""
         self.before, self.now = self.now, 0.0
 
 
@@ -195,13 +197,13 @@ class Learning:
         return kind.timings(document, hurry)
 
     def note(self, command: object, packet: bool, begun: float, heard: float, pause: float, byte_time: float) -> None:
-        """A reply came: begun after so many seconds, its first bytes handed over after `heard`, with that `pause`."""
+        """Note a reply: begun after so many seconds, its first bytes handed over after `heard`, with that `pause`."""
         kind = self.kinds.get(type(command))
         if kind is not None:
             kind.note(packet, begun, heard, pause, byte_time)
 
     def doubt(self) -> None:
-        """It was late, or has been away: the document's times, until enough replies have come."""
+        """Go back to the document's times until enough replies have come: the node was late, or has been away."""
         self.returns += 1
         for kind in self.kinds.values():
             kind.doubt()

@@ -50,6 +50,7 @@ class Leg:
         "end",
         "first_bytes",
         "latency",
+        "learns",
         "longest",
         "out",
         "paced",
@@ -66,6 +67,8 @@ class Leg:
         """When the first byte of its reply was received."""
         self.first_bytes = b""
         """What came then, at once."""
+        self.learns = False
+        """Its node's times are learned: how the reply's bytes came is noted."""
         self.pause = 0.0
         """The longest pause, in seconds, between two arrivals of its bytes."""
         self.went_on_at = -inf
@@ -90,7 +93,7 @@ class Leg:
         self.out = max(self.out, now) + count * self.byte_time
 
     def begin(self, timing: ReplyTiming, said: int, longest: int, now: float) -> float:
-        """The host says `said` bytes, and the reply has at most `longest`. Returns when it must have begun."""
+        """Begin a leg of `said` bytes, a reply of at most `longest`, and return when the reply must have begun."""
         self.timing = timing
         self.longest = longest
         self.begun = False
@@ -103,57 +106,58 @@ class Leg:
         return end + timing.window + self.latency
 
     def gap_over(self, now: float) -> float:
-        """When the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
+        """Return when the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
         timing, latency, byte_time = self.timing, self.latency, self.byte_time
-        if self.went_on_at >= self.begun_at and now - self.went_on_at > self.pause:
-            self.pause = now - self.went_on_at
-        self.went_on_at = now
+        if self.learns:
+            if self.went_on_at >= self.begun_at and now - self.went_on_at > self.pause:
+                self.pause = now - self.went_on_at
+            self.went_on_at = now
         due = now + timing.byte_gap + latency + byte_time
         limit = self.end + timing.window + latency + self.longest * byte_time + timing.byte_gap
         return due if due < limit else limit
 
     def echoed(self, now: float) -> float:
-        """The last byte of its echo came: its times start here. When its reply must begin."""
+        """Start the leg's times here, where the last byte of its echo came. Returns when its reply must begin."""
         self.shift(now - self.end)
         return now + self.timing.window + self.latency
 
     def shift(self, seconds: float) -> None:
-        """What was said is out so much later than was thought."""
+        """Note that what was said is out so many seconds later than was thought."""
         self.end += seconds
         self.out += seconds
         self.taint_until += seconds
 
     def quiet(self) -> float:
-        """The silence, in seconds, after which nothing more of a frame can come, or is awaited."""
+        """Return the silence, in seconds, after which nothing more of a frame can come, or is awaited."""
         silence = self.timing.silence
         if silence is None:
             silence = max(QUIET, self.timing.byte_gap)
         return silence + self.latency + self.byte_time
 
     def give_up(self, later: Sequence[LaterLeg]) -> None:
-        """Its reply may still come; then its node goes on by itself with those of the `later` legs that need no word
-        from the host (MSC: the packet after its ACK)."""
+        """Stop waiting for the reply. It may still come; then its node goes on by itself with those of the `later` legs
+        that need no word from the host (MSC: the packet after its ACK)."""
         self._follows = later[0].timing if later and not later[0].sent else None
         if self._follows is not None:
             self._follows_until = self._past(self.end, self._follows)
 
     def answered(self) -> None:
-        """What was answered has left, whatever the baud rate says: not every port keeps to it."""
+        """Note that what was answered has left, whatever the baud rate says: not every port keeps to it."""
         if self.end > self.begun_at:
             self.end = self.out = self.begun_at
 
     def came_unasked(self, now: float) -> None:
-        """Something came: perhaps the reply that was given up, and its next leg begins here. Or it was noise, and the
-        next leg is still to come after that: what is known of it is kept until the line has settled."""
+        """Note that something came: perhaps the reply that was given up, and its next leg begins here. Or it was noise,
+        and the next leg is still to come after that: what is known of it is kept until the line has settled."""
         if self._follows is not None:
             self._follows_until = max(self._follows_until, self._past(now, self._follows))
 
     def settled(self) -> None:
-        """Nothing of it can come any more."""
+        """Note that nothing of the leg can come any more."""
         self._follows = None
 
     def past(self) -> float:
-        """From then on, no byte of a reply to it can be the first one that is received (R3)."""
+        """Return from when on no byte of a reply to it can be the first one that is received (R3)."""
         past = self._past(self.end, self.timing)
         return past if self._follows is None else max(past, self._follows_until)
 

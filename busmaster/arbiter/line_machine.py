@@ -93,10 +93,8 @@ class LineMachine:
     # inputs
 
     def line_up(self, now: float, *, paced: bool = False) -> None:
-        """The port is open. What an earlier master asked may still be answered: settle first.
-
-        `paced`: bytes leave at the baud rate, so that an earlier reply cannot be one (R4).
-        """
+        """Note that the port is open, and settle first: what an earlier master asked may still be answered. If `paced`,
+        bytes leave at the baud rate, so that a reply that comes earlier cannot be one (R4)."""
         if self.state is not OFFLINE or self._closed:
             return
         self._leg.paced = paced and not self._echo.declared
@@ -108,7 +106,7 @@ class LineMachine:
         self._settle(now)
 
     def line_down(self, cause: str, now: float) -> None:
-        """The port is gone: everything fails, and nothing that waited is sent any more (R13)."""
+        """Fail everything, for the port is gone, and send nothing any more of what waited (R13)."""
         if self.state is OFFLINE:
             return
         self._counters.losses += 1
@@ -120,6 +118,7 @@ class LineMachine:
         self.dispatcher.fail_all(now)
 
     def data_received(self, data: bytes, now: float) -> None:
+        """Take bytes as they come: an echo, a reply, or what nobody asked for."""
         if self._echo.owed:
             data = self._strip_echo(data, now)
             if not data:
@@ -133,7 +132,7 @@ class LineMachine:
             self._take(data, now)
 
     def byte_marked(self, mark: Mark, now: float) -> None:
-        """The UART says that a byte came damaged, or a break: whatever it was, it is nobody's answer."""
+        """Note that the UART says that a byte came damaged, or a break: whatever it was, it is nobody's answer."""
         self._counters.mark(mark)
         self._unasked.last_byte = now
         self._echo.forget()
@@ -144,7 +143,7 @@ class LineMachine:
             self._take_unasked(b"\0", now)
 
     def transmitted(self, now: float) -> None:
-        """The port has taken only now what `poll_transmit` gave: whoever held the process up meanwhile."""
+        """Note that the port took what `poll_transmit` gave only now: whoever held the process up meanwhile."""
         wire = self._wire
         said_at = wire.output.said_at
         late = now - said_at
@@ -161,18 +160,18 @@ class LineMachine:
                 wire.transaction.started = now
 
     def line_due(self, now: float) -> bool:
-        """A deadline of the line falls due: `unsent` is to be told first, where it is known."""
+        """Return whether a deadline of the line falls due: `unsent` is to be told first, where it is known."""
         return now >= self._deadlines.line
 
     def unsent(self, count: int, now: float) -> None:
-        """So many of the bytes said have not left: until they have, nothing runs out, nothing else is said and nothing
-        is their answer. Told again, then, before the bytes that come."""
+        """Note that so many of the bytes said have not left: until they have, nothing runs out, nothing else is said
+        and nothing is their answer. The caller tells it again, then, before the bytes that come."""
         again = self._wire.output.unsent(count, now)
         if again is not None:
             self._deadlines.line = self._due_anew(now) if again == inf else again
 
     def _due_anew(self, now: float) -> float:
-        """The deadline of the line, from the end of what has only just left."""
+        """Return the deadline of the line, from the end of what has only just left."""
         if self.state is EXCHANGE:
             return self._wire.due_anew(now)
         if self.state is SETTLING:
@@ -181,7 +180,7 @@ class LineMachine:
         return now + self._leg.timing.turnaround if self.state is HOLDOFF else inf
 
     def handle_timeout(self, now: float, *, unread: bool = False) -> None:
-        """`unread`: bytes have come that were not handed over yet, so the silence of the line is not known."""
+        """Do what is due. If `unread`, bytes have come that were not handed over: the line's silence is not known."""
         deadlines = self._deadlines
         if now >= deadlines.failing:
             self.dispatcher.fail_more(now)
@@ -208,7 +207,7 @@ class LineMachine:
     # one exchange
 
     def _advance(self, now: float) -> bool:
-        """Start the next transaction, right behind our own last byte. False if none waits."""
+        """Start the next transaction, right behind our own last byte. Returns False if none waits."""
         if now < self._quarantine:
             self._settle(now)
             return True
@@ -229,7 +228,7 @@ class LineMachine:
         return True
 
     def _begin_reply(self, data: bytes, now: float) -> bytes:
-        """The first bytes of a leg: returns those that may be its reply."""
+        """Take the first bytes of a leg. Returns those that may be its reply."""
         wire, leg = self._wire, self._leg
         transaction, exchange = wire.transaction, wire.exchange
         assert transaction is not None
@@ -280,7 +279,7 @@ class LineMachine:
                 self._deadlines.line = self._leg.gap_over(now)
 
     def _complete(self, step: Done[Any], now: float) -> None:
-        """A value: the line is free when the closing ACK has left and the node has let go of the line."""
+        """Deliver a value: the line is free when the closing ACK has left and the node has let go of the line."""
         wire, leg = self._wire, self._leg
         transaction, exchange = wire.transaction, wire.exchange
         assert transaction is not None
@@ -356,7 +355,7 @@ class LineMachine:
         self._settle(now, begun=spared)
 
     def _refused(self, refusal: Refused, now: float) -> None:
-        """A NAK to a write is certain; a NAK to a read may be noise before the true reply (R7).
+        """Take a refusal: a NAK to a write is certain; a NAK to a read may be noise before the true reply (R7).
 
         While something is owed, no refusal is certain: it may be an earlier request's (R15).
         """
@@ -386,7 +385,7 @@ class LineMachine:
     # the line between exchanges
 
     def _release(self, hold: float, now: float) -> None:
-        """The outcome was certain: the next request may follow `hold` seconds behind our own last byte."""
+        """Let the next request follow `hold` seconds behind our own last byte: the outcome was certain."""
         if self._closed:
             self._go_offline(now)
         elif hold or not self._advance(now):
@@ -395,7 +394,7 @@ class LineMachine:
             self._deadlines.line = free if free > now else inf
 
     def _settle(self, now: float, begun: bool = False) -> None:
-        """Discard until it has been silent long enough, and nothing can come any more (R3) unless it has `begun`."""
+        """Discard until the line was silent long enough, and nothing can come any more (R3) unless it has `begun`."""
         if self._closed:
             self._go_offline(now)
             return
@@ -410,7 +409,7 @@ class LineMachine:
         self._deadlines.line = self._unasked.look_before(self._silent_at, now)
 
     def _free(self, now: float) -> None:
-        """A holdoff or a settle is over."""
+        """End a holdoff or a settle."""
         if self.state is SETTLING:
             self._leg.settled()
             self._hear_out(self._unasked.silent(), now)
@@ -425,7 +424,7 @@ class LineMachine:
         self._advance(now)
 
     def _take_unasked(self, data: bytes, now: float) -> None:
-        """Bytes that nobody asked for."""
+        """Take bytes that nobody asked for."""
         unasked = self._unasked
         unasked.note(data, now, self._leg.quiet())
         self._leg.came_unasked(now)
@@ -442,13 +441,13 @@ class LineMachine:
             self.dispatcher.fail_all(now)
 
     def _hear_out(self, run: bytes, now: float) -> None:
-        """The line is silent, and this came before: whoever said it, and owed it, is alive (R11, R15)."""
+        """Take what came before this silence: whoever said it, and owed it, is alive (R11, R15)."""
         node = self._trust.hear(self._wire, run, self._unasked, now) if run else None
         if node is not None and node.health is DOWN:
             self.dispatcher.probes.alive(node, now)
 
     def _answer_unasked(self, send: bytes, now: float) -> bool:
-        """True if an answer was owed: then the line settles again, and what was said just now echoes."""
+        """Return True if an answer was owed: then the line settles again, and what was said just now echoes."""
         if send:
             self._wire.say(send, now)
             owed = self._echo.owed
@@ -476,7 +475,7 @@ class LineMachine:
         return rest
 
     def _go_offline(self, now: float) -> None:
-        """Whatever is on the wire is cut off."""
+        """Cut off whatever is on the wire."""
         transaction = self._wire.transaction
         self._enter(OFFLINE, now)
         self.noisy = False

@@ -36,6 +36,7 @@ class OnWire:
         self.transaction = transaction
         self.exchange = exchange
         self.came_unasked = False
+        self.leg.learns = transaction.node.learning is not None
         request, timing = exchange.request, exchange.timing
         due = self.leg.begin(timing, len(request), exchange.sizes.longest, now)
         self._deadlines.line = due if exchange.answered else self.leg.end + timing.turnaround
@@ -77,7 +78,7 @@ class OnWire:
         self.leg.say(len(send), now)
 
     def due_anew(self, now: float) -> float:
-        """The deadline of the leg, where what was said has left only now."""
+        """Return the deadline of the leg, where what was said has left only now."""
         leg, exchange = self.leg, self.exchange
         if leg.begun:
             return leg.gap_over(now)
@@ -85,7 +86,8 @@ class OnWire:
         return now + (leg.timing.window + leg.latency if answered else leg.timing.turnaround)
 
     def _next_leg(self, step: Expect, now: float) -> None:
-        """Raises FrameError instead, where a repeat would hold the line past its limit or an urgent command (R9)."""
+        """Begin the next leg. Raises FrameError instead, where a repeat would hold the line past its limit or an urgent
+        command (R9)."""
         transaction = self.transaction
         assert transaction is not None
         limit = transaction.node.profile.exchange_limit

@@ -27,19 +27,19 @@ class Output:
         """The time from which the leg of what was said last is reckoned."""
 
     def add(self, data: bytes, now: float) -> None:
-        """Say this next."""
+        """Say these bytes next."""
         self.waiting += data
         self.said_at = now
         if self._echo.declared:
             self._echo.sent(data)
 
     def discard(self) -> None:
-        """What has not been handed over is not said, and what the port holds goes with it."""
+        """Drop what has not been handed over: it is not said, and what the port holds goes with it."""
         self.waiting = b""
         self.held = False
 
     def unsent(self, count: int, now: float) -> float | None:
-        """So many bytes have not left. Returns when to ask again; None if all have, inf if they have just left."""
+        """Note how many bytes have not left. Returns when to ask again; None if all left earlier, inf if just now."""
         if count:
             self.held = True
             return now + max(count * self._leg.byte_time, HELD_LOOK)

@@ -35,7 +35,7 @@ def quietest_offset(
 ) -> Generator[int, None, float]:
     """Find the seconds from `now`, below the period, at which this poll's cycles meet the others' least.
 
-    A generator that returns the offset; between, it yields how much it has looked at since, never much more than
+    It is a generator that returns the offset; between, it yields how much it has looked at since, never much more than
     STRIDE. All costs are multiplied by `stretch`. The time in which two polls want the line at once is a function of
     their offset modulo the common divisor of their periods, made of straight pieces; the least sum of all of them lies
     at one of the kinks. Among equals the earliest wins. The search ends early where there would be too many kinks.
@@ -97,7 +97,7 @@ def _least(pairs: Iterable[Pair], own: float, reach: float, pieces: int) -> Gene
 
 
 def _kinks(pair: Pair, own: float, reach: float) -> Iterator[tuple[float, float]]:
-    """Where the overlap with one other poll changes its slope, from before 0 up to `reach`, and by how much."""
+    """Yield where the overlap with one other poll changes its slope, from before 0 up to `reach`, and by how much."""
     begin, length, step, weight = pair
     shorter = min(own, length)
     first = begin - own - step * floor((begin + length) / step)
@@ -111,7 +111,7 @@ def _kinks(pair: Pair, own: float, reach: float) -> Iterator[tuple[float, float]
 
 
 def common_divisor(first: float, second: float) -> float:
-    """The greatest time of which both periods are multiples, within a ten-thousandth of the shorter one."""
+    """Return the greatest time of which both periods are multiples, within a ten-thousandth of the shorter one."""
     first, second = max(first, second), min(first, second)
     least = 1e-4 * second
     while second > least:

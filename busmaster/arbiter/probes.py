@@ -37,7 +37,7 @@ class Probes:
         self._deadlines.health = min(due, free)
 
     def next(self, now: float, usable: bool, idle: bool) -> Transaction | None:
-        """The probe of the node whose turn it is, if the line is `usable`, and the budget allows it or it is free."""
+        """Return the probe of the node in turn, if the line is `usable`, and the budget allows it or it is free."""
         down = [node for node in self.nodes if node.health is DOWN and node.suspended_until <= now]
         if self._running is not None or not down or not usable:
             self._put_off(now)
@@ -57,7 +57,8 @@ class Probes:
         return self._probe(node, cost, now)
 
     def spare(self, cost: float, now: float) -> bool:
-        """Pay for a caller's request to a dead node, if the budget holds that beside the probe that is due."""
+        """Pay for a caller's request to a dead node, if the budget holds that beside the probe that is due. Returns
+        whether it did."""
         # The probe that is due keeps its share: else a caller that asks a dead node again and again would spend all
         # there is, and the other dead ones would never be found to be back.
         due = max((n.lateness for n in self.nodes if n.health is DOWN and n.probe_at <= now), default=0.0)
@@ -66,19 +67,19 @@ class Probes:
         return self.budget.take(cost, now)
 
     def alive(self, node: NodeRecord, now: float) -> None:
-        """A dead node was heard: it will answer its probe, which therefore costs nothing."""
+        """Note that a dead node was heard: it will answer its probe, which therefore costs nothing."""
         node.probe_at = min(node.probe_at, now)
         self.budget.refund(node.lateness)
         self.plan()
 
     def over(self, probe: Transaction) -> None:
-        """This transaction has ended; it may have been the probe that was out."""
+        """Note that this transaction has ended; it may have been the probe that was out."""
         if probe is self._running:
             self._running = None
             self.plan()
 
     def _is_free(self, node: NodeRecord, now: float, idle: bool) -> bool:
-        """Nobody waits, nothing is due before the probe is over, or nobody lives whom it could delay."""
+        """Return whether nobody waits, nothing is due before the probe is over, or nobody lives whom it could delay."""
         if not idle or now < self._free_at:
             return False
         return now + node.lateness < self._deadlines.schedule or all(other.health is DOWN for other in self.nodes)
@@ -93,7 +94,7 @@ class Probes:
         return probe
 
     def _put_off(self, now: float) -> None:
-        """Look again when the next is due; a free one may have to wait for the line to be idle."""
+        """Look again when the next probe is due; a free one may have to wait for the line to be idle."""
         self.plan()
         if self._deadlines.health <= now:
             self._deadlines.health = now + LONGEST_BUDGET_WAIT

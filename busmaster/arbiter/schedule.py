@@ -28,10 +28,11 @@ AT_ONCE = 32
 
 
 def line_time(exchange: Exchange[Any], byte_time: float, reply_time: float | None = None) -> float:
-    """Seconds of the line that one undisturbed attempt takes: bytes both ways, and the wait before each reply leg.
+    """Return the seconds of the line that one undisturbed attempt takes.
 
-    `reply_time` is the node's measured time to its first byte; where it is None, half of `nominal` is assumed.
-    The one function by which merging, phases and planning weigh exchanges.
+    These are bytes both ways, and the wait before each reply leg. `reply_time` is the node's measured time to its first
+    byte; where it is None, half of `nominal` is assumed.
+    This is the one function by which merging, phases and planning weigh exchanges.
     """
     sent = len(exchange.request) + exchange.closing
     timing = exchange.timing
@@ -64,7 +65,7 @@ class Schedule:
         self._left_over_at = inf
 
     def add(self, poll: Poll, now: float) -> None:
-        """A poll without a phase gets one when it is first due: those added together are placed jointly.
+        """Put a poll on it. One without a phase gets it when first due: those added together are placed jointly.
 
         Raises InvalidCommand for a poll that is, or was, on it.
         """
@@ -76,7 +77,7 @@ class Schedule:
         self.prepare(poll, now)
 
     def prepare(self, poll: Poll, now: float) -> None:
-        """Do its preparation: as far as one slice of work goes at once, where no other work waits."""
+        """Do the poll's preparation: as far as one slice of work goes at once, where no other work waits."""
         if not poll.active:
             return
         if poll.preparation is None:
@@ -90,7 +91,7 @@ class Schedule:
         self._work_at = now if self.unplaced() else inf
 
     def remove(self, poll: Poll) -> None:
-        """What is planned for it is left out when its turn comes."""
+        """Take a poll off the schedule: what is planned for it is left out when its turn comes."""
         if poll.active:
             poll.active = False
             poll.preparation = None
@@ -102,20 +103,21 @@ class Schedule:
                 self._work_at = inf
 
     def demand(self, poll: Poll) -> None:
-        """One cycle off the grid, with the next call of `begin`; of a poll that is being prepared, after that."""
+        """Run one cycle off the grid, with the next call of `begin`; of a poll that is being prepared, after that."""
         if poll.preparation is not None:
             poll.wanted = True
         else:
             self._demanded.append(poll)
 
     def next_due(self) -> float:
+        """Return when something is due next: a cycle, work, or what was left over; inf if nothing is."""
         heap = self._heap
         while heap and not heap[0][2].active:
             heapq.heappop(heap)
         return min(heap[0][0] if heap else inf, self._work_at, self._left_over_at)
 
     def begin(self, now: float) -> list[Transaction]:
-        """The transactions, ready to be queued, of cycles that start now: at most AT_ONCE of them."""
+        """Return the transactions, ready to be queued, of cycles that start now: at most AT_ONCE of them."""
         due = self.release(now)
         while self._demanded:
             poll = self._demanded.popleft()
@@ -134,7 +136,7 @@ class Schedule:
         return begun
 
     def release(self, now: float) -> list[Poll]:
-        """The polls whose cycle starts now, each with `due` set. Cycles that could not start are counted missed."""
+        """Return the polls whose cycle starts now, `due` set. Cycles that could not start are counted missed."""
         if self._work_at <= now:
             self.work(now)
         starting: list[Poll] = []
@@ -150,7 +152,7 @@ class Schedule:
         return starting
 
     def _starts(self, poll: Poll, now: float) -> bool:
-        """The first of the heap is due: put it back where it is due next."""
+        """Put the first poll of the heap, which is due, back where it is due next. Returns whether its cycle starts."""
         # From the number of the period, never by adding periods up: sums of floats drift, and a grid must not (R10).
         behind = floor((now - poll.base) / poll.period) - poll.number
         if poll.base + (poll.number + max(behind, 0) + 1) * poll.period <= now:
@@ -172,7 +174,7 @@ class Schedule:
     # what cannot start yet
 
     def work(self, now: float) -> None:
-        """One slice. Short periods are placed first: what is left free then repeats, and longer periods find it."""
+        """Do one slice. Short periods are placed first: what is left free then repeats, and longer periods find it."""
         left = SLICE
         while left > 0 and self.unplaced():
             left -= self._prepare(now) if self._preparing else self._place(now)
@@ -180,7 +182,7 @@ class Schedule:
             self._work_at = inf
 
     def unplaced(self) -> bool:
-        """Whether some poll cannot start yet: it is prepared, or placed, by further calls of `work` or `release`."""
+        """Return whether some poll cannot start yet: further calls of `work` or `release` prepare it, or place it."""
         while self._preparing and not self._preparing[0].active:
             self._preparing.popleft()
         while self._unplaced and not self._unplaced[0][2].active:
@@ -190,7 +192,7 @@ class Schedule:
         return bool(self._preparing or self._unplaced) or self._placing is not None
 
     def _prepare(self, now: float) -> int:
-        """One step; the units that it took."""
+        """Do one step of a poll's preparation. Returns the units that it took."""
         poll = self._preparing[0]
         units = None if poll.preparation is None else next(poll.preparation, None)
         if units is not None:
@@ -211,7 +213,7 @@ class Schedule:
             self._demanded.append(poll)
 
     def _place(self, now: float) -> int:
-        """One step; the units that it took."""
+        """Do one step of placing a poll. Returns the units that it took."""
         if self._placing is None:
             poll = heapq.heappop(self._unplaced)[2]
             self._placing = poll, now, self._search(poll, now)
@@ -226,7 +228,7 @@ class Schedule:
             return 1
 
     def _search(self, poll: Poll, now: float) -> Generator[int, None, float]:
-        """Where it meets those that have their place, if all spread over the time that there is."""
+        """Find where it meets least those that have their place, if all spread over the time that there is."""
         load = 0.0
         others = []
         for number, other in enumerate(tuple(self.polls), 1):
@@ -238,7 +240,7 @@ class Schedule:
         return (yield from quietest_offset(poll, others, now, FILL / load if load else 1.0))
 
     def _start(self, poll: Poll, base: float, now: float) -> None:
-        """Its grid begins with the first time from now on."""
+        """Begin the poll's grid with its first time from now on."""
         poll.placed = True
         poll.base = base + ceil((now - base) / poll.period) * poll.period
         poll.number = 0

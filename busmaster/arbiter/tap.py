@@ -76,7 +76,7 @@ class Attempt:
         self.ended_at = -inf
 
     def end(self, verdict: Verdict, result: Any, now: float) -> None:
-        """Say how it ended."""
+        """Say how the attempt ended."""
         self.result = result
         self.ended_at = now
         self.verdict = verdict  # last: whoever looks from another thread finds the rest
@@ -87,7 +87,7 @@ class Attempt:
         return self.command.open(self.address, self.timings).request
 
     def __str__(self) -> str:
-        """The command and what came of it: "read element 100: 12.5"."""
+        """Return the command and what came of it: "read element 100: 12.5"."""
         ok = self.verdict is Verdict.OK
         result = ("ok" if self.result is None else repr(self.result)) if ok else self.result
         return f"{self.command}: {result}"

@@ -24,6 +24,7 @@ class TappedDispatcher(Dispatcher):
         self._numbers: dict[Transaction, int] = {}
 
     def started(self, transaction: Transaction, now: float) -> None:
+        """Begin the attempt that goes out now, with the number of its transaction."""
         super().started(transaction, now)
         if transaction.attempts == 1:
             self._numbers[transaction] = next(self._order_of_transactions)
@@ -39,25 +40,30 @@ class TappedDispatcher(Dispatcher):
         )
 
     def succeeded(self, transaction: Transaction, value: Any, now: float) -> None:
+        """Tell that the attempt brought a value."""
         self._over(transaction, Verdict.OK, value, now)
         super().succeeded(transaction, value, now)
 
     def attempt_failed(
         self, transaction: Transaction, no_reply: bool, what: str, now: float, doubted: bool = False
     ) -> None:
+        """Tell that the attempt failed, and how."""
         verdict = Verdict.NO_REPLY if no_reply else Verdict.SPOILT if what in SPOILING else Verdict.GARBLED
         self._over(transaction, Verdict.DOUBTED if doubted else verdict, what, now)
         super().attempt_failed(transaction, no_reply, what, now, doubted)
 
     def broken(self, transaction: Transaction, bug: Exception, now: float) -> None:
+        """Tell that the protocol's reader failed on what came."""
         self._over(transaction, Verdict.GARBLED, f"a bug in the protocol's reader: {bug!r}", now)
         super().broken(transaction, bug, now)
 
     def refused(self, transaction: Transaction, refusal: Refused, certain: bool, now: float) -> None:
+        """Tell that the node refused."""
         self._over(transaction, Verdict.REFUSED, refusal.what, now)
         super().refused(transaction, refusal, certain, now)
 
     def cut_off(self, transaction: Transaction, error: BusError, now: float) -> None:
+        """Tell that the line was lost under the attempt."""
         self._over(transaction, Verdict.CUT_OFF, error.what, now)
         super().cut_off(transaction, error, now)
 

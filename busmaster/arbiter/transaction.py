@@ -144,7 +144,7 @@ class Transaction:
         self.reset()
 
     def reset(self) -> None:
-        """Fresh for its (next) run: a poll's transaction lives as long as the poll."""
+        """Make it fresh for its (next) run: a poll's transaction lives as long as the poll."""
         self.phase = IDLE
         self.attempts = 0
         self.retried = 0
@@ -175,6 +175,8 @@ class Transaction:
         return node.learning.timings(self.command, node.timings, hurry)
 
     def timeline(self) -> Timeline:
+        """Return when its steps happened, None for those that did not, and what went ahead of it."""
+
         def known(time: float) -> float | None:
             return None if time == -inf else time
 
@@ -254,7 +256,9 @@ class Poll:
 
     @property
     def running(self) -> bool:
+        """Whether its last cycle still runs."""
         return self.remaining > 0
 
     def next_due(self) -> float:
+        """Return when its next cycle is due on the grid."""
         return self.base + self.number * self.period

@@ -37,7 +37,7 @@ class Trust:
         """An answer that is delivered only if no other comes meanwhile."""
 
     def weigh(self, wire: OnWire, step: Done[Any], now: float) -> str | float | None:
-        """Weigh an answer: None if it is believed, else why not; or until when it is `held`."""
+        """Weigh an answer. Returns None if it is believed, else why not; or until when it is `held`."""
         transaction, exchange, leg = wire.transaction, wire.exchange, wire.leg
         assert transaction is not None
         assert exchange is not None
@@ -61,8 +61,8 @@ class Trust:
         return None
 
     def owe(self, wire: OnWire, *, heard: bool, whole: bool = False) -> None:
-        """An attempt ends: its reply may still come. What was `heard` was not it, and may have been a part of it; a
-        `whole` one lacks nothing but what noise may have pushed out at its end."""
+        """Note that an attempt ends: its reply may still come. What was `heard` was not it, and may have been a part of
+        it; a `whole` one lacks nothing but what noise may have pushed out at its end."""
         exchange, transaction = wire.exchange, wire.transaction
         assert transaction is not None
         assert exchange is not None
@@ -80,7 +80,7 @@ class Trust:
             self._in_step.owe(keys, transaction.node, leg.end, over, awaited)
 
     def hear(self, wire: OnWire, run: bytes, unasked: UnaskedBytes, now: float) -> NodeRecord | None:
-        """The line is silent, and this came before. Returns who owed it, if that is known."""
+        """Take what came before this silence of the line. Returns who owed it, if that is known."""
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
         if paid is not None and node is not None and node.learning is not None and paid.awaited is not None:

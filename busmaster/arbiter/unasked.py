@@ -45,7 +45,7 @@ class UnaskedBytes:
         """The request that was not answered: its node, when it was out, its lateness. What comes may be its reply."""
 
     def note(self, data: bytes, now: float, quiet: float) -> None:
-        """Count them; `quiet` is the silence, in seconds, after which a run of noise is over."""
+        """Count these bytes; `quiet` is the silence, in seconds, after which a run of noise is over."""
         self._counters.unasked_bytes += len(data)
         if len(self.run) < LONGEST_RUN:
             self.run += data
@@ -56,11 +56,11 @@ class UnaskedBytes:
         self.blame(now)
 
     def babbling(self, now: float) -> bool:
-        """They have not paused for so long that nothing can be sent."""
+        """Return whether unasked bytes have not paused for so long (NOISY_AFTER) that nothing can be sent."""
         return now - self._noise_since >= NOISY_AFTER
 
     def silent(self) -> bytes:
-        """The line is silent: returns what came before."""
+        """Note that the line is silent. Returns what came before."""
         self._noise_since = inf
         run = bytes(self.run)
         self.run.clear()
@@ -69,19 +69,20 @@ class UnaskedBytes:
     # stragglers (R3)
 
     def unanswered(self, node: NodeRecord, asked: float, lateness: float) -> None:
-        """A request, out since `asked`, got no reply within its window; what comes next may be its straggler."""
+        """Note that a request, out since `asked`, got no reply in its window; what comes next may be its straggler."""
         self.unanswered_one = (node, asked, lateness)
 
     def answered(self) -> None:
+        """Note that no request is unanswered any more: what comes next is nobody's straggler."""
         self.unanswered_one = None
 
     def looked(self, now: float, due: float) -> None:
-        """Nothing lies unread now, and the line is looked at again by `due`: so well is a straggler's age known."""
+        """Note that nothing lies unread, and the next look is due by `due`: so well is a straggler's age known."""
         self._looked = now
         self._look_at = due
 
     def look_before(self, due: float, now: float) -> float:
-        """When to look at the line again, where nothing is to be done before `due`."""
+        """Return when to look at the line again, where nothing is to be done before `due`."""
         if self.unanswered_one is not None and now - self.unanswered_one[1] > STRAGGLER_MEMORY:
             self.unanswered_one = None
         if self.unanswered_one is not None:
@@ -90,7 +91,7 @@ class UnaskedBytes:
         return due
 
     def blame(self, first_byte: float) -> None:
-        """A reply came long after its request: its node is slower than was believed, so its lateness is raised."""
+        """Raise the lateness of a node whose reply came long after its request: it is slower than was believed."""
         if self.unanswered_one is None:
             return
         node, asked, lateness = self.unanswered_one
@@ -105,7 +106,7 @@ class UnaskedBytes:
             self._events.append(LatenessRaised(node, age, raised))
 
     def blame_for(self, node: NodeRecord, asked: float, first_byte: float) -> None:
-        """The reply to an earlier request came, though the line had gone on."""
+        """Blame the node whose reply to an earlier request came, though the line had gone on."""
         self.unanswered(node, asked, node.timings.read.lateness)
         self.looked(first_byte, first_byte)
         self.blame(first_byte)
@@ -113,7 +114,7 @@ class UnaskedBytes:
     # what may be owed an answer: MSC sends a packet again until it is ACKed
 
     def reply_to(self, data: bytes) -> bytes:
-        """What must be said to these bytes, if anything."""
+        """Return what must be said to these bytes, if anything."""
         if self.listener is None:
             return b""
         try:
@@ -125,7 +126,7 @@ class UnaskedBytes:
         return step.send if isinstance(step, Done) else b""
 
     def reply_to_silence(self) -> bytes:
-        """What must be said to a packet that was cut off, if anything."""
+        """Return what must be said to a packet that was cut off, if anything."""
         if self.listener is None or not self._listening:
             return b""
         self._listening = False

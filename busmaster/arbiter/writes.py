@@ -17,18 +17,18 @@ class Writes:
         self._backlog = backlog
 
     def is_first(self, write: Transaction) -> bool:
-        """Whether no earlier write to its node is under way."""
+        """Return whether no earlier write to its node is under way."""
         return self.queues[write.node][0] is write
 
     def park(self, write: Transaction) -> None:
-        """Have it wait behind an earlier write to its node, and lend that one its class."""
+        """Have the write wait behind an earlier write to its node, and lend that one its class."""
         write.phase = PARKED
         first = self.queues[write.node][0]
         if first.priority > write.priority and first.phase is QUEUED:
             self._backlog.promote(first, write.priority)
 
     def over(self, write: Transaction) -> None:
-        """It has ended: the next one of its node may go."""
+        """Note that the write has ended: the next one of its node may go."""
         writes = self.queues[write.node]
         if writes and writes[0] is write:
             writes.popleft()

@@ -134,7 +134,7 @@ class Bus:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Waiting callers get BusClosed at once; the exchange on the wire may end, within its own window."""
+        """Close the bus: waiting callers get BusClosed at once; the exchange on the wire may end, in its own window."""
         self.check_loop()
         self._line.closed = True
         for group in self.groups:
@@ -148,7 +148,7 @@ class Bus:
                 await self._let_go()
 
     async def _let_go(self) -> None:
-        """Nothing is on the wire, or nobody waits for its end."""
+        """Close the port, as nothing is on the wire, or nobody waits for its end."""
         assert self._connection is not None
         self._line.unbind()
         try:
@@ -271,7 +271,7 @@ class Bus:
         return self.pump.clock()
 
     def wall_time(self) -> float:
-        """The same moment in seconds since 1970, by the machine's clock."""
+        """Return the same moment as `now` in seconds since 1970, by the machine's clock."""
         return self.now() + self._line.wall_offset()
 
     @property
@@ -389,7 +389,7 @@ class Bus:
         return next((node.profile.line for node in self._nodes.values()), LineSettings(9600))
 
     def _asked(self) -> list[Read]:
-        """Every kind of command that was asked of a node, once for all nodes with the same timings."""
+        """Return every kind of command that was asked of a node, once for all nodes with the same timings."""
         nodes = self._nodes.values()
         asked = {
             (id(node.record.profile), id(node.record.timings), kind): (node, command)
@@ -415,13 +415,13 @@ class Bus:
         )
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
-        """A task of the bus's own: a task group would tie entering and leaving the bus to one task."""
+        """Start a task of the bus's own: a task group would tie entering and leaving the bus to one task."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     async def _run_hook(self, node: Node) -> None:
-        """A hook that fails must not take the bus down: the node's polls resume all the same.
+        """Run a node's hook. One that fails must not take the bus down: the node's polls resume all the same.
 
         A node that comes back again while its hook still runs gets another run of it, after that one.
         """

@@ -48,7 +48,7 @@ class Handle(ABC):
 
     @abstractmethod
     async def read(self, item: Any, /, **options: Unpack[ReadOptions]) -> Any:
-        """What an item holds now. `RequestOptions` says what the options are."""
+        """Return what an item holds now. `RequestOptions` says what the options are."""
 
     @abstractmethod
     async def write(self, item: Any, value: Any, /, **options: Unpack[WriteOptions]) -> None:

@@ -288,7 +288,7 @@ class Node:
         return transaction, line.pump.transact(transaction)
 
     def _give_up(self, transaction: Transaction) -> None:
-        """Nobody waits for it any more. A write that is on the wire now is over before anything else can be read."""
+        """Cancel what nobody waits for any more. A write that is on the wire ends before anything else can be read."""
         line = self.shared
         line.pump.cancel(transaction)
         # Its end is told to nobody, but what it may have changed is: samples that were read before it are stale now.

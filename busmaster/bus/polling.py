@@ -293,7 +293,7 @@ class PollGroup:
         poll.cost = sum(read.line_time for read in reads)
 
     def _reads(self, merged: bool) -> Generator[int, None, list[_Read]]:
-        """Two points with one command behind them cost one exchange, and merges are taken where they are cheaper."""
+        """Choose the reads: points with one command share an exchange, and merges are taken where they are cheaper."""
         behind: dict[Node, dict[Command[Any], list[Point[Any]]]] = {}
         for point, node in tuple(self._points.items()):
             behind.setdefault(node, {}).setdefault(point.command, []).append(point)
@@ -329,7 +329,7 @@ class PollGroup:
         return _Read(node, served, points, bytes_time, unwaited, 1 + len(exchange.later), guess, blank)
 
     def _sound(self, merge: Merge, node: Node | None = None) -> Merge:
-        """The same merge without what this node (or any, if None) has refused."""
+        """Return the same merge without what this node (or any, if None) has refused."""
         refused = {command for who, command in self._refused if node in (None, who)}
 
         def sound(commands: Sequence[Command[Any]]) -> Sequence[Batch]:
@@ -338,13 +338,13 @@ class PollGroup:
         return sound if refused else merge
 
     def _fall_back(self) -> None:
-        """A batch that was refused says nothing of its commands: they are asked at once, one by one."""
+        """Ask the commands of a refused batch at once, one by one: the refusal says nothing of them."""
         self._refused |= {(read.node, read.served.command) for read in self._refusals}
         self._choose()
         self._line.demand(self._poll)
 
 
 def _measure(transaction: Transaction, read: _Read) -> None:
-    """The mean of what the node takes to reply, over the last of its replies."""
+    """Note what the node takes to reply, as the mean over the last of its replies."""
     if transaction.attempts == 1:  # of a repeated one, the time includes what the failed attempts cost
         read.node.note_wait((transaction.last_byte - transaction.started - read.bytes_time) / read.legs)

@@ -142,11 +142,11 @@ class Requester(Protocol):
         ...
 
     def now(self) -> float:
-        """The line's clock, in seconds."""
+        """Return the time of the line's clock, in seconds."""
         ...
 
     def latest(self, point: Hashable, /) -> Sample[Any] | None:
-        """The youngest good sample of a point in any poll group, unless a write has made it stale."""
+        """Return the youngest good sample of a point in any poll group, unless a write has made it stale."""
         ...
 
     def merge_reads(self, merge: Merge, /) -> None:

@@ -55,13 +55,13 @@ class SharedLine:
         return self.thread != 0
 
     def bind(self, loop: asyncio.AbstractEventLoop) -> None:
-        """The bus is open from now on, and used from this thread, by this loop."""
+        """Note that the bus is open from now on, and used from this thread, by this loop."""
         self.loop_runs = loop.is_running
         self.pump.bind(loop)
         self.thread = get_ident()
 
     def unbind(self) -> None:
-        """It is open no longer."""
+        """Note that the bus is open no longer."""
         self.thread = 0
 
     # time
@@ -140,7 +140,10 @@ class SharedLine:
             self._check_elsewhere()
 
     def _check_elsewhere(self) -> None:
-        """Its loop does not run here: right only in its own thread, between two runs of the loop."""
+        """Check a use while its loop does not run here: right only in its own thread, between two runs of the loop.
+
+        Raises InvalidCommand elsewhere.
+        """
         if get_ident() != self.thread or running_loop() is not None:
             raise InvalidCommand(
                 f"the bus on {self.name} was used from thread {current_thread().name!r} outside the "

@@ -112,6 +112,7 @@ class Tally:
                 self.settling_ahead += transaction.settling_ahead
 
     def statistics(self, poll: Poll) -> GroupStatistics:
+        """Return an immutable snapshot of the group's counts."""
         cycles = self.cycles
         return GroupStatistics(
             cycles=cycles,

@@ -46,7 +46,10 @@ class _Exchange:
         return self.kind is not None and self.node is not None and self.node == self.kind.profile.broadcast
 
     def is_behind(self, frame: Frame) -> bool:
-        """By the frames alone: it came from a node after the answer, or before anything was asked."""
+        """Return whether a frame is from a node after the answer, or before anything was asked.
+
+        This is judged by the frames alone.
+        """
         if self.attempt is not None and self.request is None:
             return False  # its protocol is not known here: the frames say nothing
         if frame.fault == UNASKED or self.request is None or self.released:
@@ -59,14 +62,14 @@ class _Exchange:
         return frame.kind is Kind.NOISE
 
     def outcome(self) -> tuple[Outcome, str]:
-        """How it ended, and that in words."""
+        """Return how the exchange ended, and that in words."""
         attempt = self.attempt
         if attempt is None or attempt.verdict is None:
             return self.judge()
         return Outcome[attempt.verdict.name], str(attempt)
 
     def judge(self) -> tuple[Outcome, str]:
-        """By the frames alone."""
+        """Return, by the frames alone, how the exchange ended, and that in words."""
         asked, last = self.request, self.last
         if asked is None:
             return Outcome.NONE, ""
@@ -199,7 +202,7 @@ class Assembler:
             packet.transaction, packet.attempt = attempt.transaction, attempt.number
 
     def _straggler(self) -> str:
-        """What a stray may be, if that is known."""
+        """Return what a stray may be, "" if that is not known."""
         attempt = self._exchange.attempt
         late = self._told and attempt is not None and attempt.verdict is Verdict.NO_REPLY
         return f"perhaps a late answer to {attempt.command}" if late and attempt is not None else ""
@@ -209,9 +212,9 @@ class Assembler:
         return "" if self._kind is None else self._kind.name
 
     def _strip_echo(self, data: bytes) -> bytes:
-        """What is not the echo of what was sent last, or before that (MSC's closing ACK comes with the next request).
+        """Return what is not the echo of what was sent last, or before that.
 
-        An echo that differs is left as it came: the line collided.
+        MSC's closing ACK comes with the next request. An echo that differs is left as it came: the line collided.
         """
         for owed in (self._sent, self._echo_owed):
             length = min(len(owed), len(data))
@@ -222,7 +225,7 @@ class Assembler:
         return data
 
     def _decoder(self) -> Decoder | None:
-        """Of what is spoken; None where that is not known."""
+        """Return the decoder of what is spoken; None where that is not known."""
         if self._name and self._name not in self._decoders:
             self._decoders[self._name] = Decoder(find(self._name).protocol.dialect())
         return self._decoders.get(self._name)
@@ -238,7 +241,7 @@ class Assembler:
             self._take(frame)
 
     def _rest(self) -> None:
-        """What the node left unfinished stays so."""
+        """Take what the node left unfinished as it is."""
         decoder = self._decoder()
         for frame in decoder.quiet() if decoder else ():
             self._take(frame)

@@ -24,14 +24,18 @@ class Dialect(Protocol):
     """The bytes that can begin a frame."""
 
     def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
-        """Length of the frame that `data`, never empty, begins with.
+        """Return the length of the frame that `data`, never empty, begins with.
 
-        0: not whole yet. Below 0: that many bytes are no frame. With `quiet` nothing more follows: never 0.
+        A length of 0 says that the frame is not whole yet; one below 0 that so many bytes are no frame. With `quiet`
+        nothing more follows, and the length is never 0.
         """
         ...
 
     def explain(self, raw: bytes, sender: Direction, /) -> Frame:
-        """What a whole frame says. `sender` UNKNOWN: it is inferred from the frame and what was asked before."""
+        """Return what a whole frame says.
+
+        A `sender` that is UNKNOWN is inferred from the frame and what was asked before.
+        """
         ...
 
     def command(self, request: Frame, continued: Sequence[Frame], /) -> Command[Any]:
@@ -72,7 +76,7 @@ class Decoder:
         return frames
 
     def quiet(self) -> list[Frame]:
-        """What is unfinished ends here: the line was silent for the gap, or somebody else began to speak."""
+        """End what is unfinished here: the line was silent for the gap, or somebody else began to speak."""
         frames: list[Frame] = []
         self._cut(frames, quiet=True)
         self._flush(frames)
@@ -116,7 +120,7 @@ class Decoder:
         self._rejected += raw
 
     def _flush(self, frames: list[Frame]) -> None:
-        """What could not be read becomes one frame of its own."""
+        """Make one frame of its own of what could not be read."""
         if not self._rejected:
             return
         raw = bytes(self._rejected)

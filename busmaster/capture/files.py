@@ -47,7 +47,7 @@ class CaptureFiles:
         return len(data)
 
     def flush(self) -> None:
-        """Raises OSError where not all can be written; the rest is kept."""
+        """Write what was taken. Raises OSError where not all can be written; the rest is kept."""
         while self._pending:
             written = self._file.write(self._pending) or 0
             del self._pending[:written]
@@ -63,14 +63,17 @@ class CaptureFiles:
         self._size = 0
 
     def close(self) -> None:
-        """Raises OSError where not all can be written, or where the disk says so late."""
+        """Write the rest and close the file.
+
+        Raises OSError where not all can be written, or where the disk says so late.
+        """
         try:
             self.flush()
         finally:
             self._file.close()
 
     def _new(self) -> io.FileIO:
-        """The next one that is not there yet."""
+        """Open the next file that is not there yet."""
         while True:
             self.path = self._name()
             try:
@@ -87,7 +90,7 @@ class CaptureFiles:
         return self._wanted if self._number == 1 else f"{root}-{self._number}{extension}"
 
     def _remove(self, path: str) -> None:
-        """One that somebody has moved away is his."""
+        """Remove a file of ours; one that somebody has moved away is his."""
         try:
             os.unlink(path)
         except FileNotFoundError:

@@ -112,6 +112,7 @@ class PcapngWriter:
         self._interface_of("")
 
     def write(self, packet: Packet) -> None:
+        """Write one packet."""
         interface = self._interface_of(packet.protocol)
         node = NO_NODE if packet.node is None else packet.node
         capture_id = find(packet.protocol).capture_id if packet.protocol else 0
@@ -128,12 +129,12 @@ class PcapngWriter:
         self._write(_PACKET, fixed + _padded(data) + options)
 
     def finish(self, micros: int, dropped: int) -> None:
-        """The closing statistics: how many events were dropped in all."""
+        """Write the closing statistics: how many events were dropped in all, at `micros` since 1970."""
         fixed = struct.pack("<III", 0, micros >> 32, micros & 0xFFFFFFFF)
         self._write(_STATISTICS, fixed + _options((_IF_DROPPED, struct.pack("<Q", dropped))))
 
     def _interface_of(self, protocol: str) -> int:
-        """The number of a protocol's interface, which is described in the file before its first packet."""
+        """Return the number of a protocol's interface, which is described in the file before its first packet."""
         if protocol not in self._interfaces:
             self._interfaces[protocol] = len(self._interfaces)
             options = _options(
@@ -150,8 +151,10 @@ class PcapngWriter:
 
 
 def read_packets(file: BinaryIO) -> Iterator[Packet]:
-    """The packets of a capture of ours, in order. Raises CaptureError for any other file, and CutOff, behind all
-    that is whole, for one that ends in mid-block."""
+    """Yield the packets of a capture of ours, in order.
+
+    Raises CaptureError for any other file, and CutOff, behind all that is whole, for one that ends in mid-block.
+    """
     interfaces: list[_Interface] = []
     for kind, body, order in _blocks(file):
         if kind == _SECTION:
@@ -213,12 +216,12 @@ def _packet(micros: int, protocol: str, data: bytes, options: list[tuple[int, by
 
 
 def _by_id() -> dict[int, str]:
-    """The protocols of older files."""
+    """Return the protocols of older files."""
     return {0: "", **{kind.capture_id: kind.name for kind in kinds().values() if kind.capture_id}}
 
 
 def _blocks(file: BinaryIO) -> Iterator[tuple[int, bytes, str]]:
-    """Kind, body and byte order ("<" or ">") of each block."""
+    """Yield kind, body and byte order ("<" or ">") of each block."""
     order = "<"
     first = True
     while head := file.read(8):
@@ -247,7 +250,7 @@ def _padded(data: bytes) -> bytes:
 
 
 def _options(*options: tuple[int, bytes | None]) -> bytes:
-    """The options that are not None, and their end; nothing at all if every one is."""
+    """Return the options that are not None, and their end; nothing at all if every one is."""
     given = ((code, value) for code, value in options if value is not None)
     coded = b"".join(struct.pack("<HH", code, len(value)) + _padded(value) for code, value in given)
     return coded + bytes(4) if coded else b""

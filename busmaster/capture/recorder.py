@@ -119,7 +119,7 @@ class Recorder:
     # elsewhere
 
     def close(self) -> None:
-        """Write what waits and close the file. Never raises; may be called twice."""
+        """Write what waits and close the file. It never raises, and may be called twice."""
         self._stop.set()
         self._thread.join()
 
@@ -162,7 +162,7 @@ class Recorder:
         self._events.clear()
 
     def _drain(self) -> None:
-        """In small helpings, so that the loop never waits long for the interpreter."""
+        """Write what waits in small helpings, so that the loop never waits long for the interpreter."""
         handled = 0
         while self._events and self.error is None:
             self._handle(self._events.popleft())
@@ -180,7 +180,10 @@ class Recorder:
         self._try(self._files.flush)
 
     def _begin_next(self) -> None:
-        """Between two events: those of one exchange that is not over yet are all in the next file."""
+        """Go on in a new file, between two events.
+
+        Those of one exchange that is not over yet are all in the next file.
+        """
         self._writer.finish(round(time.time() * 1e6), self.dropped)
         if self._try(self._files.begin_next):
             self._writer = PcapngWriter(self._files, port=self._port)

@@ -44,7 +44,10 @@ class Result:
         return f"{name}: {text}" if text else name
 
     def same_as(self, now: Result) -> bool:
-        """By the value as it was shown if that is known, else by the numbers. Wordings of failures do not count."""
+        """Return whether both are the same: by the value as it was shown if that is known, else by the numbers.
+
+        Wordings of failures do not count.
+        """
         if self.outcome is not Outcome.OK or now.outcome is not Outcome.OK:
             return self.outcome is now.outcome
         return self.text == now.text if self.text else now.values is None or self.values == now.values
@@ -194,7 +197,7 @@ class _Run:
         return result_of(Ending(error=failure)) if isinstance(failure, FrameError) and failure.send == said else None
 
     def _abandon(self) -> None:
-        """It would have said something again, and the host did not: there was no more time for that (R9)."""
+        """Note that it would have said something again, and the host did not: there was no more time for that (R9)."""
         if self._abandonable and self._unsaid and self._driver.ending is None:
             self._driver.abandon()
             self._unsaid = b""
@@ -215,7 +218,7 @@ def result_of(ending: Ending) -> Result:
 
 
 def replay(packets: Iterable[Packet]) -> Iterator[Replayed]:
-    """Each exchange of a capture, in order."""
+    """Yield each exchange of a capture, in order."""
     heard = list(listen(packets))
     run: _Run | None = None
     for place, one in enumerate(heard):
@@ -239,7 +242,7 @@ def replay(packets: Iterable[Packet]) -> Iterator[Replayed]:
 
 
 def listen(packets: Iterable[Packet]) -> Iterator[_Heard]:
-    """Every packet with the frame that it is."""
+    """Yield every packet with the frame that it is."""
     decoders: dict[str, Decoder] = {}
     for number, packet in enumerate(packets, 1):
         if packet.protocol and packet.protocol not in decoders:
@@ -252,7 +255,7 @@ def listen(packets: Iterable[Packet]) -> Iterator[_Heard]:
 
 
 def open_run(heard: Sequence[_Heard], place: int) -> _Run:
-    """Today's exchange for a recorded request. Raises InvalidCommand for one that we would not send."""
+    """Return today's exchange for a recorded request. Raises InvalidCommand for one that we would not send."""
     asked = heard[place]
     continued = []
     for follower in heard[place + 1 :]:
@@ -281,7 +284,7 @@ def command_of(protocol: Protocol, request: Frame, continued: Sequence[Frame] = 
 
 
 def recorded_outcome(heard: Sequence[_Heard], place: int) -> Outcome:
-    """Of the exchange that begins there."""
+    """Return the recorded outcome of the exchange that begins there."""
     outcome = heard[place].packet.outcome
     for follower in heard[place + 1 :]:
         if follower.is_request:
@@ -296,7 +299,7 @@ def _replayed(asked: _Heard, command: str, recorded: Result, now: Result) -> Rep
 
 
 def numbers_in(text: str) -> list[float]:
-    """Of a listener's values, those that are numbers."""
+    """Return those of a listener's values that are numbers."""
     numbers = []
     for part in text.split(","):
         try:
@@ -307,7 +310,7 @@ def numbers_in(text: str) -> list[float]:
 
 
 def numbers_of(value: Any) -> list[float] | None:
-    """A command's value as a list of numbers; None for none."""
+    """Return a command's value as a list of numbers; None for none."""
     if value is None:
         return None
     if isinstance(value, AbstractSet):

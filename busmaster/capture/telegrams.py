@@ -17,7 +17,10 @@ HEXADECIMAL = made_of(b"0123456789ABCDEF")
 
 
 def field_end(data: bytes, start: int) -> int:
-    """Where the printable characters from `start` end: at a control character, or at the end of what is there."""
+    """Return where the printable characters from `start` end.
+
+    That is at a control character, or at the end of what is there.
+    """
     for position in range(start, len(data)):
         if data[position] < SPACE:
             return position
@@ -25,7 +28,7 @@ def field_end(data: bytes, start: int) -> int:
 
 
 def closed_size(data: bytes, start: int) -> int:
-    """`Dialect.size` of a telegram whose data begin at `start` and are closed by ETX and a checksum."""
+    """Return `Dialect.size` of a telegram whose data begin at `start` and are closed by ETX and a checksum."""
     end = field_end(data, start)
     if end - start > _LONGEST_FIELD:
         return -start - _LONGEST_FIELD
@@ -35,22 +38,23 @@ def closed_size(data: bytes, start: int) -> int:
 
 
 def checked(raw: bytes, start: int, check: Callable[[bytes], int]) -> str:
-    """What is wrong with the checksum, the last byte, of what is before it from `start` on; empty if it is right."""
+    """Say what is wrong with the checksum, the last byte, of what is before it from `start` on; "" if it is right."""
     right = check(raw[start:-1])
     return "" if raw[-1] == right else f"bad checksum {raw[-1]:02X}, not {right:02X}"
 
 
 def characters(field: bytes) -> str:
+    """Return the characters of a field as text."""
     return field.decode("ascii", "backslashreplace")
 
 
 def came_back(raw: bytes) -> Frame:
-    """A whole request that was received by the host: an echo that nobody declared, or that differs."""
+    """Return as noise a whole request that was received by the host: an echo that nobody declared, or that differs."""
     return Frame(Kind.NOISE, Direction.NODE, raw, fault="a request, received")
 
 
 def number(field: bytes, base: int, digits: bytes) -> int | None:
-    """The number that these characters spell, or None if one is none of `digits` (a table of `made_of`)."""
+    """Return the number that these characters spell, or None if one is none of `digits` (a table of `made_of`)."""
     return int(field, base) if field.translate(digits) == field else None
 
 

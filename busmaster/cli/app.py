@@ -41,9 +41,11 @@ COMMANDS = (
 
 class Commands(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of the commands that are there, in the order of the help."""
         return [name for name in COMMANDS if importlib.util.find_spec(f"busmaster.cli.{name}")]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import a command and return it; None for a name that is none."""
         if cmd_name not in self.list_commands(ctx):
             return None
         command = importlib.import_module(f"busmaster.cli.{cmd_name}").command
@@ -53,12 +55,14 @@ class Commands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command that the arguments name. Raises UsageError, with what was meant, for a name that is none."""
         known = self.list_commands(ctx)
         if args and not args[0].startswith("-") and args[0] not in known:
             raise click.UsageError(f"no such command {args[0]!r}; {meant(args[0], known)}", ctx)
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
+        """Run a command and return its result, or the exit status of what it raised."""
         try:
             return super().invoke(ctx)
         except (click.ClickException, click.exceptions.Exit, click.Abort):
@@ -68,6 +72,7 @@ class Commands(click.Group):
 
 
 def version(ctx: click.Context, _parameter: click.Parameter, asked: bool) -> None:
+    """Print the version and end the command, if it was asked for."""
     if asked:
         try:
             number = importlib.metadata.version("busmaster")
@@ -89,7 +94,10 @@ def cli() -> None:
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """The exit status: 0 all good, 1 an error from the line, 2 wrong usage, 130 after Ctrl-C. Never raises."""
+    """Run one command and return the exit status.
+
+    The status is 0 if all is good, 1 after an error from the line, 2 after wrong usage, 130 after Ctrl-C. Never raises.
+    """
     listen_quietly()
     print_somewhere()
     try:
@@ -110,14 +118,20 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 def print_somewhere() -> None:
-    """Whoever closed standard output or standard error wants to hear nothing there: print would use the other."""
+    """Replace standard output or standard error by nothing where its reader has closed it.
+
+    Whoever closed it wants to hear nothing there: print would use the other.
+    """
     if sys.stdout is None or sys.stderr is None:
         nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  it stays open as long as the process
         sys.stdout, sys.stderr = sys.stdout or nowhere, sys.stderr or nowhere
 
 
 def listen_quietly() -> None:
-    """Logs and warnings stay off standard error, where one line says what went wrong; BUSMASTER_DEBUG=1 shows them."""
+    """Keep logs and warnings off standard error, where one line says what went wrong.
+
+    BUSMASTER_DEBUG=1 shows them.
+    """
     if os.environ.get("BUSMASTER_DEBUG"):
         logging.basicConfig(level=logging.DEBUG)
     else:
@@ -133,24 +147,29 @@ def show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
+    """Print a warning meant for the user as one line on standard error; leave out any other."""
     if issubclass(category, UserWarning):
         print(f"busmaster: warning: {printable(str(message))}", file=file or sys.stderr, flush=True)
 
 
 def usage_text(error: click.UsageError) -> str:
-    """What is wrong, and what was meant, or else where to look."""
+    """Return what is wrong, and what was meant, or else where to look."""
     text = error.format_message().rstrip(".").replace(". Did you mean", ": did you mean")
     text = text[:1].lower() + text[1:]
     return text if error.ctx is None or text.endswith("?") else f"{text}; see {error.ctx.command_path} --help"
 
 
 def complain(text: str, status: int) -> int:
+    """Say on one line of standard error what went wrong, and return `status`."""
     note(" ".join(text.split()), Level.ERROR)
     return status
 
 
 def status_of(error: BaseException) -> int:
-    """Say in one line what went wrong, and with which status the process ends."""
+    """Say in one line what went wrong, and return the status with which the process ends.
+
+    An error that nobody foresaw is raised again under BUSMASTER_DEBUG=1.
+    """
     error = only_one(error)
     match error:
         case KeyboardInterrupt():
@@ -178,7 +197,7 @@ def status_of(error: BaseException) -> int:
 
 
 def bus_error_text(error: BusError) -> str:
-    """As the error says it; without the command where only the node matters."""
+    """Return what the error says, without the command where only the node matters."""
     if not isinstance(error, NoReply):
         return str(error)
     text = f"{error.label}: {error.what}" if error.label else error.what
@@ -188,7 +207,7 @@ def bus_error_text(error: BusError) -> str:
 
 
 def only_one(error: BaseException) -> BaseException:
-    """Out of a task group's wrapping: the first that says something, Ctrl-C before all."""
+    """Take an error out of a task group's wrapping: the first that says something, Ctrl-C before all."""
     while isinstance(error, BaseExceptionGroup):
         interrupts = error.subgroup(KeyboardInterrupt)
         error = (interrupts or error).exceptions[0]
@@ -196,6 +215,7 @@ def only_one(error: BaseException) -> BaseException:
 
 
 def can_flush() -> bool:
+    """Flush standard output, and tell whether that worked."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -204,7 +224,10 @@ def can_flush() -> bool:
 
 
 def forget_standard_output() -> None:
-    """Whoever read it has gone, which is no error: what is left unsaid must not complain at exit."""
+    """Point standard output at nothing: what is left unsaid must not complain at exit.
+
+    Whoever read it has gone, which is no error.
+    """
     devnull = os.open(os.devnull, os.O_WRONLY)
     os.dup2(devnull, sys.stdout.fileno())
     os.close(devnull)

@@ -41,25 +41,28 @@ class Connection:
 
     @property
     def profile(self) -> Profile:
+        """The profile of the protocol."""
         return find(self.protocol).profile
 
     @property
     def line(self) -> LineSettings:
+        """The settings of the line: those of the protocol, at the baud rate of the options."""
         return line_settings(self.profile, self.baud)
 
     @property
     def timings(self) -> Timings | Learned | None:
+        """The timings that the options say; None leaves the protocol's."""
         if self.timeout is None or isinstance(self.timeout, Learned):
             return self.timeout
         return self.profile.timings.with_window(self.timeout)
 
     def endpoint(self) -> SerialPort | TcpPort:
-        """Raises InvalidCommand for a PORT that is none."""
+        """Return the endpoint that PORT names. Raises InvalidCommand for a PORT that is none."""
         found = endpoint(self.port, defaults=self.line)
         return replace(found, echo=True) if self.echo else found
 
     def open_bus(self) -> Bus:
-        """The bus on it, which `async with` opens. Raises InvalidCommand for a PORT that is none.
+        """Return the bus on PORT, which `async with` opens. Raises InvalidCommand for a PORT that is none.
 
         With --capture it is recorded until the command ends. Raises UsageError if that file cannot be written.
         """
@@ -68,20 +71,26 @@ class Connection:
         return Bus(where, tap=click.get_current_context().with_resource(recording))
 
     def open_handle(self, bus: Bus, address: int) -> Handle:
-        """A handle on the bus, which need not be open. Raises InvalidCommand."""
+        """Return a handle on the bus, which need not be open. Raises InvalidCommand."""
         handle: Callable[..., Handle] = find(self.protocol).handle
         return handle(bus, address, timings=self.timings, retries=self.retries, **self.options)
 
     def node_number(self, address: int) -> int | None:
-        """For JSON: null where the protocol has no addresses."""
+        """Return the address as JSON has it: null where the protocol has no addresses."""
         return address if self.profile.addressed else None
 
     def one_address(self, node: int | None) -> int:
-        """Of `--node N`. Raises UsageError if it is missing, or given where there are no addresses."""
+        """Return the address of `--node N`.
+
+        Raises UsageError if it is missing, or given where there are no addresses.
+        """
         return only_address(self.profile) if node is None else checked(self.profile, (node,))[0]
 
     def addresses(self, nodes: Sequence[int] | None) -> tuple[int, ...]:
-        """Of `--nodes N-M,K`, likewise."""
+        """Return the addresses of `--nodes N-M,K`.
+
+        Raises UsageError if they are missing, or given where there are no addresses.
+        """
         return (only_address(self.profile),) if nodes is None else checked(self.profile, nodes)
 
 
@@ -97,17 +106,22 @@ class View:
 
 
 def line_settings(profile: Profile, baud: int | None) -> LineSettings:
-    """The protocol's line, at another baud rate if one is given."""
+    """Return the settings of the protocol's line, at another baud rate if one is given."""
     return profile.line if baud is None else replace(profile.line, baudrate=baud)
 
 
 def only_address(profile: Profile) -> int:
+    """Return the one address of a protocol without addresses. Raises UsageError for one that has them."""
     if profile.addressed:
         raise click.UsageError(f"{profile.name} needs a node: one of {span(profile)}")
     return profile.addresses[0]
 
 
 def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
+    """Return the nodes that were given.
+
+    Raises UsageError for one that the protocol cannot have, and for any where it has no addresses.
+    """
     if not profile.addressed:
         raise click.UsageError(f"{profile.name} has no addresses: one drive a line, named without a node")
     for node in nodes:
@@ -116,7 +130,7 @@ def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
 
 
 def slaves_of(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
-    """The addresses to emulate: those of --nodes, else 1, or the one drive. Raises UsageError."""
+    """Return the addresses to emulate: those of --nodes, else 1, or the one drive. Raises UsageError."""
     if nodes is None:
         return (1,) if 1 in profile.addresses else (profile.addresses[0],)
     if profile.broadcast in nodes:
@@ -125,6 +139,7 @@ def slaves_of(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
 
 
 def span(profile: Profile) -> str:
+    """Return the protocol's lowest and highest address, as `1-8`."""
     return f"{profile.addresses[0]}-{profile.addresses[-1]}"
 
 

@@ -61,10 +61,11 @@ def capture_option(command: F) -> F:
 
 @contextmanager
 def capturing(path: str | None, *, port: str, protocol: str = "", echo: bool = False) -> Iterator[Recorder | None]:
-    """A recorder to be the bus's tap, or None without a path. Enter it outside the loop: leaving waits for the disk.
+    """Yield a recorder to be the bus's tap, or None without a path.
 
-    What it is named, and what could not be recorded, is said on standard error: at once, or at the end where a live
-    view may be drawn. Raises UsageError if the file cannot be written at all.
+    Enter it outside the loop: leaving waits for the disk. What it is named, and what could not be recorded, is said on
+    standard error: at once, or at the end where a live view may be drawn. Raises UsageError if the file cannot be
+    written at all.
     """
     if path is None:
         yield None

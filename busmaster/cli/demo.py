@@ -42,7 +42,7 @@ def command(seconds: float | None, plain: bool) -> int:
 
 @contextmanager
 def emulated_line() -> Iterator[str]:
-    """The path of the line's pseudo-terminal, served by another process while the context lasts."""
+    """Serve the line in another process while the context lasts, and yield the path of its pseudo-terminal."""
     process = subprocess.Popen(
         [sys.executable, "-m", "busmaster.cli.demo_line"],
         stdin=subprocess.PIPE,
@@ -63,6 +63,7 @@ def emulated_line() -> Iterator[str]:
 
 
 async def demo(path: str, view: View) -> int:
+    """Poll the line at `path` and command its drives, until the view ends: return the exit status."""
     bus = Bus(SerialPort(path, baudrate=SETTINGS.baudrate))
     axes = [Hcp2Controller(bus, address).axis(0) for address in CONTROLLERS]
     drives = [MicroFlexDrive(bus, address) for address in DRIVES]
@@ -87,7 +88,10 @@ async def command_drives(watch: Watch, drives: list[MicroFlexDrive]) -> None:
 
 
 async def attempt(watch: Watch, drive: MicroFlexDrive, order: Callable[..., Awaitable[object]], *values: float) -> bool:
-    """What goes wrong is an event to show: the demo goes on."""
+    """Give a drive one order, and tell whether it took it.
+
+    An order that goes wrong is an event to show: the demo goes on.
+    """
     try:
         await order(*values)
     except BusError as error:

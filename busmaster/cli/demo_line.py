@@ -28,7 +28,7 @@ UP_FOR, AWAY_FOR = 15.0, 6.0
 
 
 def make_line(seed: int = 1) -> Line:
-    """The line, not yet served."""
+    """Make the line, not yet served."""
     delay = Delay(0.001, 0.004)
     line = Line(SETTINGS, chance=random.Random(seed))
     for address in CONTROLLERS:
@@ -41,20 +41,23 @@ def make_line(seed: int = 1) -> Line:
 
 
 def input_ended(within: float) -> bool:
-    """Wait so many seconds for the end of standard input."""
+    """Wait so many seconds for the end of standard input, and tell whether it came."""
     readable, _, _ = select.select([sys.stdin], (), (), within)
     return bool(readable) and not os.read(sys.stdin.fileno(), 1)
 
 
 def unplug(server: LineServer, address: int) -> None:
+    """Cut the wire of one drive."""
     server.call(lambda line, now: line.cut(now, line.device(address)))
 
 
 def plug_in(server: LineServer) -> None:
+    """Mend the wire that was cut."""
     server.call(lambda line, now: line.restore(now))
 
 
 def main() -> None:
+    """Serve the line until standard input ends. One drive loses its wire again and again."""
     with serve_pty(make_line()) as server:
         print(server.path, flush=True)
         while not input_ended(UP_FOR):

@@ -41,6 +41,7 @@ class AskValue(ModalScreen[str | None]):
             yield Input(placeholder="value")
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
+        """Take the value and ask whether it is meant, or say why it is no number."""
         if not event.value.strip():
             return
         try:
@@ -53,5 +54,6 @@ class AskValue(ModalScreen[str | None]):
         self.query_one(Label).update(f"write {self.asked} = {f'{self.value} {self.unit}'.rstrip()}?  y or n")
 
     def action_agree(self) -> None:
+        """End the question with the value, once there is one."""
         if self.value is not None:
             self.dismiss(self.value)

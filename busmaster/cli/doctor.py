@@ -67,7 +67,7 @@ def command(
 
 
 def patient_of(connection: Connection, nodes: Sequence[int] | None) -> Patient:
-    """What the options say. Raises UsageError."""
+    """Return what is to be examined, as the options say. Raises UsageError."""
     if connection.protocol:
         where = parsed(lambda _: connection.endpoint(), connection.port)
         addresses = nodes_to_ask(connection.profile, nodes)
@@ -80,7 +80,10 @@ def patient_of(connection: Connection, nodes: Sequence[int] | None) -> Patient:
 
 
 def nodes_to_ask(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
-    """Raises UsageError for addresses that no node can have."""
+    """Return the addresses to ask: those of --nodes, else all.
+
+    Raises UsageError for addresses that no node can have.
+    """
     if nodes is None:
         return tuple(profile.addresses) if profile.addressed else (only_address(profile),)
     if profile.broadcast in nodes:
@@ -89,7 +92,10 @@ def nodes_to_ask(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ..
 
 
 def lines_of(finding: Finding) -> Iterator[str]:
-    """`ok`; `note`: in order, but could be better; `MEND`: not in order."""
+    """Yield the lines of a finding, the first behind its mark.
+
+    The mark is `ok`; `note`: in order, but could be better; `MEND`: not in order.
+    """
     mark = "MEND" if not finding.ok else "note" if finding.advice else "ok"
     yield f"{mark:4}  {finding.topic:{TOPIC}}  {finding.what}"
     if finding.advice:

@@ -55,7 +55,7 @@ async def draw(picture: Callable[[], Frame], act: Callable[[Action], object]) ->
 
 
 async def feed(writer: asyncio.StreamWriter, picture: Callable[[], Frame]) -> None:
-    """A frame at each interval, but none while the screen has not taken the one before."""
+    """Send a frame at each interval, but none while the screen has not taken the one before."""
     while not writer.is_closing():
         if writer.transport.get_write_buffer_size() == 0:
             writer.write(encode(picture()))
@@ -63,7 +63,7 @@ async def feed(writer: asyncio.StreamWriter, picture: Callable[[], Frame]) -> No
 
 
 async def hear(reader: asyncio.StreamReader, act: Callable[[Action], object]) -> int:
-    """Pass on what the person asks for, until it is to end: the exit status."""
+    """Pass on what the person asks for, until it is to end, and return the exit status."""
     try:
         while line := await reader.readline():
             action = decode_action(line)
@@ -76,7 +76,7 @@ async def hear(reader: asyncio.StreamReader, act: Callable[[Action], object]) ->
 
 
 def terminal_state() -> list[Any] | None:
-    """How the terminal is set, None without one."""
+    """Return how the terminal is set, None without one."""
     try:
         return termios.tcgetattr(sys.stdin.fileno())
     except (termios.error, OSError, ValueError):
@@ -94,7 +94,7 @@ def restore_terminal(before: list[Any] | None) -> None:
 
 
 def see_off(process: subprocess.Popen[bytes]) -> None:
-    """The screen ends by itself when its socket does."""
+    """Wait for the screen, which ends by itself when its socket does; kill it after FAREWELL seconds."""
     try:
         process.wait(FAREWELL)
     except subprocess.TimeoutExpired:

@@ -85,7 +85,7 @@ def command(
 
 
 def line_of(file: LineFile, delay: Delay | None, faults: tuple[str, ...], seed: int | None, paced: bool) -> Line:
-    """The file's line; what the command line says goes before what the file says."""
+    """Return the file's line; what the command line says goes before what the file says."""
     ConfiguredLine(file, outputs=False)  # what is wrong in it is said here as everywhere
     line = emulated_line(file, paced=paced or None, seed=seed)
     for device in line.devices:
@@ -95,7 +95,7 @@ def line_of(file: LineFile, delay: Delay | None, faults: tuple[str, ...], seed: 
 
 
 def own_port(port: SerialPort | TcpPort) -> tuple[str | None, tuple[str, int] | None]:
-    """The link, or the address, by which `busmaster run` with the same file will find the line."""
+    """Return the link, or the address, by which `busmaster run` with the same file will find the line."""
     if isinstance(port, TcpPort):
         return None, (port.host, port.port)
     is_device = port.path.startswith(USB) or os.path.abspath(port.path).startswith("/dev/")
@@ -111,6 +111,7 @@ def drives(
     seed: int | None,
     paced: bool,
 ) -> Line:
+    """Make the line that the command line says, without a file. Raises UsageError."""
     if protocol is None:
         raise click.UsageError("name a LINE.toml, or the drives: --protocol P")
     profile = find(protocol).profile
@@ -123,7 +124,7 @@ def drives(
 
 
 def serve(line: Line, link: str | None, address: tuple[str, int] | None) -> LineServer:
-    """On TCP if there is an address, else on a pty. Raises LineDown for what cannot be had."""
+    """Serve the line on TCP if there is an address, else on a pty. Raises LineDown for what cannot be had."""
     try:
         return serve_tcp(line, *address) if address else serve_pty(line, link or None)
     except OSError as error:

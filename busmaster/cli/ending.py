@@ -46,7 +46,10 @@ class Ending:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """What still comes while a process that was told to end shuts down is not heard."""
+        """Give the signals back, unless one was heard.
+
+        What still comes while a process that was told to end shuts down is not heard.
+        """
         for number, handler in self._before.items():
             signal.signal(number, signal.SIG_IGN if self.number else handler)
 
@@ -66,7 +69,10 @@ class Ending:
         raise KeyboardInterrupt if self.number == signal.SIGINT else SystemExit(128 + self.number)
 
     def run(self, function: Callable[..., Awaitable[T]], *arguments: Any) -> T:
-        """As anyio.run. Raises KeyboardInterrupt or SystemExit if it was cancelled by a signal."""
+        """Run an async function as anyio.run does.
+
+        Raises KeyboardInterrupt or SystemExit if it was cancelled by a signal.
+        """
 
         async def cancellable() -> T:
             loop, task = asyncio.get_running_loop(), asyncio.current_task()
@@ -89,6 +95,6 @@ class Ending:
 
 
 def until_ended(function: Callable[..., Awaitable[T]], *arguments: Any) -> T:
-    """Run it in an event loop, to be ended by the signals of the command that runs."""
+    """Run an async function in an event loop, to be ended by the signals of the command that runs."""
     ending = click.get_current_context().find_object(Ending)
     return anyio.run(function, *arguments) if ending is None else ending.run(function, *arguments)

@@ -41,18 +41,18 @@ def command(protocol: str, words: tuple[str, ...], as_json: bool) -> None:
 
 
 def text_of(item: Item) -> str:
-    """All that is said of an item, to be searched."""
+    """Return all that is said of an item, to be searched."""
     bits = " ".join(f"{bit.name} {bit.severity} {bit.meaning}" for bit in item.bits)
     return f"{item.item} {item.number} {item.unit} {item.access} {item.meaning} {item.keyword} {bits}"
 
 
 def guess(words: Sequence[str], kind: NodeKind) -> str:
-    """The item that may have been meant."""
+    """Return words that name the item that may have been meant, or the items that there are if none is near."""
     return meant(words[0], (item.item for item in kind.documented))
 
 
 def page(items: Iterable[Item]) -> Iterator[str]:
-    """A table, with the bits of a word below it."""
+    """Yield the lines of a table, with the bits of a word below it."""
     rows = [HEAD]
     bits: dict[int, tuple[Bit, ...]] = {}
     for item in items:
@@ -65,12 +65,13 @@ def page(items: Iterable[Item]) -> Iterator[str]:
 
 
 def bit_row(bit: Bit) -> tuple[str, ...]:
+    """Return the cells of one bit."""
     severity = f"{bit.severity}: " if bit.severity else ""
     return f"  bit {bit.number}", bit.name, severity + bit.meaning
 
 
 def fields(item: Item) -> dict[str, Any]:
-    """For JSON; null for what the documents do not say."""
+    """Return the item for JSON; null for what the documents do not say."""
     return {
         "item": item.item,
         "number": item.number or None,

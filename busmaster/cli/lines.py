@@ -16,7 +16,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def file_argument(required: bool = True) -> Callable[[F], F]:
-    """LINE.toml, as `path`. A file that is not there is wrong usage."""
+    """Give a command LINE.toml, as `path`. A file that is not there is wrong usage."""
     return click.argument(
         "path",
         required=required,
@@ -29,7 +29,10 @@ port_option = click.option("--port", metavar="PORT", help="Use this port in plac
 
 
 def other_port(file: LineFile, port: str | None) -> SerialPort | TcpPort | None:
-    """Return that of --port; what it leaves open of a serial line is as the file's line is. Raises InvalidCommand."""
+    """Return the port of --port. Raises InvalidCommand.
+
+    What it leaves open of a serial line is as the file's line is. None without a --port.
+    """
     return None if port is None else endpoint(port, defaults=line_settings(file))
 
 

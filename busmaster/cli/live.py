@@ -47,7 +47,10 @@ OLD_AFTER = 3
 
 
 def sparkline(numbers: Sequence[float | None]) -> str:
-    """The last values between their own lowest and highest; a gap where there was none. A ripple is not a trend."""
+    """Draw the last values between their own lowest and highest; a gap where there was none.
+
+    A ripple is not a trend.
+    """
     known = [number for number in numbers if number is not None]
     if not known:
         return ""
@@ -57,6 +60,7 @@ def sparkline(numbers: Sequence[float | None]) -> str:
 
 
 def age_text(seconds: float | None) -> str:
+    """Return an age as `2.5s`, `30s` or `12m`; `-` for none."""
     if seconds is None:
         return "-"
     if seconds < 10:
@@ -65,15 +69,18 @@ def age_text(seconds: float | None) -> str:
 
 
 def clock_text(seconds: float) -> str:
+    """Return seconds as `H:MM:SS`."""
     minutes, seconds = divmod(int(seconds), 60)
     return f"{minutes // 60:d}:{minutes % 60:02d}:{seconds:02d}"
 
 
 def fit(text: str, width: int) -> str:
+    """Return the text, cut short with an ellipsis if it is wider than `width` columns."""
     return text if len(text) <= width else text[: width - 1] + "…"
 
 
 def title_line(frame: Frame, width: int) -> Text:
+    """Draw the first line: the title, the port, and the time since the start."""
     left = Text.assemble((f" {frame.title}", "bold"), f"  {frame.port}")
     clock = clock_text(frame.now)
     left.truncate(width - len(clock) - 2, overflow="ellipsis", pad=True)
@@ -81,6 +88,7 @@ def title_line(frame: Frame, width: int) -> Text:
 
 
 def gauge_line(frame: Frame) -> Text:
+    """Draw how busy the line is, its state, and how many requests wait."""
     filled = min(GAUGE, round(frame.utilisation * GAUGE))
     style = "red" if frame.utilisation > 0.9 else "green"
     return Text.assemble(
@@ -94,6 +102,7 @@ def gauge_line(frame: Frame) -> Text:
 
 
 def group_line(group: GroupRow) -> Text:
+    """Draw the line of one poll group: its periods in milliseconds, and its cycles."""
     line = Text.assemble(" ", (group.name, "bold"), f" every {group.period * 1000:g} ms")
     if group.achieved is not None:
         line.append(f", achieved {group.achieved * 1000:.1f}")
@@ -107,7 +116,7 @@ def group_line(group: GroupRow) -> Text:
 
 
 def column_widths(width: int) -> dict[str, int]:
-    """The columns of a terminal that is so wide."""
+    """Return the width of each column in a terminal of `width` columns."""
     widths = dict(COLUMNS)
     spare = width - sum(widths.values()) - 2 * len(widths)
     for name, growth in GROWTH.items():
@@ -118,6 +127,7 @@ def column_widths(width: int) -> dict[str, int]:
 
 
 def right(text: str, width: int, style: str = "") -> Text:
+    """Return the text flush right in `width` columns."""
     return Text(fit(text, width).rjust(width), style=style)
 
 
@@ -168,12 +178,14 @@ class Screen(App[None]):
         yield Footer(show_command_palette=False)
 
     def on_mount(self) -> None:
+        """Begin to hear the connection."""
         self.theme = "ansi-dark"
         self.table.focus()
         if self.connection is not None:
             self.run_worker(self.listen(self.connection), exit_on_error=True)
 
     def on_resize(self) -> None:
+        """Fit the columns to the terminal's new width."""
         self.widths = column_widths(self.size.width)
         self.shown = []
         self.table.clear(columns=True)
@@ -189,15 +201,18 @@ class Screen(App[None]):
 
     @property
     def selected(self) -> Row | None:
+        """The row under the cursor, None where there is none."""
         rows, index = self.frame.rows if self.frame else (), self.table.cursor_row
         return rows[index] if index < len(rows) else None
 
     @property
     def table(self) -> DataTable[Text]:
+        """The table of the points."""
         table: DataTable[Text] = self.base.query_one("#points", DataTable)
         return table
 
     async def listen(self, connection: socket.socket) -> None:
+        """Take every frame that the connection brings; end the screen when it ends."""
         reader, self.writer = await asyncio.open_connection(sock=connection, limit=FRAME_LIMIT)
         try:
             while line := await reader.readline():
@@ -207,17 +222,21 @@ class Screen(App[None]):
             self.writer.close()
 
     def send(self, action: Action) -> None:
+        """Send what the person asked for, as long as somebody is there to hear it."""
         if self.writer is not None and not self.writer.is_closing():
             self.writer.write(encode(action))
 
     def action_leave(self, kind: Any) -> None:
+        """Say that the person leaves, and end."""
         self.send(Action(kind))
         self.exit()
 
     def action_ask(self, kind: Any) -> None:
+        """Send an action on all groups."""
         self.send(Action(kind))
 
     def action_suspend(self) -> None:
+        """Ask for the selected point's node to be suspended, or to go on."""
         row = self.selected
         if row is not None:
             self.send(Action("suspend", row.node))
@@ -238,9 +257,10 @@ class Screen(App[None]):
         self.push_screen(AskValue(f"{row.node} {row.item}", row.unit), send)
 
     def action_scroll(self) -> None:
-        """Stands in the footer for the table's own keys."""
+        """Stand in the footer for the table's own keys."""
 
     def take_frame(self, frame: Frame) -> None:
+        """Draw this frame."""
         self.frame = frame
         width = self.size.width
         head = [title_line(frame, width), gauge_line(frame), *map(group_line, frame.groups)]
@@ -250,6 +270,7 @@ class Screen(App[None]):
         self.draw_rows(frame)
 
     def draw_rows(self, frame: Frame) -> None:
+        """Draw the points of a frame: only the cells that have changed, unless other points are shown."""
         table, nodes = self.table, {node.label: node for node in frame.nodes}
         keys = [(row.node, row.item) for row in frame.rows]
         if keys != self.shown:
@@ -273,7 +294,7 @@ class Screen(App[None]):
 
 
 def point_cells(row: Row, trend: list[float | None], old: float, widths: dict[str, int]) -> dict[str, Text]:
-    """The cells of one point. An age beyond `old` seconds stands out."""
+    """Return the cells of one point. An age beyond `old` seconds stands out."""
     style = "red" if row.error else "magenta" if row.late else "bold"
     return {
         "ITEM": Text(fit(row.item, widths["ITEM"])),
@@ -285,7 +306,7 @@ def point_cells(row: Row, trend: list[float | None], old: float, widths: dict[st
 
 
 def node_cells(node: NodeRow, widths: dict[str, int]) -> dict[str, Text]:
-    """What is the node's: it stands beside the node's first point."""
+    """Return the cells of a node, which stand beside the node's first point."""
     return {
         "NODE": Text(fit(node.label, widths["NODE"]), style="bold"),
         "P50ms": right(f"{node.p50 * 1000:.1f}" if node.requests else "", widths["P50ms"]),

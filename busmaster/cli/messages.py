@@ -82,6 +82,7 @@ class Action(msgspec.Struct, array_like=True, frozen=True):
 
 
 def encode(message: Frame | Action) -> bytes:
+    """Return the message as one line of JSON."""
     return msgspec.json.encode(message) + b"\n"
 
 

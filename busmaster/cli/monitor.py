@@ -68,6 +68,7 @@ def command(port: str, protocol: str | None, baud: int | None, as_json: bool, ca
 
 
 def is_line_file(port: str) -> bool:
+    """Tell whether PORT is a LINE.toml that is there."""
     return port.endswith(".toml") and os.path.isfile(port)
 
 
@@ -96,7 +97,7 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
 
 
 def plain_values(snapshot: Snapshot) -> list[str]:
-    """`2026-11-22T14:02:11.485+00:00 winder/position 12.5`."""
+    """Return a line a value, as `2026-11-22T14:02:11.485+00:00 winder/position 12.5`."""
     return [
         f"{datetime.fromtimestamp(sample.wall, UTC).isoformat(timespec='milliseconds')} "
         f"{point.key} {value_text(sample.value)}"
@@ -117,6 +118,7 @@ class Listener(asyncio.Protocol):
         self.lost: asyncio.Future[None] = self._loop.create_future()
 
     def data_received(self, data: bytes) -> None:
+        """Decode these bytes and tell the frames; a frame that is not finished waits for silence."""
         now = time.monotonic()
         if self._recorder is not None:
             self._recorder.overheard(now, data)
@@ -127,6 +129,7 @@ class Listener(asyncio.Protocol):
             self._timer = self._loop.call_later(DEFAULT_GAP, self._rest)
 
     def connection_lost(self, cause: Exception | None) -> None:
+        """Tell the last frame, and end `lost` with LineDown."""
         self._rest()
         if not self.lost.done():
             what = cause.what if isinstance(cause, BusError) else str(cause or "the line was closed")
@@ -136,7 +139,10 @@ class Listener(asyncio.Protocol):
         self._pass(self._decoder.quiet())
 
     def _pass(self, frames: list[Frame]) -> None:
-        """Raises nothing into the transport: whoever waits for the end of the line is told."""
+        """Tell each frame.
+
+        Nothing is raised into the transport: whoever waits for the end of the line is told.
+        """
         try:
             for frame in frames:
                 self._tell(frame)
@@ -148,7 +154,7 @@ class Listener(asyncio.Protocol):
 async def listen(
     endpoint: Any, decoder: Decoder, tell: Callable[[Frame], None], recorder: Recorder | None = None
 ) -> None:
-    """Until the line is lost. Raises LineDown."""
+    """Listen until the line is lost. Raises LineDown then, and the OSError of a frame that could not be told."""
     listener = Listener(decoder, tell, recorder)
     transport = await endpoint.open(lambda: listener)
     try:
@@ -158,7 +164,10 @@ async def listen(
 
 
 def plain_text(frame: Frame, names: Mapping[str, str]) -> str:
-    """`14:02:11.485012 <- node 5   100 (axis0.position) = 12.5  2.9 ms`; the bytes too, if something is wrong."""
+    """Return a frame as one line; the bytes too, if something is wrong.
+
+    It reads `14:02:11.485012 <- node 5   100 (axis0.position) = 12.5  2.9 ms`.
+    """
     moment = datetime.fromtimestamp(frame.time).astimezone().strftime("%H:%M:%S.%f")
     node = "" if frame.node is None else f"node {frame.node}"
     text = frame.text
@@ -173,6 +182,7 @@ def plain_text(frame: Frame, names: Mapping[str, str]) -> str:
 
 
 def json_text(frame: Frame, names: Mapping[str, str]) -> str:
+    """Return a frame as one JSON object; null for what it does not say."""
     sender = None if frame.sender is Direction.UNKNOWN else frame.sender.name.lower()
     fields = {
         "time": round(frame.time, 6),
@@ -191,12 +201,13 @@ def json_text(frame: Frame, names: Mapping[str, str]) -> str:
 
 
 def json_values(frame: Frame) -> Any:
-    """One number, or a list where there are several; text that is no number stays text."""
+    """Return one number, or a list where there are several; text that is no number stays text."""
     values = [number_of(part) for part in frame.value.split(",")] if frame.value else []
     return values if frame.item == "flags" or len(values) != 1 else values[0]
 
 
 def number_of(text: str) -> int | float | str:
+    """Return the number that the text is, whole if it can be, else the text."""
     for kind in (int, float):
         try:
             return kind(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import io
 import os
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
@@ -32,12 +33,13 @@ def emit(*lines: str) -> None:
 
 
 def emit_all(lines: Iterable[str]) -> None:
+    """Print the lines to standard output and flush. Raises BrokenPipeError when nobody reads it any more."""
     sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
     sys.stdout.flush()
 
 
 def columns(rows: Sequence[Sequence[str]], right: Container[int] = ()) -> Iterator[str]:
-    """The lines of a table: each column as wide as its widest cell; those numbered in `right` flush right."""
+    """Yield the lines of a table: each column as wide as its widest cell; those numbered in `right` flush right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for cells in rows:
         padded = (
@@ -58,7 +60,7 @@ class Level(enum.IntEnum):
 
 
 def note(line: str, level: Level = Level.INFO) -> None:
-    """A line for the person, on standard error; where that is systemd's journal, with its level.
+    """Print a line for the person, on standard error; where that is systemd's journal, with its level.
 
     A standard error that nobody can write to any more (its terminal was closed, its disk is full) ends nothing.
     """
@@ -68,12 +70,14 @@ def note(line: str, level: Level = Level.INFO) -> None:
     try:
         sys.stderr.flush()
         os.write(sys.stderr.fileno(), text.encode(errors="backslashreplace"))  # past the buffer, where it would stay
+    except io.UnsupportedOperation:
+        sys.stderr.write(text)  # a program of ours runs within another, which has put a stream of its own there
     except OSError:
         pass
 
 
 def is_journal(stream: TextIO, device_and_inode: str) -> bool:
-    """Whether the stream is the one that systemd has connected to its journal, as JOURNAL_STREAM names it."""
+    """Tell whether the stream is the one that systemd has connected to its journal, as JOURNAL_STREAM names it."""
     try:
         status = os.fstat(stream.fileno())
     except (OSError, ValueError):

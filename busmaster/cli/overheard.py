@@ -30,7 +30,7 @@ Question = tuple[int, Command[Any]]
 
 
 def silent(file: LineFile) -> LineFile:
-    """Return it with outputs that take no commands: nothing may be sent."""
+    """Return the file with outputs that take no commands: nothing may be sent."""
     outputs = {
         kind: replace(settings, allow_commands=()) if isinstance(settings, MqttSettings) else settings
         for kind, settings in file.outputs.items()
@@ -39,7 +39,10 @@ def silent(file: LineFile) -> LineFile:
 
 
 def only_protocol(file: LineFile) -> str:
-    """Raises InvalidCommand for a file with several kinds of nodes: a listener reads one."""
+    """Return the protocol that a listener to the file reads.
+
+    Raises InvalidCommand for a file with several kinds of nodes: a listener reads one.
+    """
     names = {node.protocol for node in file.nodes.values()}
     spoken = {find(name).protocol.name for name in names}
     if len(spoken) > 1:
@@ -60,14 +63,16 @@ class HeardGroup:
         self._consumers: list[Stream[Snapshot]] = []
 
     def subscribe(self, buffer: int) -> Stream[Snapshot]:
+        """Return a stream of the snapshots from now on, which holds `buffer` of them."""
         return Stream(self._consumers, buffer)
 
     def take(self, point: Point[Any], sample: Sample[Any]) -> None:
+        """Keep a sample for this period, if the point is of this group."""
         if point in self.points:
             self._heard[point] = sample
 
     def turn(self, now: float, wall: float) -> Snapshot | None:
-        """Hand on what was heard since the last time; None where nothing was."""
+        """Hand on what was heard since the last time, and return it; None where nothing was."""
         due, self.due = self.due, self.due + self.period * max(1, (now - self.due) // self.period)
         if not self._heard:
             return None
@@ -80,6 +85,7 @@ class HeardGroup:
         return snapshot
 
     def close(self) -> None:
+        """End all streams of this group."""
         for consumer in list(self._consumers):
             consumer.close()
 
@@ -111,7 +117,7 @@ class Overheard:
             self._answer(self._driver, frame)
 
     def _ask(self, frame: Frame) -> None:
-        """A new request ends the exchange before."""
+        """Begin an exchange; a new request ends the exchange before."""
         self._driver = None
         if frame.fault or frame.node is None or frame.kind is not Kind.READ:
             return
@@ -124,7 +130,7 @@ class Overheard:
                 self._driver = Driver(exchange, noise_tolerant=self._profile.noise_tolerant)
 
     def _go_on(self, driver: Driver) -> None:
-        """The host says something in the midst: what the reader wants to say, or else it has given up."""
+        """Take what the host says in the midst: what the reader wants to say, or else it has given up."""
         if not driver.said:
             driver.expire()
         driver.said.clear()

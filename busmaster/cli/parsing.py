@@ -27,7 +27,10 @@ class Whole(click.IntRange):
 
 
 def option_type(parse: Callable[[str], T]) -> Callable[[str], T]:
-    """For click's `type=`: a value that `parse` refuses with InvalidCommand is wrong usage of that option."""
+    """Return a reader for click's `type=`.
+
+    A value that `parse` refuses with InvalidCommand is wrong usage of that option.
+    """
 
     def convert(text: str) -> T:
         try:
@@ -39,7 +42,7 @@ def option_type(parse: Callable[[str], T]) -> Callable[[str], T]:
 
 
 def parse_nodes(text: str) -> tuple[int, ...]:
-    """The addresses of `1-8,255`. Raises InvalidCommand."""
+    """Return the addresses of `1-8,255`. Raises InvalidCommand."""
     addresses: dict[int, None] = {}
     for part in text.split(","):
         first, dash, last = (piece.strip() for piece in part.partition("-"))
@@ -55,7 +58,7 @@ def parse_nodes(text: str) -> tuple[int, ...]:
 
 
 def parse_seconds(text: str) -> float:
-    """Seconds above 0. Raises InvalidCommand."""
+    """Return a time in seconds, above 0. Raises InvalidCommand for any other."""
     seconds = parse_value(text)
     if not 0 < seconds < float("inf"):
         raise InvalidCommand(f"a time is above 0, not {text}")
@@ -63,7 +66,10 @@ def parse_seconds(text: str) -> float:
 
 
 def parse_window(text: str) -> float | Learned:
-    """A reply window in milliseconds, in seconds, or `learned`. Raises InvalidCommand for one that is far too long."""
+    """Read a reply window in milliseconds, or `learned`, and return it in seconds.
+
+    Raises InvalidCommand for one that is far too long.
+    """
     if text == "learned":
         return LEARNED
     seconds = parse_seconds(text) / 1000
@@ -73,7 +79,7 @@ def parse_window(text: str) -> float | Learned:
 
 
 def parse_items(text: str) -> tuple[str, ...]:
-    """The items of `--items a,b,c`. Raises InvalidCommand for none."""
+    """Return the items of `--items a,b,c`. Raises InvalidCommand for none."""
     items = tuple(item for item in (part.strip() for part in text.split(",")) if item)
     if not items:
         raise InvalidCommand("--items names at least one item")
@@ -81,7 +87,7 @@ def parse_items(text: str) -> tuple[str, ...]:
 
 
 def parse_assignment(text: str) -> tuple[str, tuple[float, ...]]:
-    """`ITEM=VALUE[,VALUE...]` -> the item and its numbers. Raises InvalidCommand."""
+    """Return the item and the numbers of `ITEM=VALUE[,VALUE...]`. Raises InvalidCommand."""
     item, equals, values = text.partition("=")
     if not equals or not item.strip() or not values.strip():
         raise InvalidCommand(f"an assignment is written ITEM=VALUE, like 1=123.456, not {text!r}")
@@ -89,7 +95,7 @@ def parse_assignment(text: str) -> tuple[str, tuple[float, ...]]:
 
 
 def parse_value(text: str) -> float:
-    """A whole number stays one. Hexadecimal (0x41) is taken for the words. Raises InvalidCommand."""
+    """Return the number; a whole one stays whole. Hexadecimal (0x41) is taken for the words. Raises InvalidCommand."""
     text = text.strip()
     try:
         return int(text, 16) if text.lower().startswith("0x") else int(text)
@@ -102,7 +108,7 @@ def parse_value(text: str) -> float:
 
 
 def parse_host_port(text: str) -> tuple[str, int]:
-    """`HOST:PORT`. Raises InvalidCommand."""
+    """Return the host and the port of `HOST:PORT`. Raises InvalidCommand."""
     host, colon, port = text.rpartition(":")
     if not colon or not host or not is_decimal(port) or int(port) > HIGHEST_PORT:
         raise InvalidCommand(f"a TCP address is written HOST:PORT, like 127.0.0.1:5020, not {text!r}")
@@ -110,7 +116,7 @@ def parse_host_port(text: str) -> tuple[str, int]:
 
 
 def parsed(parse: Callable[[S], T], value: S) -> T:
-    """What `parse` makes of an argument; what it refuses is wrong usage. Raises UsageError."""
+    """Return what `parse` makes of an argument; what it refuses is wrong usage. Raises UsageError."""
     try:
         return parse(value)
     except InvalidCommand as error:

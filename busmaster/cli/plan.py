@@ -41,7 +41,7 @@ def command(path: str, as_json: bool) -> int:
 
 
 def page(head: str, plan: Plan) -> list[str]:
-    """What a person wants to know: a table of the groups, the waits, and what would fit."""
+    """Return what a person wants to know: a table of the groups, the waits, and what would fit."""
     table = columns([HEAD, *(row(group) for group in plan.groups)], right=range(1, len(HEAD)))
     verdict = "it fits" if plan.fits and not plan.advice else "it fits, barely" if plan.fits else "it does not fit"
     share = f"the schedule asks for {plan.utilisation:.0%} of the line"
@@ -55,12 +55,16 @@ def page(head: str, plan: Plan) -> list[str]:
 
 
 def port_text(endpoint: Endpoint, line: LineSettings) -> str:
-    """Behind a TCP port the framing is the server's business."""
+    """Return the name and the rate of a port, with the framing of a serial one.
+
+    Behind a TCP port the framing is the server's business.
+    """
     framing = f" {line.framing}" if isinstance(endpoint, SerialPort) else ""
     return f"{endpoint.name}, {line.baudrate} baud{framing}"
 
 
 def row(group: GroupPlan) -> tuple[str, ...]:
+    """Return the cells of one group."""
     return (
         group.name,
         time_text(group.period),
@@ -74,13 +78,14 @@ def row(group: GroupPlan) -> tuple[str, ...]:
 
 
 def time_text(seconds: float) -> str:
+    """Return a time as `2.5 ms` or `1.25 s`, to three digits; `never` for one that does not end."""
     if not math.isfinite(seconds):
         return "never"
     return f"{seconds * 1000:.3g} ms" if seconds < 0.9995 else f"{seconds:.3g} s"
 
 
 def fields(plan: Plan) -> dict[str, Any]:
-    """For JSON. Times in seconds; null for what never comes."""
+    """Return the plan for JSON. Times are in seconds; null stands for what never comes."""
     return {
         "fits": plan.fits,
         "utilisation": plan.utilisation,
@@ -114,4 +119,5 @@ def fields(plan: Plan) -> dict[str, Any]:
 
 
 def finite(number: float) -> float | None:
+    """Return the number, None for one that is not finite."""
     return number if math.isfinite(number) else None

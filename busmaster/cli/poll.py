@@ -33,6 +33,7 @@ def command(
 async def poll(
     connection: Connection, addresses: tuple[int, ...], items: tuple[str, ...], period: float, view: View
 ) -> int:
+    """Poll the items of all addresses every `period` seconds until the view ends, and return the exit status."""
     bus = connection.open_bus()
     handles = [connection.open_handle(bus, address) for address in addresses]
     points = [handle.point(item) for handle in handles for item in items]

@@ -30,12 +30,13 @@ class Bar:
         self._hide()
 
     def advance(self) -> None:
+        """Count one more and draw the bar."""
         if self._bar is not None:
             self._bar.update(self._task, advance=1, refresh=True)
 
     @contextmanager
     def hidden(self) -> Iterator[None]:
-        """The bar is gone while a result is printed."""
+        """Hide the bar while a result is printed."""
         self._hide()
         try:
             yield

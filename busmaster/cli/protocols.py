@@ -18,7 +18,7 @@ WIDTH = 77
 
 
 def parse_protocol(text: str) -> str:
-    """The name of a kind of node. Raises InvalidCommand for any other."""
+    """Return the name of a kind of node. Raises InvalidCommand for any other."""
     return find(text).name
 
 
@@ -26,12 +26,13 @@ class ProtocolOption(click.Option):
     """`--protocol P`, whose help names them all."""
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the help, with the names of all protocols in it."""
         self.help = (self.help or "").replace("{}", ", ".join(kinds()))
         return super().get_help_record(ctx)
 
 
 def protocol_option(*, required: bool = True, text: str = "One of {}.") -> Callable[[F], F]:
-    """`--protocol P`; `{}` in its help, `text`, stands for the names."""
+    """Give a command `--protocol P`; `{}` in its help, `text`, stands for the names."""
     return click.option(
         "--protocol", cls=ProtocolOption, required=required, type=option_type(parse_protocol), metavar="P", help=text
     )
@@ -44,7 +45,7 @@ class Offer(NamedTuple):
     kinds: tuple[str, ...]
 
     def parameter(self) -> click.Option:
-        """Return it as click has it."""
+        """Return the option as click has it."""
         flag = f"--{self.option.name.replace('_', '-')}"
         text = f"{', '.join(self.kinds)}: {self.option.help}."
         match self.option.kind:
@@ -57,7 +58,7 @@ class Offer(NamedTuple):
 
 
 def offers(options_of: Callable[[NodeKind], Iterable[Option]]) -> list[Offer]:
-    """Those options of all kinds of nodes that the command line has, each name once."""
+    """Return those options of all kinds of nodes that the command line has, each name once."""
     found: dict[str, Offer] = {}
     for kind in kinds().values():
         for option in options_of(kind):
@@ -68,12 +69,12 @@ def offers(options_of: Callable[[NodeKind], Iterable[Option]]) -> list[Offer]:
 
 
 def handle_options() -> list[Offer]:
-    """What a handle takes."""
+    """Return the options that a handle takes."""
     return offers(lambda kind: kind.options)
 
 
 def read_options() -> list[Offer]:
-    """What reading an item takes."""
+    """Return the options that reading an item takes."""
     return offers(lambda kind: kind.read_options)
 
 
@@ -94,9 +95,11 @@ class NodeCommand(click.Command):
     """A command on nodes: it takes the options of their handles too."""
 
     def offers(self) -> list[Offer]:
+        """Return the options that the command takes beyond its own."""
         return handle_options()
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Return the command's own parameters, then what is offered, then --help."""
         *own, show_help = super().get_params(ctx)
         return [*own, *(offer.parameter() for offer in self.offers()), show_help]
 
@@ -105,13 +108,14 @@ class ItemCommand(NodeCommand):
     """A command on items: its help says what they are, and where more is said of each."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write what an ITEM is, protocol by protocol, below the help."""
         head = "ITEM, by protocol (`busmaster items PROTOCOL` says what each is):"
         self.epilog = "\n".join(("\b", head, *item_lines()))
         super().format_epilog(ctx, formatter)
 
 
 def item_lines() -> Iterator[str]:
-    """What an ITEM is, of each kind of node."""
+    """Yield the lines that say what an ITEM is, of each kind of node."""
     margin = 4 + max(map(len, kinds()))
     for kind in kinds().values():
         yield from textwrap.wrap(

@@ -35,6 +35,7 @@ def command(connection: Connection, node: int | None, items: tuple[str, ...], as
 async def read(
     connection: Connection, address: int, items: tuple[str, ...], how: dict[str, Any], as_json: bool
 ) -> None:
+    """Read the items of one node and print each; all are checked before the first is asked for."""
     bus = connection.open_bus()
     handle = connection.open_handle(bus, address)
     for item in items:
@@ -49,7 +50,7 @@ async def read(
 
 
 def plain_lines(handle: Handle, item: str, value: Any) -> Iterator[str]:
-    """A line, or for a run a line a value."""
+    """Yield a line, or for a run a line a value."""
     if not isinstance(value, tuple):
         yield f"{item} {value_text(value)}"
         return

@@ -39,7 +39,7 @@ def command(capture: str) -> int:
 
 
 def whole_packets(file: BinaryIO) -> Iterator[Packet]:
-    """Up to where the file is cut off, if it is. Raises CaptureError for one that is no capture."""
+    """Yield the packets up to where the file is cut off, if it is. Raises CaptureError for one that is no capture."""
     packets = 0
     try:
         for packet in read_packets(file):
@@ -50,12 +50,14 @@ def whole_packets(file: BinaryIO) -> Iterator[Packet]:
 
 
 def changed_text(one: Replayed) -> str:
+    """Return the line of an exchange that has changed: what was recorded, and what comes out now."""
     moment = datetime.fromtimestamp(one.micros / 1e6).astimezone().strftime("%H:%M:%S.%f")
     node = "" if one.node is None else f"node {one.node}: "
     return f"packet {one.packet}, {moment}, {node}{one.command}: was {one.recorded}, is {one.now}"
 
 
 def summary_text(counts: Counter[str]) -> str:
+    """Return the line that says how many exchanges there were, and how many have changed."""
     total = counts.total()
     text = f"{total} exchange{'' if total == 1 else 's'}: {counts['same']} the same, {counts['changed']} changed"
     return text + (f", {counts['unjudged']} not judged" if counts["unjudged"] else "")

@@ -88,6 +88,7 @@ class Running:
         self._manager = ServiceManager()
 
     async def run(self) -> int:
+        """Run the line until it is told to end, send its safe state, and return the exit status."""
         entered = False
         self.line.outputs.tell = self._tell_of_output
         try:
@@ -149,7 +150,10 @@ class Running:
         self._manager.ready()
 
     def _checked_file(self) -> LineFile:
-        """Raises OSError, and InvalidCommand, naming line and key, for what is wrong with the file."""
+        """Load the file and check it.
+
+        Raises OSError, and InvalidCommand, naming line and key, for what is wrong with the file.
+        """
         file = load(self._path)
         ConfiguredLine(file, port=self.line.bus.endpoint)
         return file
@@ -173,7 +177,7 @@ class Running:
 
 @contextmanager
 def hangups() -> Iterator[MemoryObjectReceiveStream[None]]:
-    """What SIGHUP brings, from now on; several that come while one is served are one more."""
+    """Yield a stream of what SIGHUP brings, from now on; several that come while one is served are one more."""
     send, receive = anyio.create_memory_object_stream[None](1)
 
     def heard() -> None:
@@ -195,6 +199,7 @@ def hangups() -> Iterator[MemoryObjectReceiveStream[None]]:
 
 
 def output_text(counts: OutputStatistics) -> str:
+    """Return the line that says what an output has written and dropped, and what it is down with."""
     text = f"{counts.kind}: {counts.written} {counts.what}, {counts.dropped} dropped"
     if counts.spilled:
         text += f", {counts.spilled} kept on disk for the next time"

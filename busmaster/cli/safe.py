@@ -31,6 +31,7 @@ def command(path: str, port: str | None) -> int:
 
 
 async def leave(line: ConfiguredLine) -> int:
+    """Send the safe state, print each point that was confirmed, and return the exit status."""
     async with line.bus:
         outcomes = await line.safe_state.enter(line.bus)
     for name, error in outcomes.items():
@@ -40,7 +41,7 @@ async def leave(line: ConfiguredLine) -> int:
 
 
 def tell_unsafe(outcomes: Mapping[str, BusError | None]) -> int:
-    """Name each point that was not confirmed on standard error: the exit status."""
+    """Name each point that was not confirmed on standard error, and return the exit status."""
     unsafe = {name: error for name, error in outcomes.items() if error is not None}
     for name, error in unsafe.items():
         note(f"the safe state of {name} is not confirmed: {error}", Level.CRITICAL)

@@ -33,6 +33,7 @@ def command(connection: Connection, nodes: tuple[int, ...] | None, as_json: bool
 
 
 async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool) -> None:
+    """Ask each address once, and print what answers, behind a bar of the progress."""
     bus = connection.open_bus()
     nodes = [bus.node(connection.profile, address, timings=connection.timings) for address in addresses]
     async with bus:
@@ -49,7 +50,7 @@ async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool
 
 
 async def ask(node: Node) -> tuple[object, str] | None:
-    """The value and what happened in words; None if nothing was heard of it."""
+    """Ask a node once, and return the value and what happened in words; None if nothing was heard of it."""
     probe = node.profile.probe
     try:
         value = await node.request(probe, retries=0)

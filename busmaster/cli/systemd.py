@@ -37,7 +37,7 @@ class ServiceManager:
         self.interval = int(micros) / 1e6 if wanted and path else 0.0
 
     def tell(self, **fields: str | int) -> None:
-        """Send these, as one message."""
+        """Send these fields, as one message."""
         if self._socket is not None:
             text = "\n".join(f"{name}={value}" for name, value in fields.items())
             try:
@@ -46,18 +46,19 @@ class ServiceManager:
                 pass
 
     def ready(self) -> None:
-        """It does what it is for; also after `reloading`."""
+        """Say that the service does what it is for; also after `reloading`."""
         self.tell(READY=1)
 
     def reloading(self) -> None:
-        """It reads its file again, until it is `ready`."""
+        """Say that the service reads its file again, until it is `ready`."""
         self.tell(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
 
     def stopping(self) -> None:
-        """It ends, in order."""
+        """Say that the service ends, in order."""
         self.tell(STOPPING=1)
 
     def close(self) -> None:
+        """Close the socket; nothing is told any more."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -82,7 +83,7 @@ class Movement:
         self._since = bus.now()
 
     def goes_on(self, patience: float) -> bool:
-        """Whether there was an exchange in the last `patience` seconds, or in two periods if those are longer.
+        """Tell whether there was an exchange in the last `patience` seconds, or in two periods if those are longer.
 
         A line has no reason to move while its port is away (it is opened again, and that is told), while nothing is
         polled, or while every node is down or suspended.

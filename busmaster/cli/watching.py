@@ -71,17 +71,18 @@ class Watch:
         self._loads: deque[tuple[float, float]] = deque()
 
     def since(self, time: float) -> float:
+        """Return a time of the bus in seconds since the start."""
         return round(time - self.start, 6)
 
     def add(self, group: PollGroup) -> None:
-        """Show this one too, from now on."""
+        """Show this group too, from now on."""
         self.groups.append(group)
         self._periods[group.name] = deque(maxlen=KEPT_PERIODS)
         if self._tasks is not None:
             self._begin(self._tasks, group)
 
     def replace_groups(self, groups: Iterable[PollGroup]) -> None:
-        """Show these from now on; one that is shown already goes on."""
+        """Show these groups from now on; one that is shown already goes on."""
         wanted = list(groups)
         for gone in [group for group in self.groups if group not in wanted]:
             self.groups.remove(gone)
@@ -122,7 +123,10 @@ class Watch:
                 self.tell(text)
 
     def _level(self, event: Event) -> Level | None:
-        """How much it matters to whoever is not looking: a loss, and its end, once each. None for the rest."""
+        """Return how much an event matters to whoever is not looking: a loss, and its end, once each.
+
+        None stands for the rest.
+        """
         match event:
             case PortFailed():
                 self._troubles.add(LINE)
@@ -136,7 +140,7 @@ class Watch:
                 return None
 
     def _turn(self, what: str, trouble: Level | None) -> Level | None:
-        """It is in trouble, or no longer: how much that matters if it is new."""
+        """Note that `what` is in trouble, or no longer, and return how much that matters if it is new."""
         if trouble is None:
             known = what in self._troubles
             self._troubles.discard(what)
@@ -157,7 +161,7 @@ class Watch:
             note(text, level)
 
     def picture(self) -> Frame:
-        """For the screen. Cheap: it is taken on the loop that owns the line."""
+        """Return the frame for the screen. Cheap: it is taken on the loop that owns the line."""
         now = self.bus.now()
         if now >= self._counted + COUNTED_EVERY:
             self._counted = now
@@ -180,6 +184,7 @@ class Watch:
 
     @property
     def port(self) -> str:
+        """The name of the port, with the rate and framing where it has them."""
         settings = self.bus.endpoint.settings
         name = self.bus.endpoint.name
         return f"{name}  {settings.baudrate} {settings.framing}" if settings else name
@@ -199,14 +204,14 @@ class Watch:
         self._counted = -math.inf
 
     def _pause(self) -> None:
-        """Or go on. The time in between is no period."""
+        """Pause all groups, or go on with them. The time in between is no period."""
         paused = all(group.paused for group in self.groups)
         self._started.clear()
         for group in self.groups:
             group.resume() if paused else group.pause()
 
     def _suspend(self, label: str) -> None:
-        """Or go on."""
+        """Suspend the node for SUSPENDED_FOR seconds, or go on with it."""
         for node in self.bus.nodes:
             if node.label == label:
                 node.suspend(0.0 if node.suspended else SUSPENDED_FOR)
@@ -262,7 +267,7 @@ class Watch:
         return GroupRow(group.name, group.period, mean, p99_of(periods), counts.cycles, counts.missed, group.paused)
 
     def summarise(self) -> None:
-        """On standard error: cycles, missed, achieved period, utilisation; a line for each node."""
+        """Print the summary on standard error: cycles, missed, achieved period, utilisation; a line for each node."""
         counts = self.bus.statistics()
         if self.bus.state is LineState.SETTLING and not (counts.exchanges or counts.unasked_bytes):
             note("nothing was asked: a new line rests until replies to an earlier master are past; let it run longer")
@@ -281,31 +286,35 @@ class Watch:
 
 
 def p99_of(periods: Iterable[float]) -> float | None:
+    """Return the period that 99 % do not exceed, None without any."""
     ordered = sorted(periods)
     return ordered[math.ceil(0.99 * len(ordered)) - 1] if ordered else None
 
 
 def short_unit(unit: str) -> str:
-    """A column has no room for "% of rated current"."""
+    """Shorten a unit: a column has no room for "% of rated current"."""
     return unit.partition(" of ")[0]
 
 
 def json_cycle(watch: Watch, snapshot: Snapshot) -> str:
+    """Return a cycle as one JSON object."""
     return json_line(**cycle_fields(snapshot, watch.since))
 
 
 def plain_cycle(watch: Watch, snapshot: Snapshot) -> Iterator[str]:
-    """A line a sample: seconds since the start, node and item, the value, or what went wrong."""
+    """Yield a line a sample: seconds since the start, node and item, the value, or what went wrong."""
     for point, sample in snapshot.samples.items():
         value = error_text(sample.error) if sample.error else value_text(sample.value)
         yield f"{snapshot.finished - watch.start:.3f} {point.key} {value}"
 
 
 def error_text(error: BusError) -> str:
+    """Return what stands in place of the value that could not be read."""
     return f"- {error.what}"
 
 
 def print_cycle(watch: Watch, snapshot: Snapshot) -> None:
+    """Print one cycle, as JSON or as plain lines."""
     lines = [json_cycle(watch, snapshot)] if watch.view.as_json else plain_cycle(watch, snapshot)
     emit_all(lines) if watch.output is None else watch.output.print(lines)
 
@@ -318,12 +327,13 @@ async def print_cycles(watch: Watch, group: PollGroup) -> None:
 
 
 async def count_cycles(watch: Watch, group: PollGroup) -> None:
+    """Count every cycle, and print none."""
     async for snapshot in group:
         watch.saw(snapshot)
 
 
 async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] | None = None) -> int:
-    """Show the watch's groups for its seconds, or until the person quits: the exit status.
+    """Show the watch's groups for its seconds, or until the person quits, and return the exit status.
 
     `beside` runs meanwhile, and is cancelled at the end.
     """
@@ -334,7 +344,7 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
     status = OK
 
     async def show(tasks: TaskGroup) -> None:
-        """Beside the others: a screen that takes its time to end holds up nothing else that is to be done then."""
+        """Draw beside the others: a screen that takes its time to end holds up nothing else that is to be done then."""
         nonlocal status
         status = await draw(watch.picture, lambda action: tasks.start_soon(watch.act, action))
         if status == FAILED and watch.output is not None:
@@ -359,10 +369,10 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
 
 
 def wants_screen(view: View) -> bool:
-    """A terminal on both sides, and nobody who would rather have it otherwise."""
+    """Tell whether there is a terminal on both sides, and nobody who would rather have it otherwise."""
     return not view.plain and not view.as_json and sys.stdout.isatty() and sys.stdin.isatty()
 
 
 def shown_on_screen(view: View) -> bool:
-    """And the library that draws is there."""
+    """Tell whether a screen is wanted, and the library that draws is there."""
     return wants_screen(view) and find_spec("textual") is not None

@@ -32,6 +32,7 @@ def command(
 async def write(
     connection: Connection, address: int, pairs: list[tuple[str, tuple[float, ...]]], verify: bool, as_json: bool
 ) -> None:
+    """Write the pairs to one node, one after another, and print each; all are checked before the first is sent."""
     bus = connection.open_bus()
     handle = connection.open_handle(bus, address)
     prepared = [(item, handle.prepare_write(item, values, verify=verify)) for item, values in pairs]

@@ -35,7 +35,10 @@ def emulated_line(file: LineFile, *, paced: bool | None = None, seed: int | None
 
 
 def line_settings(file: LineFile) -> LineSettings:
-    """Those of a serial port; behind a TCP port those of the first node's protocol, at the port's baud rate."""
+    """Return the settings of the serial port.
+
+    Behind a TCP port they are those of the first node's protocol, at the port's baud rate.
+    """
     if isinstance(file.port, SerialPort):
         return file.port.settings
     own = next(iter(file.nodes.values())).profile.line
@@ -72,7 +75,7 @@ def _hold(device: Device, node: NodeSection, key: str, values: tuple[float, ...]
 
 
 def _scale(node: NodeSection, point: PointSection | None, item: str) -> Scale:
-    """What a number on the line means to the file."""
+    """Return what a number on the line means to the file."""
     whole = node.kind.whole_numbers(item)
     decimals = 0 if point is None else point.decimals
     if node.kind.takes_decimals:

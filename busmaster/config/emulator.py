@@ -63,7 +63,7 @@ def read_emulator(table: Table, nodes: Mapping[str, NodeKind]) -> EmulatorSectio
 
 
 def _changed(section: EmulatedSection, table: Table, kind: NodeKind, shared: Table) -> EmulatedSection:
-    """The section with what a node's table says."""
+    """Return the section with what a node's table says."""
     check_keys(table, kind, OWN_KEYS, lambda other: other.emulated)
     values = table.table("values")
     return EmulatedSection(
@@ -81,7 +81,7 @@ def _delay(table: Table, default: Delay) -> Delay:
 
 
 def _faults(table: Table, base: Mapping[str, Any]) -> Faults:
-    """Those of the table over `base`."""
+    """Return the faults of the table over `base`."""
     table.only(*NAMES)
     faults = Faults()
     for name, rate in {**base, **{name: table.number(name) for name in table.data}}.items():

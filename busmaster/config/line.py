@@ -64,7 +64,7 @@ class ConfiguredLine:
             self._add_outputs()
 
     async def __aenter__(self) -> ConfiguredLine:
-        """Raises LineDown if the port cannot be opened."""
+        """Open the port, and start the groups and the outputs. Raises LineDown if the port cannot be opened."""
         await self.bus.__aenter__()
         try:
             self._start_groups()
@@ -77,7 +77,7 @@ class ConfiguredLine:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """The line is closed first; the outputs then have a few seconds to write what they still hold."""
+        """Close the line first; the outputs then have a few seconds to write what they still hold."""
         try:
             await self.bus.__aexit__(kind, error, traceback)
         finally:
@@ -110,7 +110,10 @@ class ConfiguredLine:
         await self.outputs.replace(dict(self._wanted_outputs()), self.groups.values())
 
     def point(self, name: str) -> NamedPoint:
-        """The point that the file calls so: "winder/position", "press/2008:32". Raises InvalidCommand."""
+        """Return the point that the file calls so: "winder/position", "press/2008:32".
+
+        Raises InvalidCommand for what is no point of the line.
+        """
         node, slash, item = name.partition("/")
         if not slash or node not in self.nodes:
             raise InvalidCommand(f"no such point {name!r}: use NODE/ITEM with one of {', '.join(self.nodes)}")
@@ -121,7 +124,7 @@ class ConfiguredLine:
         return self._wanted[group]
 
     def plan(self) -> Plan:
-        """Whether the file's poll groups fit its line. Pure arithmetic: nothing is opened."""
+        """Work out whether the file's poll groups fit its line. This is pure arithmetic: nothing is opened."""
         planned = (
             PlannedGroup(
                 group.name,
@@ -138,7 +141,7 @@ class ConfiguredLine:
     # inside
 
     def _start_groups(self) -> None:
-        """Start those that do not run."""
+        """Start the groups that do not run."""
         for group in self.file.groups.values():
             if group.name not in self.groups:
                 with group.table.at():
@@ -192,7 +195,10 @@ class ConfiguredLine:
                     yield point
 
     def _names(self, text: str) -> Iterator[tuple[str, str]]:
-        """Nodes and items of `drive4-8/speed_measured,current`. Raises InvalidCommand."""
+        """Yield nodes and items of `drive4-8/speed_measured,current`.
+
+        Raises InvalidCommand for names that cannot be read.
+        """
         nodes, slash, items = text.partition("/")
         if not slash:
             raise InvalidCommand(f"a point is written NODE/ITEM, not {text!r}")
@@ -224,7 +230,7 @@ class ConfiguredLine:
         return NamedPoint.of(source, where=where, name=name, unit=section.unit, scale=scale, declared=section.writable)
 
     def _safe_writes(self) -> Iterator[SafeWrite]:
-        """The writes of `[safe]`, as they stand there."""
+        """Yield the writes of `[safe]`, in their order there."""
         section = self.file.safe
         table = section.table.table("writes")
         known: dict[object, str] = {}
@@ -283,7 +289,10 @@ def _settings(node: NodeSection) -> tuple[object, ...]:
 
 
 def _section(file: LineFile, name: str) -> PointSection | None:
-    """What a file says of the point that it calls so; None for one that goes by its item, and of a node it has not."""
+    """Return what a file says of the point that it calls so.
+
+    None stands for a point that goes by its item, and for one of a node that the file has not.
+    """
     node, _, point = name.partition("/")
     return file.nodes[node].points.get(point) if node in file.nodes else None
 
@@ -311,7 +320,7 @@ def decimals_of(node: NodeSection) -> dict[str, int]:
 
 
 def open_line(path: str | os.PathLike[str], *, outputs: bool = True, tap: Tap | None = None) -> ConfiguredLine:
-    """The line that a LINE.toml describes, to be used in `async with`.
+    """Return the line that a LINE.toml describes, to be used in `async with`.
 
         async with open_line("line.toml") as line:
             await line.nodes["winder"].write(1, 123.456)

@@ -15,7 +15,10 @@ MOST = 1000
 
 
 def expanded(name: str, known: Container[str] = ()) -> Iterator[str]:
-    """The names that `name` stands for; one that is `known` as it is stands for itself. Raises InvalidCommand."""
+    """Yield the names that `name` stands for; one that is `known` as it is stands for itself.
+
+    Raises InvalidCommand for a range that goes downwards or is too long.
+    """
     found = None if name in known else RANGE.search(name)
     if found is None:
         yield name
@@ -32,7 +35,7 @@ def expanded(name: str, known: Container[str] = ()) -> Iterator[str]:
 
 
 def listed(text: str) -> list[str]:
-    """What stands between commas. Raises InvalidCommand for nothing."""
+    """Return what stands between commas. Raises InvalidCommand where nothing does."""
     parts = [part.strip() for part in text.split(",")]
     if not all(parts):
         raise InvalidCommand(f"there is a name missing in {text!r}")

@@ -29,7 +29,10 @@ class Scale:
 
     @classmethod
     def of(cls, factor: float = 1, offset: float = 0, decimals: int = 0, whole: bool = False) -> Scale:
-        """Raises InvalidCommand for a factor of 0."""
+        """Return the scale of these numbers, kept exactly as they are written.
+
+        Raises InvalidCommand for a factor of 0.
+        """
         if not factor:
             raise InvalidCommand("a factor of 0 makes every value the same")
         return cls(Fraction(repr(factor)) / 10**decimals, Fraction(repr(offset)), whole)
@@ -39,7 +42,10 @@ class Scale:
         return self.factor == 1 and not self.offset
 
     def reader(self) -> Callable[[Any], Any]:
-        """From the line to the value. Words, flags and texts are left as they are; of a run every number is scaled."""
+        """Return a function from the line's number to the value.
+
+        Words, flags and texts are left as they are; of a run every number is scaled.
+        """
         below = self.factor.denominator * self.offset.denominator
         times = self.factor.numerator * self.offset.denominator
         plus = self.offset.numerator * self.factor.denominator
@@ -54,7 +60,7 @@ class Scale:
         return read
 
     def write(self, value: Any) -> Any:
-        """From the value to the line."""
+        """Return the line's number, or run of numbers, for a value."""
         if isinstance(value, list | tuple):
             return tuple(map(self.write, value))
         if type(value) is int or (type(value) is float and math.isfinite(value)):
@@ -64,7 +70,7 @@ class Scale:
 
 
 def rounded(number: Fraction) -> int:
-    """Half away from zero."""
+    """Round half away from zero."""
     magnitude = (2 * abs(number.numerator) + number.denominator) // (2 * number.denominator)
     return magnitude if number >= 0 else -magnitude
 
@@ -85,6 +91,7 @@ class NamedPoint(Point[Any]):
     def of(
         cls, source: Point[Any], *, where: str, name: str, unit: str, scale: Scale, declared: bool = True
     ) -> NamedPoint:
+        """Return the point under the file's names, with its unit and scale."""
         decode, encode = source.decode, source.encode if declared else None
         if not scale.trivial:
             decode = _after(source.decode, scale.reader())
@@ -112,7 +119,7 @@ class NamedPoint(Point[Any]):
         return self.declared and self.source.writable
 
     async def write(self, value: Any, **options: Unpack[CommandOptions]) -> None:
-        """As `Point.write`. A run is written in as many exchanges as it takes."""
+        """Write a value as `Point.write` does. A run is written in as many exchanges as it takes."""
         if self.writable and self.encode is None:
             await self.source.write(value if self.scale.trivial else self.scale.write(value), **options)
         else:

@@ -13,7 +13,10 @@ from busmaster.transport.tcp import TcpPort
 
 
 def read_port(top: Table, profiles: Sequence[Profile]) -> SerialPort | TcpPort:
-    """`port = "/dev/ttyUSB0"` or `[port]`. What it leaves open of a serial line is as the nodes' protocols want it."""
+    """Read `port = "/dev/ttyUSB0"` or `[port]`.
+
+    What it leaves open of a serial line is as the nodes' protocols want it.
+    """
     if isinstance(top.data.get("port"), str):
         with top.at("port"):
             return endpoint(top.text("port"), defaults=_agreed(profiles))
@@ -33,6 +36,6 @@ def read_port(top: Table, profiles: Sequence[Profile]) -> SerialPort | TcpPort:
 
 
 def _agreed(profiles: Sequence[Profile]) -> LineSettings | None:
-    """The line that all the protocols are meant for, if there is one."""
+    """Return the line that all the protocols are meant for, None if there is none."""
     lines = {profile.line for profile in profiles}
     return lines.pop() if len(lines) == 1 else None

@@ -21,7 +21,10 @@ Outputs: TypeAlias = dict[str, Settings]
 
 
 def read_outputs(table: Table, groups: Iterable[str]) -> Outputs:
-    """Raises FileError, naming line and key: also in one that is not enabled."""
+    """Read `[outputs]`, and return those that are enabled.
+
+    Raises FileError, naming line and key, for what is wrong: also in one that is not enabled.
+    """
     table.only(*KINDS)
     return dict(_enabled(table, tuple(groups)))
 
@@ -46,7 +49,7 @@ def _groups(table: Table, key: str, known: Collection[str]) -> tuple[str, ...]:
 
 
 def _mode(table: Table, key: str) -> int:
-    """Who may read and write a new file, as chmod takes it in octal."""
+    """Read who may read and write a new file, as chmod takes it in octal."""
     text = table.text(key)
     if len(text) not in (3, 4) or not set(text) <= set("01234567") or int(text, 8) > 0o777:
         raise table.error('a mode is octal, as chmod takes it: mode = "0640"', key)
@@ -54,7 +57,7 @@ def _mode(table: Table, key: str) -> int:
 
 
 def _limit(table: Table, key: str) -> float:
-    """How much is kept, where not everything is."""
+    """Read how much is kept, where not everything is."""
     limit = table.number(key)
     if limit <= 0:
         raise table.error(f"must be more than 0, not {limit}; leave it out to keep all", key)

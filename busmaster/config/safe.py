@@ -41,7 +41,7 @@ class SafeSection:
 
 
 def read_safe(table: Table) -> SafeSection:
-    """Raises FileError, naming line and key."""
+    """Read `[safe]`. Raises FileError, naming line and key, for what is wrong in it."""
     table.only("within", "repeatable", "writes")
     within = table.number("within", WITHIN)
     if not 0 < within <= LONGEST:
@@ -72,7 +72,10 @@ class SafeWrite:
 
     @classmethod
     def of(cls, point: NamedPoint, handle: Handle, value: float, *, repeatable: bool) -> SafeWrite:
-        """Raises InvalidCommand for what cannot be sent, may not be repeated, or cannot be read back."""
+        """Check and make one write of the safe state.
+
+        Raises InvalidCommand for what cannot be sent, may not be repeated, or cannot be read back.
+        """
         if not point.writable:
             raise InvalidCommand(f"{point.key} is read-only")
         if point.encode is None:
@@ -115,7 +118,7 @@ class SafeState:
         return bool(self.writes)
 
     async def enter(self, bus: Bus) -> dict[str, BusError | None]:
-        """Send all, urgently, and read them back: of each point why it was not confirmed, None if it was.
+        """Send all, urgently, read them back, and return by point why it was not confirmed, None if it was.
 
         From now on the bus takes no other write. Nodes are served at the same time, each in the file's order; what
         fails is tried again until the time is over.

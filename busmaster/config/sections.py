@@ -113,7 +113,7 @@ def load(path: str | os.PathLike[str]) -> LineFile:
 
 
 def read(source: Source) -> LineFile:
-    """Raises FileError, naming line and key."""
+    """Read what a source says of a line. Raises FileError, naming line and key, for what is wrong in it."""
     top = Table(source)
     top.only("title", "port", "strict", "timing", "protocols", "nodes", "groups", "outputs", "safe", "emulator")
     nodes = {node.name: node for node in _nodes(top, _defaults(top))}
@@ -139,7 +139,7 @@ def read(source: Source) -> LineFile:
 
 
 def _defaults(top: Table) -> dict[str, Table]:
-    """`[protocols.hcp2]`: what holds for all nodes of one protocol that do not say otherwise."""
+    """Read `[protocols.hcp2]`: what holds for all nodes of one protocol that do not say otherwise."""
     tables = {table.name: table for table in top.tables("protocols")}
     top.table("protocols").only(*kinds())
     for protocol, table in tables.items():
@@ -168,7 +168,10 @@ def _nodes(top: Table, defaults: Mapping[str, Table]) -> Iterator[NodeSection]:
 
 
 def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iterator[NodeSection]:
-    """The nodes of one table: several where its name is a range. `learned`: the line's reply times are."""
+    """Yield the nodes of one table: several where its name is a range.
+
+    `learned` says whether the reply times of the line are learned.
+    """
     protocol = table.choice("protocol", kinds())
     own = find(protocol).options
     check_keys(table, find(protocol), NODE_KEYS, lambda kind: kind.options)
@@ -204,7 +207,7 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
 
 
 def _addresses(table: Table, profile: Profile) -> Sequence[int]:
-    """`address = 5`, or `address = "4-8"`."""
+    """Read `address = 5`, or `address = "4-8"`."""
     if not profile.addressed:
         if "address" in table:
             raise table.error(f"{profile.name} has no addresses: one drive a line", "address")

@@ -39,7 +39,7 @@ class Source:
     """The values of one file, and where each of them stands."""
 
     def __init__(self, name: str, text: str) -> None:
-        """Raises FileError, with the line, for what is no TOML."""
+        """Read a TOML text. Raises FileError, with the line, for what is no TOML."""
         self.name = name
         try:
             self.data: dict[str, Any] = tomllib.loads(text)
@@ -52,7 +52,7 @@ class Source:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Source:
-        """Raises OSError where it cannot be read, and FileError for what is no TOML."""
+        """Read a file. Raises OSError where it cannot be read, and FileError for what is no TOML."""
         name = os.fspath(path)
         try:
             return cls(name, Path(path).read_bytes().decode())
@@ -61,19 +61,19 @@ class Source:
             raise FileError(f"{name}:{line}: this is no TOML: it is not written in UTF-8") from None
 
     def line(self, key: Key) -> int:
-        """Where `key` stands, or what it would be part of."""
+        """Return the line on which `key` stands, or what it would be part of."""
         while key and key not in self._places:
             key = key[:-1]
         return self._places.get(key, 1)
 
     def error(self, key: Key, text: str) -> FileError:
-        """What is wrong at `key`, with its place: "line.toml:12: nodes.winder.address: ..."."""
+        """Return an error of what is wrong at `key`, with its place: "line.toml:12: nodes.winder.address: ..."."""
         shown = "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in key).lstrip(".")
         return FileError(f"{self.name}:{self.line(key)}: {shown}: {text}" if key else f"{self.name}: {text}")
 
 
 def places(text: str) -> dict[Key, int]:
-    """The line, from 1, on which each table, key and array element of a valid TOML text begins."""
+    """Return the line, from 1, on which each table, key and array element of a valid TOML text begins."""
     return _Walk(text).places
 
 
@@ -101,7 +101,7 @@ class _Walk:
                 self._pair(table)
 
     def _header(self) -> Key:
-        """`[table]`, or one more `[[element]]`."""
+        """Take `[table]`, or one more `[[element]]`, and return its key."""
         line = self._line()
         brackets = 0
         while self._peek() == "[":
@@ -119,7 +119,7 @@ class _Walk:
         return key
 
     def _inside(self, names: Key) -> Key:
-        """A name on the way that is an array of tables means its last element."""
+        """Return the key of a header's names. A name on the way that is an array of tables means its last element."""
         key: Key = ()
         for name in names[:-1]:
             key = (*key, name)
@@ -171,7 +171,7 @@ class _Walk:
         return tuple(names)
 
     def _skip(self) -> str:
-        """To the next token that is no new line."""
+        """Go to the next token that is no new line, and return it."""
         while self._peek() == "\n":
             self._take()
         return self._peek()

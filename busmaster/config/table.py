@@ -41,17 +41,18 @@ class Table:
         return key in self.data
 
     def only(self, *known: str) -> None:
-        """Raises FileError for a key that is none of these."""
+        """Refuse other keys. Raises FileError for a key that is none of these."""
         for key in self.data:
             if key not in known:
                 raise self.error(f"no such key; {meant(key, known)}", key)
 
     def error(self, text: str, *way: str | int) -> FileError:
+        """Return an error with the place of this table, or of what `way` leads to in it."""
         return self.source.error((*self.key, *way), text)
 
     @contextmanager
     def at(self, *way: str | int) -> Iterator[None]:
-        """What is wrong inside gets this place."""
+        """Give this place to what is wrong inside: an InvalidCommand becomes a FileError."""
         try:
             yield
         except FileError:
@@ -62,47 +63,52 @@ class Table:
     # values
 
     def text(self, key: str, default: T | _Required = REQUIRED) -> str | T:
+        """Read a text."""
         value: str | T = self._take(key, str, default, "a text in quotes")
         return value
 
     def flag(self, key: str, default: bool) -> bool:
+        """Read true or false."""
         value: bool = self._take(key, bool, default, "true or false")
         return value
 
     def whole(self, key: str, default: T | _Required = REQUIRED, *, least: int = 0, most: int = MILLION) -> int | T:
+        """Read a whole number, `least` to `most`."""
         value: int | T = self._take(key, int, default, "a whole number")
         if key in self.data and isinstance(value, int) and not least <= value <= most:
             raise self.error(f"must be {least} to {most}, not {value}", key)
         return value
 
     def number(self, key: str, default: T | _Required = REQUIRED) -> float | T:
+        """Read a finite number."""
         value: float | T = self._take(key, (int, float), default, "a number")
         if isinstance(value, float) and not math.isfinite(value):
             raise self.error(f"must be finite, not {value}", key)
         return value
 
     def seconds(self, key: str, default: T | _Required = REQUIRED) -> float | T:
-        """0 or more."""
+        """Read a number of seconds, 0 or more."""
         value: float | T = self._take(key, (int, float), default, "a number of seconds")
         if isinstance(value, int | float) and not 0 <= value < math.inf:
             raise self.error(f"must be a number of seconds, 0 or more, not {value}", key)
         return value
 
     def positive(self, key: str) -> float:
-        """Above 0."""
+        """Read a number above 0."""
         value = self.number(key)
         if value <= 0:
             raise self.error(f"must be above 0, not {value}", key)
         return value
 
     def share(self, key: str) -> float:
-        """0 to 1."""
+        """Read a number from 0 to 1."""
         value = self.number(key)
         if not 0 <= value <= 1:
             raise self.error(f"must be 0 to 1, not {value}", key)
         return value
 
     def choice(self, key: str, known: Iterable[str], default: T | _Required = REQUIRED) -> str | T:
+        """Read a text that is one of `known`."""
         known = tuple(known)
         value = self.text(key, default)
         if key in self.data and value not in known:
@@ -110,7 +116,7 @@ class Table:
         return value
 
     def texts(self, key: str, default: T | _Required = REQUIRED) -> tuple[str, ...] | T:
-        """One text or several."""
+        """Read one text or several."""
         if key in self.data and isinstance(self.data[key], str):
             return (self.data[key],)
         values: list[Any] | T = self._take(key, list, default, "a list of texts")
@@ -122,7 +128,7 @@ class Table:
         return tuple(values)
 
     def wholes(self, key: str, *, most: int = MILLION) -> tuple[int, ...]:
-        """Whole numbers, 0 to `most`, in a list."""
+        """Read a list of whole numbers, 0 to `most`."""
         values = self._take(key, list, REQUIRED, "a list of whole numbers")
         for number, value in enumerate(values):
             if type(value) is not int or not 0 <= value <= most:
@@ -130,7 +136,7 @@ class Table:
         return tuple(values)
 
     def numbers(self, key: str) -> tuple[float, ...]:
-        """One finite number, or true or false, or several of them."""
+        """Read one finite number, or true or false, or several of them."""
         given = self.data[key]
         values = given if isinstance(given, list) else [given]
         for number, value in enumerate(values):
@@ -182,14 +188,15 @@ class Table:
     # tables
 
     def table(self, key: str) -> Table:
-        """An empty one where there is none."""
+        """Return the table under this key, an empty one where there is none."""
         return Table(self.source, (*self.key, key), self._take(key, dict, {}, f"a table: [{self._path(key)}]"))
 
     def tables(self, key: str) -> Iterator[Table]:
-        """Each of the tables in it: `[nodes.winder]`, `[nodes.press]`."""
+        """Return each of the tables in it: `[nodes.winder]`, `[nodes.press]`."""
         return self.table(key).each()
 
     def each(self) -> Iterator[Table]:
+        """Return each of the tables in this one."""
         return map(self.table, self.data)
 
     def _path(self, key: str) -> str:
@@ -207,4 +214,5 @@ class Table:
 
 
 def shown(value: object) -> str:
+    """Return a value as a message shows it."""
     return {dict: "a table", list: "a list", bool: str(value).lower()}.get(type(value), repr(value))

@@ -19,7 +19,10 @@ LEARNED_WORD = "learned"
 
 
 def read_timings(table: Table, base: Timings) -> Timings:
-    """`base` with what the table's `timing` changes. Nominal and lateness move with the window where they must."""
+    """Return `base` with what the table's `timing` changes.
+
+    Nominal and lateness move with the window where they must.
+    """
     if isinstance(table.data.get("timing"), str):
         table.choice("timing", (LEARNED_WORD,))
         return base

@@ -61,6 +61,7 @@ class Timings:
 
     @classmethod
     def uniform(cls, timing: ReplyTiming) -> Timings:
+        """Return the same times for reads, writes and packets."""
         return cls(timing, timing, timing)
 
     def with_window(self, window: float) -> Timings:
@@ -69,6 +70,7 @@ class Timings:
         return Timings(self.read.with_window(window), self.write.with_window(window), packet)
 
     def with_lateness(self, lateness: float) -> Timings:
+        """Return the same with at least this lateness for each of the three."""
         return Timings(
             self.read.with_lateness(lateness), self.write.with_lateness(lateness), self.packet.with_lateness(lateness)
         )

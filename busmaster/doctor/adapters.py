@@ -41,7 +41,7 @@ class Finding:
 
 
 def inspect(name: str, *, proc: Path = PROC) -> tuple[Finding, ...]:
-    """Everything that can be said without opening it of the port at a path, or of usb:SERIAL. May block."""
+    """Say everything that can be said without opening it of the port at a path, or of usb:SERIAL. May block."""
     try:
         path = identity.resolve(name)
     except LineDown as error:
@@ -53,7 +53,7 @@ def inspect(name: str, *, proc: Path = PROC) -> tuple[Finding, ...]:
 
 
 def latency_timer(path: str) -> int | None:
-    """Milliseconds for which an FTDI adapter gathers bytes before it passes them on; None for other adapters."""
+    """Return the milliseconds for which an FTDI adapter gathers bytes before it passes them on; else None."""
     try:
         return int((_device(path) / "latency_timer").read_text())
     except (OSError, ValueError):
@@ -61,7 +61,7 @@ def latency_timer(path: str) -> int | None:
 
 
 def low_latency(descriptor: int) -> bool | None:
-    """Whether the driver of an open port has its low-latency flag set; None if it knows no such flag."""
+    """Return whether the driver of an open port has its low-latency flag set; None if it knows no such flag."""
     settings = array.array("i", [0] * 32)  # struct serial_struct, with room to grow
     try:
         fcntl.ioctl(descriptor, termios.TIOCGSERIAL, settings)
@@ -71,7 +71,7 @@ def low_latency(descriptor: int) -> bool | None:
 
 
 def rs485_mode(descriptor: int) -> bool | None:
-    """Whether the driver of an open port switches the transmitter by itself; None if it cannot."""
+    """Return whether the driver of an open port switches the transmitter by itself; None if it cannot."""
     settings = array.array("I", [0] * 32)  # struct serial_rs485, with room to grow
     try:
         fcntl.ioctl(descriptor, TIOCGRS485, settings)
@@ -94,7 +94,7 @@ def _existence(path: str) -> Finding:
 
 
 def _name(name: str, path: str) -> Iterator[Finding]:
-    """Which USB adapter it is, and by what name that is found again."""
+    """Say which USB adapter it is, and by what name that is found again."""
     with contextlib.suppress(OSError):  # it has just gone, which opening it will say
         device = identity.usb_device(os.stat(path).st_rdev)
         if device is None:
@@ -155,7 +155,7 @@ def _latency_timer(path: str) -> Iterator[Finding]:
 
 
 def _entry(path: str) -> Path:
-    """Where the kernel describes this device; a pseudo-terminal is not there."""
+    """Return where the kernel describes this device; a pseudo-terminal is not there."""
     number = os.stat(path).st_rdev
     return identity.SYS / f"dev/char/{os.major(number)}:{os.minor(number)}"
 

@@ -32,6 +32,7 @@ class Record:
     probes: list[Probe]
 
     def count(self, outcome: Outcome) -> int:
+        """Return how many probes ended so."""
         return sum(probe.outcome is outcome for probe in self.probes)
 
     @property
@@ -58,7 +59,7 @@ class Record:
 
 
 def unasked(heard: bytes, protocol: str | None) -> Finding:
-    """What was heard before anything was sent."""
+    """Say what was heard before anything was sent."""
     if not heard:
         return Finding("silence", True, "nobody speaks unasked")
     known = [] if protocol is None else spoken(heard, protocol)
@@ -78,14 +79,14 @@ def unasked(heard: bytes, protocol: str | None) -> Finding:
 
 
 def spoken(heard: bytes, protocol: str) -> list[str]:
-    """The whole frames among it, in words."""
+    """Return the whole frames among it, in words."""
     decoder = Decoder(find(protocol).protocol.dialect())
     frames = [*decoder.feed(heard, 0.0), *decoder.quiet()]
     return [frame.text for frame in frames if not frame.fault and frame.kind is not Kind.NOISE]
 
 
 def echo(sent: bytes, heard: bytes, declared: bool) -> Finding:
-    """What came back of bytes that nobody answers."""
+    """Say what came back of bytes that nobody answers."""
     if heard.startswith(sent):
         if declared:
             return Finding("echo", True, "the adapter hears what it sends, as declared")
@@ -108,7 +109,7 @@ def echo(sent: bytes, heard: bytes, declared: bool) -> Finding:
 
 
 def garbage(data: bytes) -> str:
-    """A few of the bytes, and what they look like."""
+    """Return a few of the bytes, and what they look like."""
     text = data[:SHOWN].hex(" ") + (" ..." if len(data) > SHOWN else "")
     guess = _looks_like(data)
     return f"{text} ({guess})" if guess else text
@@ -132,7 +133,7 @@ def _looks_like(data: bytes) -> str:
 
 
 def nodes(records: Sequence[Record], timing: ReplyTiming) -> Iterator[Finding]:
-    """Each node, and what their latencies say of the reply times set."""
+    """Say how each node does, and what their latencies say of the reply times set."""
     for record in records:
         others = [other for other in records if other is not record and other.lives]
         clean = bool(others) and not any(other.count(Outcome.GARBLED) for other in others)
@@ -143,7 +144,7 @@ def nodes(records: Sequence[Record], timing: ReplyTiming) -> Iterator[Finding]:
 
 
 def node(record: Record, others_are_clean: bool) -> Finding:
-    """How one node does; `others_are_clean` tells a trouble of its own from one of the line."""
+    """Say how one node does; `others_are_clean` tells a trouble of its own from one of the line."""
     asked, garbled, silent = len(record.probes), record.count(Outcome.GARBLED), record.count(Outcome.SILENT)
     label, who = record.label, f"another node with {_address_of(record)}"
     if record.doubled:
@@ -181,7 +182,7 @@ def _address_of(record: Record) -> str:
 
 
 def windows(starts: Sequence[float], timing: ReplyTiming) -> Finding:
-    """How measured latencies, in seconds, go with the reply times set."""
+    """Say how measured latencies, in seconds, go with the reply times set."""
     slow = percentile(sorted(starts))
     times = " / ".join(milliseconds(value) for value in (timing.nominal, timing.window, timing.lateness))
     what = f"replies begin within {milliseconds(slow)} ms; set are {times} ms (nominal / window / lateness)"
@@ -200,7 +201,7 @@ def windows(starts: Sequence[float], timing: ReplyTiming) -> Finding:
 
 
 def nobody(asked: str, profile: Profile, settings: LineSettings | None) -> Finding:
-    """No node has answered. `asked` names them, as in "nodes 1-4"."""
+    """Say that no node has answered. `asked` names them, as in "nodes 1-4"."""
     at = "" if settings is None else f" at {speed(settings)}"
     return Finding(
         "nodes",
@@ -212,7 +213,7 @@ def nobody(asked: str, profile: Profile, settings: LineSettings | None) -> Findi
 
 
 def other_rate(address: int | None, settings: LineSettings, asked: str, tried: int) -> Finding:
-    """What came of trying other settings; `settings` are those at which the node `address` answered, if one did."""
+    """Say what came of trying other settings; `settings` are those at which the node `address` answered, if one did."""
     if address is None:
         what = f"{asked}: no answer with {tried} other settings either"
         return Finding("settings", False, what, "name your nodes with --nodes if these are not among them")
@@ -221,19 +222,21 @@ def other_rate(address: int | None, settings: LineSettings, asked: str, tried: i
 
 
 def percentile(ordered: Sequence[float], share: float = 0.99) -> float:
-    """Of at least one value, in order: the smallest that so many are not above."""
+    """Return, of at least one value, in order, the smallest that such a share of them (0 to 1) are not above."""
     return ordered[math.ceil(share * len(ordered)) - 1]
 
 
 def rounded_up(seconds: float) -> float:
+    """Round a time in seconds up to a whole STEP."""
     return math.ceil(seconds / STEP - 1e-9) * STEP
 
 
 def milliseconds(seconds: float) -> str:
-    """With one decimal below 10 ms, and without a needless zero."""
+    """Write seconds as milliseconds, with one decimal below 10 ms, and without a needless zero."""
     value = seconds * 1000
     return f"{value:.1f}".removesuffix(".0") if value < 10 else f"{value:.0f}"
 
 
 def speed(settings: LineSettings) -> str:
+    """Return the baud rate and the framing in a few words."""
     return f"{settings.baudrate} {settings.framing}"

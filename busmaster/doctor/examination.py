@@ -83,7 +83,7 @@ class Patient:
         return find(self.protocol).profile
 
     def crowd(self, addresses: Sequence[int]) -> str:
-        """How nodes that do not answer are spoken of."""
+        """Return how nodes that do not answer are spoken of."""
         if len(addresses) == 1:
             return self.profile.label(addresses[0])
         if len(addresses) > 2 * STRANGERS:
@@ -114,7 +114,7 @@ async def examine(patient: Patient, tell: Tell, tap: Tap | None = None) -> None:
 
 
 def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
-    """What can be said of an open port."""
+    """Say what can be said of an open port."""
     where = patient.endpoint
     assert wire.transport is not None
     profile = None if patient.protocol is None else patient.profile
@@ -131,7 +131,7 @@ def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
 
 
 def driver(descriptor: int) -> Iterator[Finding]:
-    """What the driver of an open serial port does."""
+    """Say what the driver of an open serial port does."""
     match adapters.low_latency(descriptor):
         case None:
             yield Finding("driver", True, "it has no low-latency flag")
@@ -154,6 +154,7 @@ def driver(descriptor: int) -> Iterator[Finding]:
 
 
 async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
+    """Tell what is found on an open line; what makes the rest pointless is the last."""
     where = patient.endpoint
     assert wire.port is not None
     await wire.hear_all(OPENING)
@@ -189,7 +190,7 @@ async def examine_line(patient: Patient, wire: Wire, tell: Tell) -> None:
 
 
 async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
-    """Every address once, and those that live again and again. The silent are left out, unless they were named."""
+    """Ask every address once, and those that live again and again. The silent are left out, unless they were named."""
     records = []
     label = patient.profile.label
     with patient.progress("asking", len(patient.addresses)) as bar:
@@ -211,7 +212,7 @@ async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
 
 
 async def try_settings(patient: Patient, wire: Wire, prober: Prober, tell: Tell) -> None:
-    """Nobody answers: would somebody at another rate, or with another framing? The port is left as it was."""
+    """Try, as nobody answers, whether somebody would at another rate or framing. The port is left as it was."""
     assert wire.transport is not None
     device, settings = wire.transport.get_extra_info("serial"), patient.endpoint.settings
     if device is None or settings is None:
@@ -238,7 +239,7 @@ async def try_settings(patient: Patient, wire: Wire, prober: Prober, tell: Tell)
 async def answers_at(
     settings: LineSettings, device: Any, prober: Prober, asked: Sequence[int], patience: float
 ) -> int | None:
-    """The first node that answers with these settings; None too where the port does not take them."""
+    """Return the first node that answers with these settings; None too where the port does not take them."""
     try:
         await anyio.to_thread.run_sync(configure, device, settings)
     except (OSError, ValueError):
@@ -251,7 +252,7 @@ async def answers_at(
 
 
 def configure(device: Any, settings: LineSettings) -> None:
-    """Blocks. Raises OSError or ValueError for what the port does not take."""
+    """Give an open port other settings. Blocks. Raises OSError or ValueError for what the port does not take."""
     device.apply_settings(
         {
             "baudrate": settings.baudrate,
@@ -263,7 +264,7 @@ def configure(device: Any, settings: LineSettings) -> None:
 
 
 def other_settings(settings: LineSettings) -> list[LineSettings]:
-    """Other rates with this framing first, then other framings."""
+    """Return other rates with this framing first, then other framings."""
     own = (settings.bytesize, settings.parity)
     framings = [own, *(framing for framing in FRAMINGS if framing != own)]
     tried = (

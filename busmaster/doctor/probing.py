@@ -60,7 +60,7 @@ class Wire(asyncio.Protocol):
         self.port = open_port(transport)
 
     def byte_marked(self, byte: bytes, mark: Mark) -> None:
-        """What is damaged is heard all the same: whoever looks for what is wrong wants to see it."""
+        """Hear what is damaged all the same: whoever looks for what is wrong wants to see it."""
         self.marked[mark] += 1
         self.data_received(byte)
 
@@ -77,7 +77,7 @@ class Wire(asyncio.Protocol):
         self._arrived.set()
 
     def say(self, data: bytes) -> float:
-        """Returns when it was handed to the port. Raises LineDown if that is gone."""
+        """Send `data`, and return when it was handed to the port. Raises LineDown if that is gone."""
         if self.transport is None or self.closed.is_set():
             raise self._loss()
         self.transport.write(data)
@@ -93,7 +93,7 @@ class Wire(asyncio.Protocol):
             self._tap.attempted(attempt)
 
     async def hear(self, until: float) -> tuple[float, bytes] | None:
-        """The next bytes and their time; None if nothing has come by `until`. Raises LineDown if the port is lost."""
+        """Return the next bytes and their time; None if none came by `until`. Raises LineDown if the port is lost."""
         while not self._chunks:
             if self.closed.is_set():
                 raise self._loss()
@@ -106,9 +106,9 @@ class Wire(asyncio.Protocol):
         return self._chunks.popleft()
 
     async def hear_all(self, within: float, quiet: float = QUIET) -> bytes:
-        """What begins to come `within` so many seconds, up to a silence of `quiet` seconds.
+        """Return what begins to come `within` so many seconds, up to a silence of `quiet` seconds.
 
-        Of what does not fall silent, BABBLE seconds or MUCH.
+        Of what does not fall silent, it hears BABBLE seconds or MUCH.
         """
         heard = b""
         until = self.clock() + within
@@ -126,7 +126,7 @@ class Wire(asyncio.Protocol):
 
 @asynccontextmanager
 async def opened(endpoint: Endpoint, tap: Tap | None = None) -> AsyncIterator[Wire]:
-    """The port, until the end of the block. Raises LineDown."""
+    """Open the port until the end of the block. Raises LineDown."""
     wire = Wire(endpoint, tap)
     transport = await endpoint.open(lambda: wire)
     wire.paced = is_paced(endpoint, transport)
@@ -173,9 +173,10 @@ class Prober:
         self._numbers = count(1)
 
     async def ask(self, address: int, *, patience: float | None = None, alone: bool = False) -> Probe:
-        """`patience`: seconds to wait for the first byte, the lateness by default. Raises LineDown.
+        """Ask a node with its probe. `patience`: seconds to wait for the first byte, the lateness by default.
 
-        `alone`: whatever still comes within the lateness is this node's doing, and not left for the next request.
+        Raises LineDown. `alone`: whatever still comes within the lateness is this node's doing, and not left for the
+        next request.
         """
         profile, wire = self._profile, self._wire
         command = profile.probe
@@ -204,7 +205,7 @@ class Prober:
         return hearing.probe(self._echo.strip(rest) or b"")
 
     def _say(self, data: bytes) -> float:
-        """Returns when it will have left: at once, where nobody knows how long it takes."""
+        """Send `data`, and return when it will have left: at once, where nobody knows how long it takes."""
         self._echo.sent(data)
         return self._wire.say(data) + (len(data) * self.byte_time if self._wire.paced else 0.0)
 
@@ -221,7 +222,7 @@ class _Hearing:
         self._collided = False
 
     def take(self, now: float, data: bytes, say: Callable[[bytes], float]) -> float:
-        """Returns until when to wait for more."""
+        """Take the next bytes, and return until when to wait for more."""
         driver = self.driver
         self._hear(now, data)
         driver.said.clear()
@@ -254,7 +255,7 @@ class _Hearing:
                 raise bug
 
     def probe(self, rest: bytes) -> Probe:
-        """`rest` came after all was over."""
+        """Return what came of the probe; `rest` came after all was over."""
         verdict, result = self.verdict()
         if self.start is None:
             return Probe(Outcome.SILENT)

@@ -25,7 +25,7 @@ UART_ERRORS = {
 
 
 def damage(damaged: int, breaks: int, driver: DriverErrors | None) -> dict[str, int]:
-    """What was found wrong, by the keys of UART_ERRORS: the driver's counts where it has any, else the marks."""
+    """Return what was found wrong, by the keys of UART_ERRORS: the driver's counts where it has any, else the marks."""
     counts = {} if driver is None else {name: getattr(driver, name) for name in UART_ERRORS if name != "damaged"}
     if not any(counts.values()):
         counts = {"damaged": damaged, "breaks": breaks}
@@ -33,12 +33,12 @@ def damage(damaged: int, breaks: int, driver: DriverErrors | None) -> dict[str, 
 
 
 def damage_text(counts: Mapping[str, int]) -> str:
-    """What was found wrong in a few words; empty if nothing was."""
+    """Return what was found wrong in a few words; empty if nothing was."""
     return ", ".join(counted(count, UART_ERRORS[name][0]) for name, count in counts.items())
 
 
 def findings(damaged: int, breaks: int, driver: DriverErrors | None) -> Iterator[Finding]:
-    """What the UART found wrong while nodes were asked. Nothing is said of a port that cannot tell."""
+    """Say what the UART found wrong while nodes were asked. Nothing is said of a port that cannot tell."""
     counts = damage(damaged, breaks, driver)
     if driver is not None and not counts:
         yield Finding("uart", True, "no byte was damaged or lost")
@@ -48,6 +48,6 @@ def findings(damaged: int, breaks: int, driver: DriverErrors | None) -> Iterator
 
 
 def counted(count: int, what: str) -> str:
-    """`1 break`, `2 bytes lost in the UART`."""
+    """Return a count in words: `1 break`, `2 bytes lost in the UART`."""
     first, space, rest = what.partition(" lost")
     return f"{count} {what}" if count == 1 else f"{count} {first}s{space}{rest}"

@@ -36,6 +36,7 @@ class AttachedDevices:
         self._attentive: dict[Device, None] = {}
 
     def add(self, device: Device) -> None:
+        """Attach a device, which then keeps the line's time and its chance."""
         device.tau = self._tau
         device.chance = self._chance
         self.devices.append(device)
@@ -43,12 +44,13 @@ class AttachedDevices:
         self._note(device, 0.0)
 
     def remove(self, device: Device) -> None:
+        """Detach a device. Raises ValueError if it is not attached."""
         self.devices.remove(device)
         self._attentive.pop(device, None)
         self._learn_routes()
 
     def request(self, frame: bytes, start: float, end: float) -> None:
-        """A frame of the host's passed undisturbed."""
+        """Take a frame of the host's that passed undisturbed from `start` to `end`."""
         for size in self._route_sizes:
             routed = self._routes.get(frame[:size])
             if routed is not None:
@@ -71,7 +73,10 @@ class AttachedDevices:
             self.hear([device for device in self._attentive if device not in routed], frame, start, end)
 
     def overhear(self, data: bytes, start: float, end: float, talker: Device | None, whole: bool) -> None:
-        """Bytes passed that are no request in one piece; `whole`: a reply in one piece, which begins with no route."""
+        """Take bytes that passed and are no request in one piece.
+
+        With `whole` they are a reply in one piece, which begins with no route.
+        """
         if whole or self._openers.isdisjoint(data):
             if not self._attentive:
                 return
@@ -81,13 +86,13 @@ class AttachedDevices:
         self.hear([device for device in listeners if device is not talker], data, start, end)
 
     def scatter(self, collision: Collision, end: float) -> None:
-        """What several talkers made of each other's bytes passed; each heard what did not fall in its own talking."""
+        """Let each device hear what several talkers made of each other's bytes, but for what fell in its own talk."""
         for device in self.devices:
             for start, byte in collision.heard(device):
                 self.hear((device,), bytes((byte,)), start, end)
 
     def wake(self) -> None:
-        """`wakeup` has come."""
+        """Wake the devices whose time has come, now that `wakeup` has."""
         now = self.wakeup
         self.wakeup = NEVER
         for device in self.devices:
@@ -98,11 +103,12 @@ class AttachedDevices:
                 self.wakeup = device.wakeup
 
     def restart(self, device: Device, now: float) -> None:
+        """Restart a device at `now`, and note what it says and when it wants to be woken."""
         device.restart(now)
         self._note(device, now)
 
     def hear(self, listeners: Iterable[Device], data: bytes, start: float, now: float) -> None:
-        """`listeners` hear `data` byte by byte; its last byte ended at `now`."""
+        """Let `listeners` hear `data` byte by byte; its last byte ended at `now`."""
         for device in listeners:
             if device in self.cut_off:
                 continue
@@ -115,7 +121,7 @@ class AttachedDevices:
         return bool(device.faults.hearing) or device.away_until > 0.0
 
     def _note(self, device: Device, now: float) -> None:
-        """What it has come to say, whether it must hear everything from now on, and when it wants to be woken."""
+        """Note what it has come to say, whether it must hear everything from now on, and when it wants to be woken."""
         if device.outbox:
             said = device.outbox[:]
             device.outbox.clear()

@@ -38,7 +38,7 @@ class Collision:
         self._talks: list[tuple[int, int, Device | None]] = []
 
     def add(self, start: float, data: bytes, talker: Device | None, hold: float = 0.0) -> None:
-        """`talker` says `data` from `start` on; its driver then holds the line idle for `hold` seconds.
+        """Have `talker` say `data` from `start` on; its driver then holds the line idle for `hold` seconds.
 
         Where another already drives a bit and they disagree, chance decides.
         """
@@ -59,7 +59,7 @@ class Collision:
     def heard(
         self, listener: Device | None, until: float = math.inf, *, echo: bool = False
     ) -> Iterator[tuple[float, int]]:
-        """When each byte began, and the byte, as far as it ended by `until`.
+        """Yield when each byte began, and the byte, as far as it ended by `until`.
 
         `listener` (None: the host) does not hear what comes while it talks, unless it has an `echo`.
         """

@@ -57,7 +57,7 @@ class Delay:
 
     @classmethod
     def parse(cls, text: str) -> Delay:
-        """Milliseconds as the command line gives them: "2" or "50-100". Raises InvalidCommand."""
+        """Parse milliseconds as the command line gives them: "2" or "50-100". Raises InvalidCommand."""
         low, dash, high = text.partition("-")
         try:
             return cls(float(low) / 1000, float(high) / 1000 if dash else None)
@@ -67,6 +67,7 @@ class Delay:
             raise InvalidCommand(f"a reply delay is milliseconds, as 2 or 50-100, not {text!r}") from None
 
     def draw(self, chance: Chance) -> float:
+        """Return a delay in seconds, drawn by `chance` unless it is always the same."""
         if self.stragglers and chance.random() < self.stragglers:
             return chance.uniform(*self.straggle)
         return self.low if self.high is None else chance.uniform(self.low, self.high)
@@ -124,30 +125,30 @@ class Device(ABC):
     # What the line calls
 
     def hear(self, data: bytes, start: float) -> None:
-        """Contiguous bytes off the line, the first of which began at `start`. Never raises, whatever they are."""
+        """Take contiguous bytes off the line, the first of which began at `start`. Never raises, whatever they are."""
         tau = self.tau
         for number, byte in enumerate(data, 1):
             self.hear_byte(byte, start + number * tau)
 
     @abstractmethod
     def hear_byte(self, byte: int, now: float) -> None:
-        """One byte off the line, which ended at `now`. `reply` answers it. Never raises."""
+        """Take one byte off the line, which ended at `now`. `reply` answers it. Never raises."""
 
     def take(self, frame: bytes, now: float) -> bool:
-        """A frame that begins with a route, whole and undisturbed, whose last byte ended at `now`.
+        """Take a frame that begins with a route, whole and undisturbed, whose last byte ended at `now`.
 
-        True: it was exactly one request and has been answered (or rightly not), just as `hear` would have done it.
-        False, and nothing has happened: it is something else, or the device is in mid-frame; it is then heard byte by
-        byte.
+        Returns True if it was exactly one request and has been answered (or rightly not), just as `hear` would have
+        done it. Returns False, and nothing has happened, if it is something else, or the device is in mid-frame; it is
+        then heard byte by byte.
         """
         return False
 
     def wake(self, now: float) -> None:
-        """`wakeup` has come. Must set another `wakeup`, or NEVER."""
+        """Do what is due now that `wakeup` has come. Must set another `wakeup`, or NEVER."""
         self.wakeup = NEVER
 
     def restart(self, now: float) -> None:
-        """Power was lost and is back: what was in RAM is gone, what it was about to say too.
+        """Begin anew, as power was lost and is back: what was in RAM is gone, what it was about to say too.
 
         A kind of device with RAM or a parser extends this.
         """
@@ -157,9 +158,10 @@ class Device(ABC):
         self.free_at = now
 
     def disguise(self, reply: bytes, chance: Chance) -> bytes:
-        """The same reply as if for another element, parameter or unit, with a right checksum. A fault asks for it.
+        """Return the same reply as if for another element, parameter or unit, with a right checksum.
 
-        Unchanged if it carries no such thing (a lone ACK). With an traceable, its value is another node's.
+        A fault asks for it. It is unchanged if it carries no such thing (a lone ACK). A traceable value becomes another
+        node's.
         """
         return reply
 

@@ -8,7 +8,7 @@ from busmaster.emulator.faults import FORGED, NO_NOISE, Faults
 
 
 def misses(device: Device, start: float, end: float, request: bool, chance: Chance) -> bool:
-    """Whether `device` does not get what passed from `start` to `end`; `request`: a whole frame meant for it."""
+    """Return whether `device` misses what passed from `start` to `end`; `request`: a whole frame meant for it."""
     if start < device.away_until:
         return True
     faults = device.faults
@@ -42,7 +42,7 @@ Said = tuple[float, bytes, int]
 
 
 def distort(faults: Faults, said: Said, device: Device | None, tau: float, chance: Chance) -> list[Said]:
-    """What becomes of a frame said by `device` (None: the host). Possibly nothing, possibly several."""
+    """Return what becomes of a frame said by `device` (None: the host): possibly nothing, possibly several."""
     start, data, chunk = said
     more: list[Said] = []
     for name, rate in faults.speaking:
@@ -81,8 +81,10 @@ def distort(faults: Faults, said: Said, device: Device | None, tau: float, chanc
 
 
 def noise(chance: Chance, longest: int) -> bytes:
-    """One to `longest` bytes as a disturbed line makes them: all zeros, all ones, or anything but `NO_NOISE`, now and
-    then behind an STX, as if it were a telegram."""
+    """Return one to `longest` bytes as a disturbed line makes them.
+
+    They are all zeros, all ones, or anything but `NO_NOISE`, now and then behind an STX, as if it were a telegram.
+    """
     kind = chance.randrange(0, 4)
     count = chance.randrange(1, longest + 1)
     if kind < 2:
@@ -92,7 +94,7 @@ def noise(chance: Chance, longest: int) -> bytes:
 
 
 def flipped(data: bytes, chance: Chance, count: int) -> bytes:
-    """The same bit flipped in `count` bytes; fewer where there are not so many."""
+    """Return the data with the same bit flipped in `count` bytes; in fewer where there are not so many."""
     mask = 1 << chance.randrange(0, 8)
     changed = bytearray(data)
     places = list(range(len(data)))

@@ -106,7 +106,7 @@ class Faults:
 
     @classmethod
     def parse(cls, settings: Iterable[str]) -> Faults:
-        """From texts such as "lost=0.1". Raises InvalidCommand, naming the nearest fault."""
+        """Parse texts such as "lost=0.1". Raises InvalidCommand, naming the nearest fault."""
         faults = cls()
         for setting in settings:
             name, _, text = (part.strip() for part in setting.partition("="))

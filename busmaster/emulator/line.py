@@ -124,26 +124,27 @@ class Line:
         return self._attached.devices
 
     def add(self, device: Device) -> None:
-        """Two devices may have one address: then both answer, and collide."""
+        """Attach a device. Two devices may have one address: then both answer, and collide."""
         self._attached.add(device)
 
     def remove(self, device: Device) -> None:
+        """Detach a device. Raises ValueError if it is not on the line."""
         self._attached.remove(device)
 
     def device(self, address: int) -> Device:
-        """The first device with that address. Raises KeyError."""
+        """Return the first device with that address. Raises KeyError if there is none."""
         for device in self.devices:
             if device.address == address:
                 return device
         raise KeyError(address)
 
     def restart(self, device: Device, now: float) -> None:
-        """Its power fails and is back at once: what was in its RAM is lost."""
+        """Fail the power of a device and bring it back at once: what was in its RAM is lost."""
         self._advance(now)
         self._attached.restart(device, now)
 
     def cut(self, now: float, *devices: Device) -> None:
-        """The wire to `devices` (to all of them, by default) breaks: what they say or hear ends there and then."""
+        """Break the wire to `devices` (to all of them, by default): what they say or hear ends there and then."""
         self._advance(now)
         lost = devices or tuple(self.devices)
         self._mending = None
@@ -161,7 +162,7 @@ class Line:
             self._activate(heappop(self._pending)[2])
 
     def restore(self, now: float) -> None:
-        """The wire is whole again. Who was cut off does not hear the frame that the host is in the middle of."""
+        """Make the wire whole again. Who was cut off does not hear the frame that the host is in the middle of."""
         self._advance(now)
         talk = self._active
         if talk is not None and talk.talker is None and talk.start < now:
@@ -172,14 +173,14 @@ class Line:
     # What the host does
 
     def send(self, data: bytes, now: float) -> None:
-        """The host says `data`, behind what it is still sending."""
+        """Have the host say `data`, behind what it is still sending."""
         self._advance(now)
         start = now if now > self._sent_by else self._sent_by
         self._sent_by = start + len(data) * self.tau
         self._say(None, start, data)
 
     def receive(self, now: float) -> bytes:
-        """What has wholly arrived at the host's port by `now` and was not yet given to it."""
+        """Return what has wholly arrived at the host's port by `now` and was not yet given to it."""
         self._advance(now)
         talk = self._active
         if talk is not None and talk.start < now:
@@ -192,7 +193,7 @@ class Line:
         return data
 
     def next_event(self) -> float:
-        """When something happens next, be it within the line, or has happened unnoticed; NEVER if nothing will."""
+        """Return when something happens next, be it within the line, or has happened unseen; NEVER if nothing will."""
         if self._inbox:
             return self._arrived
         when = self._attached.wakeup
@@ -250,7 +251,7 @@ class Line:
             talk.collision.add(talk.start, talk.data, talk.talker, self._hold(talk))
 
     def _advance(self, now: float) -> None:
-        """Lets happen, in order, all that happens up to `now`."""
+        """Let happen, in order, all that happens up to `now`."""
         attached = self._attached
         while True:
             talk = self._active
@@ -303,15 +304,15 @@ class Line:
     # What the host hears of it
 
     def _heard_at_once(self, talk: Talk) -> bool:
-        """Whether the host hears it as it comes."""
+        """Return whether the host hears it as it comes."""
         return talk.talker is not None or (self.echo is not None and not self.echo.delay and not self.echo.corrupt)
 
     def _count(self, talk: Talk, now: float) -> int:
-        """How many of its bytes have ended."""
+        """Return how many of its bytes have ended."""
         return min(len(talk.data), int((now - talk.start) / self.tau + ROUNDING)) if self.tau else len(talk.data)
 
     def _give(self, talk: Talk, now: float) -> None:
-        """What has passed of it reaches the host."""
+        """Let what has passed of it reach the host."""
         if talk.collision is not None:
             data = self._host_hears(talk.collision, now)[talk.given :]
         elif self._heard_at_once(talk):
@@ -322,7 +323,7 @@ class Line:
         self._arrive(data, now)
 
     def _reach_host(self, talk: Talk) -> None:
-        """The rest of it reaches the host."""
+        """Let the rest of it reach the host."""
         if talk.collision is not None:
             self._arrive(self._host_hears(talk.collision, NEVER)[talk.given :], talk.end)
         elif talk.talker is not None:
@@ -337,7 +338,7 @@ class Line:
         return bytes(byte for _, byte in collision.heard(None, until, echo=self.echo is not None))
 
     def _next_byte(self, collision: Collision, given: int) -> float:
-        """When the host has heard the next byte of several talkers, whom it hears one byte at a time."""
+        """Return when the host has heard the next byte of several talkers, whom it hears one byte at a time."""
         begins = [start for start, _ in collision.heard(None, echo=self.echo is not None)]
         return begins[given] + self.tau if given < len(begins) else NEVER
 

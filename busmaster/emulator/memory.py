@@ -45,13 +45,13 @@ class MemoryPort:
         return self.line.paced
 
     def presence(self) -> None:
-        """It never goes away."""
+        """Return None: it never goes away."""
         return None
 
     async def open(
         self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
     ) -> MemoryTransport:
-        """Never fails."""
+        """Open it, which never fails."""
         return MemoryTransport(asyncio.get_running_loop(), protocol_factory(), self.line)
 
 
@@ -74,11 +74,11 @@ class MemoryTransport(asyncio.Transport):
         self._arm(line.next_event())
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
-        """`line` is the emulated line."""
+        """Return the emulated line for the name `line`; the default for any other."""
         return self._line if name == "line" else default
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Never waits, unless it is held: the line takes everything, and sends it byte by byte."""
+        """Give all of `data` to the line at once, unless it is held: the line takes all, and sends it byte by byte."""
         if self._closing:
             return
         if self._held is None:
@@ -89,11 +89,11 @@ class MemoryTransport(asyncio.Transport):
         self._protocol.pause_writing()
 
     def get_write_buffer_size(self) -> int:
-        """What is held."""
+        """Return how many bytes are held."""
         return len(self._held or b"")
 
     def hold(self) -> None:
-        """As if flow control stopped the port: what is written waits."""
+        """Hold back what is written from now on, as if flow control stopped the port."""
         if self._held is None:
             self._held = b""
 
@@ -114,7 +114,7 @@ class MemoryTransport(asyncio.Transport):
         self.lose(None)
 
     def lose(self, cause: Exception | None) -> None:
-        """As if the port were unplugged: the protocol is told at the next turn of the loop, once."""
+        """Lose the port, as if it were unplugged: the protocol is told at the next turn of the loop, once."""
         if self._closing:
             return
         self._closing = True
@@ -123,7 +123,7 @@ class MemoryTransport(asyncio.Transport):
         self._loop.call_soon(self._protocol.connection_lost, cause)
 
     def _arm(self, due: float) -> None:
-        """One timer, left alone if it comes sooner."""
+        """Set the one timer, which is left alone if it comes sooner."""
         if due >= self._armed or self._closing:
             return
         if self._timer is not None:

@@ -26,7 +26,7 @@ class Ramp:
     now: float = NEVER
 
     def advance(self, now: float) -> None:
-        """To `now`; never back."""
+        """Go on to `now`; never back."""
         if self.now == NEVER:
             self.now = now
         left = now - self.now
@@ -76,6 +76,7 @@ class Axis:
         self._run(Motion.FOLLOW, speed, now)
 
     def stop(self, now: float) -> None:
+        """Stop at once, where it is at `now`: IDLE."""
         self.position(now)
         self._arrives = NEVER
         self._ramp.speed = self._ramp.target = 0.0
@@ -96,12 +97,13 @@ class Axis:
         self.motion = motion
 
     def swing(self, amplitude: float, period: float, phase: float, now: float) -> None:
-        """To and fro for ever: something to look at. `period` in seconds, `phase` in turns."""
+        """Swing to and fro for ever: something to look at. `period` is in seconds, `phase` in turns."""
         self.stop(now)
         self._swing = (amplitude, math.tau / period, phase * math.tau)
         self.motion = Motion.SWING
 
     def position(self, now: float) -> float:
+        """Return where it is at `now`."""
         ramp = self._ramp
         if self.motion is Motion.SWING:
             amplitude, omega, phase = self._swing
@@ -117,6 +119,7 @@ class Axis:
         return ramp.position
 
     def velocity(self, now: float) -> float:
+        """Return how fast it moves at `now`, per second."""
         self.position(now)
         if self.motion is Motion.SWING:
             amplitude, omega, phase = self._swing
@@ -124,7 +127,7 @@ class Axis:
         return self._ramp.speed
 
     def idle(self, now: float) -> bool:
-        """In position: IDLE."""
+        """Return whether it is in position: IDLE."""
         self.position(now)
         return self.motion is Motion.IDLE
 

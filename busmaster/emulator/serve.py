@@ -52,7 +52,7 @@ class LineServer(ABC):
         self._thread.start()
 
     def call(self, action: Callable[[Line, float], T]) -> T:
-        """Has the thread call `action(line, now)` and returns, or raises, what came of it.
+        """Have the thread call `action(line, now)`, and return, or raise, what came of it.
 
         Raises RuntimeError if the line is no longer served.
         """
@@ -64,7 +64,7 @@ class LineServer(ABC):
         return result.result()
 
     def close(self) -> None:
-        """Clients find their port gone. Raises what ended the thread before its time, if anything did."""
+        """Stop serving: clients find their port gone. Raises what ended the thread before its time, if anything did."""
         if self._closed:
             return
         self._closed = self._closing = True
@@ -85,11 +85,11 @@ class LineServer(ABC):
 
     @abstractmethod
     def _sources(self) -> list[int]:
-        """The descriptors to read from."""
+        """Return the descriptors to read from."""
 
     @abstractmethod
     def _read(self, source: int) -> bytes:
-        """What the host says there."""
+        """Return what the host says there."""
 
     @abstractmethod
     def _deliver(self, data: bytes) -> None:
@@ -248,12 +248,12 @@ class TcpServer(LineServer):
 
 
 def serve_pty(line: Line, link: str | os.PathLike[str] | None = None) -> PtyServer:
-    """Serves `line` on a pseudo-terminal, and makes `link` (replacing a symbolic link) point to it until closed."""
+    """Serve `line` on a pseudo-terminal, and make `link` (replacing a symbolic link) point to it until closed."""
     return PtyServer(line, link)
 
 
 def serve_tcp(line: Line, host: str = "127.0.0.1", port: int = 0) -> TcpServer:
-    """Serves `line` on a TCP port until closed."""
+    """Serve `line` on a TCP port until closed."""
     return TcpServer(line, host, port)
 
 

@@ -13,7 +13,7 @@ SPREAD = 10_007
 
 
 def traceable_value(node: int, element: int, writes: int, modulus: int = 10**12) -> int:
-    """From 0 to modulus - 1: who is asked (`node`), for what (`element`), and after how many writes to it.
+    """Return a value, 0 to modulus - 1, by who is asked (`node`), for what (`element`), and after how many writes.
 
     `modulus` is how many values the protocol can carry: 10**12 for HCP and HCP2 (exact as text), 2**31 for MSC,
     10**4 for Mentor II, 2**16 for DC104.
@@ -32,14 +32,15 @@ class TraceableMemory:
         """Writes taken whose value was meant for another node or element, or was garbled unnoticed."""
 
     def read(self, element: int) -> int:
+        """Return the value of an element after the writes to it so far."""
         return traceable_value(self.node, element, self.writes[element], self.modulus)
 
     def elsewhere(self) -> int:
-        """A value of another node: what a reply carries that answers for somebody else."""
+        """Return a value of another node: what a reply carries that answers for somebody else."""
         return traceable_value(self.node + 1, 0, 0, self.modulus)
 
     def write(self, element: int, value: float, slack: int = 64) -> None:
-        """Counts it. The writer is to send `traceable_value(node, element, n)` with n within `slack` of the count."""
+        """Count a write. The writer is to send `traceable_value(node, element, n)`, n within `slack` of the count."""
         count = self.writes[element]
         self.writes[element] = count + 1
         base = traceable_value(self.node, element, 0, self.modulus)

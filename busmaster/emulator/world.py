@@ -77,30 +77,30 @@ class World:
     def node(
         self, profile: Profile, address: int, *, timings: Timings | Learned | None = None, retries: int | None = None
     ) -> NodeRecord:
-        """Makes the arbiter know a node. Once each."""
+        """Make the arbiter know a node. Call it once for each."""
         return self.arbiter.add_node(profile, address, self.now, timings, retries)
 
     def request(
         self, node: NodeRecord, command: Command[Any], priority: Priority = Priority.COMMAND, **options: Any
     ) -> Transaction:
-        """Submits it now; `options` are those of Transaction. Its end comes as an event, perhaps at once."""
+        """Submit a command now; `options` are those of Transaction. Its end comes as an event, perhaps at once."""
         transaction = Transaction(node, command, priority=priority, **options)
         self.arbiter.submit(transaction, self.now)
         return transaction
 
     def at(self, when: float, action: Callable[[], object]) -> None:
-        """`action` is called at that time, after what the line and the arbiter have to do then."""
+        """Call `action` at that time, after what the line and the arbiter have to do then."""
         heapq.heappush(self._actions, (max(when, self.now), next(self._order), action))
 
     def plug(self) -> None:
-        """The port is there (again)."""
+        """Bring the port (again)."""
         if not self.plugged:
             self.plugged = True
             self.line.receive(self.now)
             self.arbiter.line_up(self.now, paced=self.line.paced)
 
     def unplug(self, cause: str = "unplugged") -> None:
-        """The port is gone, and what the line has for the host is lost until it is back."""
+        """Take the port away, and lose what the line has for the host until it is back."""
         if self.plugged:
             self.plugged = False
             self.arbiter.line_down(cause, self.now)
@@ -108,7 +108,7 @@ class World:
     # How it goes on
 
     def run(self, until: float) -> None:
-        """To that time."""
+        """Run to that time."""
         arbiter, line, actions = self.arbiter, self.line, self._actions
         steps = 0
         self._pump()
@@ -131,7 +131,7 @@ class World:
         self.now = max(self.now, until)
 
     def run_until(self, done: Callable[[], bool], limit: float) -> bool:
-        """Until `done()` holds, at most `limit` seconds on. Returns whether it came to hold."""
+        """Run until `done()` holds, at most `limit` seconds on. Returns whether it came to hold."""
         end = self.now + limit
         while not done():
             self._pump()
@@ -176,7 +176,7 @@ class World:
                 self.tap.transmitted(self.now, data, self.arbiter.attempt)
 
     def _pump(self) -> None:
-        """What the arbiter says goes on the line, and its events to whom they concern."""
+        """Put on the line what the arbiter says, and tell its events to whom they concern."""
         arbiter = self.arbiter
         while True:
             data = arbiter.poll_transmit()
@@ -198,7 +198,7 @@ class World:
 
 
 def told(event: Event) -> str:
-    """An event in a line of text, the same on every run."""
+    """Return an event in a line of text, the same on every run."""
     match event:
         case Transaction():
             outcome = event.value if event.error is None else repr(event.error)

@@ -53,7 +53,7 @@ Item: TypeAlias = Snapshot | Happening | WriteRecord
 
 
 def size_of(item: Item) -> int:
-    """In values; an event, or a write, counts as one."""
+    """Return how many values an item holds; an event, or a write, counts as one."""
     return len(item.samples) if isinstance(item, Snapshot) else 1
 
 
@@ -75,7 +75,7 @@ class OutputStatistics:
 
 
 def reason(error: BaseException) -> str:
-    """On one line."""
+    """Return on one line what went wrong."""
     while isinstance(error, BaseExceptionGroup):
         error = error.exceptions[0]
     text = str(error)
@@ -97,7 +97,7 @@ def check_folder(path: str) -> None:
 
 
 def check_extra(package: str, extra: str) -> None:
-    """Raises InvalidCommand, saying what to install, where the package of an extra is not there."""
+    """Raise InvalidCommand, saying what to install, where the package of an extra is not there."""
     if importlib.util.find_spec(package) is None:
         raise InvalidCommand(
             f"this output needs {package}, which the extra named {extra} brings: pip install 'busmaster[{extra}]'"
@@ -132,10 +132,11 @@ class Output(ABC):
     # on the loop that owns the line
 
     def start(self) -> None:
+        """Start the output's thread."""
         self._thread.start()
 
     def offer(self, item: Item) -> None:
-        """Never waits. Drops the oldest where the output does not keep up."""
+        """Hand it an item without ever waiting. The oldest are dropped where the output does not keep up."""
         self._waiting.append(item)
         self.offered += size_of(item)
         while self.offered - self.dropped - self.written - self.spilled - self.lost > self._capacity:
@@ -146,7 +147,7 @@ class Output(ABC):
             self.dropped += size_of(oldest)
 
     def miss(self, values: int) -> None:
-        """So many were lost before they could be offered."""
+        """Count so many values as lost before they could be offered."""
         self.offered += values
         self.dropped += values
 
@@ -155,12 +156,13 @@ class Output(ABC):
         self._reopen.set()
 
     def succeed(self, before: Output) -> None:
-        """Count on from the one that it replaces, which is closed. Called before it is started."""
+        """Count on from the output that this one replaces, which is closed. Call this before the new one is started."""
         self.offered += before.offered
         self.dropped += before.dropped
         self.written += before.written
 
     def statistics(self) -> OutputStatistics:
+        """Return the counts of this output, and why it is down."""
         dropped = self.dropped + self.lost
         waiting = self.offered - self.written - dropped
         return OutputStatistics(self.kind, self.what, self.written, dropped, waiting, self.error, self.spilled)
@@ -170,7 +172,7 @@ class Output(ABC):
     def close(self, within: float) -> None:
         """Let it write what waits, for so many seconds; what is left, and not on disk, is dropped.
 
-        Nothing is offered any more.
+        Nothing may be offered any more.
         """
         self._stop.set()
         if self._thread.ident is not None:
@@ -181,23 +183,24 @@ class Output(ABC):
 
     @abstractmethod
     def work(self) -> None:
-        """Take what is offered until it is stopped, then the rest. Called again, later, if it raises."""
+        """Take what is offered until it is stopped, then the rest. It is called again, later, if it raises."""
 
     def take(self) -> Item | None:
-        """The oldest that waits."""
+        """Take the oldest item that waits; None if none does."""
         try:
             return self._waiting.popleft()
         except IndexError:
             return None
 
     def up(self) -> None:
-        """It works."""
+        """Note that the output works, and say so if it was down."""
         self._retry = FIRST_RETRY
         if self.error:
             self.error = ""
             self._say(f"{self.kind} is up again")
 
     def down(self, error: BaseException) -> None:
+        """Note why the output does not work, and say so where that is new."""
         text = reason(error)
         if text != self.error:
             self.error = text
@@ -208,7 +211,7 @@ class Output(ABC):
         self._stop.wait(seconds)
 
     def _run(self) -> None:
-        """Whatever goes wrong is told and tried again: it must not end the thread."""
+        """Work until stopped. Whatever goes wrong is told and tried again: it must not end the thread."""
         while True:
             last = self._stop.is_set()
             try:
@@ -237,17 +240,18 @@ class BatchOutput(Output, Generic[Formatted]):
 
     @abstractmethod
     def format(self, item: Item) -> Formatted | None:
-        """None for what is not written here."""
+        """Return the item as it is written; None for what is not written here."""
 
     @abstractmethod
     def commit(self, batch: list[Formatted]) -> None:
-        """Write it whole. Raises, having written nothing, where that fails."""
+        """Write the batch whole. It raises, having written nothing, where that fails."""
 
     @abstractmethod
     def shut(self) -> None:
-        """Let go of what `commit` opened. Never raises."""
+        """Let go of what `commit` opened. It never raises."""
 
     def work(self) -> None:
+        """Write batch by batch until it is stopped, then the rest."""
         try:
             stopped = False
             while not stopped:
@@ -265,15 +269,21 @@ class BatchOutput(Output, Generic[Formatted]):
             self.shut()
 
     def unhurried(self, snapshot: Snapshot) -> Iterator[tuple[Point[Any], Sample[Any]]]:
-        """Its points and samples; the thread lets go of the interpreter after each PIECE, so that a cycle of hundreds
-        of points keeps the line's loop no longer than one of a few."""
+        """Yield the points and samples of a cycle.
+
+        The thread lets go of the interpreter after each PIECE, so that a cycle of hundreds of points keeps the line's
+        loop no longer than one of a few.
+        """
         for number, item in enumerate(snapshot.samples.items(), 1):
             yield item
             if number % PIECE == 0 and not self._stop.is_set():
                 time.sleep(PAUSE)
 
     def _fill(self) -> bool:
-        """Format what waits, up to a batch; the batch that could not be written first."""
+        """Format what waits, up to a batch, and return whether there is one.
+
+        A batch that could not be written goes first.
+        """
         for item in self._items():
             formatted = self.format(item)
             if formatted is not None:

@@ -46,7 +46,7 @@ class Wanted(NamedTuple):
     commands: Mapping[str, Point[Any]]
 
     def same(self, other: Wanted | None) -> bool:
-        """Whether the other is the same output: points that are equal may have another scale."""
+        """Return whether the other is the same output: points that are equal may have another scale."""
         return (
             other is not None
             and self.settings == other.settings
@@ -72,12 +72,15 @@ class Distributor:
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def add(self, kind: str, settings: Settings, *, commands: Mapping[str, Point[Any]] | None = None) -> None:
-        """One more. `commands`: the points that it lets others write. Raises InvalidCommand if an extra is missing."""
+        """Add one more output.
+
+        `commands` are the points that it lets others write. Raises InvalidCommand if an extra is missing.
+        """
         self._wanted[kind] = wanted = Wanted(settings, commands or {})
         self._outputs.append(self._make(kind, *wanted))
 
     def start(self, groups: Iterable[Source]) -> None:
-        """From now on, until `close`."""
+        """Start the outputs and feed them from these groups, from now on, until `close`."""
         self._loop = asyncio.get_running_loop()
         for output in self._outputs:
             output.start()
@@ -111,7 +114,10 @@ class Distributor:
             output.offer(write)
 
     async def close(self) -> None:
-        """When the bus is closed: what was polled is still handed on, and written within FAREWELL seconds."""
+        """Close the outputs, once the bus is closed.
+
+        What was polled is still handed on, and written within FAREWELL seconds.
+        """
         with anyio.CancelScope(shield=True):
             await asyncio.gather(*self._feeding.values(), return_exceptions=True)
             if self._watching is not None:
@@ -122,10 +128,11 @@ class Distributor:
         self._watching = None
 
     def statistics(self) -> tuple[OutputStatistics, ...]:
+        """Return the counts of each output."""
         return tuple(output.statistics() for output in self._outputs)
 
     def _take_in(self, groups: Iterable[Source]) -> None:
-        """In tasks of their own: a task group would tie entering and leaving the line to one task."""
+        """Feed the outputs in tasks of their own: a task group would tie entering and leaving the line to one task."""
         if not self._outputs:
             return
         for group in groups:
@@ -156,7 +163,7 @@ class Distributor:
                     output.offer(Happening(micros(self._bus.wall_time()), node, text))
 
     def _say(self, text: str) -> None:
-        """From any thread, to the loop; when that is gone nobody listens any more."""
+        """Hand a text from any thread to the loop; when that is gone nobody listens any more."""
         if self._loop is not None:
             try:
                 self._loop.call_soon_threadsafe(self.tell, text)

@@ -55,6 +55,7 @@ class CsvOutput(FileOutput):
     head = ",".join(COLUMNS).encode() + b"\n"
 
     def format(self, item: Item) -> bytes | None:
+        """Return a line for each value of a cycle; None for the rest, which is not written here."""
         if not isinstance(item, Snapshot):
             return None
         return csv_lines(
@@ -80,6 +81,7 @@ class JsonlOutput(FileOutput):
     """
 
     def format(self, item: Item) -> bytes:
+        """Return one line of JSON for a cycle, an event or a write."""
         if isinstance(item, Snapshot):
             fields = cycle_fields(item, item.wall_at)
         elif isinstance(item, WriteRecord):
@@ -90,13 +92,14 @@ class JsonlOutput(FileOutput):
 
 
 def csv_lines(rows: Iterable[Iterable[object]]) -> bytes:
+    """Return the rows as lines of CSV."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue().encode()
 
 
 def value_cell(sample: Sample[Any]) -> str:
-    """A value as text; only one that is a text itself could be taken for a formula."""
+    """Return a value as text. Only one that is a text itself could be taken for a formula."""
     if sample.error:
         return ""
     text = value_text(sample.value)
@@ -104,9 +107,10 @@ def value_cell(sample: Sample[Any]) -> str:
 
 
 def no_formula(text: str) -> str:
-    """The text, behind an apostrophe where a spreadsheet would otherwise compute it."""
+    """Return the text, behind an apostrophe where a spreadsheet would otherwise compute it."""
     return f"'{text}" if text[:1] in FORMULA else text
 
 
 def utc(moment: float) -> str:
+    """Return a time in seconds since 1970 as UTC text, to the millisecond."""
     return datetime.fromtimestamp(moment, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

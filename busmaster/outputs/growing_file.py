@@ -52,7 +52,7 @@ class GrowingFile:
             self._synced = time.monotonic()
 
     def close(self) -> None:
-        """Let go of it. Never raises."""
+        """Let go of the file. It never raises."""
         if self._descriptor is not None:
             descriptor, self._descriptor = self._descriptor, None
             try:
@@ -62,7 +62,7 @@ class GrowingFile:
             os.close(descriptor)
 
     def _current(self) -> int:
-        """The file of today, opened if it is not."""
+        """Return the descriptor of today's file, which is opened if it is not yet."""
         path = time.strftime(self._pattern)
         if path != self._path:
             self.close()
@@ -85,7 +85,7 @@ class GrowingFile:
         return descriptor
 
     def _write(self, descriptor: int, lines: bytes) -> None:
-        """What the disk has no room for is cut off again."""
+        """Write the lines whole. What the disk has no room for is cut off again. Raises OSError then."""
         end = os.lseek(descriptor, 0, os.SEEK_END)
         rest = memoryview(lines if end else self._head + lines)
         try:
@@ -97,7 +97,7 @@ class GrowingFile:
 
 
 def is_at(path: str, descriptor: int) -> bool:
-    """Whether the open file is still what the path leads to."""
+    """Return whether the open file is still what the path leads to."""
     try:
         return os.path.samestat(os.stat(path), os.fstat(descriptor))
     except FileNotFoundError:
@@ -105,7 +105,7 @@ def is_at(path: str, descriptor: int) -> bool:
 
 
 def ends_in_a_half_line(path: str) -> bool:
-    """Whether its last byte ends no line. A file that may not be read is believed to be whole."""
+    """Return whether the file's last byte ends no line. A file that may not be read is believed to be whole."""
     try:
         with open(path, "rb") as file:
             end = file.seek(0, os.SEEK_END)

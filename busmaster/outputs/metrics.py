@@ -93,14 +93,15 @@ class MetricsOutput(Output):
         super().start()
 
     def offer(self, item: object) -> None:
-        """Nothing waits here: what is asked for is read then."""
+        """Ignore the item: nothing waits here, and what is asked for is read then."""
 
     def miss(self, values: int) -> None:
-        """Likewise."""
+        """Ignore the count: nothing waits here, so nothing is lost."""
 
     # on threads
 
     def work(self) -> None:
+        """Serve the metrics until it is stopped."""
         from prometheus_client.core import CollectorRegistry
 
         registry = CollectorRegistry()
@@ -111,11 +112,11 @@ class MetricsOutput(Output):
             asyncio.run(serve(listener, partial(page, registry), self._stop))
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing: so that registering does not ask the line."""
+        """Return nothing, so that registering does not ask the line."""
         return ()
 
     def collect(self) -> Iterator[Metric]:
-        """Asked for by a scrape, on its thread. Raises TimeoutError where the loop does not answer."""
+        """Yield every metric when a scrape asks, on its thread. Raises TimeoutError where the loop does not answer."""
         yield from self._of_line()
         yield from self._of_nodes()
         yield from self._of_groups()
@@ -193,7 +194,7 @@ class MetricsOutput(Output):
         yield from (cycles, missed, wanted, achieved)
 
     def _of_points(self) -> Iterator[Metric]:
-        """The last values of the groups that are to be told: what is no number, or was not read, is left out."""
+        """Yield the last values of the groups that are to be told. What is no number, or was not read, is left out."""
         from prometheus_client.core import GaugeMetricFamily
 
         labels = ["group", "node", "item", "unit"]
@@ -227,19 +228,22 @@ class MetricsOutput(Output):
 
 
 def number_of(value: object) -> float | None:
-    """As a gauge has it: words and flags by their number, None for what is not one number."""
+    """Return a value as a gauge has it: words and flags by their number, None for what is not one number."""
     number = value.value if isinstance(value, enum.Enum) else value
     return float(number) if isinstance(number, int | float) else None
 
 
 def read_node(node: Node) -> tuple[NodeStatistics, list[tuple[float, int]], float]:
-    """Its counts, and its latencies: (upper edge, count) of the buckets in use, and their sum."""
+    """Return the counts of a node and its latencies.
+
+    The latencies are pairs (upper edge, count) of the buckets in use, and their sum; edges and sum are in seconds.
+    """
     latency = node.record.counters.latency
     return node.statistics(), latency.buckets(), latency.total
 
 
 def add_histogram(family: HistogramMetricFamily, node: str, buckets: Sequence[tuple[float, int]], total: float) -> None:
-    """Our fine buckets in a few: each counted with the first edge that is not below its own."""
+    """Add our fine buckets in a few: each is counted with the first edge that is not below its own."""
     counts = [0] * (len(EDGES) + 1)
     for upper, count in buckets:
         counts[bisect_left(EDGES, upper)] += count

@@ -113,17 +113,21 @@ class MqttOutput(Output):
     # on the thread
 
     def work(self) -> None:
+        """Publish until it is stopped. What is left in memory then goes to disk, if it may."""
         asyncio.run(self._in_time())
 
     def rest(self, seconds: float) -> None:
-        """What comes while the broker is away goes to disk, if it may."""
+        """Wait so many seconds, or until it is stopped. What comes while the broker is away goes to disk, if it may."""
         over = time.monotonic() + seconds
         while not self._stop.is_set() and time.monotonic() < over:
             self._put_by()
             self._stop.wait(min(SPILL_EVERY, seconds))
 
     async def _in_time(self) -> None:
-        """Whatever happens, what is left in memory is on disk when this ends, if it may: before the process does."""
+        """Publish until it is stopped.
+
+        Whatever happens, what is left in memory is on disk when this ends, if it may: before the process does.
+        """
         try:
             async with anyio.create_task_group() as tasks:
                 if self._spool is not None:
@@ -134,7 +138,7 @@ class MqttOutput(Output):
             self._put_by()
 
     async def _hurry(self, scope: anyio.CancelScope) -> None:
-        """A broker that does not answer when all is to end is not waited for to the last moment."""
+        """Give up on a broker that does not answer when all is to end: it is not waited for to the last moment."""
         while not self._stop.is_set():  # noqa: ASYNC110  # another thread sets it
             await anyio.sleep(TICK)
         await anyio.sleep(HURRY)
@@ -165,7 +169,7 @@ class MqttOutput(Output):
                 time.sleep(PAUSE)
 
     async def _send_spilled(self, client: Client) -> None:
-        """All that is on disk; what comes meanwhile goes behind it. When all is to end the rest stays there."""
+        """Send all that is on disk; what comes meanwhile goes behind it. When all is to end the rest stays there."""
         while self._spool is not None and self.spilled and not self._stop.is_set():
             up_to, records = self._spool.oldest(AT_ONCE)
             await self._send(client, (Outgoing(topic, payload, retain) for topic, payload, retain, _ in records))
@@ -221,7 +225,7 @@ class MqttOutput(Output):
         return client
 
     async def _send(self, client: Client, messages: Iterable[Outgoing]) -> None:
-        """In order, and acknowledged at QoS 1. Raises what went wrong first."""
+        """Send the messages in order, and acknowledged at QoS 1. Raises what went wrong first."""
         under_way: deque[asyncio.Task[None]] = deque()
         try:
             for number, (topic, payload, retain) in enumerate(messages, 1):
@@ -239,7 +243,7 @@ class MqttOutput(Output):
             await asyncio.gather(*under_way, return_exceptions=True)
 
     def _fill(self, most: int) -> bool:
-        """What was not acknowledged comes first."""
+        """Hold up to `most` values, and return whether there are any. What was not acknowledged comes first."""
         size = sum(map(size_of, self._held))
         while size < most and (item := self.take()) is not None:
             self._held.append(item)
@@ -262,7 +266,7 @@ class MqttOutput(Output):
                 yield Outgoing(self._topic("values", topic_part(point.key)), payload, settings.retain)
 
     def _changes(self) -> Iterator[Outgoing]:
-        """What is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
+        """Yield what is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
         now = {"line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")}
         for node in self._bus.nodes:
             now[f"health/{topic_part(node.label.removeprefix('node '))}"] = ("health", node.health.value)
@@ -278,17 +282,17 @@ class MqttOutput(Output):
     # commands
 
     async def _listen(self, client: Client) -> None:
-        """Raises MqttError when the broker goes away, also while there is nothing to send."""
+        """Raise MqttError when the broker goes away, also while there is nothing to send."""
         async for _ in client.messages:
             raise AssertionError("messages are taken in as they arrive")
 
     async def _write(self, wish: Wish) -> WriteRecord:
-        """On the loop that owns the line."""
+        """Write it on the loop that owns the line."""
         assert self._owner is not None
         return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(self._gate.write(wish), self._owner))
 
     def _keep(self, wish: Wish, error: str) -> None:
-        """On that loop too: what was refused is on record."""
+        """Put on record, on that loop too, what was refused."""
         assert self._owner is not None
         self._owner.call_soon_threadsafe(self._gate.refuse, wish, error)
 
@@ -298,12 +302,12 @@ class MqttOutput(Output):
 
 
 def topic_part(name: str) -> str:
-    """Without what has a meaning in topics. Two names stay two."""
+    """Return the name without what has a meaning in topics. Two names stay two."""
     return name.replace("%", "%25").replace("+", "%2B").replace("#", "%23")
 
 
 def secrets(settings: MqttSettings) -> tuple[str | None, str | None, ssl.SSLContext | None]:
-    """User name, password and TLS context. Raises InvalidCommand for a file that cannot be read."""
+    """Return user name, password and TLS context. Raises InvalidCommand for a file that cannot be read."""
     password = tls = None
     try:
         if settings.password_file is not None:

@@ -36,9 +36,9 @@ class Retention:
         self._believed_from = 0.0
 
     def apply(self, database: sqlite3.Connection, tables: tuple[str, ...]) -> None:
-        """Delete a piece, if there is anything to be deleted; more of it at the next call. Each table has a `time`.
+        """Delete a piece, if there is anything to be deleted; more of it goes at the next call.
 
-        The first table is the large one: by it the size is brought down.
+        Each table has a `time`. The first table is the large one: by it the size is brought down.
         """
         clock, now = time.time(), time.monotonic()
         if self._bytes is not None and used(database) > self._bytes:
@@ -52,7 +52,7 @@ class Retention:
         self._next = now if deleted >= AT_ONCE else now + EVERY
 
     def _trusts(self, database: sqlite3.Connection, tables: tuple[str, ...], clock: float, now: float) -> bool:
-        """Whether the clock may be believed. It is looked at with every batch, so that no jump is missed."""
+        """Return whether the clock may be believed. It is looked at with every batch, so that no jump is missed."""
         offset = clock - now
         if self._offset is None:
             newest = max((newest_of(database, table) for table in tables), default=None, key=lambda t: t or 0.0)
@@ -69,7 +69,7 @@ class Retention:
 
 
 def delete_older(database: sqlite3.Connection, table: str, moment: float) -> int:
-    """Delete a piece of what is older than a moment, the oldest first: how many rows."""
+    """Delete a piece of what is older than a moment, the oldest first, and return how many rows that was."""
     return database.execute(
         f"delete from {table} where rowid in (select rowid from {table} where time < ? order by time limit ?)",
         (moment, AT_ONCE),
@@ -94,13 +94,13 @@ def delete_oldest(database: sqlite3.Connection, table: str) -> None:
 
 
 def newest_of(database: sqlite3.Connection, table: str) -> float | None:
-    """The time of the newest row; None if there is none."""
+    """Return the time of the newest row, in seconds since 1970; None if there is none."""
     [newest] = database.execute(f"select max(time) from {table}").fetchone()
     return None if newest is None else float(newest)
 
 
 def used(database: sqlite3.Connection) -> int:
-    """Bytes of the file that hold anything; what was deleted is used again before the file grows."""
+    """Return how many bytes of the file hold anything. What was deleted is used again before the file grows."""
     [[pages], [free], [size]] = (
         database.execute(f"pragma {name}").fetchone() for name in ("page_count", "freelist_count", "page_size")
     )

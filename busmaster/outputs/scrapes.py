@@ -35,13 +35,13 @@ Page = tuple[str, bytes]
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Raises OSError where the port is taken."""
+    """Open a socket that listens on the port. Raises OSError where the port is taken."""
     family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     return socket.create_server(address[:2], family=family, backlog=BACKLOG)
 
 
 def page(registry: CollectorRegistry, accept: str) -> Page:
-    """In the form that a scraper accepts."""
+    """Return the content type and the text of the metrics, in the form that a scraper accepts."""
     from prometheus_client.exposition import choose_encoder
 
     encoder, content_type = choose_encoder(accept)
@@ -49,7 +49,7 @@ def page(registry: CollectorRegistry, accept: str) -> Page:
 
 
 async def serve(listener: socket.socket, make: Callable[[str], Page], stop: threading.Event) -> None:
-    """Until `stop` is set."""
+    """Answer scrapes until `stop` is set."""
     with ThreadPoolExecutor(1, "busmaster scrape") as maker:
         server = _Server(make, maker)
         serving = await asyncio.start_server(server.answer, sock=listener, limit=LONGEST_REQUEST)
@@ -70,6 +70,7 @@ class _Server:
         self._asking: set[asyncio.StreamWriter] = set()
 
     async def answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer one request and close its connection."""
         self._silent[writer] = None
         while len(self._silent) > MOST_SILENT:
             self._drop(next(iter(self._silent)))
@@ -88,6 +89,7 @@ class _Server:
             self._drop(writer)
 
     def close(self) -> None:
+        """Close every connection."""
         for writer in [*self._silent, *self._asking]:
             self._drop(writer)
 
@@ -118,7 +120,7 @@ class _Server:
         return answer if words[0] == "GET" else answer[: answer.index(b"\r\n\r\n") + 4]
 
     async def _page(self, accept: str) -> Page:
-        """All that ask while one is being made wait for the same."""
+        """Return the metrics; all that ask while a page is being made wait for the same one."""
         making = self._making.get(accept)
         if making is None:
             making = asyncio.get_running_loop().run_in_executor(self._maker, self._make, accept)
@@ -128,7 +130,7 @@ class _Server:
 
 
 def response(status: str, content_type: str, body: bytes, **headers: str) -> bytes:
-    """The connection ends with it."""
+    """Return an HTTP response, which says that the connection ends with it."""
     said = {"Content-Type": content_type, "Content-Length": str(len(body)), "Connection": "close", **headers}
     lines = [f"HTTP/1.1 {status}", *(f"{name}: {text}" for name, text in said.items())]
     return "\r\n".join([*lines, "", ""]).encode() + body

@@ -77,6 +77,7 @@ class Spool:
         self.values -= values
 
     def close(self) -> None:
+        """Close the file; what it holds stays there."""
         self._database.close()
 
     def _forget(self, values: int) -> int:

@@ -86,6 +86,7 @@ class SqliteOutput(BatchOutput[Rows]):
         self._numbers: dict[str, int] = {}
 
     def format(self, item: Item) -> Rows:
+        """Return the rows of one cycle or one event."""
         if isinstance(item, Happening):
             return Rows([], (item.time, item.node or None, item.text))
         if isinstance(item, WriteRecord):
@@ -144,7 +145,7 @@ class SqliteOutput(BatchOutput[Rows]):
 
 
 def number_of(database: sqlite3.Connection, point: Point[Any]) -> int:
-    """The point's row; made if there is none, and with the unit that the point has now."""
+    """Return the number of the point's row. It is made if there is none, and gets the unit that the point has now."""
     node, _, item = point.key.partition("/")
     row = database.execute(
         "insert into points (node, item, unit) values (?, ?, ?)"
@@ -155,7 +156,7 @@ def number_of(database: sqlite3.Connection, point: Point[Any]) -> int:
 
 
 def column(value: Any) -> Any:
-    """SQLite holds numbers and texts; several values are JSON."""
+    """Return a value as SQLite can hold it: a number, a text or None; several values are JSON."""
     plain = json_value(value)
     if isinstance(plain, list):
         return json.dumps(plain)

@@ -17,7 +17,10 @@ from busmaster.gate.record import WriteRecord
 
 
 def number_text(value: float) -> str:
-    """Shortest exact, without an exponent: 12.5, -0.0001, 1234; whole numbers without ".0", zero without a sign."""
+    """Return the shortest exact text, without an exponent: 12.5, -0.0001, 1234.
+
+    Whole numbers are without ".0", zero without a sign.
+    """
     if isinstance(value, int):
         return str(int(value))
     if not math.isfinite(value):
@@ -29,7 +32,7 @@ def number_text(value: float) -> str:
 
 
 def word_text(word: enum.Flag) -> str:
-    """The number and the names of the bits that are set: `65 PROGRAM_RUNNING|AUTO_START_ENABLED`."""
+    """Return the number and the names of the bits that are set: `65 PROGRAM_RUNNING|AUTO_START_ENABLED`."""
     number: int = word.value
     names, rest = [], number
     for member in type(word):
@@ -42,7 +45,7 @@ def word_text(word: enum.Flag) -> str:
 
 
 def value_text(value: Any) -> str:
-    """One value on one line. A set of numbers (flags that are on) as `0,5,31`, or `none`."""
+    """Return one value on one line. A set of numbers (flags that are on) becomes `0,5,31`, or `none`."""
     match value:
         case None:
             return "-"
@@ -61,7 +64,10 @@ def value_text(value: Any) -> str:
 
 
 def json_value(value: Any) -> Any:
-    """The same for JSON: words as numbers, sets and runs as lists, whole numbers without a fraction, NaN as null."""
+    """Return a value as JSON has it.
+
+    Words become numbers, sets and runs lists, whole numbers lose their fraction, and NaN and infinity become null.
+    """
     match value:
         case enum.Enum():
             return json_value(value.value)
@@ -80,17 +86,17 @@ def json_value(value: Any) -> Any:
 
 
 def json_line(**fields: Any) -> str:
-    """What JSON has no word for is written as text."""
+    """Return the fields as one line of JSON. What JSON has no word for is written as text."""
     return json.dumps(fields, ensure_ascii=False, default=str)
 
 
 def micros(moment: float) -> float:
-    """To the microsecond: what is behind that is noise."""
+    """Round a time in seconds to the microsecond: what is behind that is noise."""
     return round(moment, 6)
 
 
 def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[str, Any]:
-    """One cycle as a JSON object; `time_of` makes its times, to the microsecond, of the bus's."""
+    """Return one cycle as a JSON object; `time_of` makes its times, to the microsecond, of the bus's."""
 
     def at(moment: float) -> float:
         return micros(time_of(moment))
@@ -107,7 +113,7 @@ def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[
 
 
 def sample_fields(sample: Sample[Any]) -> dict[str, Any]:
-    """A value, or what went wrong."""
+    """Return a value, or what went wrong, and whether it is late."""
     return {
         "value": json_value(sample.value),
         "error": None if sample.error is None else sample.error.what,
@@ -130,7 +136,7 @@ def write_fields(record: WriteRecord) -> dict[str, Any]:
 
 
 def event_text(event: Event) -> str:
-    """What a person wants to know of, in a sentence; "" for the rest."""
+    """Return what a person wants to know of an event, in a sentence; "" for the rest."""
     match event:
         case NodeChanged() if event.before is not Health.UNKNOWN or event.after is not Health.UP:
             return f"{event.node.label} is {event.after.value}, was {event.before.value}"

@@ -243,7 +243,7 @@ class _Draft:
 def _exchanges(
     group: PlannedGroup, merges: Sequence[Merge], byte_time: float
 ) -> Generator[int, None, list[tuple[PlannedNode, Served]]]:
-    """Node by node, each command once."""
+    """Choose the exchanges node by node, each command once."""
     commands: dict[PlannedNode, dict[Command[Any], None]] = {}
     for node, command in group.reads:
         commands.setdefault(node, {})[command] = None
@@ -258,7 +258,7 @@ def _exchanges(
 
 
 def _play(drafts: Sequence[_Draft]) -> Generator[int, None, None]:
-    """The timetable, if every exchange takes its line time: earliest deadline first, and BACKGROUND as R9 has it."""
+    """Play the timetable, if every exchange takes its line time: earliest deadline first, and BACKGROUND as in R9."""
     schedule, order = Schedule(), count()
     for draft in drafts:
         schedule.add(draft.poll, 0.0)
@@ -328,7 +328,7 @@ def _fitting_baudrate(drafts: Sequence[_Draft], line: LineSettings) -> Generator
 
 
 def _rounded_up(seconds: float) -> float:
-    """To two digits: a period that somebody would write down."""
+    """Round up to two digits: to a period that somebody would write down."""
     unit = 10.0 ** (floor(log10(seconds)) - 1)
     return round(ceil(seconds / unit - 1e-9) * unit, 9)
 

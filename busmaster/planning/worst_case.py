@@ -32,10 +32,11 @@ class PlannedNode:
     reply_time: float | None = None
 
     def open(self, command: Command[Any]) -> Exchange[Any]:
+        """Open the exchange of a command to this node, by its own timings or else its profile's."""
         return command.open(self.address, self.timings or self.profile.timings)
 
     def line_time(self, command: Command[Any], byte_time: float) -> float:
-        """Seconds of the line that one undisturbed attempt takes."""
+        """Return the seconds of the line that one undisturbed attempt takes."""
         return line_time(self.open(command), byte_time, self.reply_time)
 
 
@@ -43,16 +44,16 @@ Read: TypeAlias = tuple[PlannedNode, Command[Any]]
 
 
 def shape(exchange: Exchange[Any]) -> tuple[object, ...]:
-    """What, beside its timings, tells how long an exchange can take: two of one shape take equally long."""
+    """Return what, beside its timings, tells how long an exchange can take: two of one shape take equally long."""
     later = tuple((leg.sent, leg.sizes.longest) for leg in exchange.later)
     return len(exchange.request), exchange.sizes.longest, later
 
 
 def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: float = 0.0) -> float:
-    """Seconds for which one attempt can keep the line from others, its settle included, if nothing is repeated in it.
+    """Return for how many seconds one attempt can keep the line from others, if nothing is repeated in it.
 
-    The H of R9: each leg's request, its window (or lateness) and its longest reply; then the silence after the last
-    byte, which a reply that trickles in puts off.
+    Its settle is included. It is the H of R9: each leg's request, its window (or lateness) and its longest reply; then
+    the silence after the last byte, which a reply that trickles in puts off.
     """
     before = worst = 0.0
     legs = [(len(exchange.request), exchange.timing, exchange.sizes)]
@@ -68,7 +69,7 @@ def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: flo
 
 
 def unanswered(exchange: Exchange[Any], byte_time: float) -> float:
-    """Seconds for which one attempt keeps the line from others if no byte of a reply comes."""
+    """Return for how many seconds one attempt keeps the line from others if no byte of a reply comes."""
     return len(exchange.request) * byte_time + max(exchange.timing.lateness, exchange.timing.turnaround)
 
 
@@ -88,10 +89,11 @@ class Bounds:
     """The longest time, in seconds, for which a poll lets later ones with a shorter period pass."""
 
     def wait(self, priority: Priority, *, ahead: int = 0, patience: float | None = None) -> float:
-        """`ahead`: how many of URGENT or COMMAND wait already. Of URGENT, it is the wait of a write.
+        """Return how long, in seconds, a request of this class waits at most until it is sent.
 
-        Before each request, MOST_BEFORE others may go while an answer could be taken for its own (R15); an urgent
-        write is never held back so, an urgent read waits for so many more.
+        `ahead` says how many of URGENT or COMMAND wait already. Of URGENT, it is the wait of a write. Before each
+        request, MOST_BEFORE others may go while an answer could be taken for its own (R15); an urgent write is never
+        held back so, an urgent read waits for so many more.
         """
         each = 1 + MOST_BEFORE
         if priority is Priority.URGENT:
@@ -108,7 +110,7 @@ class Bounds:
 def bounds(
     reads: Iterable[Read], byte_time: float, receive_latency: float = 0.0, *, polls: int = 0, background: int = 0
 ) -> Bounds:
-    """The bounds for a line on which nothing else is asked than these, and every node's probe."""
+    """Return the bounds for a line on which nothing else is asked than these, and every node's probe."""
     return at_once(bound_steps(reads, byte_time, receive_latency, polls, background))
 
 

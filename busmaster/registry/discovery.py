@@ -81,7 +81,10 @@ def make_device(
 
 
 def _own() -> Iterator[Protocol]:
-    """Those of this package: a folder each. What several share is in folders that begin with an underscore."""
+    """Yield the protocols of this package: a folder each.
+
+    What several share is in folders that begin with an underscore.
+    """
     package = importlib.import_module(PACKAGE)
     for module in pkgutil.iter_modules(package.__path__):
         if not module.name.startswith("_"):
@@ -99,7 +102,7 @@ def _loaded(entry: EntryPoint, known: list[Protocol]) -> Protocol:
 
 
 def _check_options(protocol: Protocol, known: list[Protocol]) -> None:
-    """An option may be one of several protocols, but then it is written in one way."""
+    """Check that an option of several protocols is written in one way. Raises InvalidCommand."""
     taken = {option.name: option.kind for other in known for kind in other.kinds for option in _options(kind)}
     for kind in protocol.kinds:
         for option in _options(kind):

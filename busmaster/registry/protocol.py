@@ -189,5 +189,5 @@ def _arguments_of(command: Any) -> dict[str, Any]:
 
 
 def _frozen(value: Any) -> Any:
-    """A list, which is what JSON makes of a tuple, as a tuple again."""
+    """Return a list, which is what JSON makes of a tuple, as a tuple again."""
     return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value

@@ -76,7 +76,10 @@ def _check_announcements(command: Command[Any], exchange: Exchange[Any]) -> Iter
 
 
 def _check_keys(command: Command[Any], exchange: Exchange[Any]) -> Iterator[str]:
-    """What replies begin with is compared, and remembered by: a tuple, and no empty key, for that fits every byte."""
+    """Say what is wrong with the keys by which replies are compared and remembered.
+
+    They are a tuple, and no key is empty, for that fits every byte.
+    """
     for name in ("answers", "owed"):
         keys: object = getattr(exchange, name, None)
         if not isinstance(keys, tuple) or not all(isinstance(key, bytes) and key for key in keys):

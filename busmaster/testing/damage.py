@@ -11,13 +11,15 @@ MANY_BYTES = 64
 
 
 def bytewise(data: bytes) -> list[bytes]:
-    """One byte at a time."""
+    """Return the data one byte at a time."""
     return [data[i : i + 1] for i in range(len(data))]
 
 
 def splits(data: bytes) -> Iterator[list[bytes]]:
-    """Ways to cut `data` into chunks: all for a few bytes; else into two, or three if there are not many, and one byte
-    at a time."""
+    """Yield ways to cut `data` into chunks: all for a few bytes; else into two, or three if there are not many.
+
+    One of them is one byte at a time.
+    """
     length = len(data)
     most = length if length <= FEW_BYTES else 3 if length <= MANY_BYTES else 2
     for count in range(1, most):
@@ -29,7 +31,7 @@ def splits(data: bytes) -> Iterator[list[bytes]]:
 
 
 def flips(data: bytes, bits: int) -> Iterator[bytes]:
-    """`data` with one of the lower `bits` of one byte flipped, for each of them."""
+    """Yield `data` with one of the lower `bits` of one byte flipped, for each of them."""
     for position in range(len(data)):
         for bit in range(bits):
             flipped = data[position] ^ 1 << bit
@@ -37,7 +39,7 @@ def flips(data: bytes, bits: int) -> Iterator[bytes]:
 
 
 def garbage_chunks(random: Random, reply: bytes) -> Iterator[bytes]:
-    """Chunks of noise, or of the reply with some of its bytes lost, doubled and overwritten."""
+    """Yield chunks of noise, or of the reply with some of its bytes lost, doubled and overwritten."""
     data = bytearray(reply if random.random() < 0.7 else random.randbytes(random.randrange(300)))
     for _ in range(random.randrange(1, 5)):
         place = random.randrange(len(data) + 1)

@@ -55,7 +55,7 @@ def _check(protocol: Protocol, case: Case) -> Iterator[str]:
 
 
 def _conversation(protocol: Protocol, case: Case) -> Iterator[Said]:
-    """What both sides say, the host's closing word too."""
+    """Yield what both sides say, the host's closing word too."""
     driver = Driver(case.command.open(case.address, protocol.profile.timings))
     yield Direction.HOST, driver.exchange.request
     heard = 0

@@ -119,7 +119,7 @@ class _Kit:
         return self.listen(case.command, case.address).feed(*chunks)
 
     def turns(self, case: Case) -> list[list[bytes]]:
-        """The legs, those in one list that come without a word of the host between: they may come in one chunk."""
+        """Return the legs, those in one list that come without a word of the host between: they may be one chunk."""
         driver = self.listen(case.command, case.address)
         turns: list[list[bytes]] = [[]]
         for leg in case.legs:
@@ -131,7 +131,7 @@ class _Kit:
         return turns
 
     def runs(self, case: Case) -> Iterator[tuple[list[bytes], bytes]]:
-        """Each turn of the node as one chunk, and what it said in the turns before."""
+        """Yield each turn of the node as one chunk, and what it said in the turns before."""
         runs = [b"".join(turn) for turn in self.turns(case) if turn]
         for number, run in enumerate(runs):
             yield runs[:number], run
@@ -139,7 +139,7 @@ class _Kit:
     # what a case says
 
     def check_reply(self, case: Case) -> Iterator[str]:
-        """The reply as it stands, and silence in its place."""
+        """Check the reply as it stands, and silence in its place."""
         driver = self.listen(case.command, case.address)
         exchange = driver.exchange
         if case.request is not None and exchange.request != case.request:
@@ -220,7 +220,7 @@ class _Kit:
                 yield f"{unseen} is seen after all, or no case has that reply: take it off the list"
 
     def check_starts(self, case: Case) -> Iterator[str]:
-        """A byte that begins no reply gives none, whatever follows it."""
+        """Check that a byte that begins no reply gives none, whatever follows it."""
         if not case.legs:
             return
         starts = self.listen(case.command, case.address).exchange.starts
@@ -243,7 +243,7 @@ class _Kit:
                 yield from self._check_listener(self.profile.listen(), chunks)
 
     def _check_listener(self, listener: Listener, chunks: Iterable[bytes]) -> Iterator[str]:
-        """One listener serves all that comes unasked: it goes on after whatever it was fed."""
+        """Check that one listener serves all that comes unasked: it goes on after whatever it was fed."""
         for chunk in chunks:
             try:
                 listener.feed(chunk)
@@ -257,7 +257,7 @@ class _Kit:
     # the replies of others
 
     def check_replies_to_others(self) -> Iterator[str]:
-        """Whatever one turn of a node brings, as far as nothing was said again in it."""
+        """Check whatever one turn of a node brings, as far as nothing was said again in it."""
         replies = {id(case): self._first_turn(case) for case in self.cases}
         for mine in self.cases:
             names = self._names(mine.command, mine.address)
@@ -270,7 +270,7 @@ class _Kit:
                     yield from self._check_not_accepted(mine.command, mine.address, heard, good, why)
 
     def check_exchangeable(self) -> Iterator[str]:
-        """Each reply in place of every other, refusals aside."""
+        """Check each reply in place of every other, refusals aside."""
         good = [case for case in self.cases if self._first_turn(case)]
         for mine in good:
             for other in good:
@@ -281,7 +281,10 @@ class _Kit:
                         yield f"{mine}: {what}, and takes the reply to {other}"
 
     def _first_turn(self, case: Case) -> bytes:
-        """Empty for a broadcast, a refusal, and where something had to be repeated: that shows not what a reply is."""
+        """Return the first turn of the node, where it shows what a reply is.
+
+        It is empty for a broadcast, a refusal, and where something had to be repeated.
+        """
         driver = self.hear(case, *case.legs)
         repeated = len(b"".join(driver.said)) != sum(leg.sent for leg in driver.exchange.later)
         return b"" if repeated or case.raises is not None else b"".join(self.turns(case)[0])
@@ -293,7 +296,10 @@ class _Kit:
     def _check_not_accepted(
         self, command: Command[Any], address: int, heard: bytes, good: set[bytes], why: str
     ) -> Iterator[str]:
-        """`good` replies may stand at the front of `heard`: what follows them is left over and settles the line."""
+        """Check that `heard` is not accepted.
+
+        `good` replies may stand at the front of `heard`: what follows them is left over and settles the line.
+        """
         self.tally["foreign"] += 1
         ending = self.listen(command, address).feed(heard).run_out()
         taken = heard.removesuffix(ending.rest)

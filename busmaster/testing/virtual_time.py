@@ -45,7 +45,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         return future
 
     async def shutdown_default_executor(self, timeout: float | None = None) -> None:
-        """Waits for its threads in earnest, without a limit: time stands still."""
+        """Wait for its threads in earnest, without a limit: time stands still."""
         self._threads += 1
         try:
             await super().shutdown_default_executor()
@@ -56,7 +56,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         self._threads -= 1
 
     def jump(self, seconds: float | None) -> float:
-        """Nothing is ready: on to the next timer. Returns the seconds to wait in earnest, for a thread.
+        """Go on to the next timer, as nothing is ready. Returns the seconds to wait in earnest, for a thread.
 
         Raises DeadlockError if there is no timer (None).
         """

@@ -92,7 +92,7 @@ class KernelTimer:
         self._settime(self.descriptor, 0, self._pointer, None)
 
     def has_expired(self) -> bool:
-        """Whether it has since it was set last: one that was set again meanwhile has not."""
+        """Return whether it has since it was set last: one that was set again meanwhile has not."""
         try:
             return len(os.read(self.descriptor, EXPIRATIONS)) == EXPIRATIONS
         except BlockingIOError:
@@ -125,7 +125,7 @@ class ItimerSpec(ctypes.Structure):
 
 
 def kernel_timer(loop: asyncio.AbstractEventLoop, on_expiry: Callable[[], None]) -> KernelTimer | None:
-    """One that this loop reads; None where there is none, which the log says once a process."""
+    """Return a timer that this loop reads; None where there is none, which the log says once a process."""
     try:
         timer = KernelTimer()
     except OSError as error:

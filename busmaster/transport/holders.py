@@ -24,13 +24,13 @@ class Holder:
 
 
 def holders(path: str, *, proc: Path = PROC) -> tuple[Holder, ...]:
-    """Who has it open, of the processes that we may look into (root sees all)."""
+    """Return who has it open, of the processes that we may look into (root sees all)."""
     device = os.path.realpath(path)
     return tuple(_holder(pid, proc) for pid in _pids(proc) if _has_open(proc / str(pid), device))
 
 
 def lock_owner(path: str, *, proc: Path = PROC) -> Holder | None:
-    """Who has locked it (flock), by the kernel's own table."""
+    """Return who has locked it (flock), by the kernel's own table; None if nobody is found there."""
     try:
         inode = os.stat(path)
         table = (proc / "locks").read_text()
@@ -46,7 +46,7 @@ def lock_owner(path: str, *, proc: Path = PROC) -> Holder | None:
 
 
 def owning_group(path: str) -> str:
-    """The group that may open it, by name where it has one."""
+    """Return the group that may open it, by name where it has one."""
     gid = os.stat(path).st_gid
     try:
         return grp.getgrgid(gid).gr_name
@@ -62,7 +62,10 @@ def _pids(proc: Path) -> list[int]:
 
 
 def _has_open(process: Path, device: str) -> bool:
-    """False too where we may not look, or it has just ended. To know a node (O_PATH) is not to have it open."""
+    """Return whether it has it open; False too where we may not look, or it has just ended.
+
+    To know a node (O_PATH) is not to have it open.
+    """
     with contextlib.suppress(OSError):
         for number in os.listdir(process / "fd"):
             with contextlib.suppress(OSError):
@@ -80,7 +83,7 @@ def _flags(descriptor: Path) -> int:
 
 
 def serves(process: Path, device: str) -> bool:
-    """Whether it has the other end of this pseudo-terminal open: then it is the line, not a second master."""
+    """Return whether it has the other end of this pseudo-terminal open: then it is the line, not a second master."""
     for descriptor in process.glob("fdinfo/*"):
         with contextlib.suppress(OSError):
             index = re.search(r"^tty-index:\s*(\d+)$", descriptor.read_text(), re.MULTILINE)

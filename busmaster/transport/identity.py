@@ -121,7 +121,7 @@ class PtyIdentity:
         return f"the pseudo-terminal made at {self._made:%Y-%m-%dT%H:%M:%S}.{self._made.microsecond // 1000:03d}Z"
 
     def accepts(self, found: Identity) -> bool:
-        """A link that was made anew vouches for what it leads to; one left behind by the dead does not."""
+        """Accept a link that was made anew: it vouches for what it leads to; one left behind by the dead does not."""
         if not isinstance(found, PtyIdentity):
             return False
         made_anew = found._links != self._links and found._links != ()
@@ -214,13 +214,13 @@ def usb_devices() -> list[UsbDevice]:
 
 
 def is_pty(device: int | str) -> bool:
-    """By the device number of a descriptor or a path: a name can be a symlink to anything."""
+    """Tell a pseudo-terminal by the device number of a descriptor or a path: a name can be a symlink to anything."""
     major = os.major(os.stat(device).st_rdev)
     return major in UNIX98_PTYS or major == BSD_PTYS
 
 
 def _entry(number: int) -> Path:
-    """Where the kernel describes the device with this number; a pseudo-terminal is not there."""
+    """Return where the kernel describes the device with this number; a pseudo-terminal is not there."""
     return SYS / f"dev/char/{os.major(number)}:{os.minor(number)}"
 
 
@@ -264,7 +264,7 @@ def _marks(device: UsbDevice) -> tuple[str, str, int, int]:
 
 
 def _is_double(device: UsbDevice, other: UsbDevice) -> bool:
-    """Whether these are two adapters that claim the same serial number."""
+    """Return whether these are two adapters that claim the same serial number."""
     return (device.kind, device.serial) == (other.kind, other.serial) and device.place != other.place
 
 
@@ -282,7 +282,7 @@ def _link(path: str, folder: str) -> str:
 
 
 def _links(path: str) -> Iterator[tuple[int, int, int]]:
-    """What tells each symbolic link on the way from one that is made in its place later."""
+    """Yield what tells each symbolic link on the way from one that is made in its place later."""
     while os.path.islink(path):
         link = os.lstat(path)
         yield link.st_dev, link.st_ino, link.st_ctime_ns

@@ -73,7 +73,7 @@ class _Descriptor(OpenPort):
         return any(events & select.POLLIN for _, events in self._input.poll(0))
 
     def _count(self, request: int) -> int:
-        """A number that an ioctl tells; 0 where it tells nothing."""
+        """Return a number that an ioctl tells; 0 where it tells nothing."""
         answer = array.array("i", [0])
         try:
             fcntl.ioctl(self._fd, request, answer)
@@ -107,7 +107,7 @@ class Tty(_Descriptor):
         self._before = self._counted()
 
     def _counted(self) -> array.array[int] | None:
-        """The driver's counts since it was loaded; None where it keeps none, as for a pty."""
+        """Return the driver's counts since it was loaded; None where it keeps none, as for a pty."""
         counts = array.array("i", [0] * ICOUNTER_SIZE)
         try:
             fcntl.ioctl(self._fd, TIOCGICOUNT, counts)
@@ -126,17 +126,17 @@ class Socket(_Descriptor):
         self._socket = sock
 
     def unsent(self, waited: float) -> int | None:
-        """What is under way counts only if its acknowledgement is later than is usual on this path."""
+        """Count what is under way only if its acknowledgement is later than is usual on this path."""
         under_way = waited >= DELAYED_ACK and waited >= self._usual_acknowledgement()
         return (super().unsent(waited) or 0) + self._count(termios.TIOCOUTQ if under_way else SIOCOUTQNSD)
 
     def discard_unsent(self) -> None:
-        """Closing would leave it to the kernel, which goes on sending: have the connection reset instead."""
+        """Have the connection reset: closing would leave it to the kernel, which goes on sending."""
         with contextlib.suppress(OSError):  # it may be gone already
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
     def _usual_acknowledgement(self) -> float:
-        """Seconds, as the kernel reckons for its own repeats; 0 where it does not tell."""
+        """Return it in seconds, as the kernel reckons for its own repeats; 0 where it does not tell."""
         if not hasattr(socket, "TCP_INFO"):
             return 0.0
         try:
@@ -157,7 +157,7 @@ def open_port(transport: asyncio.Transport) -> OpenPort:
 
 
 def _buffer_of(transport: asyncio.Transport) -> Callable[[], int] | None:
-    """How much the transport still has to write; None for one that does not tell."""
+    """Return what tells how much the transport still has to write; None for one that does not tell."""
     try:
         transport.get_write_buffer_size()
     except (AttributeError, NotImplementedError):

@@ -80,7 +80,7 @@ class Pump(asyncio.Protocol):
     # what the bus calls
 
     def transact(self, transaction: Transaction) -> asyncio.Future[Any]:
-        """Submit it; the future gets its value or its error."""
+        """Submit a transaction; the future gets its value or its error."""
         assert self._loop is not None
         future: asyncio.Future[Any] = self._loop.create_future()
         transaction.tag = future
@@ -89,6 +89,7 @@ class Pump(asyncio.Protocol):
         return future
 
     def cancel(self, transaction: Transaction) -> None:
+        """Cancel a transaction, at the time it is now."""
         self.arbiter.cancel(transaction, self.clock())
 
     def turn(self) -> None:
@@ -140,15 +141,16 @@ class Pump(asyncio.Protocol):
             await self._run_out.wait()
 
     def driver_errors(self) -> DriverErrors | None:
-        """What the driver of the port that is open has counted: the arbiter does not know of it."""
+        """Return what the driver of the port that is open has counted: the arbiter does not know of it."""
         return None if self._port is None else self._port.errors()
 
     def reset_driver_errors(self) -> None:
+        """Start the counts of the driver of the port again, if one is open."""
         if self._port is not None:
             self._port.reset()
 
     def stop(self) -> None:
-        """No timer any more: the bus is closed. Whoever still waits is told now, where nobody saw `run_out` through."""
+        """Stop the timer: the bus is closed. Whoever still waits is told now, where nobody saw `run_out` through."""
         while self.arbiter.failing:
             self.arbiter.handle_timeout(self.clock())
             self.turn()
@@ -177,7 +179,7 @@ class Pump(asyncio.Protocol):
         self.turn()
 
     def byte_marked(self, byte: bytes, mark: Mark) -> None:
-        """The UART found this byte damaged."""
+        """Take a byte that the UART found damaged."""
         now = self.clock()
         if self.tap is not None:
             self.tap.received(now, byte, self.arbiter.attempt)
@@ -185,11 +187,11 @@ class Pump(asyncio.Protocol):
         self.turn()
 
     def pause_writing(self) -> None:
-        """The transport could not hand over all that was written: nothing runs out until it has."""
+        """Note that the transport could not hand over all that was written: nothing runs out until it has."""
         self._paused = True
 
     def resume_writing(self) -> None:
-        """Now it has."""
+        """Note that the transport has handed over what was written."""
         self._paused = False
         self._check_output(self.clock())
         due = self.arbiter.poll_timeout()
@@ -210,7 +212,7 @@ class Pump(asyncio.Protocol):
         return self.arbiter.state is LineState.EXCHANGE or self.arbiter.failing
 
     def _give_up_on(self, late: Overdue) -> None:
-        """Its caller goes, the exchange stays: a write that is on the wire is over before anything else can be read."""
+        """Let its caller go and keep the exchange: a write on the wire is over before anything else can be read."""
         transaction = late.transaction
         if transaction.writes:
             self._on_written(transaction, self.clock())

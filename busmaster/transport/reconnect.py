@@ -120,7 +120,7 @@ class Connection:
         return loop.time() - since
 
     async def _wait(self, delay: float) -> bool:
-        """Wait that long, spread by the jitter. True, and earlier, if the device is seen to come back."""
+        """Wait that long, spread by the jitter. Returns True, and earlier, if the device is seen to come back."""
         loop = asyncio.get_running_loop()
         # spread, or all lines of a server that went away would come back to it at the same moments
         until = loop.time() + delay * self._jitter.uniform(0.75, 1.25)
@@ -135,7 +135,7 @@ class Connection:
         return False
 
     def _came_back(self) -> bool:
-        """Whether a device has come since the last look."""
+        """Return whether a device has come since the last look."""
         before = self._seen
         try:
             self._seen = self.endpoint.presence()

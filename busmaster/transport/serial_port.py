@@ -109,7 +109,10 @@ class SerialPort:
         return LineSettings(self.baudrate, self.bytesize, self.parity, self.stopbits)
 
     def presence(self) -> Hashable | None:
-        """Of the node that the path (perhaps a symlink) leads to now; of all ports where it is a serial number."""
+        """Tell what is seen of the node that the path (perhaps a symlink) leads to now.
+
+        It is what is seen of all ports where the path is a serial number.
+        """
         try:
             if self.path.startswith(identity.USB):
                 return tuple(sorted(os.listdir(identity.SYS / "class/tty")))
@@ -171,14 +174,17 @@ class PortTransport(_SerialTransport):
         self.set_write_buffer_limits(high=0)  # whatever is buffered pauses the protocol: it has not left yet
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
-        """`serial` is pyserial's object, `paced` whether bytes leave at the baud rate, `identity` the device's."""
+        """Return for `serial` pyserial's object, for `identity` the device's.
+
+        For `paced` it is whether bytes leave at the baud rate.
+        """
         return {"serial": self._serial, "paced": self._paced, "identity": self._identity}.get(name, default)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._port.name}{' closing' if self._closing else ''}>"
 
     def _read_ready(self) -> None:
-        """From the descriptor: pyserial's read asks select(), which fails above descriptor 1023."""
+        """Read from the descriptor: pyserial's read asks select(), which fails above descriptor 1023."""
         try:
             data = os.read(self._fd, READ_SIZE)
         except BlockingIOError:
@@ -201,7 +207,7 @@ class PortTransport(_SerialTransport):
                 self._byte_marked(piece, mark)
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """At once if nothing is buffered: else the bytes would leave one turn of the loop later than their stamp."""
+        """Write at once if nothing is buffered: else bytes would leave a turn of the loop later than their stamp."""
         if self._closing:
             return  # reported already, or asked for
         if not self._write_buffer:
@@ -245,13 +251,13 @@ class PortTransport(_SerialTransport):
         asyncio.wrap_future(closed, loop=self._loop).add_done_callback(lambda _: self._report(None))
 
     def abort(self) -> None:
-        """As `close`, without waiting for the device."""
+        """Do what `close` does, without waiting for the device."""
         if not self._closing:
             self._detach()
         self._loop.call_soon(self._report, None)
 
     def _lose(self, error: OSError | None) -> None:
-        """The port is gone: the protocol is told at the next turn of the loop, never from within its own `write`."""
+        """Give up a port that is gone: the protocol is told at the loop's next turn, never within its own `write`."""
         self._detach()
         why = "it hung up" if error is None or error.errno == errno.EIO else error.strerror
         cause = LineDown(f"{self._port.name} was lost: {why}", hint="")
@@ -274,7 +280,7 @@ class PortTransport(_SerialTransport):
 
 
 def _names_pty(path: str) -> bool:
-    """False also where nothing is there: opening it will say so."""
+    """Return whether it is a pseudo-terminal; False also where nothing is there: opening it will say so."""
     try:
         return is_pty(path)
     except OSError:
@@ -311,7 +317,7 @@ def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool,
 
 
 def _found(port: SerialPort, only: Identity | None) -> Identity:
-    """Which device has the name now. Raises LineDown, before it is touched, where that is another than `only`."""
+    """Return which device has the name now. Raises LineDown, before it is touched, if that is another than `only`."""
     try:
         found = identify(port.path)
     except OSError as error:
@@ -322,7 +328,7 @@ def _found(port: SerialPort, only: Identity | None) -> Identity:
 
 
 def _equip(port: SerialPort, device: serial.Serial) -> None:
-    """What only some drivers have is touched only if it is asked for. Raises LineDown where it is refused."""
+    """Touch what only some drivers have only if it is asked for. Raises LineDown where it is refused."""
     if port.exclusive:  # flock is advisory, and this does not stop root: only both together keep others out
         fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
     if port.rs485:
@@ -344,7 +350,7 @@ def _equip(port: SerialPort, device: serial.Serial) -> None:
 
 
 def _refusal(port: SerialPort, error: Exception) -> LineDown:
-    """Why it did not open, in words, and what to try."""
+    """Return why it did not open, in words, and what to try."""
     path, code = port.path, _code(error)
     if code in (errno.EBUSY, errno.EAGAIN):
         owner = holders.lock_owner(path) or next(iter(holders.holders(path)), "another program")
@@ -367,7 +373,7 @@ def _refusal(port: SerialPort, error: Exception) -> LineDown:
 
 
 def _code(error: Exception) -> int | None:
-    """The errno behind an error of pyserial, which hides some in its text."""
+    """Return the errno behind an error of pyserial, which hides some in its text; None if there is none."""
     for raised in (error, error.__context__):
         if isinstance(raised, termios.error):
             return int(raised.args[0])
@@ -394,7 +400,7 @@ def _release(device: serial.Serial, exclusive: bool) -> None:
 
 
 def _drop(opening: Future[tuple[MarkingSerial, bool, Identity]]) -> None:
-    """Nobody waited for this opening any more."""
+    """Release what was opened, for nobody waits for this opening any more."""
     if not opening.cancelled() and opening.exception() is None:
         device, *_ = opening.result()
         _release(device, True)

@@ -63,7 +63,7 @@ class TcpPort:
         return None if self.baudrate is None else LineSettings(self.baudrate)
 
     def presence(self) -> None:
-        """Whether a server is there again can only be found out by connecting."""
+        """Return None: whether a server is there again can only be found out by connecting."""
         return None
 
     async def open(
@@ -97,7 +97,7 @@ class TcpPort:
 
 
 def _find_out_a_dead_server(sock: socket.socket) -> None:
-    """TCP_NODELAY is asyncio's own default."""
+    """Have the kernel find out a dead server. TCP_NODELAY is asyncio's own default."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in KEEP_ALIVE.items():
         if hasattr(socket, option):  # each system has some of them

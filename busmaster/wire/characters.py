@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def made_of(characters: bytes) -> bytes:
-    """A table for `bytes.translate` that changes every byte but these: a field made of them alone stays as it is.
+    """Return a table for `bytes.translate` that changes every byte but these: a field of them alone stays as it is.
 
     This takes a third of the time of deleting them and looking for a rest.
     """

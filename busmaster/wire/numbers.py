@@ -23,7 +23,7 @@ _NUMBER_CHARACTERS = made_of(b"0123456789+-.eE ")
 
 
 def format_number(value: SupportsFloat) -> str:
-    """The shortest text with at most 4 decimals: "123.456", ".5", "-.0001", "0"; no exponent, no "-0".
+    """Return the shortest text with at most 4 decimals: "123.456", ".5", "-.0001", "0"; no exponent, no "-0".
 
     The fifth decimal rounds half away from zero, on the decimal text that Python shows for the value. Raises
     InvalidCommand for NaN, infinity, what is no number, and what takes more than 20 characters.
@@ -49,7 +49,7 @@ def _format_float(value: float) -> str:
 
 
 def format_list(values: Iterable[SupportsFloat]) -> str:
-    """Values for consecutive elements, separated by commas. Raises InvalidCommand for more than 60 characters."""
+    """Join values for consecutive elements with commas. Raises InvalidCommand for more than 60 characters."""
     text = ",".join(map(format_number, values))
     if len(text) > LONGEST_LIST:
         raise InvalidCommand(
@@ -59,7 +59,7 @@ def format_list(values: Iterable[SupportsFloat]) -> str:
 
 
 def parse_number(field: bytes) -> float:
-    """The value of a reply's data field: sign, digits, fraction, and an exponent if there is one.
+    """Return the value of a reply's data field: sign, digits, fraction, and an exponent if there is one.
 
     Spaces around it are dropped. Raises FrameError for anything else, such as "nan", "1_0" or an empty field.
     """

@@ -33,7 +33,7 @@ _REFUSALS: Mapping[int, type[Refused]] = {NAK[0]: Refused}
 
 
 def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes], int]) -> int:
-    """Where the ETX of a whole and valid telegram is; 0 if more bytes are needed.
+    """Return where the ETX of a whole and valid telegram is; 0 if more bytes are needed.
 
     `header` is STX and the echo, `longest` the most data characters. Raises FrameError as soon as the bytes cannot
     become such a telegram; `whole` only if nothing but the checksum is wrong, and nothing follows.
@@ -59,7 +59,7 @@ def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes]
 
 
 def telegram_sizes(echo: int, typical: int, longest: int) -> Sizes:
-    """Bytes of a telegram from the characters of its echo and of its data."""
+    """Reckon the bytes of a telegram from the characters of its echo and of its data."""
     return Sizes(_ENVELOPE + echo + typical, _ENVELOPE + echo + longest)
 
 
@@ -110,6 +110,7 @@ class TelegramReader(SingleLeg, Generic[T]):
         return self.answers
 
     def parse(self, field: bytes) -> T:
+        """Return the value of the data field. Raises FrameError for one that means nothing."""
         raise NotImplementedError
 
     def feed(self, data: bytes) -> Need | Expect | Done[T]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import MISSING, fields
+
 import pytest
 
+from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import (
     MOST_ANSWERED,
@@ -56,6 +59,27 @@ def test_r15_a_few_reads_that_it_has_answered_are_remembered_each_once_and_no_wr
     assert len(record.answered) == MOST_ANSWERED
     note((b"1",), hcp2.Write(1, (5,)), 0.004)
     assert record.answered[b"1",] is reads[0]
+
+
+def test_a_node_that_was_never_asked_has_failed_in_nothing_and_waits_for_nothing() -> None:
+    record = node()
+    assert (record.health, record.failures, record.unheard, record.silent) == (UNKNOWN, 0, 0, False)
+    assert (record.answered, record.holds, record.has_hook) == ({}, 0, False)
+
+
+def test_a_node_that_waits_for_no_hook_is_not_let_go_twice() -> None:
+    bench = Bench()
+    record = bench.node()
+    bench.arbiter.dispatcher.release_node(record)
+    assert record.holds == 0
+    record.holds = 2
+    bench.arbiter.dispatcher.release_node(record)
+    assert record.holds == 1
+
+
+def test_a_line_of_which_nothing_more_is_known_has_counted_nothing() -> None:
+    known = {each.name: each.default for each in fields(LineStatistics) if each.default is not MISSING}
+    assert known == {"checks": 0, "doubted": 0, "damaged": 0, "breaks": 0, "driver": None}
 
 
 # what a node's health is

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from busmaster.arbiter.health import SILENT, NodeRecord
+from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import GarbledReply, NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -136,6 +137,19 @@ def test_r15_a_debt_is_paid_by_its_own_reply_on_an_idle_line_however_late() -> N
     bench.until_ready()
     bench.ask(node)
     assert bench.sent() == request_of(1)
+
+
+@pytest.mark.parametrize("behind", [[], [2], [2, 3]])
+def test_r15_an_ack_and_the_replies_behind_it_pay_what_is_owed(behind: list[int]) -> None:
+    owed = [bytes.fromhex(reply_of(element, 5)) for element in behind]
+    in_step = InStep()
+    node = up(Bench())
+    for key in (bytes.fromhex(ACK), *owed):
+        in_step.owe((key,), node, 0.0, 0.15)
+    payer = in_step.heard(bytes.fromhex(ACK) + b"".join(owed), 1.0)
+    assert payer is not None
+    assert payer.node is node
+    assert in_step.debts == []
 
 
 @pytest.mark.parametrize("bytewise", [False, True])

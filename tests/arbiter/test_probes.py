@@ -9,7 +9,6 @@ import pytest
 from busmaster.arbiter.health import (
     BUDGET_CAPACITY,
     FIRST_PROBE_DELAY,
-    PROBE_JITTER,
     STEADY,
     Health,
     NodeRecord,
@@ -92,7 +91,7 @@ def test_r15_probes_that_follow_one_another_never_ask_for_what_is_owed() -> None
 def test_r11_the_delay_is_jittered_by_a_fifth(drawn: float) -> None:
     record = node()
     note_failure(record, 7.0, lambda: drawn)
-    assert record.probe_at == pytest.approx(7.0 + FIRST_PROBE_DELAY * (1 + PROBE_JITTER * (2 * drawn - 1)))
+    assert record.probe_at == pytest.approx(7.0 + 0.5 * (0.8 + 0.4 * drawn))
 
 
 def test_r11_a_node_that_dies_again_soon_is_probed_at_longer_delays() -> None:

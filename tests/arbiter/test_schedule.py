@@ -23,6 +23,7 @@ from busmaster.errors import InvalidCommand
 from busmaster.planning.merging import at_once
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
+from tests.arbiter.bench import Bench, up
 
 TAU = LineSettings(57600).byte_time
 PERIODS = st.sampled_from([0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0])
@@ -456,3 +457,16 @@ def test_a_demand_waits_until_the_poll_is_prepared() -> None:
     assert schedule.begin(0.0) == [member]
     assert poll.due == 0.0
     assert schedule.next_due() == pytest.approx(5.0)
+
+
+def test_a_cycle_has_begun_when_its_first_request_went_out() -> None:
+    bench = Bench()
+    poll = bench.poll(up(bench), 10.0, 1, 2)
+    assert poll.started == -inf
+    bench.until_sent()
+    begun = bench.now
+    assert poll.started == begun
+    bench.answer()
+    bench.until_sent()
+    assert bench.now > begun
+    assert poll.started == begun

@@ -16,6 +16,7 @@ from busmaster.contract.arguments import Between
 from busmaster.contract.driver import Ending
 from busmaster.contract.exchange import Done, Expect, LaterLeg, Sizes
 from busmaster.contract.items import Bit, Item
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Batch, LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
@@ -65,6 +66,7 @@ RECORDS: tuple[Any, ...] = (
     LaterLeg(TIMING, Sizes(1, 2)),
     TIMING,
     Timings.uniform(TIMING),
+    Learned(),
     LineSettings(9600),
     Batch(hcp.Read(1), (0,)),  # type: ignore[arg-type]  # whatever it serves
     Ending(5),

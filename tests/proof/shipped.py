@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from math import inf
 from typing import Any, ClassVar
 
 from busmaster.arbiter import alike, health, in_step
@@ -130,6 +131,10 @@ class AnyStep:
 
     def is_doubtful(self, *arguments: Any) -> bool:
         return self.holds[0] and bool(choose(2))
+
+    def awaited_until(self, *arguments: Any) -> float:
+        """Nothing is: no window of these worlds is learned."""
+        return -inf
 
     holds: ClassVar[list[bool]] = [False]
     """Whether an answer may be held until another could have come."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from busmaster.contract.exchange import Done
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
@@ -18,6 +19,8 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
+from busmaster.protocols.msc.exchange import packet
+from busmaster.wire.readers import ACK
 
 MINT = ReplyTiming(0.05, 0.1, 0.15, 0.02)
 ANSI = ReplyTiming(0.05, 0.15, 0.3, 0.05)
@@ -85,7 +88,8 @@ def test_msc_and_dc104_await_each_leg_in_its_own_time() -> None:
     first, packet = msc.PROFILE.timings.read, msc.PROFILE.timings.packet
     assert (first.window, packet) == (0.5, ReplyTiming(0.5, 1.0, 1.0, 0.1))
     assert (msc.PROFILE.timings.write, msc.PROFILE.exchange_limit) == (first, 2.0)
-    assert (dc104.PROFILE.timings.read.window, dc104.PROFILE.timings.write.window) == (0.1, 0.5)
+    assert dc104.PROFILE.timings.read == dc104.PROFILE.timings.packet == ReplyTiming(0.05, 0.1, 0.2, 0.02)
+    assert dc104.PROFILE.timings.write.window == 0.5
 
 
 @pytest.mark.parametrize(
@@ -169,3 +173,38 @@ def test_what_a_line_may_merge_or_hear_makes_no_other_protocol() -> None:
     assert mentor.CHAINED == mentor.PROFILE
     assert replace(msc.PROFILE, listen=None) == msc.PROFILE
     assert replace(msc.PROFILE, exchange_limit=None) != msc.PROFILE
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        lambda: dc104.Read(1, minimum=-1),
+        lambda: dc104.Read(1, minimum=2),
+        lambda: dc104.Read(1, maximum=0),
+        lambda: dc104.Read(1, maximum=256),
+        lambda: dc104.Write(1, -1),
+        lambda: dc104.Write(1, 65536),
+        lambda: ct_ansi.Write(-1, 17, 1),
+        lambda: ct_ansi.Write(100, 17, 1),
+        lambda: ct_ansi.Write(1, -1, 1),
+        lambda: ct_ansi.Write(1, 100, 1),
+        lambda: ct_ansi.Write(1, 17, 1e12),
+        lambda: msc.PickedData(0, (-1,)),
+        lambda: msc.PickedData(0, (32,)),
+        lambda: msc.PickedFlags((-1,)),
+        lambda: msc.PickedFlags((256,)),
+        lambda: msc.DataRead(-1),
+        lambda: msc.SetFlag(-1),
+    ],
+)
+def test_one_less_or_one_more_than_a_document_has_is_refused(mistake: Callable[[], object]) -> None:
+    with pytest.raises(InvalidCommand):
+        mistake()
+
+
+def test_a_program_status_has_two_bytes_or_more() -> None:
+    for size in (1, 2, 3, 8, 9):
+        exchange = msc.ReadStatus().open(1, msc.PROFILE.timings)
+        exchange.feed(ACK)
+        step = exchange.feed(packet(1, b"RQSTAT," + bytes(size)))
+        assert isinstance(step, Done) == (size >= 2), size

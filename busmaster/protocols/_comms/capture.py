@@ -38,13 +38,15 @@ class CommsDialect:
         self._asked: Frame | None = None
 
     def node(self, field: bytes) -> int | None:
+        """Return the node that the field of a request names, or None if it names none."""
         raise NotImplementedError
 
     def element(self, field: bytes) -> str:
-        """As a decimal number, or as it stands, quoted, if it is none."""
+        """Return the element's decimal number, or the field as it stands, quoted, if it is none."""
         raise NotImplementedError
 
     def request_fault(self, raw: bytes) -> str:
+        """Return what is wrong with a whole request, or an empty text."""
         raise NotImplementedError
 
     def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:

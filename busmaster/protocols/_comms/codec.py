@@ -127,6 +127,7 @@ class WritingMany(AcknowledgeReader):
     __slots__ = ()
 
     def reject(self, heard: bytes) -> NoReturn:
+        """Raise the failure that the heard byte means: for a NAK Refused, unconfirmed."""
         if heard[0] == NAK[0]:
             raise Refused(
                 "refused; the values before the one refused may be stored",
@@ -150,5 +151,5 @@ def telegrams(values: Sequence[float]) -> Iterator[tuple[int, tuple[float, ...]]
 
 
 def is_read_back(written: float, read: float) -> bool:
-    """Whether `read` is what a controller that keeps single-precision numbers shows of `written`, at 4 decimals."""
+    """Return whether `read` is what a controller of single-precision numbers shows of `written`, at 4 decimals."""
     return c_float(float(format_number(written))).value == c_float(round(read, 4)).value

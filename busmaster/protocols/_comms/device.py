@@ -49,11 +49,12 @@ class Framing:
     """Whether a read carries a checksum."""
 
     def prefix(self, address: int) -> bytes:
-        """What a request to that node begins with."""
+        """Return what a request to that node begins with."""
         node = f"{address:X}" * 2 if self.base == 10 else f"{address:02X}"
         return bytes((self.reset,)) + node.encode()
 
     def element(self, number: int) -> bytes:
+        """Return the two characters that name an element."""
         return (f"{number:02d}" if self.base == 10 else f"{number:02X}").encode()
 
 
@@ -99,14 +100,14 @@ class HostCommsDevice(Device):
 
     @abstractmethod
     def read_element(self, element: int, now: float) -> float | None:
-        """Its value, or None to refuse. `element` is one that the protocol can name."""
+        """Return its value, or None to refuse. `element` is one that the protocol can name."""
 
     @abstractmethod
     def write_element(self, element: int, value: float, now: float) -> bool:
-        """Take it, or refuse with False."""
+        """Take the value and return True, or refuse it with False."""
 
     def writable(self, element: int) -> bool:
-        """Whether `write_element` would take a value for it now. Only `all_or_nothing` asks."""
+        """Return whether `write_element` would take a value for it now. Only `all_or_nothing` asks."""
         return True
 
     # Hearing
@@ -146,7 +147,7 @@ class HostCommsDevice(Device):
             self._ground()
 
     def _goes_on(self, byte: int, now: float) -> bool:
-        """Whether `byte` may come next, and more after it."""
+        """Return whether `byte` may come next, and more after it."""
         frame = self._frame
         position = len(frame)
         if position < ELEMENT_AT - 1:
@@ -191,7 +192,7 @@ class HostCommsDevice(Device):
     # Answering
 
     def _handle(self, frame: bytes, data_length: int, now: float) -> None:
-        """A whole request to this node, up to and with its checksum."""
+        """Obey a whole request to this node, up to and with its checksum."""
         framing = self.framing
         reads = frame[DATA_AT] == ENQ
         name = frame[ELEMENT_AT:DATA_AT]
@@ -217,7 +218,7 @@ class HostCommsDevice(Device):
             self.reply(telegram(self.framing, element, text), now)
 
     def _store(self, element: int, data: bytes, now: float) -> bool:
-        """Stores value by value and stops at the first bad one: the ACK or NAK is for the whole."""
+        """Store value by value and stop at the first bad one: the ACK or NAK is for the whole."""
         if not data[-1:].isdigit():
             return False
         values = numbers(data)
@@ -247,14 +248,14 @@ class HostCommsDevice(Device):
 
 @lru_cache(maxsize=4096)
 def telegram(framing: Framing, element: int, text: bytes) -> bytes:
-    """A reply to a read: STX, element, data, ETX, and the exclusive-or of all after STX."""
+    """Return a reply to a read: STX, element, data, ETX, and the exclusive-or of all after STX."""
     covered = framing.element(element) + text + b"\x03"
     return b"\x02" + covered + bytes((xor(covered),))
 
 
 @lru_cache(maxsize=4096)
 def numbers(data: bytes) -> tuple[float | None, ...]:
-    """The values of a data field, to 4 decimals, half up on the fifth; a None ends them: that one is malformed."""
+    """Return the values of a data field, to 4 decimals, half up on the fifth. A malformed one ends them as None."""
     values: list[float | None] = []
     for part in data.split(b","):
         match = NUMBER.fullmatch(part)
@@ -267,7 +268,7 @@ def numbers(data: bytes) -> tuple[float | None, ...]:
 
 @lru_cache(maxsize=4096)
 def number_text(value: float, fixed_decimals: bool = False) -> bytes:
-    """At most 4 decimals, half up on the fifth, as few as it takes; never "-0"."""
+    """Return the text of a value: at most 4 decimals, half up on the fifth, as few as it takes; never "-0"."""
     if fixed_decimals:
         return f"{_rounded(value) + 0:.4f}".encode()
     whole = int(value)

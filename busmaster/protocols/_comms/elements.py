@@ -43,14 +43,15 @@ COMMS = (
 
 
 def whole(value: float) -> int:
-    """A count or a code, which travels as a decimal number."""
+    """Return a count or a code, which travels as a decimal number."""
     return round(value)
 
 
 def bits(value: float) -> int:
-    """A bitmap, as a non-negative integer: bit 31 of a signed number stays bit 31."""
+    """Return a bitmap as a non-negative integer: bit 31 of a signed number stays bit 31."""
     return round(value) & 0xFFFF_FFFF
 
 
 def by_name(elements: Iterable[Element[object]]) -> Mapping[str, Element[object]]:
+    """Return the elements by their names."""
     return {element.name: element for element in elements}

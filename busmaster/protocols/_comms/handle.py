@@ -38,13 +38,16 @@ class CommsHandle(Handle):
         return {str(element.number): name for name, element in cls.elements.items()}
 
     def point(self, item: str) -> Point[Any]:
-        """An element by its number, decimal, or by its name."""
+        """Return an element as a point, by its number, decimal, or by its name."""
         if is_decimal(item_text(item)):
             return self.element(int(item))
         return self.named(self._lookup(item))
 
     def element(self, number: int) -> Point[float]:
-        """An element by its number: read and written as it is, for the node to refuse unless the map is definite."""
+        """Return the point of an element number.
+
+        It is read and written as it is, for the node to refuse unless the map is definite.
+        """
 
         def encode(value: float) -> Command[None]:
             return self.write_command(number, (value,))
@@ -53,7 +56,7 @@ class CommsHandle(Handle):
         return Point(self.node, str(number), self.read_command(number), encode=None if read_only else encode)
 
     def named(self, element: Element[T]) -> Point[T]:
-        """An element by what it stands for: decoded, with its unit, and read-only if the map says so."""
+        """Return the point of a named element: decoded, with its unit, and read-only if the map says so."""
 
         def encode(value: Any) -> Command[None]:
             return self.write_command(element.number, (value,), idempotent=True)
@@ -68,7 +71,7 @@ class CommsHandle(Handle):
         )
 
     async def read(self, element: int | str, **options: Unpack[ReadOptions]) -> float:
-        """The number that an element holds now. Raises Refused for one that the node does not have."""
+        """Return the number that an element holds now. Raises Refused for one that the node does not have."""
         number = element if isinstance(element, int) else self._lookup(element).number
         return await self.node.request(self.read_command(number), **options)
 
@@ -90,9 +93,12 @@ class CommsHandle(Handle):
             await self._verify(requests, number, value)
 
     def writes(self, element: int | str, values: Sequence[float], *, stop: bool | None = None) -> list[WriteElements]:
-        """What `write` sends. Raises InvalidCommand for a value that cannot be sent, or is beyond a limit; and where
-        the map has names, for a name that it calls read-only, or that another value of the list would go to; for its
-        number where it is definite. A `stop` is held by no limit."""
+        """Return what `write` sends.
+
+        Raises InvalidCommand for a value that cannot be sent, or is beyond a limit, by which no `stop` is held; and
+        where the map has names, for a name that it calls read-only, or that another value of the list would go to; for
+        its number where it is definite.
+        """
         number = element if isinstance(element, int) else self._lookup(element).number
         if self.definite or not isinstance(element, int):
             for known in self.elements.values():
@@ -105,7 +111,7 @@ class CommsHandle(Handle):
         return commands
 
     def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
-        """Consecutive elements, in as many telegrams as it takes."""
+        """Prepare to write consecutive elements, in as many telegrams as it takes."""
         element = int(item) if is_decimal(item) else item
         self.writes(element, values, stop=options.get("safe"))
         return [lambda: self.write(element, *values, **options)]

@@ -123,12 +123,12 @@ class EmulatedMint(HostCommsDevice):
     # The program
 
     def start_program(self) -> None:
-        """From its first statement, with the comms array as it is. Its time begins when it is next asked."""
+        """Start from its first statement, with the comms array as it is. Its time begins when it is next asked."""
         self.now = NEVER
         self._run = None if self.program is None else self.program(self)
 
     def run(self, now: float) -> None:
-        """Executes the statements that are due by `now`."""
+        """Execute the statements that are due by `now`."""
         if self.now == NEVER:
             self.now = now
         while self._run is not None and self.now + self.statement <= now:
@@ -220,7 +220,7 @@ class EmulatedMint(HostCommsDevice):
 
 
 def single(value: float) -> float:
-    """As a single-precision float keeps it; beyond its range, its greatest."""
+    """Return the value as a single-precision float keeps it; beyond its range, its greatest."""
     value = max(-GREATEST_SINGLE, min(value, GREATEST_SINGLE))
     kept: float = struct.unpack("f", struct.pack("f", value))[0]
     return kept
@@ -230,7 +230,7 @@ def single(value: float) -> float:
 
 
 def winding(mint: EmulatedMint) -> Generator[int, None, None]:
-    """A drum traversed between Comms(1) and Comms(2) at the ratio Comms(3); Comms(4) is its position.
+    """Traverse a drum between Comms(1) and Comms(2) at the ratio Comms(3); Comms(4) is its position.
 
     The drum whose rotation axis 0 follows turns at 1 unit a second.
     """
@@ -250,7 +250,7 @@ def winding(mint: EmulatedMint) -> Generator[int, None, None]:
 
 
 def command_handshake(mint: EmulatedMint) -> Generator[int, None, None]:
-    """A command in Comms(1), its data in Comms(2) to Comms(4); Comms(1) becomes 0 when it is done.
+    """Obey a command in Comms(1), its data in Comms(2) to Comms(4); Comms(1) becomes 0 when it is done.
 
     The race is the document's: the last line clears Comms(1) whether or not a command was seen, so one that is
     written between the read and the clear is lost although the host sees zero.
@@ -280,7 +280,7 @@ def command_handshake(mint: EmulatedMint) -> Generator[int, None, None]:
 
 
 def report_positions(mint: EmulatedMint) -> Generator[int, None, None]:
-    """Not in the documents: keeps Comms(11) to Comms(18) at the positions of the axes, for a host that speaks HCP."""
+    """Keep Comms(11) to Comms(18) at the positions of the axes, for a host that speaks HCP: not in the documents."""
     while True:
         for number, axis in enumerate(mint.axes):
             mint.comms[REPORTED[number]] = axis.position(mint.now)
@@ -288,7 +288,7 @@ def report_positions(mint: EmulatedMint) -> Generator[int, None, None]:
 
 
 def jog_on_comms1(mint: EmulatedMint, element: int, now: float) -> None:
-    """`Event comms1`: JOG(0) = COMMS(1), on every write to Comms(1), of an equal value too."""
+    """Do as `Event comms1` does: JOG(0) = COMMS(1), on every write to Comms(1), of an equal value too."""
     if element == 1:
         mint.axes[0].jog(mint.comms[1], now)
 

@@ -58,7 +58,7 @@ class Read(mentor.Read):
     """Read one parameter: an int, or a float where the drive sends a decimal point."""
 
     def open(self, address: int, timings: Timings) -> Reading:  # type: ignore[override]  # its value may be a float
-        """Raises InvalidCommand for the broadcast address: every drive would answer at once."""
+        """Begin the read. Raises InvalidCommand for the broadcast address: every drive would answer at once."""
         request, echo = read_request(address, self.menu, self.number)
         return Reading(request, echo, timings.read)
 
@@ -68,7 +68,7 @@ class ReadRun(mentor.ReadRun):
     """Read `count` parameters from one on, in one exchange: a tuple. See Mentor II's for when that is safe."""
 
     def open(self, address: int, timings: Timings) -> RunReading:
-        """Raises InvalidCommand for the broadcast address."""
+        """Begin the read. Raises InvalidCommand for the broadcast address."""
         return RunReading(self, address, timings.read)
 
 

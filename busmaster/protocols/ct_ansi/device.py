@@ -40,11 +40,11 @@ class EmulatedCtAnsi(EmulatedMentor):
         self.width = width
 
     def has_decimal(self, parameter: int) -> bool:
-        """Whether the parameter has a decimal: 117 is 01.17."""
+        """Return whether the parameter has a decimal: 117 is 01.17."""
         return self.parameters[parameter].fine or parameter == SPEED_FEEDBACK
 
     def steps(self, parameter: int, value: float) -> float:
-        """Tenths of those that have a decimal."""
+        """Return the whole number that a value on the line is: tenths for a parameter that has a decimal."""
         return round(value * FINE, 6) if self.has_decimal(parameter) else value
 
     def _telegram(self, parameter: int, now: float) -> bytes:
@@ -57,7 +57,10 @@ class EmulatedCtAnsi(EmulatedMentor):
         return b"\x02" + summed + bytes((bcc(summed),))
 
     def _fine_of(self, parameter: Parameter, data: bytes) -> int | None:
-        """A parameter with a decimal counts in tenths of a percent, and takes no finer value."""
+        """Return the steps that a write carries, or None if it is refused.
+
+        A parameter with a decimal counts in tenths of a percent, and takes no finer value.
+        """
         if not VALUE.fullmatch(data) or len(data) > LONGEST_VALUE:
             return None
         value = Decimal(data.decode().strip())

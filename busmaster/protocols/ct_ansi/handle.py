@@ -47,7 +47,7 @@ class CtAnsiDrive(Handle):
         self._decimals = {parse_parameter(text): digits for text, digits in (decimals or {}).items()}
 
     def point(self, item: str) -> Point[Any]:
-        """A parameter ("1.21"), or a run, always read in one exchange ("1.21:8")."""
+        """Return the point of a parameter ("1.21"), or of a run, always read in one exchange ("1.21:8")."""
         text, colon, count = item_text(item).partition(":")
         try:
             menu, number = parse_parameter(text)
@@ -64,16 +64,16 @@ class CtAnsiDrive(Handle):
         return ()
 
     async def read(self, parameter: str, **options: Unpack[ReadOptions]) -> float:
-        """A parameter's value. Raises NoSuchParameter, or InvalidCommand at address 0."""
+        """Return a parameter's value. Raises NoSuchParameter, or InvalidCommand at address 0."""
         return await self.node.request(Read(*parse_parameter(parameter)), **options)
 
     async def read_run(
         self, parameter: str, count: int, *, step: int = 1, chain: bool = False, **options: Unpack[ReadOptions]
     ) -> tuple[float, ...]:
-        """`count` parameters of one menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
+        """Return `count` parameters of a menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
 
-        `step` 0 reads the same one again and again. With `chain` in one exchange, where that is safe: where no other
-        drive can take or send a lone ACK, NAK or BS for its own. Raises NoSuchParameter where the menu has a gap.
+        `step` 0 reads the same one again and again. With `chain` it takes one exchange, where that is safe: where no
+        other drive can take or send a lone ACK, NAK or BS for its own. Raises NoSuchParameter where the menu has a gap.
         """
         run = ReadRun(*parse_parameter(parameter), count, step)
         if chain:
@@ -100,7 +100,7 @@ class CtAnsiDrive(Handle):
                 )
 
     async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
-        """As `point(item).read()`; a run without `chain` parameter by parameter, which is always safe."""
+        """Do as `point(item).read()` does; read a run without `chain` parameter by parameter, which is always safe."""
         parameter, _, count = item_text(item).partition(":")
         if is_decimal(count) and not chain:
             return await self.read_run(parameter, int(count))

@@ -27,7 +27,7 @@ HIGHEST_VALUE = 65535
 
 
 def packet(*between: int) -> bytes:
-    """A packet of these bytes between STX and checksum, each 0 to 255."""
+    """Return a packet of these bytes between STX and checksum, each 0 to 255."""
     return STX + bytes((*between, sum8(bytes(between))))
 
 

@@ -76,7 +76,7 @@ class EmulatedDc104(Device):
             self.lively &= parameter != LIVE
 
     def restart(self, now: float) -> None:
-        """Its parameters are in the EEPROM."""
+        """Restart with the same parameters, which are in the EEPROM; a frame begun is forgotten."""
         super().restart(now)
         self._frame.clear()
 
@@ -139,7 +139,7 @@ class EmulatedDc104(Device):
 
 
 def packet(parameter: int, value: int) -> bytes:
-    """A reply to a read. It has no direction byte."""
+    """Return a reply to a read. It has no direction byte."""
     summed = bytes((parameter, value >> 8, value & 0xFF))
     return bytes((STX,)) + summed + bytes((sum8(summed),))
 

@@ -45,13 +45,13 @@ class Dc104Drive(Handle):
         self._read(maximum)
 
     def point(self, item: str) -> Point[int]:
-        """A parameter by its number, decimal."""
+        """Return the point of a parameter, by its number, decimal."""
         if not is_decimal(item_text(item)):
             raise unknown_item(item, (), f"a parameter number, {self._minimum} to {self._maximum}")
         return self.parameter(int(item))
 
     def parameter(self, number: int) -> Point[int]:
-        """A parameter as a point. Raises InvalidCommand for one that the drive does not have."""
+        """Return a parameter as a point. Raises InvalidCommand for one that the drive does not have."""
 
         def encode(value: int) -> Command[None]:
             return self._write(number, value)
@@ -63,7 +63,7 @@ class Dc104Drive(Handle):
         return ()
 
     async def read(self, parameter: int, **options: Unpack[ReadOptions]) -> int:
-        """A parameter's value now. Raises Refused where the drive says NAK."""
+        """Return a parameter's value now. Raises Refused where the drive says NAK."""
         return await self.node.request(self._read(parameter), **options)
 
     async def write(self, parameter: int, value: int, **options: Unpack[WriteOptions]) -> None:

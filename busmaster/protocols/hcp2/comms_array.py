@@ -29,7 +29,7 @@ AXIS: tuple[tuple[str, Callable[[float], object], str, str], ...] = (
 
 
 def axis_elements(axis: int) -> list[Element[object]]:
-    """The parameters of one axis."""
+    """Return the parameters of one axis."""
     first = FIRST_AXIS_ELEMENT + ELEMENTS_PER_AXIS * axis
     return [
         Element(f"axis{axis}.{name}", number, decode, meaning, keyword=f"{keyword}({axis})")

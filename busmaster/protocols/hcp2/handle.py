@@ -28,11 +28,12 @@ class Hcp2Controller(CommsHandle):
     form = "an element number, 1 to 255, or a name such as axis0.position"
 
     def axis(self, number: int) -> Axis:
-        """Raises InvalidCommand unless `number` is 0 to 7."""
+        """Return the points of an axis. Raises InvalidCommand unless `number` is 0 to 7."""
         return Axis(self, number)
 
     @property
     def io(self) -> Io:
+        """The points that belong to no axis."""
         return Io(self)
 
 
@@ -52,7 +53,7 @@ class Io:
         self.named = controller.named
 
     def adc(self, channel: int) -> Point[float]:
-        """An analogue input. Raises InvalidCommand unless `channel` is 0 to 7."""
+        """Return the point of an analogue input. Raises InvalidCommand unless `channel` is 0 to 7."""
         return self.named(comms_array.ANALOG[whole_number(channel, 0, comms_array.ANALOG_INPUTS - 1, "a channel")])
 
 

@@ -50,10 +50,12 @@ STATUS_BITS = bits_of(
 
 
 def command_word(value: float) -> CommandWord:
+    """Return the command word that an element's value is."""
     return CommandWord(bits(value))
 
 
 def status_word(value: float) -> StatusWord:
+    """Return the status word that an element's value is."""
     return StatusWord(bits(value))
 
 

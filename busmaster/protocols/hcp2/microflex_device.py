@@ -134,11 +134,11 @@ class EmulatedMicroFlex(HostCommsDevice):
         return True
 
     def trip_after(self, delay: float, errors: int, drive_errors: int = 0) -> None:
-        """Trip so many seconds after it is first asked."""
+        """Trip the drive `delay` seconds after it is first asked."""
         self._trip = Trip(delay, errors, drive_errors)
 
     def trip(self, errors: int, now: float, drive_errors: int = 0) -> None:
-        """An error occurs. It latches and disables the drive, unless the cancel bit was left high."""
+        """Let an error occur. It latches and disables the drive, unless the cancel bit was left high."""
         self._update(now)
         self.drive_error |= drive_errors
         if not self.command_word & CANCEL:
@@ -146,7 +146,10 @@ class EmulatedMicroFlex(HostCommsDevice):
         self._apply(now)
 
     def set_hardware_enable(self, active: bool, now: float) -> None:
-        """Without it the drive is disabled; when it comes back the drive stays so until it is commanded again."""
+        """Set the hardware enable input.
+
+        Without it the drive is disabled; when it comes back the drive stays so until it is commanded again.
+        """
         self._update(now)
         self.hardware_enable = active
         self._apply(now)
@@ -161,7 +164,7 @@ class EmulatedMicroFlex(HostCommsDevice):
         self._apply(now)
 
     def command(self, word: int, now: float) -> None:
-        """What a write to the command word does."""
+        """Do what a write to the command word does."""
         self._update(now)
         self.command_word = word
         if word & CANCEL:
@@ -201,6 +204,7 @@ class EmulatedMicroFlex(HostCommsDevice):
 
     @property
     def status_word(self) -> int:
+        """The status word as element 109 shows it."""
         return (
             STATUS_ERROR * bool(self.axis_error or self.drive_error)
             | STATUS_STOP_INPUT * self.stop_input
@@ -272,7 +276,7 @@ class EmulatedMicroFlex(HostCommsDevice):
 
     @property
     def _angle(self) -> float:
-        """Of the shaft, in radians."""
+        """Angle of the shaft, in radians."""
         return self._position % COUNTS_PER_TURN / COUNTS_PER_TURN * math.tau
 
     @property
@@ -281,7 +285,7 @@ class EmulatedMicroFlex(HostCommsDevice):
 
     @property
     def _torque(self) -> float:
-        """Demand, in %."""
+        """Torque demand, in %."""
         if not self.enabled:
             return 0.0
         if self.current_control:
@@ -295,7 +299,7 @@ class EmulatedMicroFlex(HostCommsDevice):
         return abs(self._torque) / 100 * RATED_CURRENT
 
     def _update(self, now: float) -> None:
-        """Time has passed: the motor has turned, and the drive has warmed up or cooled down."""
+        """Let time pass: the motor has turned, and the drive has warmed up or cooled down."""
         if now > self._updated:
             self._motor.advance(now)
             final = AMBIENT + HEATING * abs(self._torque) / 100
@@ -313,7 +317,10 @@ class EmulatedMicroFlex(HostCommsDevice):
             self.trip(trip.errors, now, trip.drive_errors)
 
     def _apply(self, now: float) -> None:
-        """Whether the drive runs, and at what speed it aims. After the cancel bit, motion waits until it is cleared."""
+        """Decide whether the drive runs, and at what speed it aims.
+
+        After the cancel bit, motion waits until it is cleared.
+        """
         if self.axis_error or self.drive_error or not self.hardware_enable:
             self.enabled = False
         reference = self.torque_reference if self.current_control else self.speed_reference

@@ -72,11 +72,11 @@ class MicroFlexDrive(CommsHandle):
     temperature = Named(microflex.TEMPERATURE)
 
     async def status(self, **options: Unpack[ReadOptions]) -> StatusWord:
-        """The status word."""
+        """Return the status word."""
         return await self.status_word.read(**options)
 
     async def check_firmware(self, **options: Unpack[ReadOptions]) -> int:
-        """The drive's firmware build. Raises VerifyFailed if it is too old to have this map."""
+        """Return the drive's firmware build. Raises VerifyFailed if it is too old to have this map."""
         build = await self.firmware.read(**options)
         if build < microflex.FIRST_FIRMWARE:
             raise VerifyFailed(
@@ -90,7 +90,7 @@ class MicroFlexDrive(CommsHandle):
         """Enable the drive, and return its status word once that says so.
 
         Raises VerifyFailed, naming the cause that the status word gives, if it is not enabled `within` so many
-        seconds: an axis error, or the hardware enable input. Superseded if a `disable` overtook it.
+        seconds: an axis error, or the hardware enable input. Raises Superseded if a `disable` overtook it.
         """
         within = seconds(within, f"{self.node.label}: within")
         await self._command(CommandWord.ENABLE)
@@ -135,11 +135,17 @@ class MicroFlexDrive(CommsHandle):
         return await self.status()
 
     async def set_speed_reference(self, percent: float, **options: Unpack[CommandOptions]) -> None:
-        """In % of the application's maximum speed. Raises Refused unless in speed control with the host as source."""
+        """Set the speed, in % of the application's maximum.
+
+        Raises Refused unless in speed control with the host as source.
+        """
         await self.speed_reference.write(percent, **options)
 
     async def set_torque_reference(self, percent: float, **options: Unpack[CommandOptions]) -> None:
-        """In % of the rated current. Raises Refused unless in current control with the host as source."""
+        """Set the torque, in % of the rated current.
+
+        Raises Refused unless in current control with the host as source.
+        """
         await self.torque_reference.write(percent, **options)
 
     async def _command(
@@ -191,7 +197,7 @@ class MicroFlexDrive(CommsHandle):
 async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
     """Run `work` whole, even if the caller is cancelled meanwhile: it gets its CancelledError after that.
 
-    In a task of its own, since a scope's shield holds off anyio's cancellation, but not `Task.cancel()`.
+    It runs in a task of its own, since a scope's shield holds off anyio's cancellation, but not `Task.cancel()`.
     """
     task = asyncio.ensure_future(work)
     cancelled: asyncio.CancelledError | None = None
@@ -208,7 +214,7 @@ async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
 
 
 def _why_not(status: StatusWord) -> str:
-    """Why a drive that was told to enable has not, as far as its status word tells."""
+    """Return why a drive that was told to enable has not, as far as its status word tells."""
     reasons = []
     if StatusWord.ASYNCHRONOUS_ERROR in status:
         reasons.append("it has an error (see axis_error and drive_error)")

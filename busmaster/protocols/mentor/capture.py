@@ -61,7 +61,7 @@ class MentorDialect:
         return size or (-len(data) if quiet else 0)
 
     def _after_eot(self, data: bytes, sender: Direction, quiet: bool) -> int:
-        """A request; or alone, while something is asked, "no such parameter"."""
+        """Return the size of a request; or of a lone EOT, "no such parameter", while something is asked."""
         alone = data[1] < SPACE if len(data) > 1 else quiet or sender is Direction.NODE
         if alone and (sender is Direction.NODE or (sender is Direction.UNKNOWN and self._asked)):
             return 1
@@ -109,7 +109,7 @@ class MentorDialect:
         return frame
 
     def _rewrite(self, data: bytes) -> Frame:
-        """A write without an address, which newer drives take."""
+        """Return the frame of a write without an address, which newer drives take."""
         frame = Frame(Kind.WRITE, Direction.HOST, data, None, "write", _parameter(data[1:5]), characters(data[5:-2]))
         frame.fault = checked(data, 1, bcc)
         if self._armed:

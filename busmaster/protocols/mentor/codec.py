@@ -51,12 +51,12 @@ _VALUE = re.compile(rb"[+-]?\d+")
 
 
 def with_parity(starts: bytes) -> bytes:
-    """The same characters and what they are where the parity bit comes through."""
+    """Return the same characters and what they are where the parity bit comes through."""
     return starts + bytes(byte | 0x80 for byte in starts)
 
 
 def parse_parameter(text: str) -> tuple[int, int]:
-    """Menu and number of "1.17" or "01.17". Raises InvalidCommand for anything else."""
+    """Return menu and number of "1.17" or "01.17". Raises InvalidCommand for anything else."""
     try:
         match = _PARAMETER.fullmatch(text)
     except TypeError:  # a number, of which 1.10 would be 1.1
@@ -95,7 +95,7 @@ class Read:
         return values[self.menu, self.number]
 
     def open(self, address: int, timings: Timings) -> Reading:
-        """Raises InvalidCommand for the broadcast address: every drive would answer at once."""
+        """Begin the read. Raises InvalidCommand for the broadcast address: every drive would answer at once."""
         request, echo = read_request(address, self.menu, self.number)
         return Reading(request, echo, timings.read)
 
@@ -130,7 +130,7 @@ class ReadRun:
         return f"{first} to {self.menu:02d}.{last:02d}" if self.step else f"{first}, {self.count} times"
 
     def open(self, address: int, timings: Timings) -> RunReading:
-        """Raises InvalidCommand for the broadcast address."""
+        """Begin the read. Raises InvalidCommand for the broadcast address."""
         return RunReading(self, address, timings.read)
 
 
@@ -285,7 +285,7 @@ class Broadcast(SingleLeg):
 
 
 def merge_runs(commands: Sequence[Command[Any]]) -> list[Batch]:
-    """Batches of neighbouring parameters, each read as one run of at most 8; what has no neighbour is left alone.
+    """Return batches of neighbouring parameters, each read as a run of at most 8; what has no neighbour is left alone.
 
     Short commands rest on the drive that was read last being the one that hears them (see ReadRun), so the profile has
     no merge by default: `CHAINED` has.
@@ -308,6 +308,7 @@ def merge_runs(commands: Sequence[Command[Any]]) -> list[Batch]:
 
 @lru_cache(maxsize=4096)
 def read_request(address: int, menu: int, number: int) -> tuple[bytes, bytes]:
+    """Return the read request, and the parameter as its reply echoes it. Raises InvalidCommand for address 0."""
     if not address:
         raise InvalidCommand("a read cannot go to all drives: they would answer at once")
     echo = b"%02d%02d" % (menu, number)
@@ -315,6 +316,7 @@ def read_request(address: int, menu: int, number: int) -> tuple[bytes, bytes]:
 
 
 def reset(address: int) -> bytes:
+    """Return what a request begins with: EOT and the address, each digit twice."""
     tens, units = divmod(address, 10)
     return EOT + b"%d%d%d%d" % (tens, tens, units, units)
 

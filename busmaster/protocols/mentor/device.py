@@ -139,7 +139,7 @@ class EmulatedMentor(Device):
         return value
 
     def value(self, parameter: int, now: float) -> int:
-        """Of menu x 100 + number. Raises KeyError for one that does not exist."""
+        """Return the value of parameter menu x 100 + number. Raises KeyError for one that does not exist."""
         if parameter not in self.parameters:
             raise KeyError(parameter)
         if self.traceable is not None:
@@ -151,7 +151,7 @@ class EmulatedMentor(Device):
         return math.trunc(self._fine.get(parameter, 0) / FINE)
 
     def set_value(self, parameter: int, value: float, now: float) -> None:
-        """In units of the ordinary resolution, whatever the limits."""
+        """Hold a value, in units of the ordinary resolution, whatever the limits."""
         self._fine[parameter] = round(value * FINE)
         if parameter == SPEED_REFERENCE:
             self._motor.advance(now)
@@ -249,7 +249,7 @@ class EmulatedMentor(Device):
     # Answering
 
     def _step(self, character: int, now: float) -> None:
-        """Anything but a short command ends them."""
+        """Answer a short command; anything else ends them."""
         step = STEPS.get(character)
         if step is None or self._last is None:
             self._last = None
@@ -257,7 +257,7 @@ class EmulatedMentor(Device):
             self._answer_read(self._last + step, now)
 
     def _handle(self, frame: bytes, now: float) -> None:
-        """A whole request, to this drive or to all."""
+        """Obey a whole request, to this drive or to all."""
         self._last = None
         if frame[-1] == ENQ and len(frame) == READ_SIZE:
             if self._is_mine(frame):
@@ -271,7 +271,7 @@ class EmulatedMentor(Device):
         self._say(ACK if taken else NAK, now)
 
     def _answer_read(self, parameter: int, now: float) -> None:
-        """Short commands start from here, be it there or not."""
+        """Answer a read. Short commands start from this parameter, be it there or not."""
         self._last = parameter
         if parameter not in self.parameters:
             self._say(NO_SUCH_PARAMETER, now)
@@ -294,11 +294,11 @@ class EmulatedMentor(Device):
         return True
 
     def _telegram(self, parameter: int, now: float) -> bytes:
-        """The reply to a read of one that is there."""
+        """Return the reply to a read of a parameter that is there."""
         return telegram(parameter, self.value(parameter, now), self.parameters[parameter].wide)
 
     def _fine_of(self, parameter: Parameter, data: bytes) -> int | None:
-        """The value that a write carries, in steps of the high resolution; None for what is none."""
+        """Return the value that a write carries, in steps of the high resolution; None for what is none."""
         if HIGH_RESOLUTION.fullmatch(data):
             return int(data) if parameter.fine else None
         if VALUE.fullmatch(data) and len(data) <= LONGEST_VALUE:
@@ -320,12 +320,15 @@ class EmulatedMentor(Device):
 
 
 def _is_read(plain: bytes) -> bool:
-    """A whole read request of 7-bit characters, to any drive."""
+    """Return whether it is a whole read request of 7-bit characters, to any drive."""
     return len(plain) == READ_SIZE and plain[0] == EOT and plain[-1] == ENQ and plain[1:-1].isdigit()
 
 
 def _is_write(plain: bytes) -> bool:
-    """Likewise a write. What is wrong with its text is for its checksum and the drive to find."""
+    """Return whether it is a whole write request of 7-bit characters, to any drive.
+
+    What is wrong with its text is for its checksum and the drive to find.
+    """
     return (
         len(plain) >= SHORTEST_WRITE
         and plain[0] == EOT
@@ -337,7 +340,7 @@ def _is_write(plain: bytes) -> bool:
 
 @lru_cache(maxsize=4096)
 def telegram(parameter: int, value: int, wide: bool = False) -> bytes:
-    """A reply to a read: always five characters of data."""
+    """Return a reply to a read: always five characters of data."""
     summed = b"%04d" % parameter + (b"%05d" if wide else b"%+05d") % value + b"\x03"
     return b"\x02" + summed + bytes((bcc(summed),))
 

@@ -36,7 +36,7 @@ class Place(NamedTuple):
     decimals: int | None
 
     def write(self, value: float, *, wide: bool, high_resolution: bool) -> Write:
-        """The command that writes a value; one that the guide calls wide is sent so. Raises InvalidCommand."""
+        """Return the command that writes a value; one that the guide calls wide is sent so. Raises InvalidCommand."""
         decimals = self.decimals if self.decimals is None else self.decimals + high_resolution
         wide = wide or (not high_resolution and self[:2] in WIDE)
         return Write(self.menu, self.number, to_line(value, decimals), wide, high_resolution)
@@ -91,8 +91,11 @@ class MentorDrive(Handle):
         return {f"{parameter.menu:02d}.{parameter.number:02d}": name for name, parameter in NAMED.items()}
 
     def point(self, item: str) -> Point[Any]:
-        """A parameter ("1.17", "speed_reference_1"), one written as a wide integer ("15.60:wide") or in high resolution
-        ("1.17:hires"), or a run, always read in one exchange ("1.17:20")."""
+        """Return the point of a parameter or of a run.
+
+        It is a parameter ("1.17", "speed_reference_1"), one written as a wide integer ("15.60:wide") or in high
+        resolution ("1.17:hires"), or a run, always read in one exchange ("1.17:20").
+        """
         text, colon, kind = item_text(item).partition(":")
         try:
             place = self._place(text)
@@ -114,7 +117,7 @@ class MentorDrive(Handle):
             return place.write(value, wide=wide, high_resolution=high_resolution)
 
         def decode(number: int) -> float:
-            """In the unit in which it is written: without decimals, high resolution counts in tenths."""
+            """Return it in the unit in which it is written: without decimals, high resolution counts in tenths."""
             return from_line(number * 10 if high_resolution and decimals is None else number, decimals)
 
         read = Read(place.menu, place.number)
@@ -125,7 +128,7 @@ class MentorDrive(Handle):
         return ScaledPoint(self.node, item, run, decode=lambda sent: self._values(run, sent), decimals=decimals)
 
     async def read(self, parameter: str, **options: Unpack[ReadOptions]) -> float:
-        """A parameter's value; a bit is 0 or 1. Raises NoSuchParameter, or InvalidCommand at address 0."""
+        """Return a parameter's value; a bit is 0 or 1. Raises NoSuchParameter, or InvalidCommand at address 0."""
         self._check_readable()
         place = self._place(parameter)
         found = await self.node.request(Read(place.menu, place.number), **options)
@@ -134,10 +137,10 @@ class MentorDrive(Handle):
     async def read_run(
         self, parameter: str, count: int, *, step: int = 1, chain: bool = False, **options: Unpack[ReadOptions]
     ) -> tuple[float, ...]:
-        """`count` parameters of one menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
+        """Return `count` parameters of a menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
 
-        `step` 0 reads the same one again and again. With `chain` all in one exchange, one request byte for each after
-        the first: only where no other drive can take or send that byte for its own, that is where every node of
+        `step` 0 reads the same one again and again. With `chain` it takes one exchange, with one request byte for each
+        after the first: only where no other drive can take or send that byte for its own, that is where every node of
         the line is a drive that forgets what it last sent when another is addressed. Raises NoSuchParameter where the
         menu has a gap.
         """
@@ -192,7 +195,7 @@ class MentorDrive(Handle):
         await self.bus.node(mentor.PROFILE, 0).request(command, **options)
 
     async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
-        """As `point(item).read()`; a run without `chain` parameter by parameter, which is always safe."""
+        """Do as `point(item).read()` does; read a run without `chain` parameter by parameter, which is always safe."""
         parameter, _, count = item_text(item).partition(":")
         if is_decimal(count) and not chain:
             return await self.read_run(parameter, int(count))
@@ -208,7 +211,10 @@ class MentorDrive(Handle):
             raise InvalidCommand("mentor: a read cannot go to all drives: they would answer at once")
 
     def _place(self, text: str) -> Place:
-        """Where a parameter is, by number or name; a name brings the guide's decimals unless others are declared."""
+        """Return where a parameter is, by number or name.
+
+        A name brings the guide's decimals unless others are declared.
+        """
         where = place_of(text)
         decimals = NAMED[text].decimals if text in NAMED else 0
         return Place(*where, self._decimals.get(where, decimals or None))
@@ -226,7 +232,10 @@ class ScaledPoint(Point[T]):
 
 
 def place_of(text: str) -> tuple[int, int]:
-    """Menu and number of "1.17", "01.17", or a name that the guide gives. Raises InvalidCommand for anything else."""
+    """Return menu and number of "1.17", "01.17", or a name that the guide gives.
+
+    Raises InvalidCommand for anything else.
+    """
     named = NAMED.get(str(text))  # whatever it is: what is no text is refused below
     return parse_parameter(text) if named is None else named.place
 
@@ -236,7 +245,7 @@ def _parameters(run: ReadRun) -> list[tuple[int, int]]:
 
 
 def to_line(value: float, decimals: int | None) -> int:
-    """The whole number that stands for a value, rounded half away from zero. True and False stay what they are.
+    """Return the whole number that stands for a value, rounded half away from zero. True and False stay what they are.
 
     Raises InvalidCommand for a fraction where no decimals are declared, and for NaN and infinity.
     """
@@ -252,5 +261,5 @@ def to_line(value: float, decimals: int | None) -> int:
 
 
 def from_line(number: int, decimals: int | None) -> float:
-    """The value that a number on the line stands for."""
+    """Return the value that a number on the line stands for."""
     return number / 10**decimals if decimals else number

@@ -54,7 +54,10 @@ class ModbusDialect:
         return next((length for length in lengths if length <= len(data)), -len(data))
 
     def _lengths(self, data: bytes, sender: Direction) -> list[int]:
-        """Those that the frame may have, the likelier first; more than there is, where it cannot be told yet."""
+        """Return the lengths that the frame may have, the likelier first.
+
+        A length is more than there is, where it cannot be told yet.
+        """
         reply, request = reply_length(data), request_length(data)
         if sender is Direction.HOST:
             return [request]
@@ -63,7 +66,7 @@ class ModbusDialect:
         return [reply, request] if self._answers(data) else [request]
 
     def _answers(self, data: bytes) -> bool:
-        """It may be the reply to what was asked last."""
+        """Return whether it may be the reply to what was asked last."""
         asked = self._asked
         return asked is not None and data[0] == asked.raw[0] and (len(data) < 2 or data[1] & ~REFUSED == asked.raw[1])
 
@@ -127,11 +130,12 @@ class ModbusDialect:
 
 
 def is_sound(raw: bytes) -> bool:
+    """Return whether the CRC of a whole frame is right."""
     return with_crc(raw[:-2]) == raw
 
 
 def request_length(data: bytes) -> int:
-    """Of the request that begins so; one more than there is where it cannot be told yet."""
+    """Return the length of the request that begins so; one more than there is where it cannot be told yet."""
     if len(data) < 2:
         return len(data) + 1
     if data[1] not in SEVERAL:
@@ -140,7 +144,7 @@ def request_length(data: bytes) -> int:
 
 
 def reply_length(data: bytes) -> int:
-    """Of the reply that begins so, likewise."""
+    """Return the length of the reply that begins so; one more than there is where it cannot be told yet."""
     if len(data) < 2:
         return len(data) + 1
     if data[1] & REFUSED:
@@ -151,21 +155,23 @@ def reply_length(data: bytes) -> int:
 
 
 def expected_length(request: bytes) -> int:
-    """Of the reply to a read."""
+    """Return the length of the reply to a read request."""
     count = int.from_bytes(request[4:6], "big")
     return 5 + (2 * count if request[1] > READS["discrete"] else (count + 7) // 8)
 
 
 def count_of(item: str) -> int:
-    """How many places an item names."""
+    """Return how many places an item names."""
     _, _, count = item.partition(":")[2].partition(":")
     return int(count or 1)
 
 
 def words_text(data: bytes) -> str:
+    """Return the registers of a data field as decimal numbers between commas."""
     return ",".join(str(word) for word in struct.unpack(f">{len(data) // 2}H", data[: len(data) // 2 * 2]))
 
 
 def bits_text(data: bytes, count: int) -> str:
+    """Return the first `count` bits of a data field as 0 or 1 between commas."""
     states = int.from_bytes(data, "little")
     return ",".join(str(states >> place & 1) for place in range(count))

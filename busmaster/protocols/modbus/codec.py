@@ -170,7 +170,7 @@ class ReadRegisters:
         return tuple(values[place] for place in self.places)
 
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[int, ...]]:
-        """Raises InvalidCommand for the broadcast address: nobody would answer."""
+        """Begin the read. Raises InvalidCommand for the broadcast address: nobody would answer."""
         decode = struct.Struct(f">{self.count}H").unpack
         return _ask(address, READS[self.table], self.first, self.count, 2 * self.count, timings, decode)
 
@@ -201,7 +201,7 @@ class ReadBits:
         return tuple(values[place] for place in self.places)
 
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[bool, ...]]:
-        """Raises InvalidCommand for the broadcast address."""
+        """Begin the read. Raises InvalidCommand for the broadcast address."""
 
         def decode(payload: bytes) -> tuple[bool, ...]:
             states = int.from_bytes(payload, "little")
@@ -285,7 +285,7 @@ def _ask(
 
 
 def _tell(header: bytes, timings: Timings, data: bytes = b"") -> Conversation[None]:
-    """A write: the unit says the first six bytes of it again."""
+    """Begin a write: the unit says the first six bytes of it again."""
     return Conversation(header + data, header, 0, timings.write, _nothing)
 
 

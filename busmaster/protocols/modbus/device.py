@@ -115,7 +115,10 @@ class EmulatedModbus(Device):
     # Hearing
 
     def hear_byte(self, byte: int, now: float) -> None:
-        """A frame begins after a silence, or where one to this unit ended. What is for others is let pass."""
+        """Take a byte, and obey the frame that it ends.
+
+        A frame begins after a silence, or where one to this unit ended. What is for others is let pass.
+        """
         if now - self.tau - self._heard_until > self._pause:
             self._end_of_frame(now)
         self._heard_until = now
@@ -141,7 +144,7 @@ class EmulatedModbus(Device):
         return True
 
     def wake(self, now: float) -> None:
-        """The line has been silent: whatever was begun has ended."""
+        """End whatever was begun: the line has been silent."""
         self._end_of_frame(now)
 
     def _end_of_frame(self, now: float) -> None:
@@ -156,7 +159,10 @@ class EmulatedModbus(Device):
         return max(PAUSE_CHARACTERS * self.tau, SHORTEST_PAUSE)
 
     def _length(self, frame: bytes) -> int | None:
-        """Of the request that begins so; 0 while it cannot be told, None where only silence tells."""
+        """Return the length of the request that begins so.
+
+        It is 0 while it cannot be told, and None where only silence tells.
+        """
         if len(frame) < 2:
             return 0
         if frame[1] not in self.functions:
@@ -168,7 +174,7 @@ class EmulatedModbus(Device):
     # Answering
 
     def _obey(self, frame: bytes, now: float) -> None:
-        """A whole request with a known function, to this unit or to all."""
+        """Obey a whole request with a known function, to this unit or to all."""
         if crc(frame[:-2]) != frame[-2:]:
             return
         function, first, count = struct.unpack(">BHH", frame[1:6])
@@ -205,7 +211,7 @@ class EmulatedModbus(Device):
         return words[place]
 
     def _write(self, function: int, first: int, count: int, data: bytes) -> None:
-        """Of a single write `count` is the value."""
+        """Store what a write carries. Of a single write `count` is the value. Raises Illegal."""
         if function == WRITE_COIL:
             if count not in (0x0000, 0xFF00):
                 raise Illegal(ILLEGAL_VALUE)
@@ -240,7 +246,7 @@ class EmulatedModbus(Device):
         self.reply(body + crc(body), now)
 
     def disguise(self, reply: bytes, chance: Chance) -> bytes:
-        """As if another unit had said it."""
+        """Return the reply as if another unit had said it."""
         other = chance.randrange(ALL.start, ALL.stop - 1)
         body = bytes((other + (other >= reply[0]),)) + reply[1:-2]
         if self.traceable is not None and reply[1] in (READ_HOLDING, READ_INPUTS):
@@ -279,7 +285,7 @@ _REMAINDERS = tuple(map(_remainder, range(256)))
 
 
 def crc(data: bytes) -> bytes:
-    """The check of a frame, low byte first."""
+    """Return the check of a frame, low byte first."""
     check = 0xFFFF
     for byte in data:
         check = check >> 8 ^ _REMAINDERS[check & 0xFF ^ byte]

@@ -42,7 +42,7 @@ class Place:
 
     @classmethod
     def parse(cls, item: str) -> Place:
-        """Raises InvalidCommand for an item that does not exist."""
+        """Return what an item names. Raises InvalidCommand for an item that does not exist."""
         table, _, rest = item_text(item).partition(":")
         address, *kind = rest.split(":")
         if table not in READS or not is_decimal(address):
@@ -61,6 +61,7 @@ class Place:
 
     @property
     def is_bit(self) -> bool:
+        """True for a table of bits."""
         return self.table in BITS
 
     @property
@@ -69,18 +70,18 @@ class Place:
         return 1 if self.is_bit else self.number.registers
 
     def read(self) -> ReadBits | ReadRegisters:
-        """What reads it."""
+        """Return the command that reads it."""
         count = self.width if self.count is None else self.count
         return (ReadBits if self.is_bit else ReadRegisters)(self.first, count, self.table)
 
     def decode(self, raw: Sequence[Any]) -> Any:
-        """Its value, or the tuple of a run."""
+        """Return its value, or the tuple of a run."""
         if self.count is not None:
             return tuple(raw)
         return raw[0] if self.is_bit else self.number.decode(raw)
 
     def write(self, values: Sequence[Any]) -> list[WriteCoils | WriteRegisters]:
-        """What writes the values here and behind, in as many exchanges as it takes. Raises InvalidCommand."""
+        """Return what writes the values here and behind, in as many exchanges as it takes. Raises InvalidCommand."""
         if not values or (self.count is not None and len(values) != self.count):
             wanted = "a value" if self.count is None else f"{self.count} values"
             raise InvalidCommand(f"{self.table} {self.first} takes {wanted}, not {len(values)}")
@@ -115,7 +116,7 @@ class ModbusUnit(Handle):
     profile: ClassVar[Profile] = PROFILE
 
     def point(self, item: str) -> Point[Any]:
-        """What an item names. That of a run takes as many values as it has. Inputs are read-only."""
+        """Return the point that an item names. That of a run takes as many values as it has. Inputs are read-only."""
         place = Place.parse(item)
 
         def encode(value: Any) -> WriteCoils | WriteRegisters:
@@ -134,7 +135,7 @@ class ModbusUnit(Handle):
         return ()
 
     async def read(self, item: str, **options: Unpack[ReadOptions]) -> Any:
-        """What an item holds now. Raises Refused, with the exception's name, for what the unit does not have."""
+        """Return what an item holds now. Raises Refused, with the exception's name, for what the unit does not have."""
         return await self.point(item).read(**options)
 
     async def write(self, item: str, *values: float, **options: Unpack[WriteOptions]) -> None:
@@ -152,12 +153,12 @@ class ModbusUnit(Handle):
             await self._verify(requests, command)
 
     def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
-        """Consecutive places, in as few exchanges as they fit."""
+        """Prepare to write consecutive places, in as few exchanges as they fit."""
         self._writes(item, values, options)
         return [lambda: self.write(item, *values, **options)]
 
     def run_items(self, item: str, count: int) -> tuple[str, ...]:
-        """What each value from an item on is called, each at its own address."""
+        """Return what each value from an item on is called, each at its own address."""
         place = Place.parse(item)
         kind = "" if place.count is not None else item.partition(":")[2].partition(":")[2]
         suffix = f":{kind}" if kind else ""

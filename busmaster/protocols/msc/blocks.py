@@ -13,7 +13,7 @@ Progress = Callable[[int, int], None]
 
 
 def place(address: int, index: int, step: int | None) -> int:
-    """The address of the value `index` places behind the one at `address`.
+    """Return the address of the value `index` places behind the one at `address`.
 
     Raises InvalidCommand for one that does not exist, and while the address step is unknown.
     """
@@ -36,7 +36,7 @@ class Part(NamedTuple):
 
 
 def reads(address: int, count: int, step: int | None) -> list[Part]:
-    """The exchanges that read `count` values."""
+    """Return the exchanges that read `count` values."""
     if not 1 <= count <= HIGHEST_ADDRESS:
         raise InvalidCommand(f"there are not {count} values to read")
     if step is not None:
@@ -46,7 +46,7 @@ def reads(address: int, count: int, step: int | None) -> list[Part]:
 
 
 def reads_back(address: int, count: int, step: int | None) -> list[Part]:
-    """The same for values just written, in blocks that begin one value later than `writes` has them.
+    """Return the exchanges that read values just written, in blocks that begin one value later than `writes` has them.
 
     Where the address step is wrong, the blocks written lie apart or over each other, and only blocks that span two
     of them show it.
@@ -57,7 +57,7 @@ def reads_back(address: int, count: int, step: int | None) -> list[Part]:
 
 
 def writes(address: int, values: Sequence[int], step: int | None) -> list[tuple[BlockWrite | DataWrite, int]]:
-    """The exchanges that write `values`, and how many each holds: whole blocks, and the rest one by one."""
+    """Return the exchanges that write `values`, and how many each holds: whole blocks, and the rest one by one."""
     if not values:
         raise InvalidCommand("there is no value to write")
     whole = len(values) - len(values) % BLOCK
@@ -75,6 +75,7 @@ class Count:
         self._done = 0
 
     def add(self, values: int) -> None:
+        """Tell `progress` that so many more values are done."""
         self._done += values
         if self._progress is not None:
             self._progress(self._done, self._total)

@@ -330,7 +330,7 @@ def _state_of(payload: bytes) -> bool:
 
 
 def _flags_of(payload: bytes) -> frozenset[int]:
-    """Byte B1 holds flags 7 to 0 in its bits 7 to 0, B2 flags 15 to 8, and so on."""
+    """Return the flags that are on: B1 holds flags 7 to 0 in its bits 7 to 0, B2 flags 15 to 8, and so on."""
     states = int.from_bytes(payload, "little")
     return frozenset(flag for flag in range(FLAGS) if states >> flag & 1)
 

@@ -148,11 +148,11 @@ class EmulatedMsc(Device):
         return bool(self._packet)
 
     def value(self, address: int) -> int:
-        """The signed 32-bit value at a data address. Raises KeyError for one that does not exist."""
+        """Return the signed 32-bit value at a data address. Raises KeyError for one that does not exist."""
         return int.from_bytes(self._memory[self._bytes_of(address, 1)], "big", signed=True)
 
     def set_value(self, address: int, *values: int) -> None:
-        """Consecutive values from a data address on. Raises KeyError, and OverflowError beyond 32 bits."""
+        """Hold consecutive values from a data address on. Raises KeyError, and OverflowError beyond 32 bits."""
         data = b"".join(value.to_bytes(VALUE, "big", signed=True) for value in values)
         self._memory[self._bytes_of(address, len(values))] = data
 
@@ -200,7 +200,10 @@ class EmulatedMsc(Device):
         self._settle(now)
 
     def _go_on(self, now: float) -> None:
-        """Any byte can stand anywhere in a packet: whoever it is for, its length alone says where it ends."""
+        """Obey the packet that the last byte ended, if it is to this unit.
+
+        Any byte can stand anywhere in a packet: whoever it is for, its length alone says where it ends.
+        """
         frame = self._frame
         length = len(frame)
         if length == 2 and frame[1] not in UNITS:
@@ -224,7 +227,7 @@ class EmulatedMsc(Device):
         self._settle(now)
 
     def _settle(self, now: float) -> None:
-        """Whether it must hear everything from now on, and when it wants to be woken."""
+        """Decide whether it must hear everything from now on, and when it wants to be woken."""
         if self._frame:
             self.attentive = True
             self.wakeup = self._complete_by
@@ -238,7 +241,7 @@ class EmulatedMsc(Device):
     # Answering
 
     def _handle(self, frame: bytes, now: float) -> None:
-        """A whole packet to this unit. The host has moved on from whatever it has not ACKed."""
+        """Answer a whole packet to this unit. The host has moved on from whatever it has not ACKed."""
         body = frame[HEADER:-2]
         name = body[: body.find(b",") + 1]
         operand = body[len(name) :]
@@ -283,7 +286,7 @@ class EmulatedMsc(Device):
         self._transmit(now, self.delay)
 
     def _perform(self, name: bytes, operand: bytes, now: float) -> bytes | None:
-        """What its reply holds: nothing for a write, None to refuse."""
+        """Return what its reply holds: nothing for a write, None to refuse."""
         if RUN_FLAG in self.flags:
             self._count(now)
         if name == b"RQSTAT,":
@@ -330,7 +333,7 @@ class EmulatedMsc(Device):
         return b""
 
     def _count(self, now: float) -> None:
-        """What the program has done since it was last asked. Its time begins when it is first asked."""
+        """Count what the program has done since it was last asked. Its time begins when it is first asked."""
         if self._counted_until == NEVER or not self.status & RUNNING:
             self._counted_until = now
         steps = int((now - self._counted_until) / self.period)
@@ -349,7 +352,7 @@ class EmulatedMsc(Device):
 
 
 def packet(unit: int, body: bytes) -> bytes:
-    """The block sequence number is "not presently used": 0."""
+    """Return `body` as a packet. The block sequence number is "not presently used": 0."""
     summed = bytes((unit,)) + len(body).to_bytes(2, "big") + bytes(2) + body
     return bytes((STX,)) + summed + sum16(summed).to_bytes(2, "big")
 

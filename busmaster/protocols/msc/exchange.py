@@ -46,13 +46,16 @@ STALE_PACKETS = 6
 
 
 def packet(unit: int, body: bytes) -> bytes:
-    """`body` as a packet to `unit`. The block sequence number "is not presently used": 0."""
+    """Return `body` as a packet to `unit`. The block sequence number "is not presently used": 0."""
     counted = bytes((unit, 0, len(body), 0, 0)) + body
     return STX + counted + sum16(counted).to_bytes(2, "big")
 
 
 def packet_size(data: bytes | bytearray) -> int | None:
-    """Bytes of the packet that `data` begins with: 0 while that cannot be told, None if no packet begins so."""
+    """Return the bytes of the packet that `data` begins with.
+
+    It is 0 while that cannot be told, and None if no packet begins so.
+    """
     if data[0] != STX[0]:
         return None
     if len(data) < 4:
@@ -62,7 +65,7 @@ def packet_size(data: bytes | bytearray) -> int | None:
 
 
 def is_sound(whole: bytes) -> bool:
-    """The checksum of a whole packet is right."""
+    """Return whether the checksum of a whole packet is right."""
     return sum16(whole[1:-2]) == int.from_bytes(whole[-2:], "big")
 
 
@@ -80,10 +83,11 @@ class Reply:
 
     @property
     def size(self) -> int:
+        """Bytes of the whole packet."""
         return FRAMING + len(self.name) + self.payload
 
     def echoed_by(self, whole: bytes) -> bool:
-        """This packet has the length, the unit and the command name of the reply."""
+        """Return whether this packet has the length, the unit and the command name of the reply."""
         payload = len(whole) - FRAMING - len(self.name)
         right_length = payload == self.payload if self.shortest is None else payload >= self.shortest
         return right_length and whole[1] == self.unit and whole.startswith(self.name, HEADER)
@@ -95,6 +99,7 @@ class Reply:
         return STX + bytes((self.unit, *length.to_bytes(2, "big"), 0, 0)) + self.name
 
     def payload_of(self, whole: bytes) -> bytes:
+        """Return the payload of a whole packet."""
         return whole[HEADER + len(self.name) : -2]
 
 
@@ -185,9 +190,9 @@ class PacketExchange(Generic[T]):
         return self._ask_again(FrameError(what, send=ACK))
 
     def abandon(self) -> FrameError | Refused:
-        """What to fail the attempt with in place of the last Expect's `send`, which must not have been sent.
+        """Return what to fail the attempt with in place of the last Expect's `send`, which must not have been sent.
 
-        For an Expect that would say something again (its `send` is not empty) where the exchange has lasted too
+        This is for an Expect that would say something again (its `send` is not empty) where the exchange has lasted too
         long or something urgent waits. A FrameError's own `send` leaves the device with nothing unacknowledged.
         """
         return self._failure

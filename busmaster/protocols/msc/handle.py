@@ -91,7 +91,7 @@ class MscController(Handle):
         return ("flags", "status")
 
     def point(self, item: str) -> Point[Any]:
-        """A value ("2008" or a symbol), a run of values ("2008:32"), "flag:5", "flags" or "status"."""
+        """Return the point of a value ("2008" or a symbol), a run ("2008:32"), "flag:5", "flags" or "status"."""
         if item_text(item) == "status":
             return Point(self.node, item, ReadStatus())
         if item == "flags":
@@ -117,7 +117,10 @@ class MscController(Handle):
         return Point(self.node, f"flag:{flag}", ReadFlag(flag), encode=encode)
 
     def run_items(self, item: str, count: int) -> tuple[str, ...]:
-        """What each value of a run is called: its address, or the run's with the value's number where it is unknown."""
+        """Return what each value of a run is called.
+
+        That is its address, or the run's with the value's number where it is unknown.
+        """
         name = item.partition(":")[0]
         if self.address_step is None:
             return tuple(f"{name}[{i}]" for i in range(count))
@@ -125,7 +128,7 @@ class MscController(Handle):
         return tuple(str(address + i * self.address_step) for i in range(count))
 
     async def read_item(self, item: str, **options: Any) -> Any:
-        """As `point(item).read()`; the flags of a model without RFLAGS one by one."""
+        """Do as `point(item).read()` does; read the flags of a model without RFLAGS one by one."""
         try:
             return await self.point(item).read()
         except Refused:
@@ -134,7 +137,7 @@ class MscController(Handle):
             return await self.flags()
 
     def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
-        """Consecutive data addresses, in blocks and one by one."""
+        """Prepare to write consecutive data addresses, in blocks and one by one."""
         if len(values) == 1:
             return super().prepare_write(item, values, **options)
         name, _, count = item.partition(":")
@@ -146,7 +149,7 @@ class MscController(Handle):
         return [lambda: self.write_block(name, values, **options)]
 
     def address_of(self, where: int | str) -> int:
-        """The data address of a symbol; an address is returned as it is. Raises InvalidCommand for no such symbol."""
+        """Return the data address of a symbol, or an address as it is. Raises InvalidCommand for no such symbol."""
         if not isinstance(where, str):
             return where
         if where in self.symbols:
@@ -158,7 +161,7 @@ class MscController(Handle):
     # values
 
     async def read(self, where: int | str, **options: Unpack[ReadOptions]) -> int:
-        """The value at a data address or symbol, now. Raises Refused for an address outside the data area."""
+        """Return the value at a data address or symbol, now. Raises Refused for an address outside the data area."""
         return await self.node.request(DataRead(self.address_of(where)), **options)
 
     async def write(self, where: int | str, value: int, **options: Unpack[WriteOptions]) -> None:
@@ -171,7 +174,7 @@ class MscController(Handle):
         await self.write_block(where, [value], **options)
 
     async def read_block(self, where: int | str, count: int, **options: Unpack[ReadOptions]) -> tuple[int, ...]:
-        """`count` consecutive values, 32 an exchange: not all of one moment, if they are more.
+        """Return `count` consecutive values, 32 an exchange: not all of one moment, if they are more.
 
         Where the last 32 would reach beyond the data area and are refused, the values are read one by one. Raises
         InvalidCommand for more than 32 while the address step is unknown. `start_within` is for each exchange.
@@ -249,7 +252,7 @@ class MscController(Handle):
     # flags and status
 
     async def flag(self, number: int, **options: Unpack[ReadOptions]) -> bool:
-        """Whether a flag (input, output, timer, motor status or user flag), 0 to 255, is on."""
+        """Return whether a flag (input, output, timer, motor status or user flag), 0 to 255, is on."""
         return await self.node.request(ReadFlag(number), **options)
 
     async def set_flag(self, number: int, **options: Unpack[CommandOptions]) -> None:
@@ -261,14 +264,14 @@ class MscController(Handle):
         await self.node.request(ClearFlag(number), **options)
 
     async def flags(self, **options: Unpack[ReadOptions]) -> frozenset[int]:
-        """The flags that are on: in one exchange where the model can, else in 256."""
+        """Return the flags that are on: in one exchange where the model can, else in 256."""
         if self._merging.all_flags:
             return await self.node.request(ReadFlags(), **options)
         requests = SeveralRequests(self.node, options)
         return frozenset([flag for flag in range(FLAGS) if await requests.request(ReadFlag(flag))])
 
     async def status(self, **options: Unpack[ReadOptions]) -> ProgramStatus:
-        """The macroprogram status word."""
+        """Return the macroprogram status word."""
         return await self.node.request(ReadStatus(), **options)
 
     # inside
@@ -323,6 +326,7 @@ class LongRun:
         return f"read {self.count} values from data {self.address}"
 
     def open(self, address: int, timings: Timings, /) -> NoReturn:
+        """Raise InvalidCommand: only a point of one block at most can be polled."""
         raise InvalidCommand(f"a point that is polled has at most {BLOCK} values, not {self.count}: poll several")
 
 
@@ -336,7 +340,7 @@ class Run(Point[tuple[int, ...]]):
 
     @classmethod
     def of(cls, handle: MscController, item: str, address: int, count: int) -> Run:
-        """Raises InvalidCommand for more than one block while the address step is unknown."""
+        """Return a run as a point. Raises InvalidCommand for more than one block while the address step is unknown."""
         reads(address, count, handle.address_step)
         command = BlockRead(address) if count <= BLOCK else LongRun(address, count)
         return cls(
@@ -354,13 +358,16 @@ class Run(Point[tuple[int, ...]]):
         return True
 
     async def read(self, *, max_age: float | None = None, **options: Unpack[ReadOptions]) -> tuple[int, ...]:
-        """As `Point.read`; `MscController.read_block` where it is longer than a block."""
+        """Do as `Point.read` does, or as `MscController.read_block` where it is longer than a block."""
         if self.count <= BLOCK:
             return await Point.read(self, max_age=max_age, **options)
         return await self.handle.read_block(self.address, self.count, **options)
 
     async def write(self, value: Sequence[int], **options: Unpack[WriteOptions]) -> None:
-        """As `MscController.write_block`. Raises InvalidCommand unless there are as many values as in the run."""
+        """Do as `MscController.write_block` does.
+
+        Raises InvalidCommand unless there are as many values as in the run.
+        """
         if len(value) != self.count:
             raise InvalidCommand(f"{self.node.label}: {self.item} takes {self.count} values, not {len(value)}")
         await self.handle.write_block(self.address, value, **options)
