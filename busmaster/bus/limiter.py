@@ -55,7 +55,7 @@ class Limiter:
             self._of[node].known.pop(limit, None)
 
     def forget(self, node: Requester) -> None:
-        """What the node held may not be what it holds: it was away."""
+        """Forget what the node held: it was away, and may hold something else."""
         if node in self._of:
             self._of[node].known.clear()
 
@@ -128,7 +128,7 @@ class Limiter:
         return _shortened(options, node.now() - began)
 
     def _reached(self, node: Requester) -> Iterator[NodeLimits]:
-        """The limits of those that hear what is sent to a node: of all, where it stands for all."""
+        """Yield the limits of those that hear what is sent to a node: of all, where it stands for all."""
         profile = node.profile
         if node.address != profile.broadcast:
             if node in self._of:
@@ -139,7 +139,7 @@ class Limiter:
 
 
 def _steps(reached: Iterable[NodeLimits], changes: Mapping[Hashable, Any]) -> Iterator[tuple[NodeLimits, Limit]]:
-    """The limits to the step of what a write changes."""
+    """Yield the limits to the step of what a write changes."""
     return ((one, limit) for one in reached for limit in one.touched_by(changes) if limit.max_step is not None)
 
 
@@ -154,7 +154,7 @@ def _changes(node: Requester, command: Command[Any]) -> Mapping[Hashable, Any]:
 
 
 def _remember(one: NodeLimits, node: Requester, command: Command[Any]) -> None:
-    """What was confirmed is known. A write to all is confirmed by none, nor is what a stop left half written."""
+    """Remember what was confirmed. A write to all is confirmed by none, nor is what a stop left half written."""
     changes = _changes(node, command)
     for limit in one.touched_by(changes):
         one.known.pop(limit, None)
@@ -185,7 +185,7 @@ async def _value_now(node: Requester, limit: Limit, command: Command[Any], optio
 
 
 def _shortened(options: RequestOptions, by: float) -> RequestOptions:
-    """The options of what has waited already."""
+    """Return the options of what has waited already."""
     left = {
         name: max(0.0, limit - by)
         for name in ("start_within", "finish_within")

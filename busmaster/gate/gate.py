@@ -132,11 +132,11 @@ class Gate:
 
 
 def _before(point: Point[Any] | None) -> Any:
-    """What it held when it was last read, if that is still so."""
+    """Return what it held when it was last read, None if that may not be so any more."""
     sample = None if point is None else point.node.latest(point)
     return None if sample is None else sample.value
 
 
 def _shown(value: Any) -> Any:
-    """A value that fits into a record."""
+    """Return the value as it fits into a record."""
     return value if isinstance(value, int | float) and abs(value) < 1e300 else repr(value)[:LONGEST_SHOWN]

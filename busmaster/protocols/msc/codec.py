@@ -270,7 +270,7 @@ class Merging:
 
 
 def _data_changes(profile: Profile, first: int, values: Sequence[int]) -> Mapping[Hashable, Any]:
-    """What data addresses hold after a write. Where the address step is not known, nor is what a block changes.
+    """Return what data addresses hold after a write. Where the address step is not known, nor is what a block changes.
 
     Between two values that are more than an address apart lie parts of the first, and before the first of the one
     before it.
