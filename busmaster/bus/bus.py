@@ -371,6 +371,8 @@ class Bus:
             del self._groups[group.name]
 
     def _on_event(self, event: Event) -> None:
+        if isinstance(event, NodeChanged) and event.after is Health.DOWN and self._line.limiter is not None:
+            self._line.limiter.forget(self._nodes[event.node.profile.name, event.node.address])
         if isinstance(event, NodeChanged) and event.returning:
             self._start(self._run_hook(self._nodes[event.node.profile.name, event.node.address]))
         self._line.logbook.note(event, self.now())

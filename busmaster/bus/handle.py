@@ -82,6 +82,7 @@ class Handle(ABC):
         """Return what writes one value to ITEM. Raises InvalidCommand for one that cannot be sent."""
         point = self.point(item)
         command = encoder(point)(value)
+        self.node.check(command, stop=options.get("safe"))
 
         async def send() -> None:
             requests = SeveralRequests(self.node, options)

@@ -12,6 +12,8 @@ from typing import Any, Protocol, TypeVar, Unpack
 from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import LEFT, Priority, Timeline, Transaction
+from busmaster.bus.limiter import Limiter
+from busmaster.bus.limits import Limit
 from busmaster.bus.requester import ORDINARY, CommandOptions, Requester, RequestOptions
 from busmaster.bus.samples import Sample
 from busmaster.bus.shared_line import SharedLine
@@ -163,15 +165,42 @@ class Node:
         """Have poll groups propose `merge` for this node's reads from now on, in place of what its profile had."""
         self.shared.arbiter.change_profile(self.record, replace(self.record.profile, merge=merge))
 
+    def limit(self, limit: Limit, /) -> None:
+        """Refuse, from now on, every write beyond a limit, whatever names what it writes; also of those to all nodes.
+
+        Raises InvalidCommand for what this node's line never reads so.
+        """
+        line = self.shared
+        line.limiter = line.limiter or Limiter()
+        line.limiter.add(self, limit)
+
+    def lift(self, limit: Limit) -> None:
+        """Hold a limit no longer; the others stay."""
+        if self.shared.limiter is not None:
+            self.shared.limiter.drop(self, limit)
+
+    def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
+        """Raise InvalidCommand if one of these writes is beyond a limit: before the first of several is sent.
+
+        A `stop` is held by no limit.
+        """
+        if self.shared.limiter is not None and not stop:
+            for command in commands:
+                self.shared.limiter.check(self, command)
+
     async def request(
         self,
         command: Command[T],
         *,
         touches: Command[Any] | None = None,
         stops_seen: int | None = None,
+        stop: bool = False,
         **options: Unpack[CommandOptions],
     ) -> T:
         """Run one command and return its value. `RequestOptions` says what the options are.
+
+        A write beyond a limit of the node raises InvalidCommand; but for a `stop`, and for a write of the safe state,
+        which are held by none.
 
         `touches` is the command that reads what a write changes: samples of that which are older than the write are
         marked stale; without it, all of the node's. With `stops_seen` it raises Superseded, and sends nothing, if the
@@ -180,6 +209,10 @@ class Node:
         Raises a BusError subclass. Cancelling it frees the caller at once and never disturbs the line (R6).
         """
         chosen = self._options(options) if options else ORDINARY
+        limiter = self.shared.limiter
+        if limiter is not None and getattr(command, "writes", False):
+            async with limiter.passing(self, command, chosen, stop or chosen.safe) as left:
+                return (await self._timed(command, left, touches, stops_seen))[0]
         transaction, future = self._start(command, chosen, False, touches, stops_seen)
         try:
             value: T = await future
@@ -190,7 +223,20 @@ class Node:
 
     async def timed_request(self, command: Command[T], **options: Unpack[CommandOptions]) -> tuple[T, Timeline]:
         """Do what `request` does, and return beside the value the timeline that says why it took so long."""
-        transaction, future = self._start(command, self._options(options))
+        chosen, limiter = self._options(options), self.shared.limiter
+        if limiter is None or not getattr(command, "writes", False):
+            return await self._timed(command, chosen)
+        async with limiter.passing(self, command, chosen, chosen.safe) as left:
+            return await self._timed(command, left)
+
+    async def _timed(
+        self,
+        command: Command[T],
+        options: RequestOptions,
+        touches: Command[Any] | None = None,
+        stops_seen: int | None = None,
+    ) -> tuple[T, Timeline]:
+        transaction, future = self._start(command, options, False, touches, stops_seen)
         try:
             return await future, transaction.timeline()
         except asyncio.CancelledError:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Generic, TypeVar, Unpack
 
+from busmaster.bus.limits import Limit
 from busmaster.bus.requester import CommandOptions, ReadOptions, Requester
 from busmaster.contract.arguments import seconds
 from busmaster.contract.exchange import Command
@@ -57,6 +58,34 @@ class Point(Generic[T]):
     @property
     def writable(self) -> bool:
         return self.encode is not None
+
+    def limit(
+        self,
+        *,
+        minimum: float | None = None,
+        maximum: float | None = None,
+        max_step: float | None = None,
+        writable: bool = True,
+    ) -> Limit:
+        """Refuse, from now on, every write to what it reads that leaves its limits: InvalidCommand, and nothing sent.
+
+        They are in the point's unit, and hold whatever names the quantity, in lists, blocks and writes to all nodes
+        too, and beside those that it has already. `max_step` is the largest change from the last confirmed value, which
+        is read first if it is not known; an urgent write may take any step. A stop, such as `disable`, always passes.
+        Returns what `Node.lift` takes back.
+        """
+        limit = Limit(
+            name=self.item,
+            read=self.command,
+            decode=self.value_of,
+            unit=self.unit,
+            minimum=minimum,
+            maximum=maximum,
+            max_step=max_step,
+            writable=writable,
+        )
+        self.node.limit(limit)
+        return limit
 
     async def read(self, *, max_age: float | None = None, **options: Unpack[ReadOptions]) -> T:
         """Return its value now, or, with `max_age` in seconds, a poll group's latest sample if that is young enough.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypedDict, TypeVar, Unpack, cast
 
 from busmaster.arbiter.transaction import COMMAND, Priority
+from busmaster.bus.limits import Limit
 from busmaster.bus.samples import Sample
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.contract.exchange import Command
@@ -77,7 +78,7 @@ class RequestOptions:
     runs out unheard, and is not repeated. `retries`, 0 to 100, in place of the node's. `idempotent`: whether a write
     may be repeated after an unknown outcome (R7), in place of what its command says. `verify`: a handle's `write`
     reads back what it wrote, and raises VerifyFailed if that differs. `safe`: this write is of the safe state in which
-    a line is left, and accepted when no other is (`Bus.take_only_safe_writes`).
+    a line is left, and accepted when no other is (`Bus.take_only_safe_writes`); no limit of its point holds it.
     """
 
     priority: Priority = COMMAND
@@ -153,6 +154,17 @@ class Requester(Protocol):
         """Have poll groups propose `merge` for this node's reads from now on, in place of what its profile had."""
         ...
 
+    def limit(self, limit: Limit, /) -> None:
+        """Refuse, from now on, every write beyond a limit, whatever names what it writes."""
+        ...
+
+    def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
+        """Raise InvalidCommand if one of these writes is beyond a limit: before the first of several is sent.
+
+        A `stop` is held by no limit.
+        """
+        ...
+
     async def request(
         self,
         command: Command[T],
@@ -160,9 +172,10 @@ class Requester(Protocol):
         *,
         touches: Command[Any] | None = None,
         stops_seen: int | None = None,
+        stop: bool = False,
         **options: Unpack[CommandOptions],
     ) -> T:
-        """Run one command and return its value.
+        """Run one command and return its value. One that stops the node (`stop`) is held by no limit.
 
         `touches` is the command that reads what a write changes: samples of that which are older than the write are
         marked stale; without it, all of the node's. With `stops_seen` it raises Superseded, and sends nothing, if the

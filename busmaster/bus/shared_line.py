@@ -12,6 +12,7 @@ from typing import Any
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Poll, Transaction
+from busmaster.bus.limiter import Limiter
 from busmaster.bus.logbook import Logbook
 from busmaster.bus.points import Point
 from busmaster.bus.samples import Sample
@@ -31,6 +32,8 @@ class SharedLine:
         self.arbiter = arbiter
         self.pump: Pump
         self.logbook = Logbook(name)
+        self.limiter: Limiter | None = None
+        """None while nothing is limited."""
         self.closed = False
         self.only_safe = False
         """Whether no write is accepted any more but those of the safe state."""

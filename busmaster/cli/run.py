@@ -57,7 +57,9 @@ def command(path: str, port: str | None, capture: str | None, view: View) -> int
     context.call_on_close(lambda: sys.setswitchinterval(usual))
     sys.setswitchinterval(SWITCH_INTERVAL)
     with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
-        running = Running(ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True), path, view)
+        running = Running(
+            ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only), path, view
+        )
         ending = context.find_object(Ending)
         if ending is not None:
             ending.patience = running.line.safe_state.within + FAREWELL
@@ -82,7 +84,7 @@ class Running:
         self.left_safely = True
         self._leaving = False
         self._path = path
-        self._watch = Watch(line.bus, line.file.title, view, steady=True)
+        self._watch = Watch(line.bus, line.file.title, view, gate=line.gate, steady=True)
         self._manager = ServiceManager()
 
     async def run(self) -> int:

@@ -28,6 +28,7 @@ from busmaster.cli.output import Level, SteadyOutput, emit_all, json_line, note,
 from busmaster.cli.parsing import parse_value
 from busmaster.doctor import uart
 from busmaster.errors import BusError, InvalidCommand
+from busmaster.gate.gate import Gate, Wish
 from busmaster.outputs.values import cycle_fields, event_text
 
 KEPT_PERIODS = 1_000
@@ -45,15 +46,16 @@ STATES = {LineState.OFFLINE: "offline", LineState.SETTLING: "settling"}
 class Watch:
     """What a person sees of a bus while its groups are polled. Times are in seconds since it was made.
 
-    `view` says how it is shown. `steady`: that nobody can print any more does not end it. It hears what happens to the
-    bus from the start on, before that is entered too.
+    `view` says how it is shown, `gate` is what the writes of the screen pass. `steady`: that nobody can print any more
+    does not end it. It hears what happens to the bus from the start on, before that is entered too.
     """
 
-    def __init__(self, bus: Bus, title: str, view: View, *, steady: bool = False) -> None:
+    def __init__(self, bus: Bus, title: str, view: View, *, gate: Gate | None = None, steady: bool = False) -> None:
         self.bus = bus
         self.output = SteadyOutput(note) if steady else None
         self.title = title
         self.view = view
+        self.gate = gate or Gate(bus, read_only=view.read_only)
         self.start = bus.now()
         self.groups: list[PollGroup] = []
         self.events: deque[str] = deque(maxlen=KEPT_EVENTS)
@@ -197,7 +199,7 @@ class Watch:
                 self._pause()
             case "suspend":
                 self._suspend(action.target)
-            case "write" if not self.view.read_only:
+            case "write":
                 await self._write(action)
         self._counted = -math.inf
 
@@ -222,11 +224,12 @@ class Watch:
             return
         name = f"{action.target} {action.item}"
         try:
-            await point.write(parse_value(action.value))
-        except (BusError, InvalidCommand) as error:
-            self.tell(f"{name} = {action.value}: {error.what if isinstance(error, BusError) else error}")
-        else:
-            self.tell(f"{name} = {action.value} written")
+            value = parse_value(action.value)
+        except InvalidCommand as error:
+            self.tell(f"{name} = {action.value}: {error}")
+            return
+        write = await self.gate.write(Wish(door="screen", by="key w", name=point.key, point=point, value=value))
+        self.tell(f"{name} = {action.value} {'written' if write.ok else f': {write.error}'}".replace(" :", ":"))
 
     def _utilisation(self, now: float, busy: float) -> float:
         self._loads.append((now, busy))

@@ -11,6 +11,7 @@ from typing import Any
 from busmaster.arbiter.tap import Tap
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
+from busmaster.bus.limits import Limit
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
@@ -20,6 +21,7 @@ from busmaster.config.safe import SafeState, SafeWrite
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, PointSection, load
 from busmaster.contract.arguments import guess, is_decimal, meant
 from busmaster.errors import InvalidCommand
+from busmaster.gate.gate import Gate
 from busmaster.outputs.distributor import Distributor, Wanted
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
@@ -32,7 +34,8 @@ class ConfiguredLine:
     `nodes` are the handles by the file's names; `groups` the poll groups, once it is entered. Raises FileError, which
     names line and key, for what the protocols or the outputs cannot do. `port` is used instead of the file's. `tap`
     sees every byte. Without `outputs` nothing is recorded or published. `tell` is called, on the loop, with what
-    happens to the outputs. With `wait_for_port` a port that cannot be opened yet is no error.
+    happens to the outputs. `read_only` lets nothing from outside be written: `gate` is what all of that passes. With
+    `wait_for_port` a port that cannot be opened yet is no error.
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class ConfiguredLine:
         outputs: bool = True,
         tap: Tap | None = None,
         tell: Callable[[str], None] = lambda _: None,
+        read_only: bool = False,
         wait_for_port: bool = False,
     ) -> None:
         self.file = file
@@ -50,9 +54,12 @@ class ConfiguredLine:
         self.nodes: dict[str, Handle] = {name: self._handle(node) for name, node in file.nodes.items()}
         self.groups: dict[str, PollGroup] = {}
         self._points: dict[str, NamedPoint] = {}
+        self._limits = list(self._held_limits())
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
-        self.outputs = Distributor(self.bus, tell)
+        self.gate = Gate(self.bus, read_only=read_only)
+        self.outputs = Distributor(self.bus, tell, gate=self.gate)
+        self.gate.record = self.outputs.record
         if outputs:
             self._add_outputs()
 
@@ -89,6 +96,9 @@ class ConfiguredLine:
         self.nodes = {name: self.nodes.get(name) or fresh[name] for name in file.nodes}
         self.file = file
         self._points = {name: point for name, point in points.items() if _section(before, name) == _section(file, name)}
+        held, self._limits = self._limits, list(self._held_limits())
+        for node, limit in held:
+            node.lift(limit)
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         for name, group in list(self.groups.items()):
@@ -162,6 +172,21 @@ class ConfiguredLine:
                 handle.point(point.item)  # looked up for its complaint, which has the line here
         return handle
 
+    def _held_limits(self) -> Iterator[tuple[Node, Limit]]:
+        """Hold what the file says of its points, by whatever name they are written, and say what is held."""
+        for node in self.file.nodes.values():
+            for name, section in node.points.items():
+                if section.limited:
+                    with section.table.at():
+                        point = self._point(node.name, name)
+                        limit = point.limit(
+                            minimum=section.minimum,
+                            maximum=section.maximum,
+                            max_step=section.max_step,
+                            writable=section.writable,
+                        )
+                        yield Node.of(point), limit
+
     def _members(self, group: GroupSection) -> Iterator[NamedPoint]:
         for number, text in enumerate(group.points):
             with group.table.at("points", number):
@@ -199,11 +224,11 @@ class ConfiguredLine:
         if section is None:
             source = _known(handle, name, node.points)
             return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
-        decimals = 0 if node.kind.takes_decimals else section.decimals  # else they are the handle's: not twice
         rounds = node.kind.takes_decimals and (section.decimals or node.kind.decimals(section.item))
         whole = not rounds and node.kind.whole_numbers(section.item)  # else the handle rounds, to its decimals
-        scale = Scale.of(section.factor, section.offset, decimals, whole=whole)
-        return NamedPoint.of(handle.point(section.item), where=where, name=name, unit=section.unit, scale=scale)
+        scale = Scale.of(section.factor, section.offset, whole=whole)
+        source = handle.point(section.item)
+        return NamedPoint.of(source, where=where, name=name, unit=section.unit, scale=scale, declared=section.writable)
 
     def _safe_writes(self) -> Iterator[SafeWrite]:
         """Yield the writes of `[safe]`, in their order there."""

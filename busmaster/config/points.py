@@ -19,8 +19,8 @@ class Scale:
     """What a number on the line means: value = number / 10**decimals x factor + offset.
 
     Reckoned in whole numbers and divided once, so that 3 x 0.1 is 0.3; of a number with decimals 15 digits are kept, so
-    that 14.2953 x 0.001 is 0.0142953. `whole`: the line carries whole numbers, to
-    which a written value is rounded, half away from zero.
+    that 14.2953 x 0.001 is 0.0142953. `whole`: the line carries whole numbers, to which a written value is rounded,
+    half away from zero.
     """
 
     factor: Fraction
@@ -77,19 +77,25 @@ def rounded(number: Fraction) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NamedPoint(Point[Any]):
-    """A point under the file's names for its node and itself. `source` is the protocol's own."""
+    """A point under the file's names for its node and itself. `source` is the protocol's own.
+
+    `declared`: whether the file lets it be written, where the protocol does.
+    """
 
     where: str = field(compare=False)
     source: Point[Any] = field(compare=False)
     scale: Scale = field(compare=False)
+    declared: bool = field(compare=False)
 
     @classmethod
-    def of(cls, source: Point[Any], *, where: str, name: str, unit: str, scale: Scale) -> NamedPoint:
+    def of(
+        cls, source: Point[Any], *, where: str, name: str, unit: str, scale: Scale, declared: bool = True
+    ) -> NamedPoint:
         """Return the point under the file's names, with its unit and scale."""
-        decode, encode = source.decode, source.encode
+        decode, encode = source.decode, source.encode if declared else None
         if not scale.trivial:
             decode = _after(source.decode, scale.reader())
-            encode = None if source.encode is None else _before(scale.write, source.encode)
+            encode = None if encode is None else _before(scale.write, encode)
         return cls(
             source.node,
             name,
@@ -100,6 +106,7 @@ class NamedPoint(Point[Any]):
             where=where,
             source=source,
             scale=scale,
+            declared=declared,
         )
 
     @property
@@ -109,11 +116,11 @@ class NamedPoint(Point[Any]):
 
     @property
     def writable(self) -> bool:
-        return self.source.writable
+        return self.declared and self.source.writable
 
     async def write(self, value: Any, **options: Unpack[CommandOptions]) -> None:
         """Write a value as `Point.write` does. A run is written in as many exchanges as it takes."""
-        if self.source.writable and self.encode is None:
+        if self.writable and self.encode is None:
             await self.source.write(value if self.scale.trivial else self.scale.write(value), **options)
         else:
             await Point.write(self, value, **options)

@@ -29,12 +29,13 @@ from busmaster.transport.tcp import TcpPort
 
 NODE_KEYS = ("protocol", "address", "timing", "retries", "reply_time", "points")
 """What every node's table may say; its kind's options come to it."""
+LIMITS = ("minimum", "maximum", "max_step")
 PRIORITIES = {"poll": Priority.POLL, "background": Priority.BACKGROUND}
 
 
 @dataclass(frozen=True, slots=True)
 class PointSection:
-    """What a point is called, and what its number on the line means."""
+    """What a point is called, what its number on the line means, and what may be written to it, in its unit."""
 
     name: str
     item: str
@@ -42,7 +43,16 @@ class PointSection:
     factor: float
     offset: float
     decimals: int
+    minimum: float | None
+    maximum: float | None
+    max_step: float | None
+    writable: bool
     table: Table = field(compare=False, repr=False)
+
+    @property
+    def limited(self) -> bool:
+        """Whether anything holds it back."""
+        return not self.writable or any(limit is not None for limit in (self.minimum, self.maximum, self.max_step))
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +189,7 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
     retries = table.whole("retries", default.whole("retries", None, most=100), most=100)
     reply_time = table.seconds("reply_time", default.seconds("reply_time", None))
     options = {**read_options(default, own), **read_options(table, own)}
-    points = {point.name: _point(point) for point in table.tables("points")}
+    points = {point.name: _point(point, find(protocol)) for point in table.tables("points")}
     for name, address in zip(names, addresses, strict=True):
         if not NODE_NAME.fullmatch(name):
             raise table.error(f"a node's name is of letters, digits, _, . and -, not {name!r}")
@@ -220,20 +230,30 @@ def _no_address(text: str) -> int:
     raise InvalidCommand(f'an address is a number, or a range such as "4-8", not {text!r}')
 
 
-def _point(table: Table) -> PointSection:
-    table.only("item", "unit", "factor", "offset", "decimals")
+def _point(table: Table, kind: NodeKind) -> PointSection:
+    table.only("item", "unit", "factor", "offset", "decimals", *LIMITS, "writable")
     if not POINT_NAME.fullmatch(table.name):
         raise table.error(f"a point's name has no spaces, commas or slashes: {table.name!r} has")
     factor = table.number("factor", 1)
     if not factor:
         raise table.error("a factor of 0 makes every value the same", "factor")
+    decimals = table.whole("decimals", 0, most=9)
+    if decimals and not kind.takes_decimals:
+        raise table.error(
+            f"{kind.name} has no implied decimals: write factor = {10**-decimals:.{decimals}f} to scale what is sent",
+            "decimals",
+        )
     return PointSection(
         name=table.name,
         item=table.text("item", table.name),
         unit=table.text("unit", ""),
         factor=factor,
         offset=table.number("offset", 0),
-        decimals=table.whole("decimals", 0, most=9),
+        decimals=decimals,
+        minimum=table.number("minimum", None),
+        maximum=table.number("maximum", None),
+        max_step=table.number("max_step", None),
+        writable=table.flag("writable", True),
         table=table,
     )
 
@@ -243,7 +263,7 @@ def _point(table: Table) -> PointSection:
 
 def _group(table: Table) -> GroupSection:
     table.only("period", "phase", "points", "priority")
-    return GroupSection(
+    group = GroupSection(
         name=table.name,
         period=table.seconds("period"),
         phase=table.seconds("phase", None),
@@ -251,3 +271,6 @@ def _group(table: Table) -> GroupSection:
         points=table.texts("points"),
         table=table,
     )
+    if not group.points:
+        raise table.error("a group without points polls nothing: name some, or leave the group out", "points")
+    return group

@@ -12,6 +12,8 @@ from dataclasses import replace
 from busmaster.config.table import Table
 from busmaster.contract.timing import ReplyTiming, Timings
 
+LONGEST = 10.0
+"""Seconds: whoever writes more means milliseconds."""
 TIMES = ("nominal", "window", "lateness", "byte_gap", "turnaround")
 LEARNED_WORD = "learned"
 
@@ -46,6 +48,9 @@ def _changed(table: Table, timing: ReplyTiming, leg: bool = False) -> ReplyTimin
     if leg:
         table.only(*TIMES)
     given = {name: table.seconds(name) for name in TIMES if name in table}
+    for name, time in given.items():
+        if time > LONGEST:
+            raise table.error(f"times are in seconds, {LONGEST:g} at most: for {time:g} ms write {time / 1000:g}", name)
     window = given.get("window", timing.window)
     moved = {"nominal": min(timing.nominal, window), "lateness": max(timing.lateness, window)}
     with table.at():

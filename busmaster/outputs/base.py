@@ -24,6 +24,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar
 from busmaster.bus.points import Point
 from busmaster.bus.polling import Sample, Snapshot
 from busmaster.errors import InvalidCommand
+from busmaster.gate.record import WriteRecord
 from busmaster.outputs.settings import Settings
 
 Formatted = TypeVar("Formatted")
@@ -48,11 +49,11 @@ class Happening(NamedTuple):
     text: str
 
 
-Item: TypeAlias = Snapshot | Happening
+Item: TypeAlias = Snapshot | Happening | WriteRecord
 
 
 def size_of(item: Item) -> int:
-    """Return how many values an item holds; an event counts as one."""
+    """Return how many values an item holds; an event, or a write, counts as one."""
     return len(item.samples) if isinstance(item, Snapshot) else 1
 
 

@@ -13,6 +13,8 @@ from busmaster.arbiter.events import LatenessRaised, NodeChanged
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import Snapshot, Stream
+from busmaster.gate.gate import Gate
+from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Happening, Output, OutputStatistics
 from busmaster.outputs.files import CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings, MetricsSettings, MqttSettings, Settings, SqliteSettings
@@ -54,10 +56,14 @@ class Wanted(NamedTuple):
 
 
 class Distributor:
-    """The outputs of one bus. `tell` is called, on the loop, with what happens to them."""
+    """The outputs of one bus. `tell` is called, on the loop, with what happens to them.
 
-    def __init__(self, bus: Bus, tell: Callable[[str], None] = lambda _: None) -> None:
+    `gate` is what the commands pass that they take in.
+    """
+
+    def __init__(self, bus: Bus, tell: Callable[[str], None] = lambda _: None, *, gate: Gate | None = None) -> None:
         self.tell = tell
+        self.gate = gate or Gate(bus)
         self._bus = bus
         self._outputs: list[Output] = []
         self._feeding: dict[Source, asyncio.Task[None]] = {}
@@ -103,6 +109,11 @@ class Distributor:
                 if kind in leaving:
                     output.succeed(leaving[kind])
                 output.start()
+
+    def record(self, write: WriteRecord) -> None:
+        """Hand a write to all of them."""
+        for output in self._outputs:
+            output.offer(write)
 
     async def close(self) -> None:
         """Close the outputs, once the bus is closed.
@@ -172,7 +183,7 @@ class Distributor:
             case MqttSettings():
                 from busmaster.outputs.mqtt import MqttOutput
 
-                return MqttOutput(kind, settings, self._bus, self._say, commands=commands)
+                return MqttOutput(kind, settings, self._bus, self._say, commands=commands, gate=self.gate)
             case MetricsSettings():
                 from busmaster.outputs.metrics import MetricsOutput
 

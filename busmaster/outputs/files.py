@@ -9,10 +9,11 @@ from datetime import UTC, datetime
 from typing import Any
 
 from busmaster.bus.polling import Sample, Snapshot
-from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
+from busmaster.gate.record import WriteRecord
+from busmaster.outputs.base import BatchOutput, Item, check_folder
 from busmaster.outputs.growing_file import GrowingFile
 from busmaster.outputs.settings import FileSettings
-from busmaster.outputs.values import cycle_fields, json_line, micros, value_text
+from busmaster.outputs.values import cycle_fields, json_line, micros, value_text, write_fields
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What a spreadsheet takes for the beginning of a formula."""
@@ -54,8 +55,8 @@ class CsvOutput(FileOutput):
     head = ",".join(COLUMNS).encode() + b"\n"
 
     def format(self, item: Item) -> bytes | None:
-        """Return a line for each value of a cycle; None for an event, which is not written here."""
-        if isinstance(item, Happening):
+        """Return a line for each value of a cycle; None for the rest, which is not written here."""
+        if not isinstance(item, Snapshot):
             return None
         return csv_lines(
             (
@@ -74,12 +75,17 @@ class CsvOutput(FileOutput):
 
 
 class JsonlOutput(FileOutput):
-    """A line a cycle, as `busmaster run --json` prints it, and a line an event. Times are seconds since 1970."""
+    """A line a cycle, as `busmaster run --json` prints it, a line an event and a line a write.
+
+    Times are seconds since 1970.
+    """
 
     def format(self, item: Item) -> bytes:
-        """Return one line of JSON for a cycle or an event."""
+        """Return one line of JSON for a cycle, an event or a write."""
         if isinstance(item, Snapshot):
             fields = cycle_fields(item, item.wall_at)
+        elif isinstance(item, WriteRecord):
+            fields = {"write": item.point, **write_fields(item)}
         else:
             fields = {"event": item.text, "node": item.node or None, "time": item.time}
         return json_line(**fields).encode() + b"\n"

@@ -7,38 +7,43 @@
     PREFIX/events             {"time": ..., "node": "winder", "text": "winder is down, was suspect"}
     PREFIX/status             online, or offline, which is also the last will; retained
 
-    PREFIX/set/NODE/ITEM      a number, or several as a JSON list, to be written
-    PREFIX/result/NODE/ITEM   {"ok": true}, or {"ok": false, "error": "..."}
+    PREFIX/set/NODE/ITEM      a number, or several as a JSON list, to be written; or {"value": 12.5, "id": "a1",
+                              "expires": 1767225600}, of which value alone must be said
+    PREFIX/result/NODE/ITEM   {"ok": true}, or {"ok": false, "error": "..."}, with the command's id if it has one
+    PREFIX/audit              each write, by whatever door: who, what, when, what became of it
 
-Times are seconds since 1970. What was not acknowledged when the broker went away is sent again when it is back.
-With `spill`, what waits for it does so on disk, and is sent by the next process if this one ends before.
+In names +, # and % are written %2B, %23 and %25. A command is written within a second of its arrival, or by `expires`
+or the message's own expiry where it has one; an older one is refused. Times are seconds since 1970. What was not
+acknowledged when the broker went away is sent again when it is back. With `spill`, what waits for it does so on disk,
+and is sent by the next process if this one ends before.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import sqlite3
 import ssl
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from math import isfinite
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import anyio
-from anyio.abc import TaskGroup
 
 from busmaster.arbiter.state import LineState
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import Snapshot
-from busmaster.errors import BusError, InvalidCommand
+from busmaster.errors import InvalidCommand
+from busmaster.gate.gate import Gate, Wish
+from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import BATCH, PAUSE, TICK, Item, Output, check_extra, reason, size_of
+from busmaster.outputs.mqtt_commands import Answer, Commands, Inbox
 from busmaster.outputs.settings import MqttSettings
 from busmaster.outputs.spool import Record, Spool
-from busmaster.outputs.values import cycle_fields, json_line, micros, sample_fields
+from busmaster.outputs.values import cycle_fields, json_line, micros, sample_fields, write_fields
 
 if TYPE_CHECKING:
     from aiomqtt import Client, Message
@@ -55,9 +60,6 @@ SPILL_EVERY = 0.2
 """Seconds between two movings of what waits to disk, while the broker is away."""
 HURRY = 2.0
 """Seconds from the wish to end until what could not be sent goes to disk."""
-START_WITHIN = 1.0
-"""Seconds after which a command that could not be sent to its node is not sent any more."""
-COMMANDS_AT_ONCE = 16
 
 
 class Outgoing(NamedTuple):
@@ -77,13 +79,16 @@ class MqttOutput(Output):
         say: Callable[[str], None] = lambda _: None,
         *,
         commands: Mapping[str, Point[Any]] | None = None,
+        gate: Gate | None = None,
     ) -> None:
         check_extra("aiomqtt", "mqtt")
         super().__init__(kind, settings, say)
         self._settings = settings
         self._secrets = secrets(settings)
         self._bus = bus
+        self._gate = gate or Gate(bus)
         self._commands = {topic_part(key): point for key, point in (commands or {}).items()}
+        self._arriving: Commands
         self._owner: asyncio.AbstractEventLoop | None = None
         self._held: list[Item] = []
         self._spool: Spool | None = None
@@ -92,7 +97,6 @@ class MqttOutput(Output):
             self.offered = self.spilled = self._spool.values  # of the last time
         self._spool_error = ""
         self._published: dict[str, str] = {}
-        self._running = 0
         self._quiet = logging.getLogger("busmaster.mqtt")
         self._quiet.addHandler(logging.NullHandler())
         self._quiet.propagate = False
@@ -183,7 +187,8 @@ class MqttOutput(Output):
             self.up()
             if self._commands:
                 await client.subscribe(self._topic("set/#"), qos=1)
-            tasks.start_soon(self._listen, client, tasks)
+            tasks.start_soon(self._listen, client)
+            tasks.start_soon(self._arriving.serve, self._write, self._keep, partial(self._answer, client))
             stopped = False
             while not stopped:
                 stopped = self._stop.is_set()  # looked at first, so that a last round sends what waits
@@ -203,9 +208,12 @@ class MqttOutput(Output):
 
         settings = self._settings
         username, password, tls = self._secrets
+        self._arriving = Commands(settings.prefix, self._gate, self._commands, self._bus.now)
         client = aiomqtt.Client(
             settings.host,
             settings.port,
+            protocol=aiomqtt.ProtocolVersion.V5,
+            queue_type=cast("type[asyncio.Queue[Message]]", partial(Inbox, self._arriving)),
             username=username,
             password=password,
             tls_context=tls,
@@ -246,7 +254,9 @@ class MqttOutput(Output):
 
     def _messages(self, item: Item) -> Iterator[Outgoing]:
         settings = self._settings
-        if not isinstance(item, Snapshot):
+        if isinstance(item, WriteRecord):
+            yield Outgoing(self._topic("audit"), json_line(**write_fields(item)))
+        elif not isinstance(item, Snapshot):
             payload = json_line(time=item.time, node=item.node or None, text=item.text)
             yield Outgoing(self._topic("events"), payload)
         elif settings.messages == "cycle":
@@ -273,72 +283,29 @@ class MqttOutput(Output):
 
     # commands
 
-    async def _listen(self, client: Client, tasks: TaskGroup) -> None:
-        """Obey commands as they come.
+    async def _listen(self, client: Client) -> None:
+        """Raise MqttError when the broker goes away, also while there is nothing to send."""
+        async for _ in client.messages:
+            raise AssertionError("messages are taken in as they arrive")
 
-        Raises MqttError when the broker goes away, also while there is nothing to send.
-        """
-        async for message in client.messages:
-            name = str(message.topic).removeprefix(self._topic("set/"))
-            refusal = self._refusal(name, message)
-            if refusal:
-                tasks.start_soon(self._answer, client, name, refusal)
-            else:
-                self._running += 1
-                tasks.start_soon(self._obey, client, name, message.payload)
-
-    def _refusal(self, name: str, message: Message) -> str:
-        """Return why a command is not obeyed, "" if it is."""
-        if name not in self._commands:
-            return "the line's file does not allow this: see allow_commands"
-        if message.retain:
-            return "a retained command is not obeyed: nobody knows how old it is"
-        if self._running >= COMMANDS_AT_ONCE:
-            return f"{COMMANDS_AT_ONCE} commands are being written already"
-        return ""
-
-    async def _obey(self, client: Client, name: str, payload: object) -> None:
-        try:
-            await self._write(self._commands[name], payload)
-        except (BusError, InvalidCommand) as error:
-            refusal = reason(error)
-        else:
-            refusal = ""
-        finally:
-            self._running -= 1
-        await self._answer(client, name, refusal)
-
-    async def _write(self, point: Point[Any], payload: object) -> None:
-        """Write the point on the loop that owns the line."""
-        value = command_value(payload)
+    async def _write(self, wish: Wish) -> WriteRecord:
+        """Write it on the loop that owns the line."""
         assert self._owner is not None
-        work = point.write(value, start_within=START_WITHIN)
-        await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self._owner))
+        return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(self._gate.write(wish), self._owner))
 
-    async def _answer(self, client: Client, name: str, refusal: str) -> None:
-        fields = {"ok": False, "error": refusal} if refusal else {"ok": True}
-        await self._send(client, [Outgoing(self._topic("result", name), json_line(**fields))])
+    def _keep(self, wish: Wish, error: str) -> None:
+        """Put on record, on that loop too, what was refused."""
+        assert self._owner is not None
+        self._owner.call_soon_threadsafe(self._gate.refuse, wish, error)
 
-
-def command_value(payload: object) -> Any:
-    """Return the number, or the list of them, that somebody wants to have written.
-
-    Raises InvalidCommand for anything else.
-    """
-    text = bytes(payload).decode(errors="replace") if isinstance(payload, bytes | bytearray) else str(payload)
-    try:
-        value = json.loads(text, parse_constant=lambda name: name)
-    except ValueError:
-        value = None
-    numbers = value if isinstance(value, list) else [value]
-    if not numbers or not all(type(n) is int or (type(n) is float and isfinite(n)) for n in numbers):
-        raise InvalidCommand(f"{text[:40]!r} is neither a number nor a list of numbers")
-    return value
+    async def _answer(self, client: Client, answer: Answer) -> None:
+        topic = self._topic("result", answer.name) if answer.name else self._topic("result")
+        await self._send(client, [Outgoing(topic, json_line(**answer.fields))])
 
 
 def topic_part(name: str) -> str:
-    """Return the name without what has a meaning in topics."""
-    return name.replace("+", "_").replace("#", "_")
+    """Return the name without what has a meaning in topics. Two names stay two."""
+    return name.replace("%", "%25").replace("+", "%2B").replace("#", "%23")
 
 
 def secrets(settings: MqttSettings) -> tuple[str | None, str | None, ssl.SSLContext | None]:

@@ -13,10 +13,11 @@ from typing import Any, NamedTuple, TypeAlias
 
 from busmaster.bus.points import Point
 from busmaster.errors import InvalidCommand
+from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
 from busmaster.outputs.retention import Retention
 from busmaster.outputs.settings import SqliteSettings
-from busmaster.outputs.values import json_value, micros
+from busmaster.outputs.values import json_value, micros, write_fields
 
 VERSION = 1
 SCHEMA = """
@@ -34,22 +35,37 @@ create index if not exists samples_of_point on samples (point, time);
 create index if not exists samples_by_time on samples (time);
 create table if not exists events (time real not null, node text, text text not null);
 create index if not exists events_by_time on events (time);
+create table if not exists audit (
+    time real not null,       -- seconds since 1970
+    door text not null,       -- mqtt, screen, ...
+    by text not null,         -- the topic, the key
+    user text not null, process integer not null,
+    point text not null,
+    before,                   -- null where it was not known
+    value,
+    outcome text not null,    -- written, refused, not started or unconfirmed
+    error text,
+    took real not null,       -- seconds
+    id text                   -- the command's own
+);
+create index if not exists audit_by_time on audit (time);
 create view if not exists history as
     select time, node, item, value, unit, quality, error from samples join points on points.id = samples.point;
 """
 BUSY = 1.0
 """Seconds for which a lock of another program is waited for, before the batch is kept for later."""
-DATED = ("samples", "events")
+DATED = ("samples", "events", "audit")
 """Tables whose rows are forgotten when they are too old."""
 
 SampleRow: TypeAlias = tuple[float, int, Any, str, str | None]
 
 
 class Rows(NamedTuple):
-    """Of one cycle, or one event: points whose number is not known yet, by their place in `samples`."""
+    """Of one cycle, one event, or one write: points whose number is not known yet, by their place in `samples`."""
 
     samples: list[tuple[float, Point[Any], Any, str, str | None]]
-    event: tuple[float, str | None, str] | None
+    event: tuple[float, str | None, str] | None = None
+    write: tuple[Any, ...] | None = None
 
 
 class SqliteOutput(BatchOutput[Rows]):
@@ -73,6 +89,8 @@ class SqliteOutput(BatchOutput[Rows]):
         """Return the rows of one cycle or one event."""
         if isinstance(item, Happening):
             return Rows([], (item.time, item.node or None, item.text))
+        if isinstance(item, WriteRecord):
+            return Rows([], write=tuple(column(value) for value in write_fields(item).values()))
         samples = [
             (
                 micros(sample.wall),
@@ -83,7 +101,7 @@ class SqliteOutput(BatchOutput[Rows]):
             )
             for point, sample in self.unhurried(item)
         ]
-        return Rows(samples, None)
+        return Rows(samples)
 
     def commit(self, batch: list[Rows]) -> None:
         database = self._open()
@@ -93,6 +111,8 @@ class SqliteOutput(BatchOutput[Rows]):
             database.executemany("insert into samples values (?, ?, ?, ?, ?)", samples)
             events = [rows.event for rows in batch if rows.event is not None]
             database.executemany("insert into events values (?, ?, ?)", events)
+            writes = [rows.write for rows in batch if rows.write is not None]
+            database.executemany(f"insert into audit values ({', '.join(12 * '?')})", writes)
 
     def shut(self) -> None:
         if self._database is not None:

@@ -13,6 +13,7 @@ from typing import Any
 from busmaster.arbiter.events import Event, LatenessRaised, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health
 from busmaster.bus.polling import Quality, Sample, Snapshot
+from busmaster.gate.record import WriteRecord
 
 
 def number_text(value: float) -> str:
@@ -118,6 +119,20 @@ def sample_fields(sample: Sample[Any]) -> dict[str, Any]:
         "value": json_value(sample.value),
         "error": None if sample.error is None else sample.error.what,
         "late": sample.quality is Quality.LATE,
+    }
+
+
+def write_fields(record: WriteRecord) -> dict[str, Any]:
+    """One write as a JSON object."""
+    return {
+        **record._asdict(),
+        "time": micros(record.time),
+        "before": json_value(record.before),
+        "value": json_value(record.value),
+        "outcome": record.outcome.value,
+        "error": record.error or None,
+        "took": micros(record.took),
+        "id": record.id or None,
     }
 
 

@@ -178,7 +178,7 @@ VALUES: list[tuple[str, str, dict[str, Any]]] = [
         node(
             "msc",
             1,
-            "address_step = 4\nsymbols = { count = 2008, cam = 3000 }\npoints = { count = { decimals = 3 } }",
+            "address_step = 4\nsymbols = { count = 2008, cam = 3000 }\npoints = { count = { factor = 0.001 } }",
             "values = { count = 1.25, cam = [5, -6, 7], 'flag:5-6' = true, status = 72 }",
         ),
         "msc",

@@ -9,6 +9,7 @@ from typing import Any, Unpack
 
 import anyio.lowlevel
 
+from busmaster.bus.limits import Limit
 from busmaster.bus.requester import CommandOptions, Priority
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
@@ -43,12 +44,19 @@ class FakeNode:
     def merge_reads(self, merge: Merge) -> None:
         self.profile = replace(self.profile, merge=merge)
 
+    def limit(self, limit: Limit) -> None:
+        """Nothing is limited."""
+
+    def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
+        """Nothing is limited."""
+
     async def request(
         self,
         command: Command[Any],
         *,
         touches: Command[Any] | None = None,
         stops_seen: int | None = None,
+        stop: bool = False,
         **options: Unpack[CommandOptions],
     ) -> Any:
         exchange = command.open(self.address, self.profile.timings)

@@ -16,8 +16,9 @@ from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand, NoReply
+from busmaster.gate.payload import Payload, read_payload
 from busmaster.outputs.base import Happening
-from busmaster.outputs.mqtt import MqttOutput, command_value
+from busmaster.outputs.mqtt import MqttOutput
 from busmaster.outputs.settings import MqttSettings
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
@@ -230,19 +231,33 @@ async def test_without_an_allow_list_nobody_listens(broker: Broker) -> None:
     assert [payload for _, payload, _ in said] == ["online", "offline"]
 
 
-@pytest.mark.parametrize(
-    ("payload", "value"), [(b"12.5", 12.5), (b"-1", -1), (b" [1, 2.5] ", [1, 2.5]), (bytearray(b"0"), 0)]
-)
-def test_a_command_is_a_number_or_a_list_of_numbers(payload: bytes, value: object) -> None:
-    assert command_value(payload) == value
+COMMANDS = [
+    (b"12.5", Payload(12.5)),
+    (b"-1", Payload(-1)),
+    (b" [1, 2.5] ", Payload([1, 2.5])),
+    (bytearray(b"0"), Payload(0)),
+    (b'{"value": 1}', Payload(1)),
+    (b'{"value": [1], "id": "a1", "expires": 17.5}', Payload([1], "a1", 17.5)),
+    (b'{"value": 1, "id": 7}', Payload(1, "7")),
+]
 
 
-@pytest.mark.parametrize(
-    "payload", [b"", b"on", b"true", b"null", b"NaN", b"[]", b"{}", b'["1"]', b"[true]", b"\xff", None]
-)
+@pytest.mark.parametrize(("payload", "said"), COMMANDS)
+def test_a_command_is_a_number_or_a_list_of_numbers_perhaps_with_its_id_and_end(payload: bytes, said: Payload) -> None:
+    assert read_payload(payload) == said
+
+
+NO_COMMANDS = [
+    *(b"", b"on", b"true", b"null", b"NaN", b"[]", b"{}", b'["1"]', b"[true]", b"\xff", None),
+    *(b"1e308", b"1" * 400, b"9" * 5000, b"[" * 4000, b'{"value": 1, "x": 2}', b'{"value": 1, "expires": "soon"}'),
+    *(b'{"value": 1e999}', b'{"value": 1, "id": []}', b'{"value": 1, "expires": 1e999}'),
+]
+
+
+@pytest.mark.parametrize("payload", NO_COMMANDS, ids=lambda payload: repr(payload)[:20])
 def test_anything_else_is_refused(payload: bytes | None) -> None:
     with pytest.raises(InvalidCommand):
-        command_value(payload)
+        read_payload(payload)
 
 
 def test_a_password_file_that_is_not_there_is_said_at_once(tmp_path: Path) -> None:

@@ -132,7 +132,7 @@ class Clocks:
 
 def database_of(*times: float) -> sqlite3.Connection:
     database = sqlite3.connect(":memory:")
-    database.executescript("create table samples (time real); create table events (time real)")
+    database.executescript(";".join(f"create table {table} (time real)" for table in DATED))
     database.executemany("insert into samples values (?)", [(moment,) for moment in times])
     return database
 

@@ -5,14 +5,14 @@ The two differ in how they address a node, count elements and check a telegram: 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from ctypes import c_float
 from dataclasses import dataclass, field
-from typing import ClassVar, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import Sizes
-from busmaster.contract.profile import LineSettings
+from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand, Refused
 from busmaster.wire.numbers import LONGEST_LIST, LONGEST_NUMBER, format_list, format_number, parse_number
@@ -41,6 +41,13 @@ class ReadElement:
 
     def __str__(self) -> str:
         return f"read element {self.element}"
+
+    @property
+    def places(self) -> tuple[Hashable, ...]:
+        return (self.element,)
+
+    def shown(self, values: Mapping[Hashable, Any]) -> Any:
+        return values[self.element]
 
     @staticmethod
     def encode(address: int, element: int) -> tuple[bytes, bytes]:
@@ -83,6 +90,10 @@ class WriteElements:
         many = len(self.values) - 1
         which = f"elements {self.element}-{self.element + many}" if many else f"element {self.element}"
         return f"write {which} = {self.text}"
+
+    def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
+        """Return what goes over the line: a value is rounded to what its text says."""
+        return dict(enumerate(map(float, self.text.split(",")), self.element))
 
     @staticmethod
     def encode(address: int, element: int, text: bytes) -> bytes:

@@ -86,18 +86,19 @@ class CommsHandle(Handle):
 
         Raises InvalidCommand before anything is sent for a value that cannot be sent, or a read-only name.
         """
-        commands = self.writes(element, values)
+        commands = self.writes(element, values, stop=options.get("safe"))
         requests = SeveralRequests(self.node, options)
         for command in commands:
             await requests.request(command)
         for number, value in enumerate(values if requests.verify else (), commands[0].element):
             await self._verify(requests, number, value)
 
-    def writes(self, element: int | str, values: Sequence[float]) -> list[WriteElements]:
+    def writes(self, element: int | str, values: Sequence[float], *, stop: bool | None = None) -> list[WriteElements]:
         """Return what `write` sends.
 
-        Raises InvalidCommand for a value that cannot be sent; and where the map has names, for a name that it calls
-        read-only, or that another value of the list would go to; for its number where it is definite.
+        Raises InvalidCommand for a value that cannot be sent, or is beyond a limit, by which no `stop` is held; and
+        where the map has names, for a name that it calls read-only, or that another value of the list would go to; for
+        its number where it is definite.
         """
         number = element if isinstance(element, int) else self._lookup(element).number
         if self.definite or not isinstance(element, int):
@@ -106,12 +107,14 @@ class CommsHandle(Handle):
                     raise InvalidCommand(f"{self.node.label}: {known.name} is read-only")
         if not values:
             raise InvalidCommand(f"{self.node.label}: there is no value to write")
-        return [self.write_command(number + offset, part) for offset, part in telegrams(values)]
+        commands = [self.write_command(number + offset, part) for offset, part in telegrams(values)]
+        self.node.check(*commands, stop=stop)
+        return commands
 
     def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Prepare to write consecutive elements, in as many telegrams as it takes."""
         element = int(item) if is_decimal(item) else item
-        self.writes(element, values)
+        self.writes(element, values, stop=options.get("safe"))
         return [lambda: self.write(element, *values, **options)]
 
     async def _verify(self, requests: SeveralRequests, number: int, written: float) -> None:

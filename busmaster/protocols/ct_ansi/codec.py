@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import FrameError, Sizes
@@ -109,6 +110,9 @@ class Write:
 
     def __str__(self) -> str:
         return f"write {self.menu:02d}.{self.number:02d} = {self.text}"
+
+    def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
+        return {(self.menu, self.number): float(self.text)}
 
     def open(self, address: int, timings: Timings, /) -> Writing | Broadcast:
         body = b"%02d%02d%b" % (self.menu, self.number, self.text.encode()) + ETX

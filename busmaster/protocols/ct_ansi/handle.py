@@ -107,7 +107,7 @@ class CtAnsiDrive(Handle):
         return await self.point(item).read()
 
     def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
-        encoder(self.point(item))(value)
+        self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
         return lambda: self.write(item, value, **options)
 
     def _write(self, menu: int, number: int, value: float) -> Write:

@@ -9,8 +9,9 @@ The checksum is the sum, modulo 256, of all bytes between STX and itself ("Readi
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import MORE, Done, FrameError, Need, Sizes, no_reply
@@ -95,6 +96,13 @@ class Read:
     def __str__(self) -> str:
         return f"read parameter {self.parameter}"
 
+    @property
+    def places(self) -> tuple[Hashable, ...]:
+        return (self.parameter,)
+
+    def shown(self, values: Mapping[Hashable, Any]) -> Any:
+        return values[self.parameter]
+
     def open(self, address: int, timings: Timings, /) -> Reading:
         return Reading(self.parameter, timings.read)
 
@@ -117,6 +125,9 @@ class Write:
 
     def __str__(self) -> str:
         return f"write parameter {self.parameter} = {self.value}"
+
+    def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
+        return {self.parameter: self.value}
 
     def open(self, address: int, timings: Timings, /) -> Writing:
         return Writing(packet(WRITE, self.parameter, self.value >> 8, self.value & 0xFF), timings.write)

@@ -83,7 +83,7 @@ class Dc104Drive(Handle):
                 )
 
     def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
-        encoder(self.point(item))(value)
+        self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
         return lambda: self.write(int(item), value, **options)
 
     def _read(self, parameter: int) -> Read:

@@ -105,7 +105,7 @@ class MicroFlexDrive(CommsHandle):
         """
         within = seconds(within, f"{self.node.label}: within")
         self.node.note_stop()  # before the write, so that a cancel_errors under way keeps no enable bit from now on
-        await self._command(_NOTHING, priority=Priority.URGENT)
+        await self._command(_NOTHING, priority=Priority.URGENT, stop=True)
         return await self._await_enabled(False, within, Priority.URGENT)
 
     async def cancel_errors(self) -> StatusWord:
@@ -150,11 +150,15 @@ class MicroFlexDrive(CommsHandle):
         await self.torque_reference.write(percent, **options)
 
     async def _command(
-        self, word: CommandWord, priority: Priority | None = None, stops_seen: int | None = None
+        self,
+        word: CommandWord,
+        priority: Priority | None = None,
+        stops_seen: int | None = None,
+        stop: bool = False,
     ) -> None:
         """Write the command word. It changes more than its own point: all samples of the drive are stale after it."""
         command = hcp2.Write(microflex.COMMAND_WORD.number, (word,), idempotent=True)
-        await self.node.request(command, priority=priority, stops_seen=stops_seen)
+        await self.node.request(command, priority=priority, stops_seen=stops_seen, stop=stop)
 
     async def _clear_cancel(self, command: Callable[[CommandWord], Coroutine[Any, Any, None]]) -> None:
         last: BusError | None = None

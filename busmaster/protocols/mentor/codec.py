@@ -11,7 +11,7 @@ where 8 bits come through, the parity bit is dropped.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, ClassVar, NoReturn, TypeVar
@@ -87,6 +87,13 @@ class Read:
 
     def __str__(self) -> str:
         return f"read {self.menu:02d}.{self.number:02d}"
+
+    @property
+    def places(self) -> tuple[Hashable, ...]:
+        return ((self.menu, self.number),)
+
+    def shown(self, values: Mapping[Hashable, Any]) -> Any:
+        return values[self.menu, self.number]
 
     def open(self, address: int, timings: Timings) -> Reading:
         """Begin the read. Raises InvalidCommand for the broadcast address: every drive would answer at once."""
@@ -165,6 +172,9 @@ class Write:
 
     def __str__(self) -> str:
         return f"write {self.menu:02d}.{self.number:02d} = {self.text}"
+
+    def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
+        return {(self.menu, self.number): self.value / 10 if self.high_resolution else int(self.value)}
 
     def open(self, address: int, timings: Timings) -> Writing | Broadcast:
         body = b"%02d%02d%b" % (self.menu, self.number, self.text.encode()) + ETX

@@ -203,7 +203,7 @@ class MentorDrive(Handle):
         return await self.point(item).read()
 
     def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
-        encoder(self.point(item))(value)
+        self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
         parameter, _, kind = item.partition(":")
         return lambda: self.write(parameter, value, wide=kind == "wide", high_resolution=kind == "hires", **options)
 

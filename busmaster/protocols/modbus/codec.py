@@ -13,9 +13,9 @@ say which register was read.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import MORE, Done, FrameError, LaterLeg, Sizes, Step, no_reply
@@ -165,6 +165,13 @@ class ReadRegisters:
     def __str__(self) -> str:
         return f"read {_span(self.table, self.first, self.count)}"
 
+    @property
+    def places(self) -> tuple[Hashable, ...]:
+        return _places(self.table, self.first, self.count)
+
+    def shown(self, values: Mapping[Hashable, Any]) -> Any:
+        return tuple(values[place] for place in self.places)
+
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[int, ...]]:
         """Begin the read. Raises InvalidCommand for the broadcast address: nobody would answer."""
         decode = struct.Struct(f">{self.count}H").unpack
@@ -188,6 +195,13 @@ class ReadBits:
 
     def __str__(self) -> str:
         return f"read {_span(self.table, self.first, self.count)}"
+
+    @property
+    def places(self) -> tuple[Hashable, ...]:
+        return _places(self.table, self.first, self.count)
+
+    def shown(self, values: Mapping[Hashable, Any]) -> Any:
+        return tuple(values[place] for place in self.places)
 
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[bool, ...]]:
         """Begin the read. Raises InvalidCommand for the broadcast address."""
@@ -221,6 +235,9 @@ class WriteRegisters:
     def __str__(self) -> str:
         return f"write {_span('holding', self.first, len(self.values))} = {_listed(self.values)}"
 
+    def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
+        return dict(zip(_places("holding", self.first, len(self.values)), self.values, strict=True))
+
     def open(self, address: int, timings: Timings, /) -> Conversation[None]:
         count = len(self.values)
         if count == 1:
@@ -248,6 +265,9 @@ class WriteCoils:
     def __str__(self) -> str:
         return f"write {_span('coil', self.first, len(self.values))} = {_listed(self.values)}"
 
+    def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
+        return dict(zip(_places("coil", self.first, len(self.values)), self.values, strict=True))
+
     def open(self, address: int, timings: Timings, /) -> Conversation[None]:
         count = len(self.values)
         if count == 1:
@@ -270,6 +290,10 @@ def _ask(
 def _tell(header: bytes, timings: Timings, data: bytes = b"") -> Conversation[None]:
     """Begin a write: the unit says the first six bytes of it again."""
     return Conversation(header + data, header, 0, timings.write, _nothing)
+
+
+def _places(table: str, first: int, count: int) -> tuple[Hashable, ...]:
+    return tuple((table, number) for number in range(first, first + count))
 
 
 def _nothing(_: bytes) -> None:

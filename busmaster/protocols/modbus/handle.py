@@ -145,7 +145,7 @@ class ModbusUnit(Handle):
         `verify` reads back, and raises VerifyFailed where a value differs. `idempotent` allows a retry after an unknown
         outcome. Raises InvalidCommand, before anything is sent, for a value that does not fit.
         """
-        commands = self._writes(item, values)
+        commands = self._writes(item, values, options)
         requests = SeveralRequests(self.node, options)
         for command in commands:
             await requests.request(command)
@@ -154,7 +154,7 @@ class ModbusUnit(Handle):
 
     def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Prepare to write consecutive places, in as few exchanges as they fit."""
-        self._writes(item, values)
+        self._writes(item, values, options)
         return [lambda: self.write(item, *values, **options)]
 
     def run_items(self, item: str, count: int) -> tuple[str, ...]:
@@ -164,11 +164,13 @@ class ModbusUnit(Handle):
         suffix = f":{kind}" if kind else ""
         return tuple(f"{place.table}:{place.first + i * place.width}{suffix}" for i in range(count))
 
-    def _writes(self, item: str, values: Sequence[Any]) -> list[WriteCoils | WriteRegisters]:
+    def _writes(self, item: str, values: Sequence[Any], options: WriteOptions) -> list[WriteCoils | WriteRegisters]:
         place = Place.parse(item)
         if place.table not in WRITABLE:
             raise InvalidCommand(f"{self.node.label}: {item} is read-only")
-        return place.write(values)
+        commands = place.write(values)
+        self.node.check(*commands, stop=options.get("safe"))
+        return commands
 
     async def _verify(self, requests: SeveralRequests, written: WriteCoils | WriteRegisters) -> None:
         count = len(written.values)

@@ -9,7 +9,7 @@ Which data addresses and flags exist, and which may be written, is the controlle
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -28,6 +28,8 @@ BLOCK = 32
 """Values of one BREAD or BWRITE: never more, never fewer."""
 FLAGS = 256
 HIGHEST_ADDRESS = 0xFFFF
+WIDEST_STEP = 4
+"""What an address grows by at most from one value to the next, as far as is known: a value has four bytes."""
 LOWEST_VALUE = -(2**31)
 HIGHEST_VALUE = 2**31 - 1
 
@@ -69,6 +71,13 @@ class DataRead(_Reading, _AtAddress):
     def __str__(self) -> str:
         return f"read data {self.address}"
 
+    @property
+    def places(self) -> tuple[Hashable, ...]:
+        return (("data", self.address),)
+
+    def shown(self, values: Mapping[Hashable, Any]) -> Any:
+        return values["data", self.address]
+
     def open(self, address: int, timings: Timings, /) -> PacketExchange[int]:
         return _ask(address, timings, b"DREAD,", self.address.to_bytes(2, "big"), 4, _value_of)
 
@@ -85,6 +94,9 @@ class DataWrite(_Writing, _AtAddress):
 
     def __str__(self) -> str:
         return f"write data {self.address} = {self.value}"
+
+    def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
+        return _data_changes(profile, self.address, (self.value,))
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
         return _tell(address, timings, b"DWRITE," + struct.pack(">Hi", self.address, self.value))
@@ -116,6 +128,9 @@ class BlockWrite(_Writing, _AtAddress):
     def __str__(self) -> str:
         return f"write {BLOCK} values from data {self.address}"
 
+    def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
+        return _data_changes(profile, self.address, self.values)
+
     def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
         return _tell(address, timings, b"BWRITE," + struct.pack(f">H{BLOCK}i", self.address, *self.values))
 
@@ -126,6 +141,9 @@ class SetFlag(_Writing, _OfFlag):
 
     def __str__(self) -> str:
         return f"set flag {self.flag}"
+
+    def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
+        return {("flag", self.flag): True}
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
         return _tell(address, timings, b"SFLAG," + self.flag.to_bytes(2, "big"))
@@ -138,6 +156,9 @@ class ClearFlag(_Writing, _OfFlag):
     def __str__(self) -> str:
         return f"clear flag {self.flag}"
 
+    def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
+        return {("flag", self.flag): False}
+
     def open(self, address: int, timings: Timings, /) -> PacketExchange[None]:
         return _tell(address, timings, b"CFLAG," + self.flag.to_bytes(2, "big"))
 
@@ -148,6 +169,13 @@ class ReadFlag(_Reading, _OfFlag):
 
     def __str__(self) -> str:
         return f"read flag {self.flag}"
+
+    @property
+    def places(self) -> tuple[Hashable, ...]:
+        return (("flag", self.flag),)
+
+    def shown(self, values: Mapping[Hashable, Any]) -> Any:
+        return values["flag", self.flag]
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[bool]:
         return _ask(address, timings, b"RFLAG,", self.flag.to_bytes(2, "big"), 2, _state_of)
@@ -239,6 +267,21 @@ class Merging:
         if self.all_flags and len(flags) > 1:
             batches.append(Batch(PickedFlags(tuple(flags.values())), tuple(flags)))
         return batches
+
+
+def _data_changes(profile: Profile, first: int, values: Sequence[int]) -> Mapping[Hashable, Any]:
+    """Return what data addresses hold after a write. Where the address step is not known, nor is what a block changes.
+
+    Between two values that are more than an address apart lie parts of the first, and before the first of the one
+    before it.
+    """
+    step = profile.merge.address_step if isinstance(profile.merge, Merging) else None
+    widest = step or (1 if len(values) == 1 else WIDEST_STEP)
+    places = range(first - widest + 1, first + len(values) * widest)
+    changed: dict[Hashable, Any] = {("data", address): None for address in places}
+    known = values if step or len(values) == 1 else values[:1]
+    changed.update((("data", first + i * widest), value) for i, value in enumerate(known))
+    return changed
 
 
 def _data_batches(commands: Sequence[Command[Any]], step: int) -> list[Batch]:

@@ -146,7 +146,8 @@ class MscController(Handle):
         if count and count != str(len(values)):
             raise InvalidCommand(f"{item} takes {count} values, not {len(values)}")
         encoder(self.point(name))
-        writes(self.address_of(name), values, self.address_step)
+        parts = writes(self.address_of(name), values, self.address_step)
+        self.node.check(*(command for command, _ in parts), stop=options.get("safe"))
         return [lambda: self.write_block(name, values, **options)]
 
     def address_of(self, where: int | str) -> int:
@@ -206,7 +207,9 @@ class MscController(Handle):
         wanted = tuple(values)
         requests = SeveralRequests(self.node, options)
         done = Count(progress, len(wanted) * (1 + requests.verify))
-        for command, size in writes(address, wanted, self.address_step):
+        parts = writes(address, wanted, self.address_step)
+        self.node.check(*(command for command, _ in parts), stop=options.get("safe"))
+        for command, size in parts:
             await requests.request(command)
             done.add(size)
         if requests.verify:

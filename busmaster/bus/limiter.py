@@ -1,0 +1,194 @@
+"""The limits of one line, held where writes pass: no name of a quantity, and no way to write it, goes round them.
+
+A write passes if it is within the limits of each quantity that it changes, at each node that hears it. Where a step is
+limited, one write at a time is under way, counted from what the one before left there; the value is read first where
+that is not known. Nothing waits for that in an urgent write, whose step is not limited; and no limit holds a stop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Hashable, Iterable, Iterator, Mapping
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import replace
+from typing import Any
+
+from busmaster.arbiter.transaction import Priority
+from busmaster.bus.limits import Limit
+from busmaster.bus.requester import Requester, RequestOptions
+from busmaster.contract.exchange import Command
+from busmaster.contract.places import Changing
+from busmaster.errors import GarbledReply, InvalidCommand, NoReply, NotStarted, Refused, Superseded
+
+
+class NodeLimits:
+    """Those of one node, and what is known of the quantities whose steps are limited."""
+
+    def __init__(self, node: Requester) -> None:
+        self.node = node
+        self.limits: list[Limit] = []
+        self.known: dict[Limit, Any] = {}
+        """The last confirmed values, in their own units."""
+        self.writing = asyncio.Lock()
+        """Held while a write whose step is limited is under way."""
+        self.urgent = 0
+        """How many urgent writes there were."""
+
+    def touched_by(self, changes: Mapping[Hashable, Any]) -> list[Limit]:
+        return [limit for limit in self.limits if limit.touched_by(changes)]
+
+
+class Limiter:
+    """All limits of one line."""
+
+    def __init__(self) -> None:
+        self._of: dict[Requester, NodeLimits] = {}
+
+    def add(self, node: Requester, limit: Limit) -> None:
+        """Hold a further limit: what is already limited stays so."""
+        self._of.setdefault(node, NodeLimits(node)).limits.append(limit)
+
+    def drop(self, node: Requester, limit: Limit) -> None:
+        """Hold it no longer; the others stay."""
+        if node in self._of and limit in self._of[node].limits:
+            self._of[node].limits.remove(limit)
+            self._of[node].known.pop(limit, None)
+
+    def forget(self, node: Requester) -> None:
+        """Forget what the node held: it was away, and may hold something else."""
+        if node in self._of:
+            self._of[node].known.clear()
+
+    def check(self, node: Requester, command: Command[Any]) -> None:
+        """Raise InvalidCommand, naming node and limit, for what may not be written. Of steps nothing is said."""
+        for one in self._reached(node):
+            changes = _changes(node, command)
+            for limit in one.touched_by(changes):
+                _checked(one.node, limit, changes)
+
+    @asynccontextmanager
+    async def passing(
+        self, node: Requester, command: Command[Any], options: RequestOptions, stop: bool = False
+    ) -> AsyncIterator[RequestOptions]:
+        """Let a write pass, or raise InvalidCommand before anything is sent. Yields the options that are left for it.
+
+        Raises NotStarted where the value before it is needed and cannot be read, Superseded where an urgent write came
+        first. A `stop` passes whatever the limits, and what the node holds after it is not known.
+        """
+        urgent = options.priority is Priority.URGENT
+        reached = list(self._reached(node))
+        for one in reached:
+            one.urgent += urgent
+        if not stop:
+            self.check(node, command)
+            reached = [one for one in reached if one.touched_by(_changes(node, command))]
+        async with AsyncExitStack() as held:
+            if not (urgent or stop) and any(limit.max_step for one in reached for limit in one.limits):
+                options = await self._step_by_step(held, node, reached, command, options)
+            try:
+                yield options
+            except BaseException:
+                for one in reached:
+                    one.known.clear()
+                raise
+            for one in reached:
+                if stop:
+                    one.known.clear()
+                else:
+                    _remember(one, node, command)
+
+    async def _step_by_step(
+        self,
+        held: AsyncExitStack,
+        node: Requester,
+        reached: list[NodeLimits],
+        command: Command[Any],
+        options: RequestOptions,
+    ) -> RequestOptions:
+        """Wait for the writes before this one, then look how far it goes."""
+        began, changes = node.now(), _changes(node, command)
+        seen = [one.urgent for one in reached]
+        patience = [limit for limit in (options.start_within, options.finish_within) if limit is not None]
+        try:
+            async with asyncio.timeout(min(patience, default=None)):
+                for one in reached:
+                    await held.enter_async_context(one.writing)
+                while unknown := _first_unknown(reached, changes):
+                    one, limit = unknown
+                    one.known[limit] = await _value_now(one.node, limit, command, options)
+        except TimeoutError as late:
+            if isinstance(late, NotStarted):
+                raise
+            raise NotStarted("its value before it was not known in time", node=node, command=str(command)) from None
+        if seen != [one.urgent for one in reached]:
+            raise Superseded("overtaken by an urgent write to the same node", node=node, command=str(command))
+        self.check(node, command)  # other limits may be held by now
+        for one, limit in _steps(reached, changes):
+            _check_step(one, limit, changes)
+        return _shortened(options, node.now() - began)
+
+    def _reached(self, node: Requester) -> Iterator[NodeLimits]:
+        """Yield the limits of those that hear what is sent to a node: of all, where it stands for all."""
+        profile = node.profile
+        if node.address != profile.broadcast:
+            if node in self._of:
+                yield self._of[node]
+            return
+        heard_by = {profile.name, *profile.shares_line_with}
+        yield from (one for one in self._of.values() if one.node.profile.name in heard_by)
+
+
+def _steps(reached: Iterable[NodeLimits], changes: Mapping[Hashable, Any]) -> Iterator[tuple[NodeLimits, Limit]]:
+    """Yield the limits to the step of what a write changes."""
+    return ((one, limit) for one in reached for limit in one.touched_by(changes) if limit.max_step is not None)
+
+
+def _first_unknown(reached: Iterable[NodeLimits], changes: Mapping[Hashable, Any]) -> tuple[NodeLimits, Limit] | None:
+    return next((step for step in _steps(reached, changes) if step[1] not in step[0].known), None)
+
+
+def _changes(node: Requester, command: Command[Any]) -> Mapping[Hashable, Any]:
+    if not isinstance(command, Changing):
+        raise InvalidCommand(f"{node.label} has limits, and {command} does not say what it changes")
+    return command.changes(node.profile)
+
+
+def _remember(one: NodeLimits, node: Requester, command: Command[Any]) -> None:
+    """Remember what was confirmed. A write to all is confirmed by none, nor is what a stop left half written."""
+    changes = _changes(node, command)
+    for limit in one.touched_by(changes):
+        one.known.pop(limit, None)
+        if one.node is node and all(changes.get(place) is not None for place in limit.places):
+            one.known[limit] = limit.value_after(changes)
+
+
+def _checked(node: Requester, limit: Limit, changes: Mapping[Hashable, Any]) -> None:
+    try:
+        limit.check(limit.value_after(changes) if limit.writable else None)
+    except InvalidCommand as refused:
+        raise InvalidCommand(f"{node.label}: {refused}") from None
+
+
+def _check_step(one: NodeLimits, limit: Limit, changes: Mapping[Hashable, Any]) -> None:
+    try:
+        limit.check_step(one.known[limit], limit.value_after(changes))
+    except InvalidCommand as refused:
+        raise InvalidCommand(f"{one.node.label}: {refused}") from None
+
+
+async def _value_now(node: Requester, limit: Limit, command: Command[Any], options: RequestOptions) -> Any:
+    try:
+        return limit.decode(await node.request(limit.read, priority=options.priority))
+    except (NoReply, GarbledReply, Refused) as error:
+        what = f"its value before it is not known, and could not be read: {error.what}"
+        raise NotStarted(what, node=node, command=str(command), hint=error.hint) from error
+
+
+def _shortened(options: RequestOptions, by: float) -> RequestOptions:
+    """Return the options of what has waited already."""
+    left = {
+        name: max(0.0, limit - by)
+        for name in ("start_within", "finish_within")
+        if (limit := getattr(options, name)) is not None
+    }
+    return replace(options, **left) if left else options

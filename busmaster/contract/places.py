@@ -1,0 +1,33 @@
+"""What a command reads or changes, place by place: what limits are held against.
+
+A place is the smallest thing that a node keeps: one element, one parameter, one register. Protocols whose frames reach
+the same nodes name their places alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from typing import Any, Protocol, runtime_checkable
+
+from busmaster.contract.profile import Profile
+
+
+@runtime_checkable
+class Placed(Protocol):
+    """A read that says where it reads. What has no such read cannot be limited."""
+
+    @property
+    def places(self) -> tuple[Hashable, ...]: ...
+
+    def shown(self, values: Mapping[Hashable, Any], /) -> Any:
+        """Return what it would return where its places hold these. Raises KeyError for a place that is missing."""
+        ...
+
+
+@runtime_checkable
+class Changing(Protocol):
+    """A write that says what it changes. One that does not is refused by a node that has limits."""
+
+    def changes(self, profile: Profile, /) -> Mapping[Hashable, Any]:
+        """Return what each place that it changes holds after it; None where that is not known."""
+        ...

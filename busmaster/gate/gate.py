@@ -1,0 +1,142 @@
+"""The one gate of a line for what comes from outside."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+from busmaster.bus.bus import Bus
+from busmaster.bus.points import Point
+from busmaster.errors import BusError, InvalidCommand, NodeDown, NotStarted, Refused, Superseded, WriteUnconfirmed
+from busmaster.gate.record import Outcome, WriteRecord, this_user
+
+FRESH = 1.0
+"""Seconds for which a command may wait that does not say until when it is meant."""
+MOST_AT_ONCE = 16
+"""Commands of one door that may be on their way to their nodes."""
+LONGEST_SHOWN = 200
+"""Characters of a value, or of an error, that are kept of a write."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wish:
+    """What somebody outside wants to have written.
+
+    `arrived` is when it came, by the bus's clock; None of a person who waits for its end. `expires` is when it is no
+    longer meant, in seconds since 1970; None where it does not say so.
+    """
+
+    door: str
+    by: str
+    name: str
+    point: Point[Any] | None
+    value: Any
+    arrived: float | None = None
+    expires: float | None = None
+    id: str = ""
+
+
+class Gate:
+    """What all doors of one line pass. `read_only` lets no write through; `record` is told of every one.
+
+    `write` never raises but when it is cancelled: whatever somebody sends, it ends as a record.
+    """
+
+    def __init__(self, bus: Bus, *, read_only: bool = False) -> None:
+        self.read_only = read_only
+        self.record: Callable[[WriteRecord], None] = lambda _: None
+        self._bus = bus
+        self._log = logging.getLogger("busmaster.audit")
+        self._log.addHandler(logging.NullHandler())
+        self._user = this_user()
+        self._running: dict[str, int] = {}
+
+    def refusal(self, wish: Wish) -> str:
+        """Return why it is not let through, "" if it is."""
+        if self.read_only:
+            return "this line is read-only"
+        if wish.point is None:
+            return "the line's file does not allow this: see allow_commands"
+        if self._left(wish) <= 0:
+            return "it is too old: nothing was sent"
+        if self._running.get(wish.door, 0) >= MOST_AT_ONCE:
+            return f"{MOST_AT_ONCE} commands are being written already"
+        return ""
+
+    async def write(self, wish: Wish) -> WriteRecord:
+        """Write it, unless it is refused, and return what became of it."""
+        began, before = self._bus.now(), _before(wish.point)
+        outcome, error = Outcome.UNCONFIRMED, "the program gave up before it was done"
+        try:
+            if error_now := self.refusal(wish):
+                outcome, error = Outcome.REFUSED, error_now
+            else:
+                outcome, error = await self._pass(wish)
+        finally:
+            record = self._keep(wish, outcome, error, before, self._bus.now() - began)
+        return record
+
+    def refuse(self, wish: Wish, error: str) -> WriteRecord:
+        """Keep a record of what was not even tried."""
+        return self._keep(wish, Outcome.REFUSED, error, None, 0.0)
+
+    async def _pass(self, wish: Wish) -> tuple[Outcome, str]:
+        assert wish.point is not None
+        self._running[wish.door] = self._running.get(wish.door, 0) + 1
+        try:
+            left = self._left(wish)
+            await wish.point.write(wish.value, start_within=None if left == inf else max(0.0, left))
+        except (NotStarted, Superseded, NodeDown) as error:
+            return Outcome.NOT_STARTED, error.what
+        except (InvalidCommand, Refused) as error:
+            return Outcome.REFUSED, str(error)
+        except WriteUnconfirmed as error:
+            return Outcome.UNCONFIRMED, error.what
+        except BusError as error:
+            return Outcome.UNCONFIRMED if error.attempts else Outcome.NOT_STARTED, error.what
+        except (ArithmeticError, TypeError, ValueError, RecursionError) as error:
+            return Outcome.REFUSED, f"this cannot be sent: {error}"  # before a frame was made of it
+        finally:
+            self._running[wish.door] -= 1
+        return Outcome.WRITTEN, ""
+
+    def _left(self, wish: Wish) -> float:
+        """Return for how many seconds it may still wait; inf for one of a person who waits for its end."""
+        if wish.expires is not None:
+            return wish.expires - time.time()
+        return inf if wish.arrived is None else wish.arrived + FRESH - self._bus.now()
+
+    def _keep(self, wish: Wish, outcome: Outcome, error: str, before: Any, took: float) -> WriteRecord:
+        record = WriteRecord(
+            time=self._bus.wall_time(),
+            door=wish.door,
+            by=wish.by[:LONGEST_SHOWN],
+            user=self._user,
+            process=os.getpid(),
+            point=wish.name[:LONGEST_SHOWN],
+            before=before,
+            value=_shown(wish.value),
+            outcome=outcome,
+            error=error[:LONGEST_SHOWN],
+            took=took,
+            id=wish.id,
+        )
+        self._log.info("%s", record.text)
+        self.record(record)
+        return record
+
+
+def _before(point: Point[Any] | None) -> Any:
+    """Return what it held when it was last read, None if that may not be so any more."""
+    sample = None if point is None else point.node.latest(point)
+    return None if sample is None else sample.value
+
+
+def _shown(value: Any) -> Any:
+    """Return the value as it fits into a record."""
+    return value if isinstance(value, int | float) and abs(value) < 1e300 else repr(value)[:LONGEST_SHOWN]

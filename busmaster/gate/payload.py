@@ -1,0 +1,55 @@
+"""What a command says that comes as text: a value, or several, and perhaps its id and until when it is meant."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, NamedTuple
+
+from busmaster.errors import InvalidCommand
+
+LONGEST = 4096
+"""Bytes of a command."""
+LONGEST_ID = 100
+LARGEST = 1e15
+"""Beyond it no quantity is meant, and no protocol has a way to send it."""
+
+
+class Payload(NamedTuple):
+    """`expires` is in seconds since 1970; None where it is not said."""
+
+    value: Any
+    id: str = ""
+    expires: float | None = None
+
+
+def read_payload(payload: object) -> Payload:
+    """Read `12.5`, `[1, 2]`, or `{"value": 12.5, "id": "a1", "expires": 1767225600}`. Raises InvalidCommand."""
+    raw = payload if isinstance(payload, bytes | bytearray) else str(payload).encode()
+    if len(raw) > LONGEST:
+        raise InvalidCommand(f"{len(raw)} bytes are no command: it has {LONGEST} at most")
+    text = bytes(raw).decode(errors="replace")
+    try:
+        said = json.loads(text, parse_constant=lambda name: name)
+    except (ValueError, RecursionError):
+        said = None
+    if not isinstance(said, dict):
+        return Payload(_numbers(said, text))
+    if not set(said) <= {"value", "id", "expires"} or "value" not in said:
+        raise InvalidCommand(f'{text[:40]!r} is not {{"value": ..., "id": ..., "expires": ...}}')
+    mark, expires = said.get("id", ""), said.get("expires")
+    if not isinstance(mark, str | int) or isinstance(mark, bool) or len(str(mark)) > LONGEST_ID:
+        raise InvalidCommand(f"an id is a text of {LONGEST_ID} characters at most, or a whole number")
+    if expires is not None and not _is_number(expires):
+        raise InvalidCommand("expires is a time in seconds since 1970")
+    return Payload(_numbers(said["value"], text), str(mark), expires)
+
+
+def _numbers(value: Any, text: str) -> Any:
+    numbers = value if isinstance(value, list) else [value]
+    if not numbers or not all(map(_is_number, numbers)):
+        raise InvalidCommand(f"{text[:40]!r} is neither a number nor a list of numbers")
+    return value
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST

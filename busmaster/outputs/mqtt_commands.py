@@ -1,0 +1,162 @@
+"""Commands that come by MQTT: each is judged as it arrives, so that those that are refused hold up nobody."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import anyio
+
+from busmaster.bus.points import Point
+from busmaster.errors import InvalidCommand
+from busmaster.gate.gate import MOST_AT_ONCE, Gate, Wish
+from busmaster.gate.payload import LONGEST, read_payload
+from busmaster.gate.record import WriteRecord
+
+if TYPE_CHECKING:
+    from aiomqtt import Message
+
+LOOK = 0.02
+"""Seconds between two looks at the clock: what arrives came after the last one, our own stalls included."""
+MOST_WAITING = 100
+"""Commands that may wait for their turn, and refusals that may wait to be answered. What is more is counted alone."""
+BREATH = 0.005
+"""Seconds between two refusals that are answered: a flood of them costs the line nothing."""
+LONGEST_NAME = 256
+"""Characters of a point's name; a longer one is answered without it."""
+EXPIRY = "MessageExpiryInterval"
+
+
+class Answer(NamedTuple):
+    """What is told of a command on PREFIX/result/NAME; without a name, on PREFIX/result."""
+
+    name: str
+    ok: bool
+    error: str
+    id: str = ""
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        fields: dict[str, Any] = {"ok": True} if self.ok else {"ok": False, "error": self.error}
+        return {**fields, "id": self.id} if self.id else fields
+
+
+Write: TypeAlias = Callable[[Wish], Awaitable[WriteRecord]]
+Say: TypeAlias = Callable[[Answer], Awaitable[None]]
+
+
+class Commands:
+    """What may be written, by topic, and what waits to be. All of it is on the thread of the output."""
+
+    def __init__(self, prefix: str, gate: Gate, points: Mapping[str, Point[Any]], now: Callable[[], float]) -> None:
+        self.refused = 0
+        """Commands that were refused, those that nobody was told of included."""
+        self.unanswered = 0
+        self.queued: deque[Wish] = deque()
+        self._prefix = prefix
+        self._gate = gate
+        self._points = points
+        self._now = now
+        self._looked = now()
+        self._answers: deque[tuple[Wish, Answer]] = deque()
+        self._something = asyncio.Event()
+
+    def arrive(self, message: Message) -> None:
+        """Take in one message. Never waits, never raises."""
+        name = str(message.topic).removeprefix(f"{self._prefix}/set/")
+        shown = name if len(name) <= LONGEST_NAME else ""
+        wish = Wish(
+            door="mqtt",
+            by=str(message.topic)[:LONGEST_NAME],
+            name=shown or name[:40],
+            point=self._points.get(name),
+            value=bytes(message.payload[:LONGEST]),
+            arrived=self._looked,
+        )
+        try:
+            if wish.point is None:
+                raise InvalidCommand(self._gate.refusal(wish))
+            if message.retain:
+                raise InvalidCommand("a retained command is not obeyed: nobody knows how old it is")
+            wish = self._read(wish, message)
+            if len(self.queued) >= MOST_WAITING:
+                raise InvalidCommand(f"{MOST_WAITING} commands are waiting already")
+        except InvalidCommand as error:
+            self._refuse(wish, shown, str(error))
+        else:
+            self.queued.append(wish)
+        self._something.set()
+
+    def _read(self, wish: Wish, message: Message) -> Wish:
+        said = read_payload(message.payload)
+        ends = [] if said.expires is None else [said.expires]
+        interval = getattr(message.properties, EXPIRY, None)
+        if interval is not None:
+            ends.append(time.time() - (self._now() - self._looked) + interval)
+        return Wish(
+            door=wish.door,
+            by=wish.by,
+            name=wish.name,
+            point=wish.point,
+            value=said.value,
+            arrived=wish.arrived,
+            expires=min(ends, default=None),
+            id=said.id,
+        )
+
+    def _refuse(self, wish: Wish, name: str, error: str) -> None:
+        self.refused += 1
+        if len(self._answers) < MOST_WAITING:
+            self._answers.append((wish, Answer(name, False, error, wish.id)))
+        else:
+            self.unanswered += 1
+
+    async def serve(self, write: Write, keep: Callable[[Wish, str], object], say: Say) -> None:
+        """Write what is allowed and answer everything, until cancelled. `keep` is told of what was refused, and why."""
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(self._look)
+            tasks.start_soon(self._answer_refusals, keep, say)
+            for _ in range(MOST_AT_ONCE):
+                tasks.start_soon(self._obey, write, say)
+
+    async def _look(self) -> None:
+        while True:
+            self._looked = self._now()
+            await anyio.sleep(LOOK)
+
+    async def _obey(self, write: Write, say: Say) -> None:
+        while True:
+            if self.queued:
+                wish = self.queued.popleft()
+                record = await write(wish)
+                await say(Answer(wish.name, record.ok, record.error, wish.id))
+            else:
+                await self._wait()
+
+    async def _answer_refusals(self, keep: Callable[[Wish, str], object], say: Say) -> None:
+        while True:
+            if self._answers:
+                wish, answer = self._answers.popleft()
+                keep(wish, answer.error)
+                await say(answer)
+                await anyio.sleep(BREATH)
+            else:
+                await self._wait()
+
+    async def _wait(self) -> None:
+        self._something.clear()
+        await self._something.wait()
+
+
+class Inbox(asyncio.Queue["Message"]):
+    """What the client puts its messages into: nothing waits in it."""
+
+    def __init__(self, commands: Commands, maxsize: int = 0) -> None:
+        super().__init__(maxsize)
+        self._commands = commands
+
+    def put_nowait(self, item: Message) -> None:
+        self._commands.arrive(item)

@@ -1,0 +1,236 @@
+"""Limits: held at the node, so that no name and no way of writing goes round them; and a stop passes all of them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from typing import Any, TypeAlias
+
+import pytest
+
+from busmaster.bus.bus import Bus
+from busmaster.bus.handle import Handle
+from busmaster.bus.node import Node, Priority
+from busmaster.emulator.device import Device
+from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
+from busmaster.errors import InvalidCommand, NotStarted, Superseded
+from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
+from busmaster.protocols.dc104.handle import Dc104Drive
+from busmaster.protocols.hcp.handle import HcpController
+from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
+from busmaster.protocols.mentor.codec import PROFILE as MENTOR
+from busmaster.protocols.mentor.handle import MentorDrive
+from busmaster.protocols.modbus.codec import PROFILE as MODBUS
+from busmaster.protocols.modbus.codec import WriteRegisters
+from busmaster.protocols.modbus.handle import ModbusUnit
+from busmaster.protocols.msc.handle import MscController
+from busmaster.registry import make_device
+
+Way: TypeAlias = Callable[[Any, float], Awaitable[None]]
+
+
+def bus_of(handle: type[Handle], *devices: Device) -> Bus:
+    return Bus(MemoryPort(Line(handle.profile.line, list(devices))))
+
+
+@asynccontextmanager
+async def controller() -> AsyncIterator[Hcp2Controller]:
+    bus = bus_of(Hcp2Controller, make_device("hcp2", 5))
+    async with bus:
+        yield Hcp2Controller(bus, 5)
+
+
+HCP2_WAYS: dict[str, Way] = {
+    "its point": lambda drive, value: drive.element(10).write(value),
+    "another point of it": lambda drive, value: drive.point("10").write(value),
+    "by number": lambda drive, value: drive.write(10, value),
+    "in a list": lambda drive, value: drive.write(9, 1.0, value, 2.0),
+    "in the second telegram of a list": lambda drive, value: drive.write(1, *[1234.5678] * 9, value),
+    "from the command line": lambda drive, value: drive.prepare_write("10", [value])[0](),
+    "as a raw command": lambda drive, value: drive.node.request(hcp2.Write(10, (value,))),
+    "as a timed request": lambda drive, value: drive.node.timed_request(hcp2.Write(10, (value,))),
+    "as an urgent command": lambda drive, value: drive.write(10, value, priority=Priority.URGENT),
+    "from another handle": lambda drive, value: MicroFlexDrive(drive.bus, 5).element(10).write(value),
+}
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("way", HCP2_WAYS.values(), ids=HCP2_WAYS)
+async def test_no_way_of_writing_goes_round_a_limit(way: Way) -> None:
+    async with controller() as drive:
+        drive.element(10).limit(minimum=-50, maximum=500)
+        await way(drive, 500)
+        assert await drive.read(10) == 500
+        sent = Node.of(drive).statistics().attempts
+        for value, limit in ((501, "maximum of 500"), (-51, "minimum of -50"), (1e9, "maximum")):
+            with pytest.raises(InvalidCommand, match=f"node 5: 10 = .* its {limit}"):
+                await way(drive, value)
+        assert Node.of(drive).statistics().attempts == sent
+        assert await drive.read(10) == 500
+
+
+@pytest.mark.asyncio
+async def test_what_may_not_be_written_is_refused_whatever_the_value() -> None:
+    async with controller() as drive:
+        drive.element(10).limit(writable=False)
+        with pytest.raises(InvalidCommand, match="10 may not be written"):
+            await drive.write(9, 1.0, 2.0)
+        await drive.write(9, 1.0)
+
+
+PLACES: list[tuple[str, type[Handle], int, str, dict[str, Any]]] = [
+    ("hcp", HcpController, 5, "10", {}),
+    ("hcp2", Hcp2Controller, 5, "10", {}),
+    ("mentor", MentorDrive, 14, "1.17", {}),
+    ("mentor", MentorDrive, 14, "speed_reference_1", {}),
+    ("ct-ansi", CtAnsiDrive, 14, "1.21", {}),
+    ("dc104", Dc104Drive, 0, "12", {}),
+    ("msc", MscController, 3, "2008", {}),
+    ("modbus", ModbusUnit, 17, "holding:40", {}),
+    ("modbus", ModbusUnit, 17, "holding:40:float32", {}),
+]
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(("kind", "handle", "address", "item", "options"), PLACES, ids=str)
+async def test_every_protocol_says_what_its_writes_change(
+    kind: str, handle: type[Handle], address: int, item: str, options: dict[str, Any]
+) -> None:
+    bus = bus_of(handle, make_device(kind, address))
+    async with bus:
+        drive = handle(bus, address, **options)
+        drive.point(item).limit(minimum=0, maximum=50, max_step=40)
+        await drive.point(item).write(30)
+        assert await drive.point(item).read() == 30
+        with pytest.raises(InvalidCommand, match=f"{item} = 51.* above its maximum of 50"):
+            await drive.point(item).write(51)
+        await drive.point(item).write(0)
+        with pytest.raises(InvalidCommand, match="max_step is 40"):
+            await drive.prepare_write(item, [45])[0]()
+
+
+@pytest.mark.asyncio
+async def test_a_number_of_two_registers_is_not_written_in_halves() -> None:
+    bus = bus_of(ModbusUnit, make_device("modbus", 17))
+    async with bus:
+        unit = ModbusUnit(bus, 17)
+        unit.point("holding:40:float32").limit(maximum=500.0)
+        for work in (
+            unit.write("holding:40", 0x4B00),
+            unit.write("holding:39", 1, 0x4B00),
+            unit.node.request(WriteRegisters(41, (5,))),
+        ):
+            with pytest.raises(InvalidCommand, match="write it as a whole"):
+                await work
+        await unit.write("holding:39", 1, 0x43FA, 0)
+        assert await unit.read("holding:40:float32") == 500.0
+        with pytest.raises(InvalidCommand, match="maximum of 500"):
+            await unit.write("holding:39", 1, 0x4B00, 0)
+
+
+@pytest.mark.asyncio
+async def test_a_block_of_an_msc_is_held_to_the_limit_of_each_of_its_values() -> None:
+    bus = bus_of(MscController, make_device("msc", 3))
+    async with bus:
+        press = MscController(bus, 3, symbols={"speed": 2012})
+        press.point("speed").limit(maximum=100)
+        press.point("flag:5").limit(writable=False)
+        with pytest.raises(InvalidCommand, match="as a whole, and alone"):
+            await press.write_block(2000, range(32))
+        press.address_step = 4
+        await press.write_block(2000, range(32))
+        for work in (
+            press.write_block(2000, range(98, 130)),
+            press.write(2012, 101),
+            press.write(2010, 1),
+            press.write_block(1996, [0, 0, 0, 0, 101]),
+            press.point("1996:5").write((0, 0, 0, 0, 101)),
+            press.set_flag(5),
+        ):
+            with pytest.raises(InvalidCommand):
+                await work
+        assert await press.read("speed") == 3
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("profile", "handle", "item", "first"),
+    [(MENTOR, MentorDrive, "1.17", 14), (MODBUS, ModbusUnit, "holding:40", 14)],
+    ids=["mentor", "modbus"],
+)
+async def test_a_write_to_all_is_held_to_the_limits_of_each(
+    profile: Any, handle: type[Handle], item: str, first: int
+) -> None:
+    bus = bus_of(handle, make_device(profile.name, first), make_device(profile.name, first + 1))
+    async with bus:
+        drives = [handle(bus, address) for address in (first, first + 1)]
+        drives[1].point(item).limit(maximum=100, max_step=60)
+        everyone = handle(bus, 0)
+        with pytest.raises(InvalidCommand, match=r"node 15: .* maximum of 100"):
+            await everyone.write(item, 101)
+        with pytest.raises(InvalidCommand, match=r"node 15: .* max_step is 60"):
+            await everyone.write(item, 61)
+        await everyone.write(item, 50)
+        await drives[0].write(item, 101)
+        with pytest.raises(InvalidCommand, match="101"):
+            await drives[1].write(item, 101)
+        await drives[1].write(item, 100)
+
+
+@pytest.mark.asyncio
+async def test_a_step_counts_from_the_last_confirmed_value_which_is_read_first_if_unknown() -> None:
+    async with controller() as drive:
+        await drive.write(10, 100.0)
+        drive.element(10).limit(max_step=20)
+        with pytest.raises(InvalidCommand, match="10 = 121 is too far from 100: its max_step is 20"):
+            await drive.write(10, 121)
+        await drive.write(10, 120)
+        await drive.write(9, 0.0, 140)
+        await drive.write(10, 0, priority=Priority.URGENT)
+        with pytest.raises(InvalidCommand, match="from 0"):
+            await drive.write(10, 21)
+        first, second = await asyncio.gather(drive.write(10, 20), drive.write(10, -20), return_exceptions=True)
+        assert first is None
+        assert "from 20" in str(second)
+        first, late = await asyncio.gather(
+            drive.write(10, 21), drive.write(10, 22, start_within=0.0), return_exceptions=True
+        )
+        assert first is None
+        assert isinstance(late, NotStarted)
+        assert await drive.read(10) == 21
+
+
+@pytest.mark.asyncio
+async def test_a_stop_passes_every_limit_and_what_waits_for_a_step_is_not_sent_after_it() -> None:
+    bus = bus_of(MicroFlexDrive, make_device("microflex", 7))
+    async with bus:
+        drive = MicroFlexDrive(bus, 7)
+        await drive.enable()
+        drive.command_word.limit(minimum=1, max_step=1, writable=False)
+        drive.speed_reference.limit(maximum=50, max_step=5)
+        with pytest.raises(InvalidCommand):
+            await drive.write("command_word", 0)
+        waiting = [asyncio.ensure_future(drive.speed_reference.write(value)) for value in (1, 2, 3)]
+        await asyncio.sleep(0)
+        await drive.disable()
+        ended = await asyncio.gather(*waiting, return_exceptions=True)
+        assert any(isinstance(end, Superseded) for end in ended)
+        assert not any(isinstance(end, InvalidCommand) for end in ended)
+        assert not await drive.status() & 0x80
+        with pytest.raises(InvalidCommand, match="maximum of 50"):
+            await drive.set_speed_reference(51)
+
+
+def test_limits_that_mean_nothing_are_refused() -> None:
+    bus = bus_of(MscController)
+    press = MscController(bus, 3)
+    wrongs: list[dict[str, Any]] = [{"minimum": 2, "maximum": 1}, {"max_step": 0}]
+    for wrong in wrongs:
+        with pytest.raises(InvalidCommand):
+            press.point("2008").limit(**wrong)
+    with pytest.raises(InvalidCommand, match="limit each value"):
+        press.point("2008:32").limit(maximum=1)

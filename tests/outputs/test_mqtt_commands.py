@@ -1,0 +1,221 @@
+"""Commands by MQTT, to a real mosquitto: how old they may be, how many, how strange; and what is kept of each."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from busmaster.bus.bus import Bus
+from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
+from busmaster.errors import BusError
+from busmaster.gate.gate import Gate
+from busmaster.gate.record import Outcome, WriteRecord
+from busmaster.outputs import mqtt_commands
+from busmaster.outputs.mqtt import MqttOutput
+from busmaster.outputs.settings import MqttSettings
+from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.registry import make_device
+from tests.outputs.brokers import Broker, needs_mosquitto, running
+
+if TYPE_CHECKING:
+    from aiomqtt import Client
+
+pytestmark = needs_mosquitto
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    with running(tmp_path) as found:
+        yield found
+
+
+class Plant:
+    """A line with one controller, whose element 1 may be written by MQTT, and somebody who writes it."""
+
+    def __init__(self, bus: Bus, gate: Gate, output: MqttOutput, client: Client) -> None:
+        self.bus, self.gate, self.output, self.client = bus, gate, output, client
+        self.controller = Hcp2Controller(bus, 5)
+        self.records: list[WriteRecord] = []
+        gate.record = self.keep
+
+    def keep(self, record: WriteRecord) -> None:
+        self.records.append(record)
+        self.output.offer(record)
+
+    async def send(self, payload: str | bytes, name: str = "5/1", **options: Any) -> None:
+        await self.client.publish(f"line/set/{name}", payload, qos=1, **options)
+
+    async def answers(self, count: int = 1) -> list[tuple[str, dict[str, Any]]]:
+        found: list[tuple[str, dict[str, Any]]] = []
+        async with asyncio.timeout(20):
+            async for message in self.client.messages:
+                found.append((str(message.topic), json.loads(bytes(message.payload))))
+                if len(found) == count:
+                    break
+        return found
+
+    async def ask(self, payload: str | bytes, name: str = "5/1", **options: Any) -> dict[str, Any]:
+        await self.send(payload, name, **options)
+        [(_, answer)] = await self.answers()
+        return answer
+
+
+@asynccontextmanager
+async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncIterator[Plant]:
+    import aiomqtt
+
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)])))
+    gate = Gate(bus, read_only=read_only)
+    controller = Hcp2Controller(bus, 5)
+    controller.element(1).limit(maximum=500)
+    settings = MqttSettings(port=broker.port, prefix="line")
+    output = MqttOutput("mqtt", settings, bus, commands={"5/1": controller.point("1")}, gate=gate)
+    async with bus, aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as client:
+        await client.subscribe("line/status", qos=1)
+        output.start()
+        async with asyncio.timeout(10):
+            async for message in client.messages:
+                if message.payload == b"online":
+                    break
+        await client.unsubscribe("line/status")
+        for topic in topics or ("line/result/#",):
+            await client.subscribe(topic, qos=1)
+        try:
+            yield Plant(bus, gate, output, client)
+        finally:
+            await asyncio.to_thread(output.close, 5)
+
+
+@pytest.mark.asyncio
+async def test_a_write_is_answered_with_its_id_and_kept_whole(broker: Broker) -> None:
+    async with plant(broker, "line/result/#", "line/audit") as there:
+        await there.send('{"value": 12.5, "id": "a1"}')
+        found = dict(await there.answers(2))
+        assert await there.controller.read(1) == 12.5
+    assert found["line/result/5/1"] == {"ok": True, "id": "a1"}
+    audit = found["line/audit"]
+    assert (audit["door"], audit["by"], audit["point"], audit["value"]) == ("mqtt", "line/set/5/1", "5/1", 12.5)
+    assert (audit["outcome"], audit["error"], audit["id"]) == ("written", None, "a1")
+    assert 0 < audit["took"] < 10
+    assert abs(audit["time"] - time.time()) < 60
+    assert audit["process"] > 0
+    assert audit["user"]
+
+
+@pytest.mark.asyncio
+async def test_a_limit_is_named_and_nothing_is_sent(broker: Broker) -> None:
+    async with plant(broker) as there:
+        for payload in ("501", "1e12", "[2, 501]", '{"value": 501, "id": 3}'):
+            answer = await there.ask(payload)
+            assert not answer["ok"], payload
+        assert "maximum of 500" in answer["error"]
+        assert answer["id"] == "3"
+        assert [record.outcome for record in there.records] == [Outcome.REFUSED] * 4
+        assert await there.controller.read(1) == 0
+
+
+@pytest.mark.asyncio
+async def test_an_old_command_is_not_executed_late(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt_commands, "LOOK", 3600.0)
+    async with plant(broker) as there:
+        answer = await there.ask(json.dumps({"value": 1, "expires": time.time() - 0.1}))
+        assert "too old" in answer["error"]
+        answer = await there.ask(json.dumps({"value": 2, "expires": time.time() + 60}))
+        assert answer["ok"]
+        there.output._arriving._looked -= 5  # as if this process had stood still for five seconds
+        answer = await there.ask("3")
+        assert "too old" in answer["error"]
+        assert await there.controller.read(1) == 2
+
+
+@pytest.mark.asyncio
+async def test_the_expiry_of_an_mqtt_message_is_kept(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
+    from paho.mqtt.packettypes import PacketTypes
+    from paho.mqtt.properties import Properties
+
+    monkeypatch.setattr(mqtt_commands, "LOOK", 3600.0)
+    async with plant(broker) as there:
+        properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+        properties.MessageExpiryInterval = 2
+        there.output._arriving._looked -= 5
+        answer = await there.ask("4", properties=properties)
+        assert "too old" in answer["error"]
+        there.output._arriving._looked = there.bus.now()
+        assert (await there.ask("4", properties=properties))["ok"]
+
+
+STRANGE: dict[str, tuple[str, str | bytes]] = {
+    "beyond any number": ("5/1", "1e308"),
+    "deep": ("5/1", "[" * 100_000),
+    "long": ("5/1", "1" * 200_000),
+    "many": ("5/1", "[" + ",".join(["1"] * 2000) + "]"),
+    "a topic of 64 kB": ("x" * 65_000, "1"),
+    "many levels": ("/".join("a" * 150), "1"),
+    "empty": ("5/1", ""),
+    "no text": ("5/1", b"\xff\xfe"),
+}
+
+
+@pytest.mark.asyncio
+async def test_whatever_is_sent_is_refused_and_answered_and_the_output_stays_up(broker: Broker) -> None:
+    async with plant(broker) as there:
+        for what, (name, payload) in STRANGE.items():
+            answer = await there.ask(payload, name)
+            assert not answer["ok"], what
+            assert there.output.error == "", what
+        assert (await there.ask("7"))["ok"]
+        assert len(there.records) == len(STRANGE) + 1
+
+
+@pytest.mark.asyncio
+async def test_refused_commands_do_not_starve_those_that_are_allowed(broker: Broker) -> None:
+    async with plant(broker, "line/result/5/1") as there:
+        for number in range(1000):
+            await there.client.publish("line/set/5/2", str(number), qos=0)
+        began = time.monotonic()
+        answer = await there.ask('{"value": 8, "expires": %f}' % (time.time() + 30))
+        assert answer["ok"]
+        assert time.monotonic() - began < 10
+        assert there.output._arriving.refused == 1000
+        assert there.output._arriving.unanswered > 500
+        assert len(there.records) < 500
+
+
+@pytest.mark.asyncio
+async def test_more_commands_than_the_line_takes_are_refused_not_kept(broker: Broker) -> None:
+    async with plant(broker) as there:
+        for number in range(200):
+            await there.send(json.dumps({"value": 1, "expires": time.time() + 30, "id": number}))
+        answers = await there.answers(200)
+        written = [answer for _, answer in answers if answer["ok"]]
+        assert 0 < len(written) <= 200
+        assert all("waiting already" in answer["error"] for _, answer in answers if not answer["ok"])
+
+
+@pytest.mark.asyncio
+async def test_read_only_means_mqtt_too(broker: Broker) -> None:
+    async with plant(broker, read_only=True) as there:
+        assert "read-only" in (await there.ask("7"))["error"]
+        assert await there.controller.read(1) == 0
+
+
+@pytest.mark.asyncio
+async def test_a_stop_passes_while_commands_are_refused(broker: Broker) -> None:
+    async with plant(broker) as there:
+        for _ in range(300):
+            await there.client.publish("line/set/5/1", "501", qos=0)
+        there.controller.element(2).limit(writable=False)
+        with pytest.raises(ValueError, match="may not be written"):
+            await there.controller.write(2, 0.0)
+        try:
+            await there.controller.node.request(there.controller.write_command(2, (0.0,)), stop=True)
+        except BusError as error:
+            pytest.fail(str(error))
