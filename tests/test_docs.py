@@ -221,7 +221,7 @@ def test_pre_commit_runs_what_the_extras_install_and_fetches_nothing() -> None:
 READ_BY_USERS = ("busmaster", "tests", "benchmarks", "examples", "docs")
 CITED_NOWHERE = re.compile(
     r"\bDESIGN(\.md)?\b|\bPROTOCOLS(\.md)?\b|\bCLI\.md\b|\b[Ii]ssue #?\d|\((H|G|M|S|D)\d{1,2}\)"
-    r"|\b(PUBLISHED in|data from|example from) seeds?\b|\bthe card('s)?\b|/work/"
+    r"|\b(PUBLISHED in|data from|example from) seeds?\b|\bthe card('s)?\b"
 )
 """Papers that are not here. The promises, R1 to R15, are in docs/promises.md."""
 

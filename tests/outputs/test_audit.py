@@ -49,7 +49,7 @@ def test_json_lines_have_a_line_of_each_write_and_csv_has_values_alone(tmp_path:
     ):
         output.start()
         output.offer(WRITE)
-        until(lambda output=output: settled(output))  # type: ignore[misc]
+        until(lambda output=output: settled(output))  # type: ignore[misc]  # bound now
         output.close(5)
         if kind == "jsonl":
             assert json.loads((tmp_path / kind).read_text()) == {"write": "winder/setpoint", **KEPT}

@@ -143,7 +143,7 @@ async def test_the_expiry_of_an_mqtt_message_is_kept(broker: Broker, monkeypatch
 
     monkeypatch.setattr(mqtt_commands, "LOOK", 3600.0)
     async with plant(broker) as there:
-        properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+        properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]  # paho has no types
         properties.MessageExpiryInterval = 2
         there.output._arriving._looked -= 5
         answer = await there.ask("4", properties=properties)

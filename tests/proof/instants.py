@@ -117,7 +117,7 @@ class Instant:
             return not (self < other or self > other)
         return self is other
 
-    __hash__ = None  # type: ignore[assignment]
+    __hash__ = None  # type: ignore[assignment]  # how Python marks what has no hash
 
     def __add__(self, other: Any) -> Any:
         if type(other) is Span:

@@ -171,7 +171,7 @@ def past_nodes(view: View) -> None:
     replied.sort(key=lambda node: sum(view.before(other.last_reply, node.last_reply) for other in replied))
     if all(_ordered(view, a.last_reply, b.last_reply) for a in replied for b in replied):
         for rank, node in enumerate(replied):
-            node.last_reply = past(rank, 0)  # type: ignore[assignment]
+            node.last_reply = past(rank, 0)  # type: ignore[assignment]  # a rank in place of a time
     for node in world.nodes:
         node.failed_at = node.up_since = -inf
         node.lateness_until = inf  # an hour: coming down again is left out

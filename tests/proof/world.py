@@ -60,6 +60,7 @@ class World:
             jitter=no_jitter,
             strict=setup.strict,
         )
+        # The stand-ins (shipped.py) have what is asked of them, not the types: hence what is ignored here.
         arbiter._counters = arbiter._unasked._counters = arbiter.dispatcher.counters = NO_COUNTERS  # type: ignore[assignment]
         arbiter.dispatcher.probes.budget = BUDGET  # type: ignore[assignment]
         if not setup.in_step:
