@@ -205,6 +205,18 @@ async def test_a_step_counts_from_the_last_confirmed_value_which_is_read_first_i
 
 
 @pytest.mark.asyncio
+async def test_an_urgent_write_that_is_refused_overtakes_nothing() -> None:
+    async with controller() as drive:
+        drive.element(10).limit(maximum=100, max_step=20)
+        waiting = asyncio.ensure_future(drive.write(10, 20))
+        await asyncio.sleep(0)
+        with pytest.raises(InvalidCommand, match="maximum of 100"):
+            await drive.element(10).write(101, priority=Priority.URGENT)
+        await waiting
+        assert await drive.read(10) == 20
+
+
+@pytest.mark.asyncio
 async def test_a_stop_passes_every_limit_and_what_waits_for_a_step_is_not_sent_after_it() -> None:
     bus = bus_of(MicroFlexDrive, make_device("microflex", 7))
     async with bus:
