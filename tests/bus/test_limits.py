@@ -29,6 +29,7 @@ from busmaster.protocols.modbus.codec import WriteRegisters
 from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.protocols.msc.handle import MscController
 from busmaster.registry import make_device
+from tests.stories import in_virtual_time
 
 Way: TypeAlias = Callable[[Any, float], Awaitable[None]]
 
@@ -58,8 +59,8 @@ HCP2_WAYS: dict[str, Way] = {
 }
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("way", HCP2_WAYS.values(), ids=HCP2_WAYS)
+@in_virtual_time
 async def test_no_way_of_writing_goes_round_a_limit(way: Way) -> None:
     async with controller() as drive:
         drive.element(10).limit(minimum=-50, maximum=500)
@@ -73,7 +74,7 @@ async def test_no_way_of_writing_goes_round_a_limit(way: Way) -> None:
         assert await drive.read(10) == 500
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_what_may_not_be_written_is_refused_whatever_the_value() -> None:
     async with controller() as drive:
         drive.element(10).limit(writable=False)
@@ -95,8 +96,8 @@ PLACES: list[tuple[str, type[Handle], int, str, dict[str, Any]]] = [
 ]
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize(("kind", "handle", "address", "item", "options"), PLACES, ids=str)
+@in_virtual_time
 async def test_every_protocol_says_what_its_writes_change(
     kind: str, handle: type[Handle], address: int, item: str, options: dict[str, Any]
 ) -> None:
@@ -113,7 +114,7 @@ async def test_every_protocol_says_what_its_writes_change(
             await drive.prepare_write(item, [45])[0]()
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_a_number_of_two_registers_is_not_written_in_halves() -> None:
     bus = bus_of(ModbusUnit, make_device("modbus", 17))
     async with bus:
@@ -132,7 +133,7 @@ async def test_a_number_of_two_registers_is_not_written_in_halves() -> None:
             await unit.write("holding:39", 1, 0x4B00, 0)
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_a_block_of_an_msc_is_held_to_the_limit_of_each_of_its_values() -> None:
     bus = bus_of(MscController, make_device("msc", 3))
     async with bus:
@@ -156,12 +157,12 @@ async def test_a_block_of_an_msc_is_held_to_the_limit_of_each_of_its_values() ->
         assert await press.read("speed") == 3
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize(
     ("profile", "handle", "item", "first"),
     [(MENTOR, MentorDrive, "1.17", 14), (MODBUS, ModbusUnit, "holding:40", 14)],
     ids=["mentor", "modbus"],
 )
+@in_virtual_time
 async def test_a_write_to_all_is_held_to_the_limits_of_each(
     profile: Any, handle: type[Handle], item: str, first: int
 ) -> None:
@@ -181,7 +182,7 @@ async def test_a_write_to_all_is_held_to_the_limits_of_each(
         await drives[1].write(item, 100)
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_a_step_counts_from_the_last_confirmed_value_which_is_read_first_if_unknown() -> None:
     async with controller() as drive:
         await drive.write(10, 100.0)
@@ -204,7 +205,7 @@ async def test_a_step_counts_from_the_last_confirmed_value_which_is_read_first_i
         assert await drive.read(10) == 21
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_an_urgent_write_that_is_refused_overtakes_nothing() -> None:
     async with controller() as drive:
         drive.element(10).limit(maximum=100, max_step=20)
@@ -216,7 +217,7 @@ async def test_an_urgent_write_that_is_refused_overtakes_nothing() -> None:
         assert await drive.read(10) == 20
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_a_stop_passes_every_limit_and_what_waits_for_a_step_is_not_sent_after_it() -> None:
     bus = bus_of(MicroFlexDrive, make_device("microflex", 7))
     async with bus:
