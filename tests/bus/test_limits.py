@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import random
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from typing import Any, TypeAlias
@@ -11,11 +12,11 @@ import pytest
 
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
-from busmaster.bus.node import Node, Priority
-from busmaster.emulator.device import Device
+from busmaster.bus.node import Health, Node, Priority
+from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
-from busmaster.errors import InvalidCommand, NotStarted, Superseded
+from busmaster.errors import InvalidCommand, NotStarted, Superseded, WriteUnconfirmed
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
 from busmaster.protocols.dc104.handle import Dc104Drive
 from busmaster.protocols.hcp.handle import HcpController
@@ -35,7 +36,7 @@ Way: TypeAlias = Callable[[Any, float], Awaitable[None]]
 
 
 def bus_of(handle: type[Handle], *devices: Device) -> Bus:
-    return Bus(MemoryPort(Line(handle.profile.line, list(devices))))
+    return Bus(MemoryPort(Line(handle.profile.line, list(devices), chance=random.Random(1))))
 
 
 @asynccontextmanager
@@ -203,6 +204,57 @@ async def test_a_step_counts_from_the_last_confirmed_value_which_is_read_first_i
         assert first is None
         assert isinstance(late, NotStarted)
         assert await drive.read(10) == 21
+
+
+@in_virtual_time
+async def test_a_step_counts_from_what_is_read_where_the_write_before_may_have_been_carried_out() -> None:
+    device = make_device("hcp2", 5)
+    async with bus_of(Hcp2Controller, device) as bus:
+        drive = Hcp2Controller(bus, 5)
+        drive.element(10).limit(max_step=20)
+        await drive.write(10, 20)
+        device.faults.lost = 1.0
+        with pytest.raises(WriteUnconfirmed):
+            await drive.write(10, 40, idempotent=False)
+        device.faults.lost = 0.0
+        await drive.write(10, 60)
+
+
+@in_virtual_time
+async def test_a_step_counts_from_what_is_read_where_the_node_was_away() -> None:
+    device = make_device("hcp2", 5)
+    async with bus_of(Hcp2Controller, device) as bus:
+        drive = Hcp2Controller(bus, 5)
+        drive.element(10).limit(max_step=20)
+        await drive.write(10, 20)
+        for state, dead in ((Health.DOWN, 1.0), (Health.UP, 0.0)):
+            device.faults.dead = dead
+            while Node.of(drive).health is not state:
+                await asyncio.gather(drive.read(1), asyncio.sleep(0.5), return_exceptions=True)
+        device.preset("10", 100)
+        with pytest.raises(InvalidCommand, match="30 is too far from 100"):
+            await drive.write(10, 30)
+
+
+@in_virtual_time
+async def test_the_time_of_a_write_counts_from_before_the_value_is_read_from_which_it_steps() -> None:
+    slow = 0.03
+    async with bus_of(Hcp2Controller, make_device("hcp2", 5, delay=Delay(slow, slow))) as bus:
+        drive = Hcp2Controller(bus, 5)
+        await drive.read(10)
+        drive.element(10).limit(max_step=20)
+        began = bus.now()
+        with pytest.raises(WriteUnconfirmed):
+            await drive.write(10, 20, finish_within=2 * slow)
+        assert bus.now() - began == pytest.approx(2 * slow, abs=0.001)
+
+
+@in_virtual_time
+async def test_a_write_to_all_is_held_to_the_limits_of_those_of_another_protocol_that_hear_it() -> None:
+    async with bus_of(MentorDrive, make_device("mentor", 14), make_device("ct-ansi", 15)) as bus:
+        CtAnsiDrive(bus, 15).point("1.21").limit(maximum=100)
+        with pytest.raises(InvalidCommand, match=r"node 15: .* maximum of 100"):
+            await MentorDrive(bus, 0).write("1.21", 101)
 
 
 @in_virtual_time
