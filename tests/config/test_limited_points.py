@@ -6,13 +6,13 @@ import asyncio
 
 import pytest
 
-from busmaster.bus.node import Priority
+from busmaster.bus.node import Node, Priority
 from busmaster.config import ConfiguredLine, FileError, LineFile, emulated_line
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
-from busmaster.errors import InvalidCommand
+from busmaster.errors import InvalidCommand, NodeDown
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from tests.stories import in_virtual_time
@@ -130,6 +130,29 @@ async def test_no_limit_holds_the_safe_state(kind: str, address: str, item: str)
             await line.point("winder/speed").write(0, priority=Priority.URGENT)
         assert await line.safe_state.enter(line.bus) == {"winder/speed": None}
         assert await line.point("winder/speed").read() == 0
+
+
+@in_virtual_time
+async def test_a_node_that_somebody_has_suspended_is_left_safely_too() -> None:
+    async with emulated(f"{POINTS}{SAFE}") as line:
+        winder = Node.of(line.nodes["winder"])
+        winder.suspend(60.0)
+        with pytest.raises(NodeDown, match="suspended"):
+            await line.point("winder/speed").write(30)
+        assert await line.safe_state.enter(line.bus) == {"winder/speed": None}
+
+
+@in_virtual_time
+async def test_a_file_that_is_read_again_keeps_its_groups_but_those_whose_points_mean_something_else() -> None:
+    text = f"{POINTS}[groups.axes]\nperiod = 0.1\npoints = ['winder/speed']\n"
+    async with emulated(text) as line:
+        await line.point("winder/speed").write(60, priority=Priority.URGENT)
+        before = line.groups["axes"]
+        await line.take(file(text))
+        assert line.groups["axes"] is before
+        await line.take(file(text.replace("0.06", "0.6")))
+        [speed] = (await anext(line.groups["axes"].subscribe())).values()
+        assert speed.value == pytest.approx(600)
 
 
 @pytest.mark.parametrize(
