@@ -195,7 +195,7 @@ def told(story: Callable[[ModbusUnit, EmulatedModbus], Coroutine[Any, Any, None]
     """With the handle of a unit, and the unit."""
 
     async def main() -> None:
-        device = EmulatedModbus(UNIT, inputs=range(1000), read_only=frozenset({990}))
+        device = EmulatedModbus(UNIT, inputs=range(1000), coils=(False,) * 2000, read_only=frozenset({990}))
         async with Bus(MemoryPort(Line(PROFILE.line, [device, EmulatedModbus(3)]))) as bus:
             await story(ModbusUnit(bus, UNIT), device)
 
@@ -230,6 +230,25 @@ def test_many_values_go_in_as_many_exchanges_as_it_takes_and_no_number_is_torn()
     told(story)
 
 
+@pytest.mark.parametrize(("item", "most"), [("holding:0", 123), ("coil:0", 1968)])
+def test_a_run_is_written_whole_by_its_point_or_not_at_all(item: str, most: int) -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        await unit.point(f"{item}:{most}").write((1,) * most)
+        stored = device.registers if item == "holding:0" else device.coils
+        assert [sum(stored), stored[most]] == [most, 0]
+        asked = unit.bus.statistics().exchanges
+        with pytest.raises(InvalidCommand, match="takes more than one exchange to write: use the handle's write"):
+            await unit.point(f"{item}:{most + 1}").write((1,) * (most + 1))
+        for wrong in (1, None, (1,) * (most - 1)):
+            with pytest.raises(InvalidCommand, match=f"takes {most} values"):
+                await unit.point(f"{item}:{most}").write(wrong)
+        assert unit.bus.statistics().exchanges == asked
+        await unit.write(f"{item}:{most + 1}", *(1,) * (most + 1))
+        assert stored[most] == 1
+
+    told(story)
+
+
 def test_what_the_unit_does_not_have_or_take_is_refused_by_name() -> None:
     async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
         with pytest.raises(Refused, match="illegal data address"):
@@ -259,6 +278,9 @@ def test_a_write_to_all_reaches_every_unit() -> None:
         assert await unit.read("holding:100") == await ModbusUnit(unit.bus, 3).read("holding:100") == 5
         with pytest.raises(InvalidCommand):
             await everyone.read("holding:100")
+        with pytest.raises(InvalidCommand, match="modbus: a write to all cannot be verified"):
+            await everyone.write("holding:100", 6, verify=True)
+        assert device.registers[100] == 5
 
     told(story)
 

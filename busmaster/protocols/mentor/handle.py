@@ -129,7 +129,6 @@ class MentorDrive(Handle):
 
     async def read(self, parameter: str, **options: Unpack[ReadOptions]) -> float:
         """Return a parameter's value; a bit is 0 or 1. Raises NoSuchParameter, or InvalidCommand at address 0."""
-        self._check_readable()
         place = self._place(parameter)
         found = await self.node.request(Read(place.menu, place.number), **options)
         return from_line(found, place.decimals)
@@ -144,7 +143,6 @@ class MentorDrive(Handle):
         the line is a drive that forgets what it last sent when another is addressed. Raises NoSuchParameter where the
         menu has a gap.
         """
-        self._check_readable()
         run = ReadRun(*place_of(parameter), count, step)
         if chain:
             return self._values(run, await self.node.request(run, **options))
@@ -170,8 +168,6 @@ class MentorDrive(Handle):
         place = self._place(parameter)
         command = place.write(value, wide=wide, high_resolution=high_resolution)
         requests = SeveralRequests(self.node, options)
-        if requests.verify:
-            self._check_readable()
         await requests.request(command)
         if requests.verify:
             check = Read(place.menu, place.number)
@@ -206,10 +202,6 @@ class MentorDrive(Handle):
         self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
         parameter, _, kind = item.partition(":")
         return lambda: self.write(parameter, value, wide=kind == "wide", high_resolution=kind == "hires", **options)
-
-    def _check_readable(self) -> None:
-        if self.node.address == self.profile.broadcast:
-            raise InvalidCommand("mentor: a read cannot go to all drives: they would answer at once")
 
     def _place(self, text: str) -> Place:
         """Return where a parameter is, by number or name.
