@@ -14,27 +14,13 @@ import pytest
 from busmaster import Bus, InvalidCommand, MemoryPort, ModbusUnit, Refused, VerifyFailed
 from busmaster.contract.exchange import Done
 from busmaster.emulator.line import Line
-from busmaster.protocols.modbus.codec import (
-    EXCEPTIONS,
-    PROFILE,
-    ReadBits,
-    ReadRegisters,
-    WriteCoils,
-    WriteRegisters,
-    with_crc,
-)
+from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
 from busmaster.protocols.modbus.device import EmulatedModbus
 from busmaster.protocols.modbus.handle import is_whole
 from busmaster.protocols.modbus.numbers import Number
 from busmaster.testing import Case, Foreign, RoundTrip, answers_of, check_protocol
 from busmaster.testing.virtual_time import run_in_virtual_time
-
-UNIT = 0x11
-
-
-def frame(text: str) -> bytes:
-    return with_crc(bytes.fromhex(text))
-
+from tests.protocols.modbus_frames import UNIT, frame
 
 CASES = [
     Case(ReadRegisters(0x6B, 3), UNIT, [frame("11 03 06 022b 0000 0064")], (555, 0, 100)),
@@ -122,13 +108,6 @@ def test_modbus_keeps_the_contract() -> None:
         device=answers_of(EmulatedModbus(UNIT)),
     )
     assert min(tally.values()) > 0
-
-
-@pytest.mark.parametrize(("code", "name"), [*EXCEPTIONS.items(), (7, "exception 7")])
-def test_an_exception_is_a_refusal_with_its_name(code: int, name: str) -> None:
-    exchange = ReadRegisters(7).open(UNIT, PROFILE.timings)
-    with pytest.raises(Refused, match=f"^refused: {name};"):
-        exchange.feed(with_crc(bytes((UNIT, 0x83, code))))
 
 
 def test_a_read_is_never_sent_to_all() -> None:
@@ -328,6 +307,3 @@ def test_only_floats_are_not_rounded_when_they_are_scaled() -> None:
     assert is_whole("holding:1")
     assert is_whole("holding:1:int32:swapped")
     assert not is_whole("holding:1:float64")
-
-
-# the emulated unit
