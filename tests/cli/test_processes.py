@@ -20,9 +20,9 @@ import pytest
 
 from busmaster.emulator.serve import TcpServer
 from tests.cli.conftest import ENVIRONMENT, ROOT, started
+from tests.patience import PATIENCE
 
 HCP2 = ("--protocol", "hcp2")
-PATIENCE = 20.0
 
 
 @contextmanager
@@ -59,7 +59,7 @@ def test_emulate_takes_its_link_away_when_it_is_terminated(tmp_path: Path) -> No
     link = str(tmp_path / "line")
     with emulated("--pty", link) as (process, _):
         process.terminate()
-        assert process.wait(5.0) == 128 + signal.SIGTERM
+        assert process.wait(PATIENCE) == 128 + signal.SIGTERM
     assert not os.path.lexists(link)
 
 

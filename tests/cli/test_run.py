@@ -20,8 +20,8 @@ from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from tests.cli.conftest import ROOT, Command, started
+from tests.patience import PATIENCE
 
-PATIENCE = 20.0
 EXAMPLES = ROOT / "examples"
 TEXT = """
 title = "Slitter"

@@ -23,6 +23,7 @@ from serial.rs485 import RS485Settings
 from busmaster.errors import LineDown
 from busmaster.transport import serial_port
 from busmaster.transport.serial_port import SerialPort
+from tests.patience import PATIENCE
 from tests.transport.fakes import PtyMaster, Recorder, closed, opened, plugged
 
 TIOCGEXCL = 0x80045440
@@ -106,7 +107,7 @@ async def _is_released_in_the_end(path: str, slow_driver: threading.Event) -> No
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(serial_port, "_release", release)
         slow_driver.set()
-        assert await asyncio.to_thread(released.wait, 2)
+        assert await asyncio.to_thread(released.wait, PATIENCE)
     await closed(*await opened(path))
 
 
