@@ -16,8 +16,7 @@ import uvloop
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport import alarm as alarm_module
 from busmaster.transport.alarm import SOON, Alarm, KernelTimer
-
-PATIENCE = 30.0
+from tests.patience import PATIENCE
 
 
 def run_on(factory: Callable[[], asyncio.AbstractEventLoop], main: Coroutine[Any, Any, None]) -> None:
