@@ -20,6 +20,7 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
 from busmaster.transport.tcp import TcpPort
+from tests.patience import PATIENCE
 from tests.stories import in_virtual_time
 
 
@@ -41,7 +42,7 @@ async def watched(server: TcpServer, *addresses: int, read_only: bool = False) -
 
 async def seen(watch: Watch, what: Callable[[Frame], bool]) -> Frame:
     """The first picture that shows it."""
-    with anyio.fail_after(10):
+    with anyio.fail_after(PATIENCE):
         while not what(frame := watch.picture()):  # noqa: ASYNC110  # a picture is looked at, it announces nothing
             await anyio.sleep(0.01)
     return frame
