@@ -51,6 +51,7 @@ OPEN: dict[str, set[str]] = {
             "events",
             "health",
             "histogram",
+            "learned",
             "mark",
             "schedule",
             "state",

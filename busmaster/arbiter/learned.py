@@ -205,6 +205,7 @@ class Learning:
     def doubt(self) -> None:
         """Go back to the document's times until enough replies have come: the node was late, or has been away."""
         self.returns += 1
+        self._known = {}
         for kind in self.kinds.values():
             kind.doubt()
 
@@ -223,6 +224,11 @@ class Learning:
     def begin_with(self, known: Iterable[LearnedTimes]) -> None:
         """Start from what an earlier run has learned: it is trusted after fewer replies."""
         self._known = {(times.kind, times.packet): times for times in known}
+
+    def to_keep(self, document: Timings) -> tuple[LearnedTimes, ...]:
+        """Return what the next run may begin with: what is trusted, and what this one began with and never doubted."""
+        trusted = {(times.kind, times.packet): times for times in self.times(document) if times.trusted}
+        return tuple({**self._known, **trusted}.values())
 
     def _begin(self, name: str) -> Kind:
         kind = Kind()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,6 +23,7 @@ from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand
+from busmaster.outputs.base import check_folder
 from busmaster.registry import NodeKind, find, kinds
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -93,12 +94,16 @@ class GroupSection:
 
 @dataclass(frozen=True, slots=True)
 class LineFile:
-    """All that one file says. `table` is the whole of it, for messages."""
+    """All that one file says. `learned` is where learned reply times are kept, if they are.
+
+    `table` is the whole of it, for messages.
+    """
 
     path: str
     title: str
     port: SerialPort | TcpPort
     strict: bool
+    learned: str | None
     nodes: Mapping[str, NodeSection]
     groups: Mapping[str, GroupSection]
     outputs: Outputs
@@ -115,13 +120,14 @@ def load(path: str | os.PathLike[str]) -> LineFile:
 def read(source: Source) -> LineFile:
     """Read what a source says of a line. Raises FileError, naming line and key, for what is wrong in it."""
     top = Table(source)
-    top.only("title", "port", "strict", "timing", "protocols", "nodes", "groups", "outputs", "safe", "emulator")
+    top.only("title", "port", "strict", "timing", "learned", "protocols", "nodes", "groups", "outputs", "safe", "emulator")
     nodes = {node.name: node for node in _nodes(top, _defaults(top))}
     groups = {table.name: _group(table) for table in top.tables("groups")}
     file = LineFile(
         path=source.name,
         title=top.text("title", os.path.basename(source.name)),
         strict=top.flag("strict", False),
+        learned=_learned(top, nodes.values()),
         port=read_port(top, [node.profile for node in nodes.values()]),
         nodes=nodes,
         groups=groups,
@@ -133,6 +139,17 @@ def read(source: Source) -> LineFile:
     if not nodes:
         raise top.error("there are no nodes: describe each in a table of its own, [nodes.NAME]")
     return file
+
+
+def _learned(top: Table, nodes: Iterable[NodeSection]) -> str | None:
+    """Read where learned reply times are kept from one run to the next."""
+    path = top.text("learned", None)
+    if path is not None:
+        if not any(isinstance(node.timings, Learned) for node in nodes):
+            raise top.error(f'no reply times are learned: say timing = "{LEARNED_WORD}" too', "learned")
+        with top.at("learned"):
+            check_folder(path)
+    return path
 
 
 # nodes
