@@ -114,7 +114,7 @@ class Transaction:
         idempotent: bool | None = None,
         probe: bool = False,
         finish_by: float = inf,
-        *,
+        touches: object = None,
         tag: Any = None,
         poll: Poll | None = None,
     ) -> None:
@@ -138,7 +138,7 @@ class Transaction:
         self.probe = probe
         self.check = False
         """It is asked for the sake of its answer's likeness alone (R15): nobody waits for it, nothing counts it."""
-        self.touches: object = None
+        self.touches = touches
         """What a write changes, for its owner to know."""
         self.refused_until = -inf
         self.refused_cycles = 0

@@ -283,8 +283,8 @@ class Node:
             options.idempotent,
             probe,
             inf if options.finish_within is None else line.now() + options.finish_within,
+            self if touches is None else (self, touches),
         )
-        transaction.touches = self if touches is None else (self, touches)
         return transaction, line.pump.transact(transaction)
 
     def _give_up(self, transaction: Transaction) -> None:

@@ -91,7 +91,7 @@ class TelegramReader(SingleLeg, Generic[T]):
     A protocol sets the class attributes. `parse` makes the value of the data field, or raises FrameError.
     """
 
-    __slots__ = ("_buffer", "_header", "answers")
+    __slots__ = ("_buffer", "answers")
 
     check = staticmethod(xor)
     longest: ClassVar[int]
@@ -101,8 +101,7 @@ class TelegramReader(SingleLeg, Generic[T]):
     def __init__(self, request: bytes, echo: bytes, timing: ReplyTiming) -> None:
         self.request = request
         self.timing = timing
-        self._header = STX + echo
-        self.answers = (self._header,)
+        self.answers = (STX + echo,)
         self._buffer = b""
 
     @property
@@ -119,11 +118,12 @@ class TelegramReader(SingleLeg, Generic[T]):
             return MORE
         if buffer[0] != _STX:
             self.reject(buffer)
-        header = self._header
+        header = self.answers[0]
         etx = find_etx(buffer, header, self.longest, self.check)
         if not etx:
             return MORE
-        return Done(self.parse(buffer[len(header) : etx]), buffer[etx + 2 :])
+        value, end = self.parse(buffer[len(header) : etx]), etx + 2
+        return Done(value) if len(buffer) == end else Done(value, buffer[end:])
 
     def expired(self, started: bool) -> NoReturn:
         raise FrameError(f"reply cut short after {len(self._buffer)} bytes") if started else no_reply()
