@@ -100,7 +100,8 @@ class Dispatcher:
             return False
         if transaction.writes and transaction.priority is URGENT:  # even if it fails below: no enable may follow it
             self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
-        waiting = self.backlog.queues[transaction.priority].live
+        queue = self.backlog.queues[transaction.priority]
+        waiting = queue.live
         if transaction.writes:
             waiting = max(waiting, len(self.writes.queues[node]))  # those that are parked are in no class
         if waiting >= self._capacity:
@@ -110,11 +111,11 @@ class Dispatcher:
             return False
         if transaction.writes:
             self.writes.queues[node].append(transaction)
-        if transaction.deadline == inf:
-            transaction.deadline = now + RETRY_PATIENCE
+        transaction.deadline = now + RETRY_PATIENCE
         if transaction.start_by < inf:
             self._expiries.expect(transaction, len(self.backlog))
-        self.backlog.push(transaction)
+        transaction.phase = QUEUED  # as backlog.push does: this is done for every request
+        queue.push(transaction)
         return True
 
     def cancel(self, transaction: Transaction, now: float) -> None:
@@ -383,7 +384,7 @@ class Dispatcher:
         check = Transaction(node, command, priority=BACKGROUND, retries=0, probe=True)
         check.check = True
         check.wanted = False
-        check.queued = now
+        check.queued, check.deadline = now, inf
         self._waits(check)
         return check
 

@@ -104,6 +104,13 @@ class Transaction:
         "writes",
     )
 
+    queued: float
+    deadline: float
+    """By which it wants to be answered."""
+    exchanges_ahead: int
+    settling_ahead: float
+    # These are set when it is queued, and not before: each costs, and this is done for every request.
+
     def __init__(
         self,
         node: NodeRecord,
@@ -156,13 +163,9 @@ class Transaction:
         self.unsure = False
         """An attempt was sent whose outcome is not known: it may have been carried out (R7)."""
         self.late = False
-        self.deadline = inf
         self.value: Any = None
         self.error: BusError | None = None
-        self.queued = 0.0
         self.started = self.first_byte = self.last_byte = self.ended_at = -inf
-        self.exchanges_ahead = 0
-        self.settling_ahead = 0.0
 
     def timings(self) -> Timings:
         """Return the times of the next attempt: a learned window only for a read that is repeated if it is over."""
