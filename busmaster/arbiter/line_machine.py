@@ -230,15 +230,14 @@ class LineMachine:
     def _begin_reply(self, data: bytes, now: float) -> bytes:
         """Take the first bytes of a leg. Returns those that may be its reply."""
         wire, leg = self._wire, self._leg
-        transaction, exchange = wire.transaction, wire.exchange
+        transaction = wire.transaction
         assert transaction is not None
-        assert exchange is not None
         if now < leg.taint_until or wire.output.held:
             self._counters.tainted += 1
             self._unasked.last_byte = now
             self._attempt_failed(FrameError(TOO_EARLY, heard=data), now)
             return b""
-        if not exchange.answered:
+        if not wire.answered:
             self._unasked.note(data, now, leg.quiet())
             wire.came_unasked = True
             return b""
@@ -284,9 +283,9 @@ class LineMachine:
         transaction, exchange = wire.transaction, wire.exchange
         assert transaction is not None
         assert exchange is not None
-        answered = exchange.answered
+        answered, rest = wire.answered, step.rest
         if answered:
-            if self._in_step.alert or step.rest:
+            if self._in_step.alert or rest:
                 verdict = self._trust.weigh(wire, step, now)
                 if isinstance(verdict, str):
                     self._disbelieve(verdict, step, now)  # before what follows: it proves not that its request left
@@ -304,9 +303,9 @@ class LineMachine:
         wire.transaction = wire.exchange = self._trust.held = None
         self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, step.value, now)
-        if step.rest:
-            self._unasked.note(step.rest, now, leg.quiet())
-        if step.rest or wire.came_unasked or (self._echo.owed and not answered):  # a broadcast's echo may never come
+        if rest:
+            self._unasked.note(rest, now, leg.quiet())
+        if rest or wire.came_unasked or (self._echo.owed and not answered):  # a broadcast's echo may never come
             self._settle(now)
             return
         self._unasked.unanswered_one = None
@@ -470,8 +469,7 @@ class LineMachine:
         if not self._echo.owed and self.state is EXCHANGE and not self._leg.begun:
             self._wire.output.held = False  # it is heard, so it has left
             due = self._leg.echoed(now)
-            answered = self._wire.exchange is not None and self._wire.exchange.answered
-            self._deadlines.line = due if answered else now + self._leg.timing.turnaround
+            self._deadlines.line = due if self._wire.answered else now + self._leg.timing.turnaround
         return rest
 
     def _go_offline(self, now: float) -> None:

@@ -109,7 +109,9 @@ class Transaction:
     """By which it wants to be answered."""
     exchanges_ahead: int
     settling_ahead: float
-    # These are set when it is queued, and not before: each costs, and this is done for every request.
+    late: bool
+    """The reply to its last attempt began after the nominal time."""
+    # These are set when it is queued, or sent, and not before: each costs, and this is done for every request.
 
     def __init__(
         self,
@@ -162,7 +164,6 @@ class Transaction:
         self.superseded = False
         self.unsure = False
         """An attempt was sent whose outcome is not known: it may have been carried out (R7)."""
-        self.late = False
         self.value: Any = None
         self.error: BusError | None = None
         self.started = self.first_byte = self.last_byte = self.ended_at = -inf
