@@ -169,17 +169,8 @@ class Arbiter(LineMachine):
     def poll_timeout(self) -> float:
         """Return when `handle_timeout` is to be called, in seconds on the caller's clock; inf if nothing is due."""
         # It is asked after every byte that comes. A call of `min` takes more than twice as long.
-        deadlines = self._deadlines
-        earliest = deadlines.line
-        if deadlines.schedule < earliest:
-            earliest = deadlines.schedule
-        if deadlines.expiry < earliest:
-            earliest = deadlines.expiry
-        if deadlines.failing < earliest:
-            earliest = deadlines.failing
-        if deadlines.health < earliest:
-            earliest = deadlines.health
-        return earliest
+        line, other = self._deadlines.line, self._deadlines.earliest_other
+        return line if line < other else other
 
     def reset_statistics(self, now: float) -> None:
         """Begin the counts of the line and of its nodes anew."""

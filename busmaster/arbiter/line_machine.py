@@ -182,15 +182,16 @@ class LineMachine:
     def handle_timeout(self, now: float, *, unread: bool = False) -> None:
         """Do what is due. If `unread`, bytes have come that were not handed over: the line's silence is not known."""
         deadlines = self._deadlines
-        if now >= deadlines.failing:
-            self.dispatcher.fail_more(now)
-        if now >= deadlines.schedule:
-            self.dispatcher.release_polls(now)
-        if now >= deadlines.expiry and not unread:
-            self.dispatcher.expire(now)
-        if now >= deadlines.health:
-            self._enter(self.state, now)
-            self.dispatcher.probe(now, self.state is READY)
+        if now >= deadlines.earliest_other:
+            if now >= deadlines.failing:
+                self.dispatcher.fail_more(now)
+            if now >= deadlines.schedule:
+                self.dispatcher.release_polls(now)
+            if now >= deadlines.expiry and not unread:
+                self.dispatcher.expire(now)
+            if now >= deadlines.health:
+                self._enter(self.state, now)
+                self.dispatcher.probe(now, self.state is READY)
         if now >= deadlines.line and not unread:
             if self.state is EXCHANGE:
                 if self._trust.held is None:
