@@ -18,7 +18,17 @@ from busmaster.contract.exchange import Abandonable, Exchange, Expect, Step
 class OnWire:
     """Of one line. `transaction` and `exchange` are None while nothing is asked; `leg` and `output` outlive them."""
 
-    __slots__ = ("_deadlines", "_echo", "_urgent_waits", "answered", "came_unasked", "exchange", "leg", "output", "transaction")
+    __slots__ = (
+        "_deadlines",
+        "_echo",
+        "_urgent_waits",
+        "answered",
+        "came_unasked",
+        "exchange",
+        "leg",
+        "output",
+        "transaction",
+    )
 
     def __init__(self, leg: Leg, echo: Echo, deadlines: Deadlines, urgent_waits: Callable[[], bool]) -> None:
         self.transaction: Transaction | None = None
@@ -45,7 +55,8 @@ class OnWire:
         due = leg.begin(timing, len(request), exchange.sizes.longest, now)
         self._deadlines.line = due if answered else leg.end + timing.turnaround
         output = self.output  # as output.add does: this is done for every request
-        output.waiting += request
+        # nearly always nothing waits, and to add to nothing takes longer than to ask
+        output.waiting = output.waiting + request if output.waiting else request
         output.said_at = now
         if self._echo.declared:
             self._echo.sent(request)
