@@ -36,8 +36,8 @@ _REFUSALS: Mapping[int, type[Refused]] = {NAK[0]: Refused}
 def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes], int]) -> int:
     """Return where the ETX of a whole and valid telegram is; 0 if more bytes are needed.
 
-    `header` is STX and the echo, without an ETX; `longest` the most data characters. Raises FrameError as soon as the bytes cannot
-    become such a telegram; `whole` only if nothing but the checksum is wrong, and nothing follows.
+    `header` is STX and the echo, without an ETX; `longest` the most data characters. Raises FrameError as soon as the
+    bytes cannot become such a telegram; `whole` only if nothing but the checksum is wrong, and nothing follows.
     """
     start = len(header)
     if buffer[:start] != header:
