@@ -28,7 +28,7 @@ from busmaster.cli.parsing import Whole
 from busmaster.cli.protocols import protocol_option
 from busmaster.cli.run import output_text
 from busmaster.config import ConfiguredLine, LineFile
-from busmaster.errors import BusError, LineDown
+from busmaster.errors import LineDown, cause_text
 from busmaster.outputs.values import cycle_fields
 from busmaster.registry import find
 
@@ -132,8 +132,7 @@ class Listener(asyncio.Protocol):
         """Tell the last frame, and end `lost` with LineDown."""
         self._rest()
         if not self.lost.done():
-            what = cause.what if isinstance(cause, BusError) else str(cause or "the line was closed")
-            self.lost.set_exception(LineDown(what, hint="start again when it is back"))
+            self.lost.set_exception(LineDown(cause_text(cause, "the line was closed"), hint="start again when it is back"))
 
     def _rest(self) -> None:
         self._pass(self._decoder.quiet())

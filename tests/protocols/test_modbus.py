@@ -230,6 +230,18 @@ def test_many_values_go_in_as_many_exchanges_as_it_takes_and_no_number_is_torn()
     told(story)
 
 
+@pytest.mark.parametrize(("item", "count"), [("holding:0", 125), ("coil:0", 1969)])
+def test_a_point_that_takes_two_writes_says_so_and_writes_nothing(item: str, count: int) -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        point = unit.point(f"{item}:{count}")
+        with pytest.raises(InvalidCommand, match="takes two writes: "):
+            await point.write((1,) * count)
+        assert not any(device.coils)
+        assert 1 not in device.registers[:3]
+
+    told(story)
+
+
 def test_what_the_unit_does_not_have_or_take_is_refused_by_name() -> None:
     async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
         with pytest.raises(Refused, match="illegal data address"):

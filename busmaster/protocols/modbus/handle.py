@@ -116,11 +116,19 @@ class ModbusUnit(Handle):
     profile: ClassVar[Profile] = PROFILE
 
     def point(self, item: str) -> Point[Any]:
-        """Return the point that an item names. That of a run takes as many values as it has. Inputs are read-only."""
+        """Return the point that an item names. That of a run takes as many values as it has. Inputs are read-only.
+
+        A point is one exchange: to write one of more than 123 registers, or 1968 coils, raises InvalidCommand. `write`
+        does it in two.
+        """
         place = Place.parse(item)
 
         def encode(value: Any) -> WriteCoils | WriteRegisters:
-            return place.write((value,) if place.count is None else tuple(value))[0]
+            first, *more = place.write((value,) if place.count is None else tuple(value))
+            if more:  # a point is one exchange: half of it must not be taken for the whole
+                most = len(first.values)
+                raise InvalidCommand(f"{item} takes two writes: {place.table}:{place.first}:{most}, then what follows")
+            return first
 
         return Point(
             self.node,
