@@ -265,3 +265,28 @@ async def test_from_the_safe_state_on_no_other_write_is_accepted_and_waiting_one
         ended = await asyncio.gather(*waiting, return_exceptions=True)
     assert all(isinstance(error, Superseded | WriteUnconfirmed) for error in ended)
     assert sum(isinstance(error, Superseded) for error in ended) >= 2
+
+
+EARLY = """
+import os, signal, sys
+from busmaster.cli import main, run
+
+def load(path, load=run.load):
+    os.kill(os.getpid(), signal.SIGHUP)
+    return load(path)
+
+run.load = load
+sys.exit(main(["run", sys.argv[1], "--plain"]))
+"""
+
+
+def test_sighup_before_the_file_is_loaded_does_not_end_a_run(path: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", EARLY, str(path)],
+        cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        told(process, "was read again")
+        polls(process)
+        process.terminate()
+        process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
