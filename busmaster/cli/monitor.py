@@ -132,7 +132,8 @@ class Listener(asyncio.Protocol):
         """Tell the last frame, and end `lost` with LineDown."""
         self._rest()
         if not self.lost.done():
-            self.lost.set_exception(LineDown(cause_text(cause, "the line was closed"), hint="start again when it is back"))
+            what = cause_text(cause, "the line was closed")
+            self.lost.set_exception(LineDown(what, hint="start again when it is back"))
 
     def _rest(self) -> None:
         self._pass(self._decoder.quiet())

@@ -105,10 +105,14 @@ class Distributor:
         with anyio.CancelScope(shield=True):
             # Closing waits for a thread, and perhaps for a disk: never on the loop that owns the line.
             await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in leaving.values()))
-            for kind, output in fresh.items():
-                if kind in leaving:
-                    output.succeed(leaving[kind])
-                output.start()
+        for kind, output in fresh.items():
+            if kind in leaving:
+                output.succeed(leaving.pop(kind))
+            output.start()
+        for kind, output in leaving.items():
+            counts = output.statistics()
+            on_disk = f", {counts.spilled} kept on disk" if counts.spilled else ""
+            self.tell(f"{kind} is ended: {counts.written} {counts.what}, {counts.dropped} dropped{on_disk}")
 
     def record(self, write: WriteRecord) -> None:
         """Hand a write to all of them."""

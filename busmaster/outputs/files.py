@@ -10,7 +10,8 @@ from typing import Any
 
 from busmaster.bus.polling import Sample, Snapshot
 from busmaster.gate.record import WriteRecord
-from busmaster.outputs.base import BatchOutput, Item, check_folder
+from busmaster.outputs.base import Item, check_folder
+from busmaster.outputs.batches import BatchOutput
 from busmaster.outputs.growing_file import GrowingFile
 from busmaster.outputs.settings import FileSettings
 from busmaster.outputs.values import cycle_fields, json_line, micros, value_text, write_fields
@@ -44,6 +45,12 @@ class FileOutput(BatchOutput[bytes]):
 
     def commit(self, batch: list[bytes]) -> None:
         self._file.append(b"".join(batch))
+
+    def pack(self, formatted: bytes) -> str:
+        return formatted.decode()
+
+    def unpack(self, text: str) -> bytes:
+        return text.encode()
 
     def shut(self) -> None:
         self._file.close()

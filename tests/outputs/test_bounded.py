@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable
 
 from busmaster.bus.polling import Snapshot
-from busmaster.outputs.base import BatchOutput, Happening, Item, Output
-from busmaster.outputs.settings import Settings
+from busmaster.outputs.base import Happening, Item, Output
+from busmaster.outputs.batches import BatchOutput
+from busmaster.outputs.settings import SpillingSettings
 from tests.outputs.cycles import cycle, settled, until
 
 
@@ -16,7 +17,7 @@ class Shelf(BatchOutput[Item]):
     """Puts everything into a list, when it is let."""
 
     def __init__(self, buffer: int = 100, say: Callable[[str], None] = lambda _: None) -> None:
-        super().__init__("shelf", Settings(buffer=buffer), say=say)
+        super().__init__("shelf", SpillingSettings(buffer=buffer), say=say)
         self.shelf: list[Item] = []
         self.let = threading.Event()
         self.let.set()
@@ -30,6 +31,11 @@ class Shelf(BatchOutput[Item]):
         if self.broken is not None:
             raise self.broken
         self.shelf += batch
+
+    def pack(self, formatted: Item) -> str:
+        raise AssertionError("it has no spool")
+
+    unpack = pack  # type: ignore[assignment]  # nor this
 
     def shut(self) -> None:
         pass
