@@ -26,7 +26,8 @@ import logging
 import ssl
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -57,6 +58,8 @@ BREATH = 0.002
 TIMEOUT = 5.0
 """Seconds in which a broker must answer."""
 KEEP_ALIVE = 15
+UNSUPPORTED_VERSION = 132
+"""What a broker says that knows MQTT 3.1.1 alone, or what the client makes of what that says."""
 HURRY = 2.0
 """Seconds from the wish to end until what could not be sent goes to disk."""
 
@@ -143,7 +146,7 @@ class MqttOutput(SpillingOutput):
             self.forwarded(up_to, records)  # only now: what is lost before it was acknowledged is sent again
 
     async def _connected(self) -> None:
-        async with self._client() as client, anyio.create_task_group() as tasks:
+        async with self._connection() as client, anyio.create_task_group() as tasks:
             self._published.clear()
             await self._send(client, [Outgoing(self._topic("status"), "online", True)])
             self.up()
@@ -163,6 +166,25 @@ class MqttOutput(SpillingOutput):
                 await anyio.sleep(0 if stopped else TICK)
             await self._send(client, [Outgoing(self._topic("status"), "offline", True)])
             tasks.cancel_scope.cancel()
+
+    @asynccontextmanager
+    async def _connection(self) -> AsyncIterator[Client]:
+        """Connect for the block. Raises ConnectionError, in words, where there is no broker that will do."""
+        import aiomqtt
+
+        broker = f"{self._settings.host}:{self._settings.port}"
+        async with AsyncExitStack() as stack:
+            try:
+                client = await stack.enter_async_context(self._client())
+            except aiomqtt.MqttCodeError as error:
+                if getattr(error.rc, "value", error.rc) == UNSUPPORTED_VERSION:
+                    raise ConnectionError(f"{broker} does not speak MQTT 5, which this output needs") from None
+                raise
+            except aiomqtt.MqttError as error:
+                if "timed out" in str(error):
+                    raise ConnectionError(f"{broker} did not answer in {TIMEOUT:g} s; does it speak MQTT 5?") from None
+                raise
+            yield client
 
     def _client(self) -> Client:
         import aiomqtt
