@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import click
 
+from busmaster.cli.output import Level, note
 from busmaster.config import LineFile, line_settings, load
+from busmaster.gate.record import WriteRecord
+from busmaster.outputs.distributor import Distributor
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -36,4 +40,21 @@ def other_port(file: LineFile, port: str | None) -> SerialPort | TcpPort | None:
     return None if port is None else endpoint(port, defaults=line_settings(file))
 
 
-__all__ = ["file_argument", "load", "other_port", "port_option"]
+def is_line_file(port: str) -> bool:
+    """Tell whether PORT is a LINE.toml that is there."""
+    return port.endswith(".toml") and os.path.isfile(port)
+
+
+async def keep(audit: Distributor, records: Iterable[WriteRecord]) -> None:
+    """Have the outputs of a line keep these records of what was written; one that could not is named."""
+    audit.start(())
+    for record in records:
+        audit.record(record)
+    await audit.close()
+    for counts in audit.statistics():
+        if counts.dropped:
+            why = f": {counts.error}" if counts.error else " in time"
+            note(f"{counts.kind} could not keep the record of what was written{why}", Level.WARNING)
+
+
+__all__ = ["file_argument", "is_line_file", "keep", "load", "other_port", "port_option"]

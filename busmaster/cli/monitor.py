@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import time
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
@@ -21,7 +20,7 @@ from busmaster.capture.recorder import Recorder
 from busmaster.cli.arguments import Connection
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
-from busmaster.cli.lines import load
+from busmaster.cli.lines import is_line_file, load
 from busmaster.cli.output import emit, emit_all, json_line, note, value_text
 from busmaster.cli.overheard import Overheard, feed, only_protocol, silent
 from busmaster.cli.parsing import Whole
@@ -65,11 +64,6 @@ def command(port: str, protocol: str | None, baud: int | None, as_json: bool, ca
     with capturing(capture, port=endpoint.name, protocol=protocol) as recorder:
         decoder = Decoder(kind.protocol.dialect())
         until_ended(listen, endpoint, decoder, lambda frame: emit(write(frame, names)), recorder)
-
-
-def is_line_file(port: str) -> bool:
-    """Tell whether PORT is a LINE.toml that is there."""
-    return port.endswith(".toml") and os.path.isfile(port)
 
 
 def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:

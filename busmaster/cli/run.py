@@ -64,8 +64,8 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
             path,
             view,
             hangups,
+            ending := context.find_object(Ending),
         )
-        ending = context.find_object(Ending)
         if ending is not None:
             ending.patience = running.line.safe_state.within + FAREWELL
         try:
@@ -84,12 +84,13 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
 class Running:
     """One line that runs as a file says, until it is told to end. `left_safely` says whether its safe state holds."""
 
-    def __init__(self, line: ConfiguredLine, path: str, view: View, hangups: Hangups) -> None:
+    def __init__(self, line: ConfiguredLine, path: str, view: View, hangups: Hangups, ending: Ending | None) -> None:
         self.line = line
         self.left_safely = True
         self._leaving = False
         self._path = path
         self._hangups = hangups
+        self._ending = ending
         self._watch = Watch(line.bus, line.file.title, view, gate=line.gate, steady=True)
         self._manager = ServiceManager()
 
@@ -169,6 +170,11 @@ class Running:
         down = any(counts.error for counts in self.line.outputs.statistics())
         self._watch.announce(text, Level.WARNING if down else Level.NOTICE)
 
+    def _why(self) -> str:
+        """Return what ends the run."""
+        number = self._ending.number if self._ending is not None else 0
+        return signal.Signals(number).name if number else "the end of the run"
+
     async def _leave(self) -> None:
         """Send the safe state, once: nothing else is written any more."""
         if self._leaving:
@@ -176,7 +182,7 @@ class Running:
         self._leaving = True
         self._manager.stopping()
         if self.line.safe_state:
-            outcomes = await self.line.safe_state.enter(self.line.bus)
+            outcomes = await self.line.safe_state.enter(self.line.gate, self._why())
             self.left_safely = tell_unsafe(outcomes) == OK
             if self.left_safely:
                 note(f"the safe state is confirmed: {', '.join(outcomes)}", Level.NOTICE)

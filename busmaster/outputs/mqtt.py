@@ -71,7 +71,10 @@ class Outgoing(NamedTuple):
 
 
 class MqttOutput(SpillingOutput):
-    """`commands` are the points, by their key, that may be written. Raises InvalidCommand if the extra is missing."""
+    """`commands` are the points, by their key, that may be written. Raises InvalidCommand if the extra is missing.
+
+    Without `in_charge` it says nothing of the state of the line and its nodes, nor that it is there.
+    """
 
     def __init__(
         self,
@@ -82,6 +85,7 @@ class MqttOutput(SpillingOutput):
         *,
         commands: Mapping[str, Point[Any]] | None = None,
         gate: Gate | None = None,
+        in_charge: bool = True,
     ) -> None:
         check_extra("aiomqtt", "mqtt")
         super().__init__(kind, settings, say)
@@ -89,6 +93,7 @@ class MqttOutput(SpillingOutput):
         self._secrets = secrets(settings)
         self._bus = bus
         self._gate = gate or Gate(bus)
+        self._in_charge = in_charge
         self._commands = {topic_part(key): point for key, point in (commands or {}).items()}
         self._arriving: Commands
         self._owner: asyncio.AbstractEventLoop | None = None
@@ -148,7 +153,7 @@ class MqttOutput(SpillingOutput):
     async def _connected(self) -> None:
         async with self._connection() as client, anyio.create_task_group() as tasks:
             self._published.clear()
-            await self._send(client, [Outgoing(self._topic("status"), "online", True)])
+            await self._send(client, self._status("online"))
             self.up()
             if self._commands:
                 await client.subscribe(self._topic("set/#"), qos=1)
@@ -164,7 +169,7 @@ class MqttOutput(SpillingOutput):
                     await self._send(client, (message for item in self._held for message in self._messages(item)))
                     self.written += self.let_go()
                 await anyio.sleep(0 if stopped else TICK)
-            await self._send(client, [Outgoing(self._topic("status"), "offline", True)])
+            await self._send(client, self._status("offline"))
             tasks.cancel_scope.cancel()
 
     @asynccontextmanager
@@ -200,7 +205,7 @@ class MqttOutput(SpillingOutput):
             username=username,
             password=password,
             tls_context=tls,
-            will=aiomqtt.Will(self._topic("status"), "offline", qos=1, retain=True),
+            will=aiomqtt.Will(self._topic("status"), "offline", qos=1, retain=True) if self._in_charge else None,
             keepalive=KEEP_ALIVE,
             timeout=TIMEOUT,
             max_inflight_messages=AT_ONCE,
@@ -250,8 +255,13 @@ class MqttOutput(SpillingOutput):
                 payload = json_line(time=micros(sample.wall), unit=point.unit, **sample_fields(sample))
                 yield Outgoing(self._topic("values", topic_part(point.key)), payload, settings.retain)
 
+    def _status(self, state: str) -> list[Outgoing]:
+        return [Outgoing(self._topic("status"), state, True)] if self._in_charge else []
+
     def _changes(self) -> Iterator[Outgoing]:
         """Yield what is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
+        if not self._in_charge:
+            return
         now = {"line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")}
         for node in self._bus.nodes:
             now[f"health/{topic_part(node.label.removeprefix('node '))}"] = ("health", node.health.value)

@@ -42,7 +42,9 @@ class Spool:
                 raise
             except sqlite3.DatabaseError as error:
                 aside = f"{path}.damaged"
-                os.replace(path, aside)
+                for part in ("", "-wal", "-shm"):  # what a crash left beside it must not be played into the new one
+                    if os.path.exists(path + part):
+                        os.replace(path + part, aside + part)
                 say(f"{path}: {error}: it is kept as {aside}, and begun anew")
                 self._database = _opened(path, kind)
             self.values: int = self._database.execute("select coalesce(sum(count), 0) from waiting").fetchone()[0]
