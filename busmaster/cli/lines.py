@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
+import anyio
 import click
 
 from busmaster.cli.output import Level, note
@@ -15,6 +16,10 @@ from busmaster.outputs.distributor import Distributor
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
+
+PATIENCE = 5.0
+"""Seconds in which outputs are to keep a record of what was written, and what waited before it."""
+LOOK = 0.02
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -50,6 +55,10 @@ async def keep(audit: Distributor, records: Iterable[WriteRecord]) -> None:
     audit.start(())
     for record in records:
         audit.record(record)
+    with anyio.move_on_after(PATIENCE):
+        # what waits on disk goes first, and would keep these there too if the outputs were closed at once
+        while any(counts.waiting and not counts.error for counts in audit.statistics()):  # noqa: ASYNC110  # by threads
+            await anyio.sleep(LOOK)
     await audit.close()
     for counts in audit.statistics():
         if counts.dropped:
