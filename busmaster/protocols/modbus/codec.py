@@ -172,6 +172,9 @@ class ReadRegisters:
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return tuple(values[place] for place in self.places)
 
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        return dict(zip(self.places, value, strict=True))
+
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[int, ...]]:
         """Begin the read. Raises InvalidCommand for the broadcast address: nobody would answer."""
         decode = struct.Struct(f">{self.count}H").unpack
@@ -202,6 +205,9 @@ class ReadBits:
 
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return tuple(values[place] for place in self.places)
+
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        return dict(zip(self.places, value, strict=True))
 
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[bool, ...]]:
         """Begin the read. Raises InvalidCommand for the broadcast address."""
