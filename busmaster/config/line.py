@@ -138,7 +138,7 @@ class ConfiguredLine:
             except (ArithmeticError, TypeError, ValueError):
                 raise InvalidCommand(f"{name} is one value: write the others by their own names") from None
         handle = self.nodes[name.partition("/")[0]]
-        return handle.prepare_write(point.source.item, [point.scale.write(value) for value in values], **options)
+        return handle.prepare_write(point.source.item, list(map(point.unscaled, values)), **options)
 
     def audit(self, tell: Callable[[str], None] = lambda _: None) -> Distributor:
         """Return those outputs of the file that keep a record of writes, for a process that polls nothing.

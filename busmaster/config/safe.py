@@ -91,7 +91,7 @@ class SafeWrite:
         node = Node.of(point)
         if node.address == node.profile.broadcast:
             raise InvalidCommand(f"{point.key} is for all nodes: nobody confirms it; write each node's own")
-        item, number = point.source.item, point.scale.write(value)
+        item, number = point.source.item, point.unscaled(value)
 
         def prepare(within: float) -> Send:
             [send] = handle.prepare_write(

@@ -15,7 +15,8 @@ from busmaster.config.line import ConfiguredLine
 from busmaster.emulator.serve import TcpServer
 from busmaster.gate.record import Outcome, WriteRecord
 from tests.cli.conftest import Command, started
-from tests.cli.test_leaving import PATIENCE, SAFE, TEXT, force, polls, winder
+from tests.cli.test_leaving import SAFE, TEXT, force, polls, winder
+from tests.patience import PATIENCE
 
 __all__ = ["winder"]  # a fixture
 
