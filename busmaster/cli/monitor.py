@@ -30,6 +30,7 @@ from busmaster.config import ConfiguredLine, LineFile
 from busmaster.errors import LineDown, cause_text
 from busmaster.outputs.values import cycle_fields
 from busmaster.registry import find
+from busmaster.transport.endpoints import Endpoint
 
 ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 
@@ -146,7 +147,7 @@ class Listener(asyncio.Protocol):
 
 
 async def listen(
-    endpoint: Any, decoder: Decoder, tell: Callable[[Frame], None], recorder: Recorder | None = None
+    endpoint: Endpoint, decoder: Decoder, tell: Callable[[Frame], None], recorder: Recorder | None = None
 ) -> None:
     """Listen until the line is lost. Raises LineDown then, and the OSError of a frame that could not be told."""
     listener = Listener(decoder, tell, recorder)
