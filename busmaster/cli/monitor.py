@@ -6,7 +6,7 @@ import asyncio
 import json
 import time
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 import anyio
@@ -28,7 +28,7 @@ from busmaster.cli.protocols import protocol_option
 from busmaster.cli.run import output_text
 from busmaster.config import ConfiguredLine, LineFile
 from busmaster.errors import LineDown, cause_text
-from busmaster.outputs.values import cycle_fields
+from busmaster.outputs.values import cycle_fields, utc
 from busmaster.registry import find
 from busmaster.transport.endpoints import Endpoint
 
@@ -92,12 +92,8 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
 
 
 def plain_values(snapshot: Snapshot) -> list[str]:
-    """Return a line a value, as `2026-11-22T14:02:11.485+00:00 winder/position 12.5`."""
-    return [
-        f"{datetime.fromtimestamp(sample.wall, UTC).isoformat(timespec='milliseconds')} "
-        f"{point.key} {value_text(sample.value)}"
-        for point, sample in snapshot.samples.items()
-    ]
+    """Return a line a value, as `2026-11-22T14:02:11.485Z winder/position 12.5`."""
+    return [f"{utc(sample.wall)} {point.key} {value_text(sample.value)}" for point, sample in snapshot.samples.items()]
 
 
 class Listener(asyncio.Protocol):

@@ -117,8 +117,8 @@ class Overheard:
         from_host = frame.sender is Direction.HOST
         if from_host and frame.kind in (Kind.READ, Kind.WRITE):  # a short command reads one more parameter
             self._ask(frame)
-        elif self._driver is not None and from_host:
-            self._go_on(self._driver)
+        elif from_host:
+            self._driver = None  # in the midst of an exchange, it has given that up
         elif self._driver is not None:
             self._answer(self._driver, frame)
 
@@ -134,12 +134,6 @@ class Overheard:
             exchange = command.open(node.address, node.timings)
             self._asked = node, command
             self._driver = Driver(exchange, noise_tolerant=self._profile.noise_tolerant)
-
-    def _go_on(self, driver: Driver) -> None:
-        """Take what the host says in the midst: what the reader wants to say, or else it has given up."""
-        if not driver.said:
-            driver.expire()
-        driver.said.clear()
 
     def _answer(self, driver: Driver, frame: Frame) -> None:
         timing, delay = driver.timing, frame.delay or 0.0

@@ -138,7 +138,6 @@ class SafeState:
             with anyio.CancelScope(shield=True):  # the signal that ends the line has cancelled this task
                 async with anyio.create_task_group() as tasks:
                     for node, ones in by_node.items():
-                        node.note_stop()  # what was decided before must not undo it
                         node.suspend(0.0)  # also one that somebody has suspended
                         tasks.start_soon(_leave, bus, ones, deadline)
         finally:

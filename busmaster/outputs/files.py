@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterable
-from datetime import UTC, datetime
 from typing import Any
 
 from busmaster.bus.polling import Sample, Snapshot
@@ -14,7 +13,7 @@ from busmaster.outputs.base import Item, check_folder
 from busmaster.outputs.batches import BatchOutput
 from busmaster.outputs.growing_file import GrowingFile
 from busmaster.outputs.settings import FileSettings
-from busmaster.outputs.values import cycle_fields, json_line, micros, value_text, write_fields
+from busmaster.outputs.values import cycle_fields, json_line, micros, utc, value_text, write_fields
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What a spreadsheet takes for the beginning of a formula."""
@@ -116,8 +115,3 @@ def value_cell(sample: Sample[Any]) -> str:
 def no_formula(text: str) -> str:
     """Return the text, behind an apostrophe where a spreadsheet would otherwise compute it."""
     return f"'{text}" if text[:1] in FORMULA else text
-
-
-def utc(moment: float) -> str:
-    """Return a time in seconds since 1970 as UTC text, to the millisecond."""
-    return datetime.fromtimestamp(moment, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -290,3 +290,25 @@ def test_sighup_before_the_file_is_loaded_does_not_end_a_run(path: Path) -> None
         process.terminate()
         process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
+
+
+SPILLING = '[outputs.jsonl]\npath = "FOLDER/line.jsonl"\nspill = "FOLDER/spool"\n'
+
+
+def test_a_spool_is_handed_over_at_sighup_and_a_damaged_one_is_told(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "spool").write_text("not a database at all " * 400)
+    path.write_text(path.read_text() + SPILLING.replace("FOLDER", str(tmp_path)))
+    with started("run", str(path), "--plain") as process:
+        assert "it is kept as" in told(process, "begun anew")
+        polls(process)
+        path.write_text(path.read_text() + "buffer = 1000\n")
+        process.send_signal(signal.SIGHUP)
+        told(process, "was read again")
+        path.write_text(path.read_text().replace("buffer = 1000", "buffer = 1001"))
+        process.send_signal(signal.SIGHUP)
+        told(process, "was read again")
+        process.terminate()
+        _, err = process.communicate(timeout=PATIENCE)
+    assert "does another process use it" not in err
+    [summary] = [line for line in err.splitlines() if line.startswith("busmaster: jsonl: ")]
+    assert summary.endswith(" written, 0 dropped")

@@ -23,6 +23,7 @@ class Shelf(BatchOutput[Item]):
         self.let = threading.Event()
         self.let.set()
         self.broken: Exception | None = None
+        self.shuts = 0
 
     def format(self, item: Item) -> Item | None:
         return None if isinstance(item, Happening) else item
@@ -39,7 +40,7 @@ class Shelf(BatchOutput[Item]):
     unpack = pack  # type: ignore[assignment]  # nor this
 
     def shut(self) -> None:
-        pass
+        self.shuts += 1
 
     @property
     def cycles(self) -> list[int]:
@@ -148,3 +149,26 @@ def test_what_an_output_does_not_write_is_no_loss_and_what_was_lost_before_it_is
     output.miss(3)
     output.close(PATIENCE)
     assert (output.written, output.dropped, output.offered) == (1, 3, 4)
+
+
+def test_one_that_is_reopened_lets_go_of_what_it_had_open_and_goes_on() -> None:
+    output = Shelf()
+    output.start()
+    offer(output, 1, 3)
+    until(lambda: settled(output))
+    output.reopen()
+    until(lambda: output.shuts == 1)
+    offer(output, 4, 5)
+    output.close(5)
+    assert output.cycles == [1, 2, 3, 4, 5]
+    assert output.shuts == 2
+
+
+def test_what_was_lost_before_it_could_be_offered_counts_as_dropped() -> None:
+    output = Shelf()
+    output.start()
+    output.miss(3)
+    offer(output, 1, 1)
+    output.close(5)
+    counts = output.statistics()
+    assert (counts.written, counts.dropped, counts.waiting) == (2, 3, 0)
