@@ -20,6 +20,7 @@ from busmaster.outputs.distributor import Distributor, Wanted
 from busmaster.outputs.files import CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings, MqttSettings, Settings, SqliteSettings
 from busmaster.outputs.sqlite import SqliteOutput
+from tests.disks import small_disk
 from tests.outputs.brokers import free_port
 from tests.outputs.cycles import BUS, cycle, settled, until
 from tests.outputs.test_audit import WRITE
@@ -247,3 +248,38 @@ async def test_an_output_that_a_file_does_not_name_any_more_says_what_it_leaves_
     await outputs.replace({}, ())
     await outputs.close()
     assert told[-1] == "csv is ended: 0 written, 0 dropped, 2 kept on disk"
+
+
+@pytest.mark.parametrize("kind", ["csv", "sqlite"])
+def test_a_full_disk_costs_nothing_where_what_waits_is_on_another(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "disk").mkdir()
+    said: list[str] = []
+    path, spill = str(tmp_path / "disk" / "x"), str(tmp_path / "spool")
+    with small_disk(tmp_path / "disk", 2000) as disk:
+        output: BatchOutput[Any] = (
+            CsvOutput(kind, FileSettings(path=path, spill=spill, buffer=100), said.append)
+            if kind == "csv"
+            else SqliteOutput(kind, SqliteSettings(path=path, spill=spill, buffer=100), said.append)
+        )
+        output.offer(cycle(1, 1))
+        output.start()
+        until(lambda: settled(output))
+        disk.fill()
+        number = 1
+        while not output.error:  # what the file system had set aside for the file is used up
+            number += 1
+            output.offer(cycle(number, number))
+            until(lambda: settled(output) or bool(output.error))
+        last = number + 300
+        while number < last:
+            number += 1
+            output.offer(cycle(number, number))
+            if number % 50 == 0:
+                until(lambda: output.spilled == output.statistics().waiting)
+        disk.clear()
+        until(lambda: settled(output))
+        output.close(5)
+        assert numbers(tmp_path / "disk" / "x") == list(range(1, last + 1))
+    assert output.dropped == output.lost == 0
+    assert "full" in said[0] or "No space left" in said[0]
+    assert said[-1] == f"{kind} is up again"
