@@ -22,7 +22,7 @@ from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Poll, Transaction
-from busmaster.errors import LineDown
+from busmaster.errors import cause_text
 from busmaster.transport.alarm import Alarm
 from busmaster.transport.clock import clock_of
 from busmaster.transport.kernel import OpenPort, open_port
@@ -203,7 +203,7 @@ class Pump(asyncio.Protocol):
     def connection_lost(self, cause: Exception | None) -> None:
         self._transport = None
         self._port = None
-        what = self._gave_up or (cause.what if isinstance(cause, LineDown) else str(cause or "it was closed"))
+        what = self._gave_up or cause_text(cause, "it was closed")
         self._gave_up = ""
         self.arbiter.line_down(what, self.clock())
         self.turn()

@@ -256,7 +256,7 @@ async def test_from_the_safe_state_on_no_other_write_is_accepted_and_waiting_one
         drive = line.nodes["winder"]
         waiting = [asyncio.ensure_future(drive.write(10 + number, 1.0)) for number in range(3)]
         await asyncio.sleep(0)
-        leaving = asyncio.ensure_future(line.safe_state.enter(line.bus))
+        leaving = asyncio.ensure_future(line.safe_state.enter(line.gate, "a test"))
         await asyncio.sleep(0)
         with pytest.raises(Superseded):
             await drive.write(20, 1.0, priority=Priority.URGENT)
@@ -265,3 +265,50 @@ async def test_from_the_safe_state_on_no_other_write_is_accepted_and_waiting_one
         ended = await asyncio.gather(*waiting, return_exceptions=True)
     assert all(isinstance(error, Superseded | WriteUnconfirmed) for error in ended)
     assert sum(isinstance(error, Superseded) for error in ended) >= 2
+
+
+EARLY = """
+import os, signal, sys
+from busmaster.cli import main, run
+
+def load(path, load=run.load):
+    os.kill(os.getpid(), signal.SIGHUP)
+    return load(path)
+
+run.load = load
+sys.exit(main(["run", sys.argv[1], "--plain"]))
+"""
+
+
+def test_sighup_before_the_file_is_loaded_does_not_end_a_run(path: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", EARLY, str(path)],
+        cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        told(process, "was read again")
+        polls(process)
+        process.terminate()
+        process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
+
+
+SPILLING = '[outputs.jsonl]\npath = "FOLDER/line.jsonl"\nspill = "FOLDER/spool"\n'
+
+
+def test_a_spool_is_handed_over_at_sighup_and_a_damaged_one_is_told(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "spool").write_text("not a database at all " * 400)
+    path.write_text(path.read_text() + SPILLING.replace("FOLDER", str(tmp_path)))
+    with started("run", str(path), "--plain") as process:
+        assert "it is kept as" in told(process, "begun anew")
+        polls(process)
+        path.write_text(path.read_text() + "buffer = 1000\n")
+        process.send_signal(signal.SIGHUP)
+        told(process, "was read again")
+        path.write_text(path.read_text().replace("buffer = 1000", "buffer = 1001"))
+        process.send_signal(signal.SIGHUP)
+        told(process, "was read again")
+        process.terminate()
+        _, err = process.communicate(timeout=PATIENCE)
+    assert "does another process use it" not in err
+    [summary] = [line for line in err.splitlines() if line.startswith("busmaster: jsonl: ")]
+    assert summary.endswith(" written, 0 dropped")

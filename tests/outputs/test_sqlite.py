@@ -189,6 +189,17 @@ def test_what_is_kept_holds_at_any_rate(monkeypatch: pytest.MonkeyPatch) -> None
     assert left_in(database) <= 20 * (2 * 60 * 20 + 10)
 
 
+@pytest.mark.parametrize(("rows", "gone"), [(100, 10), (3_000, 200)])
+def test_at_once_a_tenth_is_forgotten_and_never_more_than_a_piece(
+    monkeypatch: pytest.MonkeyPatch, rows: int, gone: int
+) -> None:
+    monkeypatch.setattr(retention, "AT_ONCE", 200)
+    database = database_of(*range(rows))
+    retention.delete_oldest(database, "samples")
+    assert left_in(database) == rows - gone
+    assert database.execute("select min(time) from samples").fetchone() == (gone,)
+
+
 def test_a_limit_in_megabytes_forgets_the_oldest_and_the_events_of_that_time(tmp_path: Path) -> None:
     path = tmp_path / "x.db"
     now = time.monotonic()

@@ -376,6 +376,8 @@ async def test_a_network_that_stands_still_for_good_takes_the_line_down_in_words
     [
         (None, "it was closed"),
         (OSError("gone"), "gone"),
+        (OSError(), "OSError"),
+        (OSError(5, "Input/output error"), "Input/output error"),
         (LineDown("the adapter is gone"), "the adapter is gone"),
     ],
 )

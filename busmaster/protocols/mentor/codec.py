@@ -95,6 +95,9 @@ class Read:
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return values[self.menu, self.number]
 
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        return {(self.menu, self.number): value}
+
     def open(self, address: int, timings: Timings) -> Reading:
         """Begin the read. Raises InvalidCommand for the broadcast address: every drive would answer at once."""
         request, echo = read_request(address, self.menu, self.number)
@@ -129,6 +132,9 @@ class ReadRun:
         first = f"read {self.menu:02d}.{self.number:02d}"
         last = self.number + self.step * (self.count - 1)
         return f"{first} to {self.menu:02d}.{last:02d}" if self.step else f"{first}, {self.count} times"
+
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        return {(self.menu, self.number + self.step * i): one for i, one in enumerate(value)}
 
     def open(self, address: int, timings: Timings) -> RunReading:
         """Begin the read. Raises InvalidCommand for the broadcast address."""
