@@ -1,7 +1,7 @@
 """The reply times that a line has learned, in a file that the next run of the line starts with.
 
-What is read from there is a hint alone: it is trusted after fewer replies, and no window that it leads to is longer than
-the document's. So a file that is damaged, or of other nodes, costs time at most; it is left out as a whole.
+What is read from there is a hint alone: it is trusted after fewer replies, and leads to no window that is longer than
+the document's. A file that is damaged is left out as a whole; one that is wrong costs time, and no more.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class ConfiguredLine:
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         self.gate = Gate(self.bus, read_only=read_only)
         self.outputs = Distributor(self.bus, tell, gate=self.gate)
-        self._kept_times = KeptTimes(self.bus, lambda text: self.outputs.tell(text))
+        self._kept_times = KeptTimes(self.bus, self._tell)
         self.gate.record = self.outputs.record
         if outputs:
             self._add_outputs()
@@ -178,6 +178,9 @@ class ConfiguredLine:
         return self.bus.plan(*planned)
 
     # inside
+
+    def _tell(self, text: str) -> None:
+        self.outputs.tell(text)
 
     def _own_nodes(self) -> dict[str, Node]:
         return {name: Node.of(handle) for name, handle in self.nodes.items()}

@@ -120,7 +120,9 @@ def load(path: str | os.PathLike[str]) -> LineFile:
 def read(source: Source) -> LineFile:
     """Read what a source says of a line. Raises FileError, naming line and key, for what is wrong in it."""
     top = Table(source)
-    top.only("title", "port", "strict", "timing", "learned", "protocols", "nodes", "groups", "outputs", "safe", "emulator")
+    top.only(
+        "title", "port", "strict", "timing", "learned", "protocols", "nodes", "groups", "outputs", "safe", "emulator"
+    )
     nodes = {node.name: node for node in _nodes(top, _defaults(top))}
     groups = {table.name: _group(table) for table in top.tables("groups")}
     file = LineFile(
