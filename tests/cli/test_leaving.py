@@ -22,6 +22,7 @@ from busmaster.errors import Superseded, WriteUnconfirmed
 from tests.cli.conftest import ENVIRONMENT, ROOT, Command, serve, started
 from tests.cli.test_processes import Terminal
 from tests.patience import PATIENCE
+from tests.ports import free_port
 
 TEXT = """
 port = "PORT?baudrate=57600"
@@ -153,11 +154,8 @@ def test_sighup_replaces_what_changed_and_leaves_the_rest_unbroken(path: Path) -
 
 
 def test_a_port_that_is_missing_at_the_start_is_waited_for(tmp_path: Path) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
     path = tmp_path / "line.toml"
-    path.write_text(TEXT.replace("PORT", f"socket://127.0.0.1:{port}"))
+    path.write_text(TEXT.replace("PORT", f"socket://127.0.0.1:{free_port()}"))
     with started("run", str(path), "--json") as process:
         told(process, "cannot connect")
         with started("emulate", str(path)) as emulated:

@@ -17,6 +17,7 @@ from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, TcpServer, serve_pty, serve_tcp
 from busmaster.protocols._comms.mint import EmulatedMint
 from tests.patience import PATIENCE
+from tests.ports import free_port
 
 WRITE = bytes.fromhex("07 30 32 02 30 31 31 32 33 2E 34 35 36 03 2B")  # AN00129: node 2, Comms(1) = 123.456
 READ = bytes.fromhex("07 30 32 02 30 31 05 04")
@@ -110,7 +111,7 @@ def test_a_tcp_port_answers_several_clients_one_after_another() -> None:
 
 
 def test_a_closed_tcp_port_can_be_served_again_at_once() -> None:
-    with serve_tcp(mint_line()) as server, connected(server) as client:
+    with serve_tcp(mint_line(), port=free_port()) as server, connected(server) as client:
         assert ask(client.fileno(), WRITE, 1) == b"\x06"
         server.close()
         assert client.recv(1) == b""
