@@ -110,7 +110,7 @@ def test_a_signal_that_another_thread_takes_ends_an_emulated_line_too() -> None:
         serve_for(None)
 
     before = signal.signal(signal.SIGUSR1, hear)
-    taking = threading.Thread(target=lambda: signal.pthread_kill(threading.get_ident(), signal.SIGUSR1))
+    taking = threading.Timer(0.1, lambda: signal.pthread_kill(threading.get_ident(), signal.SIGUSR1))
     try:
         with pytest.raises(Heard):
             serve()
