@@ -38,7 +38,7 @@ async def rung(after: float) -> tuple[float, float]:
     loop = asyncio.get_running_loop()
     done = asyncio.Event()
     alarm = Alarm(loop, done.set)
-    start = time.monotonic()
+    start = loop.time() if after >= SOON else time.monotonic()  # uvloop's own timers count from when its turn began
     alarm.set(after)
     async with asyncio.timeout(PATIENCE):
         await done.wait()
