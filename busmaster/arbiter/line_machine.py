@@ -442,7 +442,7 @@ class LineMachine:
 
     def _hear_out(self, run: bytes, now: float) -> None:
         """Take what came before this silence: whoever said it, and owed it, is alive (R11, R15)."""
-        node = self._trust.hear(self._wire, run, self._unasked, now) if run else None
+        node = self._trust.hear(self._wire, run, self._unasked, now, self._echo.astray) if run else None
         if node is not None and node.health is DOWN:
             self.dispatcher.probes.alive(node, now)
 

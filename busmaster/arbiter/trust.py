@@ -80,8 +80,14 @@ class Trust:
             transaction.node.unheard += not heard
             self._in_step.owe(keys, transaction.node, leg.end, over, awaited)
 
-    def hear(self, wire: OnWire, run: bytes, unasked: UnaskedBytes, now: float) -> NodeRecord | None:
-        """Take what came before this silence of the line. Returns who owed it, if that is known."""
+    def hear(
+        self, wire: OnWire, run: bytes, unasked: UnaskedBytes, now: float, ours: bool = False
+    ) -> NodeRecord | None:
+        """Take what came before this silence of the line. Returns who owed it, if that is known. It pays nothing where
+        it may be `ours`, an echo that went astray: the end of a request can be a whole right reply of somebody's."""
+        if ours:
+            self._in_step.owe((ANY_BYTE,), None, now, now)
+            return None
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
         if paid is not None and node is not None and node.learning is not None and paid.awaited is not None:
