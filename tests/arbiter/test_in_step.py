@@ -255,15 +255,28 @@ def test_r15_what_is_owed_outlives_a_lost_port() -> None:
     assert read.value == 7.0
 
 
-def test_r15_what_is_left_of_our_own_request_pays_nothing() -> None:
-    """On a line that echoes, a write to element 1 whose echo was damaged looks like a reply of element 1."""
+def echoing() -> tuple[Bench, NodeRecord]:
+    """A line that echoes, and a node that has answered element 2 on it."""
     bench = Bench(echo=True)
     node = bench.node()
-    for element in (2, 1):
-        bench.ask(node, hcp2.Read(element), retries=0)
-        bench.hear(bench.sent(), after=REQUEST)
-        if element == 2:
-            bench.hear(reply_of(2, 5), after=0.004)
+    echoed(bench, bench.ask(node, hcp2.Read(2)), answered_after=0.004)
+    return bench, node
+
+
+def echoed(bench: Bench, asked: Transaction, answered_after: float) -> None:
+    """It is asked, its request echoes whole, and it is answered after so many seconds."""
+    request = bench.sent()
+    bench.hear(request, after=REQUEST)
+    bench.hear(right_answer(request), answered_after)
+    bench.until_ready()
+    assert bench.ended(asked)
+
+
+def test_r15_what_is_left_of_our_own_request_pays_nothing() -> None:
+    """The end of a write to element 1, whose echo was damaged, looks like a reply of element 1."""
+    bench, node = echoing()
+    bench.ask(node, retries=0)
+    bench.hear(bench.sent(), after=REQUEST)
     bench.until_ready()
     bench.ask(node, write(5))
     assert bench.sent() == WRITE_5, "an ACK is not owed"
@@ -271,27 +284,19 @@ def test_r15_what_is_left_of_our_own_request_pays_nothing() -> None:
     bench.hear(WRITE_5[3:], after=0.002)
     following = bench.ask(node)
     bench.until_sent()
-    check = bench.sent()
-    assert check == request_of(2), "element 1 is owed still"
-    bench.hear(check, after=REQUEST)
+    assert bench.sent() == request_of(2), "a check: element 1 is owed still"
+    bench.hear(bench.asked, after=REQUEST)
     bench.hear(reply_of(1, 55), after=0.002)
     assert following.value is None
 
 
-def test_r15_a_reply_pays_again_once_an_echo_has_come_whole() -> None:
-    bench = Bench(echo=True)
-    node = bench.node()
-    first = bench.ask(node, retries=0)
+def test_r15_replies_pay_again_once_an_echo_has_come_whole() -> None:
+    bench, node = echoing()
+    bench.ask(node, retries=0)
     bench.sent()
     bench.hear("FF", after=0.002)
-    assert bench.ended(first)
-    bench.ask(node, hcp2.Read(3), retries=0)
-    for _ in range(2):
-        bench.until_sent()
-        asked = bench.sent()
-        bench.hear(asked, after=REQUEST)
-        bench.hear(right_answer(asked), after=0.004 if asked == request_of(2) else 0.120)
     bench.until_ready()
+    echoed(bench, bench.ask(node, hcp2.Read(3), retries=0), answered_after=0.120)
     before = checks(bench)
     bench.ask(node, hcp2.Read(3))
     assert (bench.sent(), checks(bench)) == (request_of(3), before), "a straggler has paid for it"
