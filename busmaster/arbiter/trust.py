@@ -46,7 +46,7 @@ class Trust:
         if any(step.rest.startswith(key) for key in answers):
             return TWO_ANSWERS
         if in_step.clashes(answers, now, transaction.node):
-            in_step.doubtful_answer(answers)
+            # It pays nothing: it may be this request's, and what was owed before is still to come.
             return "its answer may be an earlier request's, whose own never came"
         if in_step.is_doubtful(answers, now) and not held:
             latest = leg.end + transaction.node.latest(leg.timing.window) + leg.latency
