@@ -186,8 +186,8 @@ def test_r15_probes_that_can_only_ask_one_thing_find_a_node_that_is_back() -> No
 
 
 def test_r15_an_urgent_write_is_sent_at_once_and_repeated_behind_a_check_where_it_may_be() -> None:
-    """`disable()` right after an unanswered write: the ACK may be that write's, or its own, and then that one's is still
-    to come. So both nodes are checked."""
+    """`disable()` right after an unanswered write: the ACK may be that write's; or its own, and that one's is still to
+    come. So both nodes are checked."""
     bench = Bench()
     node, other = up(bench), up(bench, 2)
     lost(bench, other, write(5))
