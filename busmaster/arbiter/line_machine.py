@@ -481,8 +481,7 @@ class LineMachine:
         self.noisy = False
         self._deadlines.line = inf
         self._echo.forget()
-        self._unasked.answered()
-        self._unasked.silent()
+        self._unasked.forget()
         if transaction is not None:
             self._wire.output.discard()
             self._trust.owe(self._wire, heard=True)

@@ -185,3 +185,16 @@ def test_r3_an_ack_that_lies_behind_a_lost_port_is_followed_by_its_packet_too() 
     line.hear(ACK, after=0.7)
     line.wait(0.95)
     assert line.sent() == ""
+
+
+def test_half_a_packet_from_before_the_port_was_lost_is_not_gone_on_with() -> None:
+    line = bench()
+    line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    line.hear(REPLY_1234[:20])
+    line.arbiter.line_down("unplugged", line.now)
+    line.arbiter.line_up(line.now)
+    line.hear(REPLY_1234, after=0.1)
+    assert line.sent() == ACK, "a whole packet, acknowledged at once"
+    line.until_ready()
+    assert line.sent() == "", "and the half one not at all"
