@@ -459,6 +459,8 @@ class LineMachine:
         """Take the echo of what was sent off the front, byte for byte; a mismatch is a collision."""
         rest = self._echo.strip(data)
         self._unasked.last_byte = now  # where the echo is lost, this may be another's byte that looks like it
+        if self.state is SETTLING:  # an ACK, then, before its packet (MSC)
+            self._silent_at = max(self._silent_at, self._leg.came_unasked(now))
         if rest is None:
             self._counters.collisions += 1
             self.events.append(CameUnasked(data, collision=True))

@@ -52,9 +52,10 @@ class Trust:
             latest = leg.end + transaction.node.latest(leg.timing.window) + leg.latency
             if step.rest or leg.begun_at > latest:
                 return "its answer may be another's, said late or twice"
-            may_wait = not step.send  # MSC says its packet again until that is acknowledged
-            if may_wait and in_step.doubts(now):
-                self.held = step
+            if in_step.doubts(now):
+                if step.send:  # at once: MSC says its packet again until that is acknowledged
+                    wire.say(step.send, now)
+                self.held = Done(step.value)
                 return max(now, latest) + 2 * leg.byte_time
         in_step.answered(transaction.node, transaction.started, now, leg.timing.nominal)
         in_step.said(answers, now)
