@@ -157,6 +157,11 @@ class Arbiter(LineMachine):
         data, output.waiting = output.waiting, b""
         return data or None
 
+    @property
+    def said_until(self) -> float:
+        """When all that was said is on the wire, in seconds on the caller's clock, if the port holds none of it."""
+        return self._leg.out
+
     def poll_event(self) -> Event | None:
         """Take out the next event, in the order of `events`, or return None."""
         if self.dispatcher.unnoted is not None:

@@ -443,7 +443,7 @@ class LineMachine:
 
     def _hear_out(self, run: bytes, now: float) -> None:
         """Take what came before this silence: whoever said it, and owed it, is alive (R11, R15)."""
-        node = self._trust.hear(self._wire, run, self._unasked, now) if run else None
+        node = self._trust.hear(self._wire, run, self._unasked, now, self._echo.astray) if run else None
         if node is not None and node.health is DOWN:
             self.dispatcher.probes.alive(node, now)
 
@@ -460,6 +460,8 @@ class LineMachine:
         """Take the echo of what was sent off the front, byte for byte; a mismatch is a collision."""
         rest = self._echo.strip(data)
         self._unasked.last_byte = now  # where the echo is lost, this may be another's byte that looks like it
+        if self.state is SETTLING:  # an ACK, then, before its packet (MSC)
+            self._silent_at = max(self._silent_at, self._leg.came_unasked(now))
         if rest is None:
             self._counters.collisions += 1
             self.events.append(CameUnasked(data, collision=True))
@@ -481,8 +483,7 @@ class LineMachine:
         self.noisy = False
         self._deadlines.line = inf
         self._echo.forget()
-        self._unasked.answered()
-        self._unasked.silent()
+        self._unasked.forget()
         if transaction is not None:
             self._wire.output.discard()
             self._trust.owe(self._wire, heard=True)
