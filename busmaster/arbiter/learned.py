@@ -70,6 +70,11 @@ class LearnedTimes:
     trusted: bool
 
 
+def window_of(slowest: float, heard: float) -> float:
+    """Return the seconds in which a reply of such a node begins: see `LearnedTimes` for what is given, in seconds."""
+    return max(LEAST, max(SLOWER * slowest, heard) + MARGIN)
+
+
 class _Largest:
     """The largest of the last one or two epochs."""
 
@@ -128,7 +133,7 @@ class LegTimes:
     @property
     def window(self) -> float:
         """Seconds in which a reply begins, by all that is known."""
-        return max(LEAST, max(SLOWER * self.slowest.value, self.heard.value) + MARGIN)
+        return window_of(self.slowest.value, self.heard.value)
 
     def timing(self, document: ReplyTiming, byte_time: float, patience: int) -> ReplyTiming:
         """Return what is awaited: the document's while too little is known."""
