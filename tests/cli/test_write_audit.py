@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import getpass
 import signal
 import sqlite3
@@ -16,6 +17,8 @@ from busmaster.emulator.serve import TcpServer
 from busmaster.gate.record import Outcome, WriteRecord
 from tests.cli.conftest import Command, started
 from tests.cli.test_leaving import SAFE, TEXT, force, polls, winder
+from tests.outputs.brokers import Broker, needs_mosquitto, running
+from tests.outputs.test_mqtt import heard, listening
 from tests.patience import PATIENCE
 
 __all__ = ["winder"]  # a fixture
@@ -167,3 +170,26 @@ async def test_what_was_sent_once_stays_unconfirmed_whatever_keeps_it_from_being
         outcomes = await line.safe_state.enter(line.gate, "a test")
     assert outcomes[write.point.key] is not None
     assert [(record.outcome, record.by) for record in records] == [(Outcome.UNCONFIRMED, "a test")]
+
+
+async def told_by_mqtt(broker: Broker, path: str) -> dict[str, Any]:
+    """What is published, by topic, while a point of this file is written."""
+    async with listening(broker, "busmaster/#") as client:
+        with started("write", path, "winder/force=12.5") as process:
+            out, err = await asyncio.to_thread(process.communicate, timeout=PATIENCE)
+        assert (process.returncode, out, err) == (0, "winder/force ok\n", "")
+        await client.publish("busmaster/over", "true", qos=1)
+        topics: dict[str, Any] = {}
+        while "busmaster/over" not in topics:
+            [(topic, payload, _)] = await heard(client, 1)
+            topics[topic] = payload
+    return topics
+
+
+@needs_mosquitto
+def test_mqtt_hears_of_the_write_and_nothing_of_a_line_that_another_process_may_run(path: Path, tmp_path: Path) -> None:
+    with running(tmp_path) as broker:
+        path.write_text(f'{path.read_text()}[outputs.mqtt]\nport = {broker.port}\nallow_commands = ["winder/force"]\n')
+        topics = asyncio.run(told_by_mqtt(broker, str(path)))
+    assert topics.pop("busmaster/audit")["door"] == "command line"
+    assert set(topics) <= {"busmaster/events", "busmaster/over"}
