@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 
 from busmaster.bus.polling import Snapshot
@@ -81,9 +80,8 @@ def test_offering_never_waits_for_the_thread() -> None:
     output = Shelf(buffer=10)
     output.let.clear()
     output.start()
-    started = time.perf_counter()
     offer(output, 1, 200)
-    assert time.perf_counter() - started < 1
+    assert not output.shelf  # nothing could be written meanwhile
     output.let.set()
     output.close(PATIENCE)
     assert output.written + output.dropped == output.offered == 400
@@ -135,9 +133,8 @@ def test_one_that_hangs_is_not_waited_for() -> None:
     output.start()
     offer(output, 1, 1)
     until(lambda: not output._waiting)
-    started = time.perf_counter()
     output.close(0.01)
-    assert time.perf_counter() - started < 1
+    assert output._thread.is_alive()
     assert output.dropped == 2
     output.let.set()
 

@@ -17,15 +17,17 @@ from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand, NoReply
+from busmaster.gate import gate
 from busmaster.gate.payload import Payload, read_payload
 from busmaster.outputs.base import Happening
 from busmaster.outputs.mqtt import MqttOutput
 from busmaster.outputs.settings import MqttSettings
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
-from tests.outputs.brokers import Broker, free_port, needs_mosquitto, running
+from tests.outputs.brokers import Broker, needs_mosquitto, running
 from tests.outputs.cycles import BUS, cycle, until
 from tests.patience import PATIENCE
+from tests.ports import free_port
 
 if TYPE_CHECKING:
     from aiomqtt import Client
@@ -34,6 +36,11 @@ Heard = tuple[str, Any, bool]
 """Topic, payload, and whether it was retained."""
 
 pytestmark = needs_mosquitto
+
+
+@pytest.fixture(autouse=True)
+def commands_stay_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "FRESH", PATIENCE)
 
 
 @pytest.fixture
