@@ -21,11 +21,11 @@ from busmaster.outputs.files import CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings, MqttSettings, Settings, SqliteSettings
 from busmaster.outputs.sqlite import SqliteOutput
 from tests.disks import small_disk
-from tests.outputs.brokers import free_port
 from tests.outputs.cycles import BUS, cycle, settled, until
 from tests.outputs.test_audit import WRITE
 from tests.outputs.test_distributor import TEXT, opened
 from tests.outputs.test_spool import spool_at, spooled
+from tests.ports import free_port
 
 
 @pytest.fixture(autouse=True)
