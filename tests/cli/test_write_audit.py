@@ -69,7 +69,7 @@ def test_a_point_is_written_by_its_name_in_its_unit_and_that_is_on_record(
         ("winder/force=51", "above its maximum of 50"),
         ("winder/10=9", "below its minimum of 1"),
         ("winder/axis0.idle=1", "is read-only"),
-        ("winder/force=2,3", "is one value"),
+        ("winder/force=2,3", "does not take 2 values"),
         ("winder/force=inf", "finite number"),
     ],
 )
