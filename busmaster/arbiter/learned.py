@@ -14,12 +14,12 @@ The rule, for each kind of command (its type) and each of the node's two legs (t
 ACK) on its own: the window is twice the largest reply time of the last 500 to 1000 replies, or the largest until the
 first bytes were handed over if that is more (an adapter may hand over a whole reply at once), plus 2 ms; at least 5 ms,
 at most the document's. It is trusted after 200 replies.
-The second attempt of a read has four times that. The silence after which a reply is over is twice the longest pause
+The second attempt of a read has twice that. The silence after which a reply is over is twice the longest pause
 within one of those replies, but 17 bytes at least. (A smoothed mean and deviation, as TCP has it, follows the usual
 reply too closely: of 76,000 replies it missed 1236, the largest none.)
 
-A node that was later than three quarters of a learned window, or whose reply came after it, has the document's times
-again for 200 replies.
+A node that was later than three quarters of a learned window (one shorter than the document's), or whose reply came
+after it, has the document's times again for 200 replies.
 
 Of times nothing is done here but to add, subtract, compare and multiply by a constant.
 """
@@ -44,7 +44,7 @@ SLOWER = 2
 """How many times its slowest reply is awaited of a node."""
 LEAST = 0.005
 """The shortest window, in seconds: less than a process is held up for."""
-AT_FIRST, AGAIN, AT_LAST, NEVER = 1, 4, 10**9, 0
+AT_FIRST, AGAIN, AT_LAST, NEVER = 1, 2, 10**9, 0
 """How many times the learned window an attempt is awaited, but no longer than the document says. AT_LAST is the attempt
 on which an outcome rests: the document's window. NEVER: neither its window nor its silence is learned."""
 LATE_SHARE = 0.75

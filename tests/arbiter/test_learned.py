@@ -152,7 +152,7 @@ def test_another_node_that_answers_with_another_echo_is_asked_at_once() -> None:
     assert unlike.value == 9.0
 
 
-def test_a_second_attempt_is_awaited_four_times_as_long_and_the_last_as_long_as_the_document_says() -> None:
+def test_a_second_attempt_is_awaited_twice_as_long_and_the_last_as_long_as_the_document_says() -> None:
     bench = Bench()
     node = trained(bench)
     asked = bench.ask(node, retries=2)
@@ -167,7 +167,7 @@ def test_a_second_attempt_is_awaited_four_times_as_long_and_the_last_as_long_as_
         bench.to(bench.arbiter.poll_timeout())
         sent_at.append(bench.now)
     waited = [end - begin for begin, end in zip(sent_at[::2], sent_at[1::2], strict=True)]
-    assert waited == pytest.approx([REQUEST + WINDOW, REQUEST + 4 * WINDOW, REQUEST + TIMINGS.read.window])
+    assert waited == pytest.approx([REQUEST + WINDOW, REQUEST + 2 * WINDOW, REQUEST + TIMINGS.read.window])
     assert isinstance(asked.error, NoReply)
 
 
@@ -270,6 +270,20 @@ def test_a_reply_later_than_three_quarters_of_its_window_does_so_too() -> None:
     node = trained(bench)
     bench.served(bench.ask(node), after=REQUEST + 0.8 * WINDOW)
     assert not trusted(node)
+
+
+def test_a_node_that_has_always_been_as_slow_as_the_document_allows_is_trusted_all_the_same() -> None:
+    bench = Bench()
+    slow = 0.9 * TIMINGS.read.window
+    node = bench.arbiter.add_node(hcp2.PROFILE, 1, bench.now, LEARNED)
+    for number in range(TRUSTED_AFTER + 10):
+        bench.served(bench.ask(node, hcp2.Read(10 + number % 2)), after=REQUEST + slow)
+    assert trusted(node)
+    assert learning(node).returns == 0
+    bench.ask(node)
+    bench.sent()
+    waited = bench.until_sent()
+    assert waited == pytest.approx(REQUEST + TIMINGS.read.window), "no longer: for what is owed the line does not wait"
 
 
 def test_a_node_that_was_away_begins_again() -> None:

@@ -129,7 +129,7 @@ def test_r9_no_wait_exceeds_its_bound_whatever_was_learned_and_whenever_it_prove
         device.delay = Delay(line.random.choice(times))
 
     line.every(lambda: line.random.expovariate(2.0), change)
-    written = {hcp2.PROFILE: hcp2.Write(1, (1.0,)), mentor.PROFILE: mentor.Write(1, 17, 1)}[profile]
+    written: Command[Any] = hcp2.Write(1, (1.0,)) if profile is hcp2.PROFILE else mentor.Write(1, 17, 1)
     ahead: dict[Transaction, int] = {}
     shares: list[float] = []
 
