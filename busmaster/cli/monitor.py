@@ -100,7 +100,7 @@ def plain_values(snapshot: Snapshot) -> list[str]:
     """Return a line a value, as `2026-11-22T14:02:11.485+00:00 winder/position 12.5`."""
     return [
         f"{datetime.fromtimestamp(sample.wall, UTC).isoformat(timespec='milliseconds')} "
-        f"{point.key} {value_text(sample.value)}"
+        f"{point.key} {value_text(sample.value, point.meaning.precision)}"
         for point, sample in snapshot.samples.items()
     ]
 

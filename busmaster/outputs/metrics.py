@@ -98,6 +98,9 @@ class MetricsOutput(Output):
     def miss(self, values: int) -> None:
         """Ignore the count: nothing waits here, so nothing is lost."""
 
+    def suppress(self, values: int) -> None:
+        """Ignore the count: what is asked for is always the last value."""
+
     # on threads
 
     def work(self) -> None:
@@ -217,14 +220,18 @@ class MetricsOutput(Output):
         dropped = CounterMetricFamily("busmaster_output_dropped", "Values and events dropped", labels=["output"])
         waiting = GaugeMetricFamily("busmaster_output_waiting", "Values and events that wait", labels=["output"])
         spilled = GaugeMetricFamily("busmaster_output_spilled", "Of those, on disk", labels=["output"])
+        suppressed = CounterMetricFamily(
+            "busmaster_output_suppressed", "Values that were no news, by deadband and heartbeat", labels=["output"]
+        )
         up = GaugeMetricFamily("busmaster_output_up", "1 while the output works", labels=["output"])
         for counts in self._others():
             written.add_metric([counts.kind], counts.written)
             dropped.add_metric([counts.kind], counts.dropped)
             waiting.add_metric([counts.kind], counts.waiting)
             spilled.add_metric([counts.kind], counts.spilled)
+            suppressed.add_metric([counts.kind], counts.suppressed)
             up.add_metric([counts.kind], float(not counts.error))
-        yield from (written, dropped, waiting, spilled, up)
+        yield from (written, dropped, waiting, spilled, suppressed, up)
 
 
 def number_of(value: object) -> float | None:
