@@ -11,6 +11,16 @@ from typing import Any
 
 from busmaster.errors import InvalidCommand
 
+
+class MeansNothing(InvalidCommand):
+    """What is said of a point means nothing. `field` is the one that says so, `fault` what is wrong with it."""
+
+    def __init__(self, field: str, fault: str) -> None:
+        self.field = field
+        self.fault = fault
+        super().__init__(f"{field}: {fault}")
+
+
 BIT_NAME = re.compile(r"[^\W\d][\w-]*")
 MOST_DIGITS = 15
 """Behind them a float says nothing."""
@@ -39,7 +49,7 @@ class Named(int):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Meaning:
-    """Say what the value of a point means. Raises InvalidCommand for what means nothing.
+    """Say what the value of a point means. Raises MeansNothing, an InvalidCommand, for what means nothing.
 
         status = replace(drive.point("11"), meaning=Meaning(bits={"READY": 0, "FAULT": 3}))
         group.add(status, *status.bits)
@@ -63,7 +73,7 @@ class Meaning:
 
     def __post_init__(self) -> None:
         for name, fault in self.faults():
-            raise InvalidCommand(f"{name}: {fault}")
+            raise MeansNothing(name, fault)
 
     def faults(self) -> Iterator[tuple[str, str]]:
         """Yield what is wrong, each with the name of the field that says so."""

@@ -42,6 +42,7 @@ PROTOCOL = Protocol(
             options=(Option("chained", "flag"),),
             read_options=(CHAIN,),
             whole_numbers=everywhere,
+            width=lambda item: 16,
             takes_decimals=True,
             emulated=EMULATED,
             capture_id=5,

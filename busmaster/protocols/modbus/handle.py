@@ -100,6 +100,12 @@ def is_whole(item: str) -> bool:
     return not Place.parse(item).number.kind.startswith("float")
 
 
+def width_of(item: str) -> int:
+    """Return how many bits one value has of what an item names."""
+    place = Place.parse(item)
+    return 1 if place.is_bit else 16 * place.number.registers
+
+
 class ModbusUnit(Handle):
     """A Modbus unit, 1 to 247, or 0 to write to all. Addresses are those that are sent, 0 to 65535.
 

@@ -23,3 +23,9 @@ ITEMS = (
     Item("flags", "", "the flags that are on, of MSC-850/32 and MSC-250 in one go", access="read", keyword="RFLAGS"),
     Item("status", "", "the program's status word", access="read", keyword="RQSTAT", bits=STATUS_BITS),
 )
+
+
+def width_of(item: str) -> int:
+    """Return how many bits an item has: flags are as many as there are."""
+    name, colon, _ = item.partition(":")
+    return 1 if name == "flag" and colon else {"flags": 256, "status": 16}.get(item, 32)
