@@ -16,8 +16,9 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.config.names import expanded, listed
-from busmaster.config.point_section import PointSection, check_suits
+from busmaster.config.point_section import PointSection, check_suits, sort_of
 from busmaster.config.points import NamedPoint, Scale
+from busmaster.config.recording import check_takes
 from busmaster.config.safe import SafeState, SafeWrite
 from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
 from busmaster.contract.arguments import guess, is_decimal, meant
@@ -230,7 +231,8 @@ class ConfiguredLine:
         if section is None and (word := _word_of(node, name)) is not None:
             return self._point(where, word.name).bit(name.removeprefix(f"{word.name}."))
         if section is None:
-            source = _known(handle, name, node.points)
+            bits = (f"{point.name}.{bit}" for point in node.points.values() for bit in point.meaning.bits)
+            source = _known(handle, name, (*node.points, *bits))
             return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
         rounds = node.kind.takes_decimals and (section.decimals or node.kind.decimals(section.item))
         whole = not rounds and node.kind.whole_numbers(section.item)  # else the handle rounds, to its decimals
@@ -271,6 +273,10 @@ class ConfiguredLine:
     def _wanted_outputs(self) -> Iterator[tuple[str, Wanted]]:
         for kind, settings in self.file.outputs.items():
             table = self.file.table.table("outputs").table(kind)
+            for group in settings.groups or self._wanted:
+                points = self._wanted[group]
+                sorts = {point.key: sort_of(point.source, self.file.nodes[point.where].kind) for point in points}
+                check_takes(table, settings, group, sorts)
             writable: dict[str, Point[Any]] = {}
             if isinstance(settings, MqttSettings):
                 for number, text in enumerate(settings.allow_commands):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from enum import Enum
 from typing import Annotated, Any
 
-from busmaster.bus.meaning import Meaning, MeansNothing
+from busmaster.bus.meaning import MOST_DIGITS, OF_QUANTITIES, Meaning, MeansNothing
 from busmaster.bus.points import Point
 from busmaster.config.names import POINT_NAME
 from busmaster.config.table import Readers, Table, shown
@@ -16,6 +16,9 @@ from busmaster.contract.places import Placed
 from busmaster.errors import BusError
 from busmaster.registry import NodeKind
 
+WIDEST = 64
+"""Bits of a number: what has more is no number."""
+NO_QUANTITIES = ("word", "bit", "set")
 LIMITS = ("minimum", "maximum", "max_step")
 
 
@@ -87,12 +90,18 @@ def _labels(table: Table, key: str) -> Mapping[int, str]:
 
 
 def _named(table: Table, key: str, example: str) -> Table:
-    if not isinstance(table.data[key], dict) or not table.data[key]:
-        raise table.error(f"must be a table of names: {{ {example} }}, not {shown(table.data[key]) or 'empty'}", key)
+    given = table.data[key]
+    if not isinstance(given, dict) or not given:
+        what = "an empty table" if given == {} else shown(given)
+        raise table.error(f"must be a table of names: {{ {example} }}, not {what}", key)
     return table.table(key)
 
 
-READERS: Readers = {"bits": _bits, "labels": _labels}
+READERS: Readers = {
+    "bits": _bits,
+    "labels": _labels,
+    "precision": lambda table, key: table.whole(key, most=MOST_DIGITS),
+}
 
 
 def check_suits(section: PointSection, point: Point[Any], kind: NodeKind) -> None:
@@ -103,46 +112,46 @@ def check_suits(section: PointSection, point: Point[Any], kind: NodeKind) -> Non
 
 def _misfits(section: PointSection, point: Point[Any], kind: NodeKind) -> Iterator[tuple[str, str]]:
     """Yield what does not suit, each with its key."""
-    given, meaning, sort = section.table, section.meaning, sort_of(point)
+    given, meaning, sort = section.table, section.meaning, sort_of(point, kind)
     said = [key for key in (*LIMITS, *MEANINGS) if key in given]
     for key in said:
         if sort == "run" and key not in ("precision", "deadband", "heartbeat"):
-            yield key, f"is of one value, and {section.item} is a run: say it of each value, as a point of its own"
-        if sort == "text" and key != "heartbeat":
-            yield key, f"is of numbers, and {section.item} is a text"
-        if sort in ("word", "bit") and key in ("precision", "low", "high", "hysteresis"):
-            yield key, f"is of quantities, and {section.item} is a {sort}"
-    if sort in ("word", "bit") and meaning.deadband:
+            yield key, f"cannot be said of {section.item}, a run of values: make each value a point of its own"
+        if sort == "text" and key != "heartbeat" and (key != "deadband" or meaning.deadband):
+            yield key, f"cannot be said of {section.item}, which is a text"
+        if sort in NO_QUANTITIES and key in OF_QUANTITIES:
+            yield key, f"cannot be said of {section.item}, which is a {sort} and no quantity"
+    if sort in NO_QUANTITIES and meaning.deadband:
         yield "deadband", f"of a {sort} is 0: every change is told"
     for key in ("bits", "labels"):
         if key not in said:
             continue
         if sort == "float":
-            yield key, f"are of whole numbers, and {section.item} is one with decimals"
+            yield key, f"are of whole numbers, and {section.item} has decimals"
         for scaled in ("factor", "offset", "decimals"):
             if scaled in given:
                 yield key, f"are of the number as it is on the line: leave out {scaled}"
-    yield from _beyond(section, sort, kind.width(section.item))
+    yield from _beyond(section, 1 if sort == "bit" else kind.width(section.item))
 
 
-def _beyond(section: PointSection, sort: str, width: int) -> Iterator[tuple[str, str]]:
+def _beyond(section: PointSection, width: int) -> Iterator[tuple[str, str]]:
     """Yield bits and labels of a number that has no room for them."""
     for name, bit in section.meaning.bits.items():
-        if sort == "bit" or bit >= width:
-            yield (
-                "bits",
-                f"{name} is bit {bit}, and {section.item} has {width} ({0 if width == 1 else f'0 to {width - 1}'})",
-            )
+        if bit >= width:
+            yield "bits", f"{name} is bit {bit}, and the highest of {section.item} is bit {width - 1}"
     for number in section.meaning.labels:
         if not -(2 ** (width - 1)) <= number < 2**width:
-            yield "labels", f"{section.item} has {width} bits: it is never {number}"
+            yield "labels", f"{section.item} is never {number}: it has {width} bit{'s' * (width > 1)}"
 
 
-def sort_of(point: Point[Any]) -> str:
-    """Return what a point's values are: "float", "whole", "word", "bit", "text" or "run"; "" where nobody knows.
+def sort_of(point: Point[Any], kind: NodeKind) -> str:
+    """Return what a protocol's point is: "float", "whole", "word", "bit", "set", "text", "run"; "" where nobody knows.
 
     A read that says where it reads tells what it would return, and so what its value would be if all were 0 there.
     """
+    width = kind.width(point.item)
+    if width in (0, 1) or width > WIDEST:
+        return {0: "run", 1: "bit"}.get(width, "set")
     if not isinstance(point.command, Placed):
         return ""
     try:

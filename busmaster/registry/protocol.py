@@ -114,7 +114,7 @@ class NodeKind:
     whole_numbers: Callable[[str], bool] = nowhere
     """Whether the line carries whole numbers for an item: a value scaled by LINE.toml is then rounded to one."""
     width: Callable[[str], int] = usual_width
-    """How many bits the whole number of an item has: how many of them LINE.toml can give a name."""
+    """How many bits the whole number of an item has, so that LINE.toml can give them names; 0 for a run of several."""
     takes_decimals: bool = False
     """Its handle has an argument `decimals`, digits by item, and scales or rounds by it: LINE.toml does not."""
     capture_id: int = 0

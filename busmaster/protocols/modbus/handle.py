@@ -101,8 +101,10 @@ def is_whole(item: str) -> bool:
 
 
 def width_of(item: str) -> int:
-    """Return how many bits one value has of what an item names."""
+    """Return how many bits what an item names has; 0 for a run."""
     place = Place.parse(item)
+    if place.count is not None:
+        return 0
     return 1 if place.is_bit else 16 * place.number.registers
 
 

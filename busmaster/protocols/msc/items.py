@@ -26,6 +26,8 @@ ITEMS = (
 
 
 def width_of(item: str) -> int:
-    """Return how many bits an item has: flags are as many as there are."""
+    """Return how many bits an item has, flags as many as there are; 0 for a run."""
     name, colon, _ = item.partition(":")
-    return 1 if name == "flag" and colon else {"flags": 256, "status": 16}.get(item, 32)
+    if colon:
+        return 1 if name == "flag" else 0
+    return {"flags": 256, "status": 16}.get(item, 32)
