@@ -274,15 +274,17 @@ class ConfiguredLine:
         for kind, settings in self.file.outputs.items():
             table = self.file.table.table("outputs").table(kind)
             for group in settings.groups or self._wanted:
-                points = self._wanted[group]
-                sorts = {point.key: sort_of(point.source, self.file.nodes[point.where].kind) for point in points}
-                check_takes(table, settings, group, sorts)
+                check_takes(table, settings, group, {point.key: self._sort(point) for point in self._wanted[group]})
             writable: dict[str, Point[Any]] = {}
             if isinstance(settings, MqttSettings):
                 for number, text in enumerate(settings.allow_commands):
                     with table.at("allow_commands", number):
                         writable |= {point.key: point for point in map(self._writable, self._names(text))}
             yield kind, Wanted(settings, writable)
+
+    def _sort(self, point: NamedPoint) -> str:
+        node = self.file.nodes[point.where]
+        return sort_of(point.source, node.kind) if _word_of(node, point.item) is None else "bit"
 
     def _writable(self, name: tuple[str, str]) -> Point[Any]:
         point = self._point(*name)

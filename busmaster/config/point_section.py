@@ -158,8 +158,8 @@ def sort_of(point: Point[Any], kind: NodeKind) -> str:
         value = point.value_of(point.command.shown(dict.fromkeys(point.command.places, 0)))
     except (BusError, ArithmeticError, LookupError, TypeError, ValueError):
         return ""
-    for kind, sort in SORTS.items():
-        if isinstance(value, kind):
+    for known, sort in SORTS.items():
+        if isinstance(value, known):
             return sort
     return ""
 
