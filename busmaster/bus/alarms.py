@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 from busmaster.arbiter.events import Event
@@ -51,45 +51,51 @@ class Alarms:
     """
 
     def __init__(self, tell: Callable[[AlarmChanged], None]) -> None:
+        self.states: Mapping[Point[Any], AlarmChanged | None] = {}
+        """The alarm of each point that was looked at, None for none. Replaced whole, so that any thread may look."""
         self._tell = tell
-        self._active: dict[Point[Any], AlarmChanged] = {}
-
-    @property
-    def active(self) -> tuple[AlarmChanged, ...]:
-        return tuple(self._active.values())
 
     def look(self, points: Iterable[Point[Any]], samples: Mapping[Point[Any], Sample[Any]]) -> None:
         """Tell what the samples of these points begin and end."""
+        changed: dict[Point[Any], AlarmChanged | None] = {}
+        told: list[AlarmChanged] = []
         for point in points:
             sample = samples.get(point)
-            if sample is not None and sample.error is None and isinstance(sample.value, int | float):
-                self._look(point, sample.value)
+            if sample is None or sample.error is not None or not isinstance(sample.value, int | float):
+                continue
+            before = self.states.get(point)
+            now = before
+            if before is not None and not _holds(before.limit, point, sample.value):
+                told.append(replace(before, value=sample.value, active=False))
+                now = None
+            if now is None:
+                now = _begun(point, sample.value)
+                told += [now] if now is not None else []
+            if now is not before or point not in self.states:
+                changed[point] = now
+        self._become({**self.states, **changed} if changed else self.states, told)
 
     def forget(self, points: Iterable[Point[Any]]) -> None:
         """End the alarms of points that are polled no more."""
-        for point in points:
-            if point in self._active:
-                self._end(point, None)
+        gone = {point: self.states[point] for point in points if point in self.states}
+        if gone:
+            ended = [replace(alarm, value=None, active=False) for alarm in gone.values() if alarm is not None]
+            self._become({point: alarm for point, alarm in self.states.items() if point not in gone}, ended)
 
-    def _look(self, point: Point[Any], value: float) -> None:
-        meaning, active = point.meaning, self._active.get(point)
-        if active is not None and not _holds(active.limit, point, value):
-            self._end(point, value)
-            active = None
-        if active is not None:
-            return
-        if meaning.high is not None and value > meaning.high:
-            self._begin(AlarmChanged(point, "high", meaning.high, value, True))
-        elif meaning.low is not None and value < meaning.low:
-            self._begin(AlarmChanged(point, "low", meaning.low, value, True))
+    def _become(self, states: Mapping[Point[Any], AlarmChanged | None], told: Iterable[AlarmChanged]) -> None:
+        self.states = states
+        for alarm in told:
+            self._tell(alarm)
 
-    def _begin(self, alarm: AlarmChanged) -> None:
-        self._active[alarm.point] = alarm
-        self._tell(alarm)
 
-    def _end(self, point: Point[Any], value: float | None) -> None:
-        began = self._active.pop(point)
-        self._tell(AlarmChanged(began.point, began.limit, began.bound, value, False))
+def _begun(point: Point[Any], value: float) -> AlarmChanged | None:
+    """Return the alarm that a value begins, None if it begins none."""
+    low, high = point.meaning.low, point.meaning.high
+    if high is not None and value > high:
+        return AlarmChanged(point, "high", high, value, active=True)
+    if low is not None and value < low:
+        return AlarmChanged(point, "low", low, value, active=True)
+    return None
 
 
 def _holds(limit: Side, point: Point[Any], value: float) -> bool:

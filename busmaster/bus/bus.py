@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Coroutine, Generator, Iterable, Sequence
+from collections.abc import Coroutine, Generator, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, TypeVar
@@ -353,9 +353,13 @@ class Bus:
         return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 
     @property
-    def alarms(self) -> tuple[AlarmChanged, ...]:
-        """What has left the limits of its meaning and is not back yet, of all that is polled."""
-        return self._line.alarms.active
+    def alarms(self) -> Mapping[Point[Any], AlarmChanged | None]:
+        """What each polled point whose meaning has limits has left and is not back from; None for those within."""
+        return self._line.alarms.states
+
+    def overheard(self, samples: Mapping[Point[Any], Sample[Any]]) -> None:
+        """Take values that another master's requests have brought for what they begin and end of alarms."""
+        self._line.alarms.look([point for point in samples if point.meaning.watched], samples)
 
     def events(self) -> Stream[BusEvent]:
         """Return a stream of what happens from now on.

@@ -13,8 +13,8 @@ from typing import Any
 import anyio
 import click
 
-from busmaster.bus.alarms import AlarmChanged
-from busmaster.bus.snapshots import Snapshot
+from busmaster.bus.alarms import AlarmChanged, BusEvent
+from busmaster.bus.snapshots import Snapshot, Stream
 from busmaster.bus.suitability import check_settings
 from busmaster.capture.decode import DEFAULT_GAP, Decoder
 from busmaster.capture.frames import Direction, Frame, Kind
@@ -84,12 +84,15 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
     def show(snapshot: Snapshot) -> None:
         emit_all([json_line(**cycle_fields(snapshot, snapshot.wall_at))] if as_json else plain_values(snapshot))
 
-    def tell(alarm: AlarmChanged) -> None:
-        note(alarm.text, Level.WARNING if alarm.active else Level.NOTICE)
+    async def tell(events: Stream[BusEvent]) -> None:
+        async for event in events:
+            if isinstance(event, AlarmChanged):
+                note(event.text, Level.WARNING if event.active else Level.NOTICE)
 
     async def run(recorder: Recorder | None) -> None:
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(feed, line, overheard, show, tell)
+            tasks.start_soon(feed, line, overheard, show)
+            tasks.start_soon(tell, line.bus.events())
             await listen(file.port, Decoder(kind.protocol.dialect()), overheard.heard, recorder)
 
     with capturing(capture, port=file.port.name, protocol=protocol) as recorder:

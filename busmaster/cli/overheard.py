@@ -12,7 +12,6 @@ from typing import Any
 import anyio
 
 from busmaster.arbiter.transaction import Timeline
-from busmaster.bus.alarms import AlarmChanged, Alarms
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.samples import Quality, Sample
@@ -159,16 +158,8 @@ class Overheard:
                     group.take(point, sample)
 
 
-async def feed(
-    line: ConfiguredLine, overheard: Overheard, show: Callable[[Snapshot], None], tell: Callable[[AlarmChanged], None]
-) -> None:
+async def feed(line: ConfiguredLine, overheard: Overheard, show: Callable[[Snapshot], None]) -> None:
     """Hand on what is heard, each group at its period, until cancelled; the outputs then write what they hold."""
-
-    def changed(alarm: AlarmChanged) -> None:
-        tell(alarm)
-        line.outputs.happened(alarm)
-
-    alarms = Alarms(changed)
     now = asyncio.get_running_loop().time
     for section in line.file.groups.values():
         overheard.groups.append(HeardGroup(section.name, section.period, line.members(section.name), now()))
@@ -182,7 +173,7 @@ async def feed(
                     snapshot = group.turn(time.monotonic(), time.time())
                     if snapshot is not None:
                         show(snapshot)
-                        alarms.look((point for point in group.points if point.meaning.watched), snapshot.samples)
+                        line.bus.overheard(snapshot.samples)
     finally:
         for group in overheard.groups:  # what the last period heard, before the outputs end
             group.turn(time.monotonic(), time.time())

@@ -105,8 +105,8 @@ class Distributor:
         for output in kept:
             output.reopen()
         self._take_in(groups)
-        for news in self._news.values() if fresh else ():
-            news.forget()  # a new output knows nothing yet
+        for news in self._news.values():
+            news.forget()  # what is made or opened anew knows nothing yet
         with anyio.CancelScope(shield=True):
             # Closing waits for a thread, and perhaps for a disk: never on the loop that owns the line.
             await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in leaving.values()))
@@ -119,13 +119,6 @@ class Distributor:
         """Hand a write to all of them."""
         for output in self._outputs:
             output.offer(write)
-
-    def happened(self, event: BusEvent) -> None:
-        """Hand an event to all of them, if it is one that a person wants to know of."""
-        text = event_text(event)
-        if text:
-            for output in self._outputs:
-                output.offer(Happening(micros(self._bus.wall_time()), label_of(event), text))
 
     async def close(self) -> None:
         """Close the outputs, once the bus is closed.
@@ -177,7 +170,10 @@ class Distributor:
 
     async def _watch(self) -> None:
         async for event in self._bus.events():
-            self.happened(event)
+            text = event_text(event)
+            if text:
+                for output in self._outputs:
+                    output.offer(Happening(micros(self._bus.wall_time()), label_of(event), text))
 
     def _say(self, text: str) -> None:
         """Hand a text from any thread to the loop; when that is gone nobody listens any more."""

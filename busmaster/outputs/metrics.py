@@ -211,7 +211,13 @@ class MetricsOutput(Output):
                     node, _, item = point.key.partition("/")
                     values.add_metric([group.name, node, item, point.unit], number)
                     times.add_metric([group.name, node, item, point.unit], micros(sample.wall))
-        yield from (values, times)
+        alarms = GaugeMetricFamily(
+            "busmaster_alarm", "1 while a value is above its high, -1 below its low, else 0", labels=["node", "item"]
+        )
+        for point, alarm in self._bus.alarms.items():
+            node, _, item = point.key.partition("/")
+            alarms.add_metric([node, item], 0.0 if alarm is None else 1.0 if alarm.limit == "high" else -1.0)
+        yield from (values, times, alarms)
 
     def _of_outputs(self) -> Iterator[Metric]:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
