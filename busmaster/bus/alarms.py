@@ -64,14 +64,14 @@ class Alarms:
             if sample is None or sample.error is not None or not isinstance(sample.value, int | float):
                 continue
             before = self.states.get(point)
-            now = before
-            if before is not None and not _holds(before.limit, point, sample.value):
+            if before is not None and _holds(before.limit, point, sample.value):
+                continue
+            now = _begun(point, sample.value)
+            if before is not None:
                 told.append(replace(before, value=sample.value, active=False))
-                now = None
-            if now is None:
-                now = _begun(point, sample.value)
-                told += [now] if now is not None else []
-            if now is not before or point not in self.states:
+            if now is not None:
+                told.append(now)
+            if before is not None or now is not None or point not in self.states:
                 changed[point] = now
         self._become({**self.states, **changed} if changed else self.states, told)
 
