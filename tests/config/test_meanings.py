@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from math import inf
+from typing import Any
 
 import pytest
 
 from busmaster.bus.alarms import AlarmChanged
 from busmaster.bus.meaning import Meaning, Named
+from busmaster.bus.points import Point
 from busmaster.config import ConfiguredLine, FileError, LineFile, emulated_line
-from busmaster.config.point_section import POINT_KEYS
+from busmaster.config.point_section import POINT_KEYS, check_suits
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand
+from busmaster.registry import find
 
 PLACES = {
     "hcp": ("address = 5", "10"),
@@ -127,9 +130,6 @@ async def test_an_alarm_ends_where_the_file_watches_no_more() -> None:
 
 def test_every_key_of_a_point_is_in_one_list() -> None:
     assert {part.name for part in fields(Meaning)} < set(POINT_KEYS)
-    assert {"item", "unit", "factor", "offset", "decimals", "minimum", "maximum", "max_step", "writable"} < {
-        *POINT_KEYS
-    }
     with pytest.raises(FileError) as refused:
         parse("hcp2", 'a = { item = "10", xyzzy = 1 }')
     assert all(key in str(refused.value) for key in POINT_KEYS)
@@ -199,6 +199,20 @@ def test_what_means_nothing_is_one_sentence_with_line_and_key(kind: str, said: s
     with pytest.raises(FileError) as refused:
         parse(kind, f"a = {{ {said} }}")
     assert str(refused.value).startswith(f"line.toml:6: nodes.w.points.a.{complaint}")
+
+
+@pytest.mark.parametrize("said", ["deadband = 0.5", "low = 1", "precision = 1", 'labels = { 0 = "x" }'])
+def test_a_text_has_nothing_of_a_number(said: str) -> None:
+    section = file("hcp2", f'a = {{ item = "10", {said} }}').nodes["w"].points["a"]
+    text: Point[Any] = replace(parse("hcp2", "").nodes["w"].point("10"), decode=str)
+    with pytest.raises(FileError, match="cannot be said of 10, which is a text"):
+        check_suits(section, text, find("hcp2"))
+
+
+def test_a_text_may_be_told_by_exception() -> None:
+    section = file("hcp2", 'a = { item = "10", deadband = 0, heartbeat = 60 }').nodes["w"].points["a"]
+    text: Point[Any] = replace(parse("hcp2", "").nodes["w"].point("10"), decode=str)
+    check_suits(section, text, find("hcp2"))
 
 
 def test_the_line_is_that_of_the_key_in_a_table_of_its_own() -> None:
