@@ -8,7 +8,6 @@ from busmaster.bus.node import Node
 from busmaster.cli.arguments import Connection, connected, json_option, nodes_option
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit, json_line, json_value, value_text
-from busmaster.cli.progress import Bar
 from busmaster.cli.protocols import NodeCommand
 from busmaster.errors import GarbledReply, NodeDown, NoReply, Refused
 
@@ -34,6 +33,8 @@ def command(connection: Connection, nodes: tuple[int, ...] | None, as_json: bool
 
 async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool) -> None:
     """Ask each address once, and print what answers, behind a bar of the progress."""
+    from busmaster.cli.progress import Bar  # before the line is opened; it takes a fifth of the time of --help
+
     bus = connection.open_bus()
     nodes = [bus.node(connection.profile, address, timings=connection.timings) for address in addresses]
     async with bus:

@@ -31,3 +31,9 @@ class Changing(Protocol):
     def changes(self, profile: Profile, /) -> Mapping[Hashable, Any]:
         """Return what each place that it changes holds after it; None where that is not known."""
         ...
+
+
+__all__ = [
+    "Changing",
+    "Placed",
+]
