@@ -179,6 +179,12 @@ def test_a_mistyped_key_is_named_with_its_line_and_the_one_that_was_meant(key: s
         ("microflex", 'item = "status_word", high = 1', "high: cannot be said of status_word, which is a word and no"),
         ("hcp2", 'item = "10", labels = { on = "1" }', 'labels.on: labels are of whole numbers: { 0 = "off" }, not of'),
         ("hcp2", 'item = "10", labels = { 0 = 1 }', "labels.0: must be a text in quotes, not 1"),
+        ("hcp2", 'item = "10", labels = { 0 = "a", 00 = "b" }', "labels: say twice what a number is called"),
+        (
+            "msc",
+            'item = "flags", labels = { 0 = "x" }',
+            "labels: cannot be said of flags, which is a set of many: name",
+        ),
         ("hcp2", 'item = "10", labels = { 0 = "" }', "labels: the label of 0 is a text on one line, not ''"),
         ("hcp2", 'item = "axis0.position", labels = { 0 = "x" }', "labels: are of whole numbers, and axis0.position"),
         ("mentor", 'item = "1.17", decimals = 1, labels = { 0 = "x" }', "labels: are of whole numbers, and 1.17 has"),
