@@ -17,7 +17,7 @@ Side: TypeAlias = Literal["low", "high"]
 class AlarmChanged:
     """A polled value is above `high` or below `low` of its point (`active`), or no longer.
 
-    `limit` is the one that it crossed, `bound` that limit. `value` is None where it ended as the point is polled no
+    `limit` is the one that it crossed, `bound` that limit. `value` is None where it ended as the point is watched no
     more.
     """
 
@@ -33,7 +33,7 @@ class AlarmChanged:
         crossed = f"{'above' if self.limit == 'high' else 'below'} its {self.limit} of {self._text(self.bound)}"
         if self.active:
             return f"{self.point.key} = {self._text(self.value)} is {crossed}"
-        how = "is polled no more" if self.value is None else f"is back at {self._text(self.value)}"
+        how = "is watched no more" if self.value is None else f"is back at {self._text(self.value)}"
         return f"{self.point.key} {how}, was {crossed}"
 
     def _text(self, value: float | None) -> str:
