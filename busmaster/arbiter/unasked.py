@@ -18,7 +18,7 @@ STRAGGLER_SHARE = 0.75
 STRAGGLER_MARGIN = 1.6
 LONGEST_LATENESS = 0.5
 STRAGGLER_MEMORY = 1.0
-"""Seconds after which a unasked byte is no longer blamed on the last unanswered request."""
+"""Seconds after which an unasked byte is no longer blamed on the last unanswered request."""
 LOOKS = 10
 """In so many parts of a lateness the line is looked at while a straggler may come."""
 LOOK_SLACK = 0.005

@@ -166,10 +166,7 @@ class Node:
         self.shared.arbiter.change_profile(self.record, replace(self.record.profile, merge=merge))
 
     def limit(self, limit: Limit, /) -> None:
-        """Refuse, from now on, every write beyond a limit, whatever names what it writes; also of those to all nodes.
-
-        Raises InvalidCommand for what this node's line never reads so.
-        """
+        """Refuse, from now on, every write beyond a limit, whatever names it; writes to all nodes too."""
         line = self.shared
         line.limiter = line.limiter or Limiter()
         line.limiter.add(self, limit)

@@ -130,13 +130,16 @@ def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
     return tuple(nodes)
 
 
-def slaves_of(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
-    """Return the addresses to emulate: those of --nodes, else 1, or the one drive. Raises UsageError."""
-    if nodes is None:
-        return (1,) if 1 in profile.addresses else (profile.addresses[0],)
+def single_nodes(profile: Profile, nodes: Sequence[int]) -> tuple[int, ...]:
+    """Return the nodes that were given. Raises UsageError as `checked`, and for the address that means all nodes."""
     if profile.broadcast in nodes:
         raise click.UsageError(f"{profile.name}: no node has address {profile.broadcast}, which means all of them")
     return checked(profile, nodes)
+
+
+def nodes_to_ask(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
+    """Return the addresses to ask: those of --nodes, else all. Raises UsageError for one that no node can have."""
+    return tuple(profile.addresses) if nodes is None else single_nodes(profile, nodes)
 
 
 def span(profile: Profile) -> str:

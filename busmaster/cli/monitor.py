@@ -32,6 +32,7 @@ from busmaster.config import ConfiguredLine, LineFile
 from busmaster.errors import BusError, LineDown
 from busmaster.outputs.values import cycle_fields
 from busmaster.registry import find
+from busmaster.transport.endpoints import Endpoint
 
 ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 
@@ -159,7 +160,7 @@ class Listener(asyncio.Protocol):
 
 
 async def listen(
-    endpoint: Any, decoder: Decoder, tell: Callable[[Frame], None], recorder: Recorder | None = None
+    endpoint: Endpoint, decoder: Decoder, tell: Callable[[Frame], None], recorder: Recorder | None = None
 ) -> None:
     """Listen until the line is lost. Raises LineDown then, and the OSError of a frame that could not be told."""
     listener = Listener(decoder, tell, recorder)

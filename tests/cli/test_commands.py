@@ -111,7 +111,7 @@ def test_a_bad_assignment_is_status_2_and_nothing_is_sent(busmaster: Command, as
         (("read", "PORT", *HCP2, "--node", "one", "1"), "'one' is not a valid whole number"),
         (("read", "PORT", *HCP2, "--node", "1", "1", "--timeout", "9e9"), "at most 60000 ms"),
         (("read", "PORT", "--protcol", "hcp2", "1"), "no such option '--protcol': did you mean '--protocol'?\n"),
-        (("scan", "PORT", "--protocol", "mentor", "--nodes", "1,0"), "address 0 is for writes to all"),
+        (("scan", "PORT", "--protocol", "mentor", "--nodes", "1,0"), "means all of them"),
         (("poll", "PORT", *HCP2, "--nodes", "8-1", "--items", "1", "--period", "1"), "upwards: 1-8"),
         (("poll", "PORT", *HCP2, "--nodes", "1;2", "--items", "1", "--period", "1"), "like 1-8,255"),
         (("poll", "PORT", *HCP2, "--nodes", "1", "--items", ",", "--period", "1"), "at least one item"),

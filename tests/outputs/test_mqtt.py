@@ -250,7 +250,15 @@ def test_a_command_is_a_number_or_a_list_of_numbers_perhaps_with_its_id_and_end(
 
 NO_COMMANDS = [
     *(b"", b"on", b"true", b"null", b"NaN", b"[]", b"{}", b'["1"]', b"[true]", b"\xff", None),
-    *(b"1e308", b"1" * 400, b"9" * 5000, b"[" * 4000, b'{"value": 1, "x": 2}', b'{"value": 1, "expires": "soon"}'),
+    *(
+        b"1e308",
+        b"1" * 400,
+        b"9" * 5000,
+        b"1" + b" " * 4096,
+        b"[" * 4000,
+        b'{"value": 1, "x": 2}',
+        b'{"value": 1, "expires": "soon"}',
+    ),
     *(b'{"value": 1e999}', b'{"value": 1, "id": []}', b'{"value": 1, "expires": 1e999}'),
 ]
 
