@@ -72,6 +72,12 @@ class UnaskedBytes:
         """Note that a request, out since `asked`, got no reply in its window; what comes next may be its straggler."""
         self.unanswered_one = (node, asked, lateness)
 
+    def forget(self) -> None:
+        """Forget what came: the port is lost, and nothing that comes through the next one goes on with it."""
+        self.answered()
+        self.silent()
+        self.reply_to_silence()  # half a packet, which cannot be acknowledged any more
+
     def answered(self) -> None:
         """Note that no request is unanswered any more: what comes next is nobody's straggler."""
         self.unanswered_one = None

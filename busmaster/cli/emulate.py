@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import random
-import threading
+import time
 from collections.abc import Sequence
+from math import inf
 
 import click
 
@@ -25,6 +26,9 @@ from busmaster.registry import find, make_device
 from busmaster.transport.identity import USB
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
+
+LOOK_FOR_SIGNALS = 0.2
+"""Seconds from one look to the next."""
 
 
 @click.command(short_help="Emulate drives on a pseudo-terminal or a TCP port.")
@@ -83,7 +87,17 @@ def command(
         line = drives(protocol, nodes, baud, reply_delay, faults, seed, paced)
     with serve(line, pty, tcp) as server:
         emit(server.path)
-        threading.Event().wait(seconds)
+        serve_for(seconds)
+
+
+def serve_for(seconds: float | None) -> None:
+    """Wait so many seconds, or for ever, while the line's own thread serves it.
+
+    A signal that the system hands to that thread wakes nobody here, so that it is looked for.
+    """
+    end = inf if seconds is None else time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        time.sleep(min(left, LOOK_FOR_SIGNALS))
 
 
 def line_of(file: LineFile, delay: Delay | None, faults: tuple[str, ...], seed: int | None, paced: bool) -> Line:

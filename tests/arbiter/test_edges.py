@@ -204,9 +204,9 @@ def test_r3_noise_before_a_request_is_out_does_not_bring_its_lateness_forward() 
 # MSC: an ACK, then a packet, then the host's ACK
 
 
-def msc_line(packet: float = 1.0) -> tuple[Bench, NodeRecord]:
+def msc_line(packet: float = 1.0, *, echo: bool = False) -> tuple[Bench, NodeRecord]:
     """A line at 9600 baud that has rested, and its node, with that lateness of packets."""
-    bench = Bench()
+    bench = Bench(echo=echo)
     bench.arbiter.byte_time = MSC_TAU
     timings = msc.PROFILE.timings
     node = bench.node(1, msc.PROFILE, replace(timings, packet=replace(timings.packet, lateness=packet)))
@@ -256,6 +256,21 @@ def test_r3_a_damaged_byte_in_place_of_the_ack_may_have_been_it_and_its_packet_i
     assert bench.sent() == ACK, "what was said in its place may be a packet"
     bench.until_sent()
     assert bench.now - heard == pytest.approx(1.0 + MSC_TAU)
+
+
+def test_r3_an_ack_that_is_taken_for_an_echo_may_be_followed_by_its_packet() -> None:
+    """On a line that echoes: a byte from nowhere for an ACK, the echo for a packet, whose ACK does not echo."""
+    bench, node = msc_line(echo=True)
+    bench.ask(node, msc.DataRead(2008), retries=0)
+    bench.ask(node, msc.DataRead(2012))
+    request = bench.sent()
+    bench.hear("FF", after=MSC_REQUEST)
+    bench.hear(request)
+    assert bench.sent() == ACK, "what looks like a packet is acknowledged"
+    bench.hear(ACK, after=0.002)
+    heard = bench.now
+    bench.until_sent()
+    assert bench.now - heard >= 1.0
 
 
 def test_r3_noise_does_not_use_up_the_knowledge_that_a_packet_follows_its_ack() -> None:

@@ -63,7 +63,7 @@ async def test_the_picture_has_every_point_its_age_and_its_nodes_health(controll
             ("node 2", "outputs", 0, True),
             ("node 2", "axis0.idle", 1, False),
         ]
-        assert all(row.age is not None and 0 <= row.age < 5 for row in frame.rows)
+        assert all(row.age is not None and 0 <= row.age < PATIENCE for row in frame.rows)
         frame = await seen(watch, lambda frame: [node.health for node in frame.nodes] == ["up", "up"])
         assert frame.port == f"{controllers.host}:{controllers.port}  57600 8N1"
         assert frame.line in ("ready", "settling")

@@ -128,7 +128,7 @@ async def test_no_limit_holds_the_safe_state(kind: str, address: str, item: str)
         await line.point("winder/speed").write(40, priority=Priority.URGENT)
         with pytest.raises(InvalidCommand, match="minimum of 5"):
             await line.point("winder/speed").write(0, priority=Priority.URGENT)
-        assert await line.safe_state.enter(line.bus) == {"winder/speed": None}
+        assert await line.safe_state.enter(line.gate, "a test") == {"winder/speed": None}
         assert await line.point("winder/speed").read() == 0
 
 
@@ -139,7 +139,7 @@ async def test_a_node_that_somebody_has_suspended_is_left_safely_too() -> None:
         winder.suspend(60.0)
         with pytest.raises(NodeDown, match="suspended"):
             await line.point("winder/speed").write(30)
-        assert await line.safe_state.enter(line.bus) == {"winder/speed": None}
+        assert await line.safe_state.enter(line.gate, "a test") == {"winder/speed": None}
 
 
 @in_virtual_time

@@ -94,13 +94,13 @@ def rows(path: Path) -> list[tuple[object, ...]]:
         return database.execute("select value, typeof(value), label from history order by time").fetchall()
 
 
-def test_a_database_holds_numbers_and_knows_what_they_are_called_now(tmp_path: Path) -> None:
+def test_a_database_holds_numbers_and_what_each_was_called_last(tmp_path: Path) -> None:
     path = tmp_path / "x.sqlite"
     written(SqliteOutput("sqlite", SqliteSettings(path=str(path))), modes(1, 1), modes(2, 7))
     assert rows(path) == [(1, "integer", "on"), (7, "integer", None)]
     renamed = Meaning(labels={7: "seven"})
     written(SqliteOutput("sqlite", SqliteSettings(path=str(path))), modes(3, 7, renamed))
-    assert rows(path) == [(1, "integer", None), (7, "integer", "seven"), (7, "integer", "seven")]
+    assert rows(path) == [(1, "integer", "on"), (7, "integer", "seven"), (7, "integer", "seven")]
 
 
 def test_a_database_of_a_version_before_labels_goes_on_and_gets_them(tmp_path: Path) -> None:
