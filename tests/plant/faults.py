@@ -1,0 +1,7 @@
+"""All faults that are tried, by a short name."""
+
+from __future__ import annotations
+
+from tests.plant import faults_of_broker, faults_of_commands, faults_of_files, faults_of_line
+
+FAULTS = {**faults_of_line.FAULTS, **faults_of_broker.FAULTS, **faults_of_commands.FAULTS, **faults_of_files.FAULTS}
