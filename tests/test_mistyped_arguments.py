@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from decimal import Decimal
 from math import inf, nan
 from typing import Any, cast
 
@@ -12,6 +13,7 @@ import pytest
 
 from busmaster import (
     Bus,
+    CtAnsiDrive,
     Hcp2Controller,
     InvalidCommand,
     LineSettings,
@@ -30,7 +32,7 @@ from busmaster.bus.node import Node
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.protocols.hcp2 import codec as hcp2
-from busmaster.registry import make_device
+from busmaster.registry import find, make_device
 from busmaster.testing import run_in_virtual_time
 
 TIMING = ReplyTiming(0.05, 0.1, 0.15, 0.02)
@@ -119,6 +121,8 @@ def group(bus: Bus, **options: Any) -> PollGroup:
         lambda bus: Node.of(Hcp2Controller(bus, 1)).suspend(nan),
         lambda bus: Node.of(Hcp2Controller(bus, 1)).suspend(True),
         lambda bus: MentorDrive(bus, 11, decimals={"1.17": cast("Any", 1.5)}),
+        *(lambda bus, wrong=wrong: CtAnsiDrive(bus, 11, decimals={"1.21": wrong}) for wrong in (1.5, "1", -1, True)),
+        lambda bus: CtAnsiDrive(bus, 11, decimals={"1.21": 1, "01.21": 2}),
         *(lambda bus, wrong=wrong: group(bus, period=wrong) for wrong in (0.0, -1.0, nan, inf, True, "1")),
         *(lambda bus, wrong=wrong: group(bus, phase=wrong) for wrong in (-0.1, 1.0, nan, True)),
         *(lambda bus, wrong=wrong: group(bus, priority=wrong) for wrong in (-1, 4, True, 2.0, "poll")),
@@ -131,6 +135,44 @@ def test_a_mistyped_argument_of_a_bus_or_a_handle_is_refused(mistake: Callable[[
         async with bus_of() as bus:
             with pytest.raises(InvalidCommand):
                 mistake(bus)
+            assert bus.statistics().exchanges == 0
+
+    run_in_virtual_time(main())
+
+
+MANY = "9" * 5000
+"""More digits than Python makes a number of."""
+NO_NUMBERS: list[Any] = ["x", "", MANY, None, [], {}, b"1", 1 + 2j, nan, inf, Decimal("nan"), 10**400]
+
+
+@pytest.mark.parametrize(
+    ("protocol", "items"),
+    [
+        ("hcp", "1"),
+        ("hcp2", "1 outputs"),
+        ("microflex", "speed_reference command_word"),
+        ("msc", "2008 2008:2 flag:5"),
+        ("mentor", "1.17 speed_reference_1 1.17:wide 1.17:hires"),
+        ("ct-ansi", "1.21 1.22"),
+        ("dc104", "5"),
+        ("modbus", "holding:1 holding:1:2 holding:1:float32 holding:1:int32 coil:1 coil:1:2"),
+    ],
+)
+def test_what_is_no_number_and_no_item_is_refused_in_words_by_every_handle(protocol: str, items: str) -> None:
+    kind = find(protocol)
+    address = next(iter(kind.profile.addresses), 0) if protocol != "mentor" else 11
+
+    async def main() -> None:
+        async with Bus(MemoryPort(Line(kind.profile.line, [make_device(protocol, address)]))) as bus:
+            options: dict[str, Any] = {"decimals": {"1.21": 1}} if protocol == "ct-ansi" else {}
+            handle = kind.handle(bus, address, **options)
+            for item in items.split():
+                for wrong in NO_NUMBERS:
+                    with pytest.raises(InvalidCommand):
+                        await handle.point(item).write(wrong)
+            for mistyped in (MANY, f"1.{MANY}", f"1.17:{MANY}", f"holding:{MANY}", f"coil:1:{MANY}", "", "\u0661"):
+                with pytest.raises(InvalidCommand):
+                    handle.point(mistyped)
             assert bus.statistics().exchanges == 0
 
     run_in_virtual_time(main())

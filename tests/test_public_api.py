@@ -17,6 +17,7 @@ import pytest
 
 import busmaster
 from busmaster import errors
+from tests.patience import PATIENCE
 
 OPTIONAL = ("click", "rich", "msgspec", "textual", "aiomqtt", "prometheus_client", "matplotlib")
 
@@ -69,7 +70,7 @@ def test_importing_it_needs_no_extra() -> None:
     """With the extras hidden from it, the package imports and its names are there."""
     hide = f"import sys; sys.modules.update(dict.fromkeys({OPTIONAL!r}))"
     code = f"{hide}; import busmaster; [getattr(busmaster, name) for name in busmaster.__all__]"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE)
 
 
 def test_the_command_line_without_its_extra_says_which_one_to_install() -> None:
@@ -78,7 +79,7 @@ def test_the_command_line_without_its_extra_says_which_one_to_install() -> None:
         "u.find_spec = lambda name, *rest: None if name in ('click', 'rich', 'msgspec') else find(name, *rest); "
         "from busmaster.cli import main; sys.exit(main(['--help']))"
     )
-    done = subprocess.run([sys.executable, "-c", code], check=False, timeout=30, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], check=False, timeout=PATIENCE, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr == (

@@ -197,12 +197,14 @@ class SeveralRequests:
     """The requests of one call, one after the other, by the call's options: `finish_within` is for all of them.
 
     Once a part is written, what cannot be sent any more ends as WriteUnconfirmed: NotStarted would say that nothing
-    was.
+    was. Raises InvalidCommand for a write to all nodes that is to be verified.
     """
 
     def __init__(self, node: Requester, given: WriteOptions | ReadOptions) -> None:
         self._node = node
         chosen = RequestOptions.of(given, node.label) if given else ORDINARY
+        if chosen.verify and node.address == node.profile.broadcast:
+            raise InvalidCommand(f"{node.profile.name}: a write to all cannot be verified: nobody answers a read")
         self.verify = chosen.verify
         self._finish_by = None if chosen.finish_within is None else node.now() + chosen.finish_within
         several = {name: value for name, value in given.items() if name not in ("verify", "finish_within")}

@@ -157,18 +157,29 @@ def read_packets(file: BinaryIO) -> Iterator[Packet]:
     """
     interfaces: list[_Interface] = []
     for kind, body, order in _blocks(file):
-        if kind == _SECTION:
-            interfaces.clear()
-        elif kind == _INTERFACE:
-            interfaces.append(_interface(body, order))
-        elif kind == _PACKET:
-            number, high, low, size, _ = struct.unpack_from(f"{order}IIIII", body)
-            if number >= len(interfaces) or interfaces[number].link_type != LINK_TYPE:
-                raise CaptureError(f"not a capture of a serial line: no link type {LINK_TYPE}")
-            interface = interfaces[number]
-            micros = ((high << 32) | low) * 1_000_000 // interface.ticks
-            options = list(_read_options(body[20 + size + -size % 4 :], order))
-            yield _packet(micros, interface.protocol, body[20 : 20 + size], options, order)
+        try:
+            packet = _take_block(kind, body, order, interfaces)
+        except (struct.error, IndexError) as error:
+            raise CaptureError("a block that is too short for what it holds: the file is damaged") from error
+        if packet is not None:
+            yield packet
+
+
+def _take_block(kind: int, body: bytes, order: str, interfaces: list[_Interface]) -> Packet | None:
+    """Note an interface, or return the packet of a block."""
+    if kind == _SECTION:
+        interfaces.clear()
+    elif kind == _INTERFACE:
+        interfaces.append(_interface(body, order))
+    elif kind == _PACKET:
+        number, high, low, size, _ = struct.unpack_from(f"{order}IIIII", body)
+        if number >= len(interfaces) or interfaces[number].link_type != LINK_TYPE:
+            raise CaptureError(f"not a capture of a serial line: no link type {LINK_TYPE}")
+        interface = interfaces[number]
+        micros = ((high << 32) | low) * 1_000_000 // interface.ticks
+        options = list(_read_options(body[20 + size + -size % 4 :], order))
+        return _packet(micros, interface.protocol, body[20 : 20 + size], options, order)
+    return None
 
 
 class _Interface(NamedTuple):

@@ -14,6 +14,9 @@ from typing import NamedTuple, SupportsIndex
 
 from busmaster.errors import InvalidCommand
 
+MOST_DIGITS = 20
+"""Of a number in a text: none here has more, and Python makes no number of some thousands."""
+
 
 class Between(NamedTuple):
     """The least and the most that a number may be, bounds included: beside its type, in `Annotated`."""
@@ -44,8 +47,8 @@ def seconds(value: object, what: str) -> float:
 
 
 def is_decimal(text: str) -> bool:
-    """Return whether a text is a whole number without a sign, in digits as the command line takes them."""
-    return text.isascii() and text.isdigit()
+    """Return whether a text is a whole number without a sign, in digits as the command line takes them: 20 at most."""
+    return text.isascii() and text.isdigit() and len(text) <= MOST_DIGITS
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:

@@ -30,7 +30,11 @@ EXPIRATIONS = 8
 
 
 class Alarm:
-    """Calls `ring` once, when it is due. A later `set` replaces an earlier one."""
+    """Calls `ring` once, when it is due. A later `set` replaces an earlier one.
+
+    What is SOON rings never too early. A longer wait may, on uvloop: its timers count from the beginning of the loop's
+    turn. Whoever is rung looks at the clock.
+    """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, ring: Callable[[], None]) -> None:
         self._loop = loop

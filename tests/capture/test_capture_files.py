@@ -20,6 +20,7 @@ from busmaster.cli import main
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.disks import small_disk
 from tests.outputs.cycles import until
+from tests.patience import PATIENCE
 
 READ = hcp2.Read(1)
 REQUEST = READ.open(2, hcp2.PROFILE.timings).request
@@ -159,7 +160,7 @@ def test_a_capture_whose_process_was_killed_replays_up_to_there(
         until(lambda: path.exists() and path.stat().st_size > 20_000)
     finally:
         process.send_signal(signal.SIGKILL)
-        process.wait(10)
+        process.wait(PATIENCE)
     kept = transactions(path)
     assert kept == list(range(1, len(kept) + 1))
     data = path.read_bytes()

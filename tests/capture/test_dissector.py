@@ -21,6 +21,7 @@ from busmaster.protocols.hcp2.comms_array import ELEMENTS as CONTROLLER
 from busmaster.protocols.hcp2.microflex import ELEMENTS as DRIVE
 from busmaster.registry import kinds
 from tests.capture.hearing import HOST, NODE, sender_of, vectors
+from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
 
@@ -38,7 +39,7 @@ def dissect(folder: Path, packets: list[Packet], *fields: str) -> list[list[str]
             writer.write(packet)
     names = [argument for field in fields for argument in ("-e", field)]
     command = ["tshark", "-X", f"lua_script:{DISSECTOR}", "-r", str(path), "-T", "fields", "-E", "separator=\t", *names]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=50)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=PATIENCE)
     assert "Lua" not in done.stderr, done.stderr
     rows = [line.split("\t") for line in done.stdout.splitlines()]
     assert len(rows) == len(packets)

@@ -126,3 +126,17 @@ def test_a_packet_whose_header_means_nothing_is_refused(header: str) -> None:
     block = struct.pack("<IIIIIII", 6, length, 0, 0, 0, len(packet), len(packet)) + padded + struct.pack("<I", length)
     with pytest.raises(CaptureError, match="header"):
         list(read_packets(io.BytesIO(HEAD + block)))
+
+
+@pytest.mark.parametrize("wrong", [0x00, 0x01, 0x04, 0x08, 0x80, 0xFF])
+def test_a_file_with_any_byte_damaged_is_read_or_refused_in_words(wrong: int) -> None:
+    packets = [Packet(9, "hcp2", NODE, b"\x06", 5, Outcome.OK, "done", 3, ("late",), 7, 2)] * 2
+    whole = written(*packets, port="COM")
+    refused = 0
+    for place in range(len(whole)):
+        damaged = whole[:place] + bytes((wrong,)) + whole[place + 1 :]
+        try:
+            list(read_packets(io.BytesIO(damaged)))
+        except CaptureError:
+            refused += 1
+    assert refused

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import random
+import signal
 import subprocess
 import sys
 import warnings
@@ -61,6 +62,21 @@ def controllers() -> Iterator[TcpServer]:
     """Mint controllers 1 to 8."""
     with serve("hcp2", *range(1, 9)) as server:
         yield server
+
+
+def ended_once(seen: Callable[[list[str]], bool], *arguments: str, cwd: Path = ROOT) -> Outcome:
+    """What a command printed as a process of its own that Ctrl-C ended, once `seen` was satisfied with its lines."""
+    with started(*arguments, cwd=cwd) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        lines: list[str] = []
+        for line in process.stdout:
+            lines.append(line)
+            if seen(lines):
+                break
+        process.send_signal(signal.SIGINT)
+        out, err = "".join(lines) + process.stdout.read(), process.stderr.read()
+    return Outcome(process.returncode, out, err)
 
 
 def started(*arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:

@@ -19,9 +19,9 @@ from busmaster.config import ConfiguredLine, load
 from busmaster.transport.serial_port import SerialPort
 from tests.cli.conftest import ROOT, started
 from tests.config.test_emulated import HEAD, VALUES
+from tests.patience import PATIENCE
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
-PATIENCE = 30.0
 
 
 @contextmanager

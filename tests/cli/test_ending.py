@@ -15,6 +15,7 @@ import pytest
 from busmaster.cli.ending import Ending
 from busmaster.emulator.serve import TcpServer
 from tests.cli.conftest import ENVIRONMENT, ROOT, Command, started
+from tests.patience import PATIENCE
 
 POLL = ("--protocol", "hcp2", "--nodes", "1", "--items", "1", "--period", "0.02")
 
@@ -90,7 +91,7 @@ def test_a_signal_sent_twice_ends_a_poll_with_its_summary(
         process.stdout.readline()
         for _ in range(3):
             process.send_signal(number)
-        _, err = process.communicate(timeout=20.0)
+        _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == status
     assert "cycles" in err
     assert "Traceback" not in err
@@ -101,7 +102,7 @@ def test_a_full_disk_under_a_help_text_is_one_line(arguments: str) -> None:
     with open("/dev/full", "w", encoding="utf-8") as full:
         command = [sys.executable, "-m", "busmaster", *arguments.split()]
         with subprocess.Popen(command, cwd=ROOT, env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE) as process:
-            _, err = process.communicate(timeout=20.0)
+            _, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, err.decode()) == (1, "busmaster: No space left on device\n")
 
 

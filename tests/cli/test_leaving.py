@@ -21,8 +21,8 @@ from busmaster.emulator.serve import TcpServer
 from busmaster.errors import Superseded, WriteUnconfirmed
 from tests.cli.conftest import ENVIRONMENT, ROOT, Command, serve, started
 from tests.cli.test_processes import Terminal
+from tests.patience import PATIENCE
 
-PATIENCE = 30.0
 TEXT = """
 port = "PORT?baudrate=57600"
 [nodes.winder]

@@ -21,6 +21,7 @@ from busmaster.capture.pcapng import Outcome, read_packets
 from busmaster.cli.monitor import Listener, json_text, plain_text
 from busmaster.errors import LineDown
 from busmaster.registry import find
+from tests.patience import PATIENCE
 
 HCP2 = "07 46 46 02 36 39 05 08  02 36 39 34 30 39 36 03 07"  # AN00129: read node 255 Comms(105), and 4096
 MSC = (
@@ -129,7 +130,11 @@ def test_the_command_from_end_to_end(tmp_path: Path) -> None:
     with line_that_says(bytes.fromhex(HCP2)) as port:
         arguments = ["monitor", port, "--protocol", "microflex", "--json", "--capture", str(capture)]
         done = subprocess.run(
-            [sys.executable, "-m", "busmaster", *arguments], capture_output=True, text=True, timeout=50, check=False
+            [sys.executable, "-m", "busmaster", *arguments],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=False,
         )
     assert [json.loads(line)["item"] for line in done.stdout.splitlines()] == ["105", "105"]
     assert done.returncode == 1
@@ -146,7 +151,11 @@ def test_a_rate_that_no_device_of_the_protocol_has_is_said() -> None:
     with line_that_says(bytes.fromhex(MSC)) as port:
         arguments = ["monitor", f"{port}?baudrate=4800", "--protocol", "msc"]
         done = subprocess.run(
-            [sys.executable, "-m", "busmaster", *arguments], capture_output=True, text=True, timeout=50, check=False
+            [sys.executable, "-m", "busmaster", *arguments],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=False,
         )
     assert "flags" in done.stdout
     assert done.stderr.splitlines()[0].endswith("MSC devices speak at 9600 baud alone, not at 4800")

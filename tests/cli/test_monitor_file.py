@@ -23,6 +23,7 @@ from busmaster.config import ConfiguredLine, load
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import find
 from tests.outputs.cycles import until
+from tests.patience import PATIENCE
 
 FILE = """
 port = "socket://127.0.0.1:{port}?baudrate=57600"
@@ -90,7 +91,7 @@ def written(folder: Path, port: int = 1) -> Path:
 def rows(path: Path) -> list[tuple[str, str, float, str]]:
     if not path.exists():
         return []
-    database = sqlite3.connect(path, timeout=5)
+    database = sqlite3.connect(path, timeout=PATIENCE)
     try:
         return database.execute("select node, item, value, unit from history").fetchall()
     except sqlite3.OperationalError:
@@ -107,7 +108,7 @@ def test_points_and_outputs_are_fed_and_not_a_byte_is_sent(tmp_path: Path) -> No
             cycle = json.loads(process.stdout.readline())
             until(lambda: len(rows(tmp_path / "line.sqlite")) > 2)
             process.send_signal(signal.SIGINT)
-            _, said = process.communicate(timeout=20)
+            _, said = process.communicate(timeout=PATIENCE)
         assert line.heard == b""
     assert cycle["group"] == "fast"
     assert cycle["samples"]["winder/tension"] == {"value": 0.5, "error": None, "late": False}

@@ -10,6 +10,7 @@ from contextlib import suppress
 
 from busmaster.emulator.serve import TcpServer
 from tests.cli.conftest import ENVIRONMENT, ROOT
+from tests.patience import PATIENCE
 
 SCAN = ("scan", "--protocol", "hcp2", "--nodes", "6-9", "--timeout", "30")
 
@@ -31,7 +32,7 @@ def scan_on_a_terminal(port: str, *, results_too: bool) -> tuple[bytes, bytes]:
         while data := os.read(master, 65536):
             drawn += data
     os.close(master)
-    out, _ = process.communicate(timeout=20)
+    out, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
     return out or b"", drawn
 

@@ -54,6 +54,7 @@ def test_msc_values_in_a_row_need_the_address_step(msc: Ask) -> None:
     assert (refused.status, refused.out) == (2, "")
     assert "address step" in refused.err
     assert msc("write", "3000=1,-2,3", "--address-step", "4", "--verify").out == "3000 ok\n"
+    assert msc("write", "3012:1=4", "--verify").out == "3012:1 ok\n"
     assert msc("read", "3000:3", "--address-step", "4").lines == ["3000 1", "3004 -2", "3008 3"]
     assert json.loads(msc("read", "3000:3", "--json").out) == {"node": 3, "item": "3000:3", "value": [1, -2, 3]}
 
@@ -67,6 +68,8 @@ def test_msc_values_in_a_row_need_the_address_step(msc: Ask) -> None:
         ("2008=1.5", "whole number"),
         ("2008=4294967296", "2147483647"),
         ("3000:2=1,2,3", "3000:2 takes 2 values, not 3"),
+        ("3000:2=1", "3000:2 takes 2 values, not 1"),
+        ("flag:5=1,0", "no such item 'flag'"),
         ("speed=1", "no such item 'speed'"),
     ],
 )

@@ -19,6 +19,7 @@ from busmaster.emulator.serve import TcpServer
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.transport.tcp import TcpPort
+from tests.patience import PATIENCE
 
 
 @asynccontextmanager
@@ -39,7 +40,7 @@ async def watched(server: TcpServer, *addresses: int, read_only: bool = False) -
 
 async def seen(watch: Watch, what: Callable[[Frame], bool]) -> Frame:
     """The first picture that shows it."""
-    with anyio.fail_after(10):
+    with anyio.fail_after(PATIENCE):
         while not what(frame := watch.picture()):  # noqa: ASYNC110  # a picture is looked at, it announces nothing
             await anyio.sleep(0.01)
     return frame

@@ -16,10 +16,10 @@ from busmaster.errors import NoReply
 from busmaster.outputs.base import Output
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
+from tests.patience import PATIENCE
 
 BUS = Bus(MemoryPort(Line(hcp2.PROFILE.line)))
 NODE = Hcp2Controller(BUS, 5)
-PATIENCE = 10.0
 
 
 def point(item: str) -> Point[Any]:
@@ -47,7 +47,7 @@ def settled(output: Output) -> bool:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait for a thread, a short while."""
+    """Wait for a thread, until it has done it."""
     deadline = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() < deadline

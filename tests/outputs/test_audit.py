@@ -11,6 +11,7 @@ from busmaster.outputs.files import CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings, SqliteSettings
 from busmaster.outputs.sqlite import SqliteOutput
 from tests.outputs.cycles import settled, until
+from tests.patience import PATIENCE
 
 WRITE = WriteRecord(
     1767225600.25, "screen", "key w", "op", 17, "winder/setpoint", 1.5, 2, Outcome.UNCONFIRMED, "no reply", 0.1, "a1"
@@ -36,7 +37,7 @@ def test_sqlite_has_a_row_of_each_write(tmp_path: Path) -> None:
     output.start()
     output.offer(WRITE)
     until(lambda: settled(output))
-    output.close(5)
+    output.close(PATIENCE)
     database = sqlite3.connect(tmp_path / "line.sqlite")
     database.row_factory = sqlite3.Row
     assert [dict(row) for row in database.execute("select * from audit")] == [KEPT]
@@ -50,7 +51,7 @@ def test_json_lines_have_a_line_of_each_write_and_csv_has_values_alone(tmp_path:
         output.start()
         output.offer(WRITE)
         until(lambda output=output: settled(output))  # type: ignore[misc]  # bound now
-        output.close(5)
+        output.close(PATIENCE)
         if kind == "jsonl":
             assert json.loads((tmp_path / kind).read_text()) == {"write": "winder/setpoint", **KEPT}
         else:

@@ -10,6 +10,7 @@ from busmaster.bus.polling import Snapshot
 from busmaster.outputs.base import BatchOutput, Happening, Item, Output
 from busmaster.outputs.settings import Settings
 from tests.outputs.cycles import cycle, settled, until
+from tests.patience import PATIENCE
 
 
 class Shelf(BatchOutput[Item]):
@@ -26,7 +27,7 @@ class Shelf(BatchOutput[Item]):
         return None if isinstance(item, Happening) else item
 
     def commit(self, batch: list[Item]) -> None:
-        self.let.wait(10)
+        self.let.wait(PATIENCE)
         if self.broken is not None:
             raise self.broken
         self.shelf += batch
@@ -48,7 +49,7 @@ def test_everything_is_written_in_order() -> None:
     output = Shelf()
     output.start()
     offer(output, 1, 20)
-    output.close(5)
+    output.close(PATIENCE)
     assert output.cycles == list(range(1, 21))
     assert output.statistics().written == 40
 
@@ -63,7 +64,7 @@ def test_one_that_is_stuck_drops_the_oldest_and_counts_what_it_drops() -> None:
     counts = output.statistics()
     assert (counts.dropped, counts.written, counts.waiting) == (14, 0, 10)
     output.let.set()
-    output.close(5)
+    output.close(PATIENCE)
     assert output.cycles == [1, 9, 10, 11, 12]
     counts = output.statistics()
     assert (counts.dropped, counts.written, counts.waiting) == (14, 10, 0)
@@ -77,7 +78,7 @@ def test_offering_never_waits_for_the_thread() -> None:
     offer(output, 1, 200)
     assert time.perf_counter() - started < 1
     output.let.set()
-    output.close(5)
+    output.close(PATIENCE)
     assert output.written + output.dropped == output.offered == 400
 
 
@@ -94,7 +95,7 @@ def test_what_failed_is_written_when_it_works_again_and_both_are_told() -> None:
     offer(output, 4, 5)
     until(lambda: settled(output))
     assert said == ["shelf is down: /disk/x: No space left on device", "shelf is up again"]
-    output.close(5)
+    output.close(PATIENCE)
     assert output.cycles == [1, 2, 3, 4, 5]
     assert output.statistics().error == ""
 
@@ -108,7 +109,7 @@ def test_a_bug_in_an_output_does_not_end_it() -> None:
     until(lambda: output.statistics().error == "division by zero")
     output.broken = None
     until(lambda: settled(output))
-    output.close(5)
+    output.close(PATIENCE)
     assert output.cycles == [1]
 
 
@@ -117,7 +118,7 @@ def test_what_is_left_when_it_is_closed_is_counted_as_dropped() -> None:
     output.broken = OSError("gone")
     output.start()
     offer(output, 1, 5)
-    output.close(5)
+    output.close(PATIENCE)
     assert (output.written, output.dropped) == (0, 10)
 
 
@@ -139,5 +140,5 @@ def test_what_an_output_does_not_write_is_no_loss_and_what_was_lost_before_it_is
     output.start()
     output.offer(Happening(0.0, "winder", "winder is down"))
     output.miss(3)
-    output.close(5)
+    output.close(PATIENCE)
     assert (output.written, output.dropped, output.offered) == (1, 3, 4)

@@ -17,6 +17,7 @@ from busmaster.outputs.files import COLUMNS, CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings
 from busmaster.protocols.msc.status import ProgramStatus
 from tests.outputs.cycles import cycle
+from tests.patience import PATIENCE
 
 
 def written(path: Path) -> list[str]:
@@ -30,7 +31,7 @@ def test_csv_has_a_line_a_value_under_a_head_and_grows(tmp_path: Path) -> None:
         output = CsvOutput("csv", FileSettings(path=str(path)))
         output.start()
         output.offer(cycle(number, 12.5, ProgramStatus(65), (1, 2), NoReply("no reply within 100 ms")))
-        output.close(5)
+        output.close(PATIENCE)
     rows = list(csv.DictReader(written(path)))
     assert [row["cycle"] for row in rows] == ["1"] * 4 + ["2"] * 4
     assert [row["value"] for row in rows[:4]] == ["12.5", "65 PROGRAM_RUNNING|AUTO_START_ENABLED", "1,2", ""]
@@ -48,7 +49,7 @@ def test_json_lines_are_cycles_and_events(tmp_path: Path) -> None:
     output.start()
     output.offer(cycle(1, 12.0, NoReply("no reply")))
     output.offer(Happening(time.time(), "winder", "winder is down, was suspect"))
-    output.close(5)
+    output.close(PATIENCE)
     first, second = map(json.loads, written(path))
     assert first["samples"] == {
         "5/1": {"value": 12, "error": None, "late": False},

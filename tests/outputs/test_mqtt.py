@@ -24,6 +24,7 @@ from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
 from tests.outputs.brokers import Broker, free_port, needs_mosquitto, running
 from tests.outputs.cycles import BUS, cycle, until
+from tests.patience import PATIENCE
 
 if TYPE_CHECKING:
     from aiomqtt import Client
@@ -71,7 +72,7 @@ async def publishing(
     try:
         yield output
     finally:
-        await asyncio.to_thread(output.close, 5)
+        await asyncio.to_thread(output.close, PATIENCE)
 
 
 @asynccontextmanager
@@ -86,7 +87,7 @@ async def listening(broker: Broker, *topics: str, **options: Any) -> AsyncIterat
 
 async def heard(client: Client, count: int) -> list[Heard]:
     found: list[Heard] = []
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(PATIENCE):
         async for message in client.messages:
             text = bytes(message.payload).decode()
             found.append((str(message.topic), json.loads(text) if text[:1] in "{[" else text, message.retain))
@@ -191,7 +192,7 @@ async def test_without_a_broker_the_oldest_are_dropped_and_counted() -> None:
     counts = output.statistics()
     assert (counts.written, counts.dropped, counts.waiting) == (0, 190, 10)
     assert "refused" in counts.error
-    await asyncio.to_thread(output.close, 5)
+    await asyncio.to_thread(output.close, PATIENCE)
     assert output.dropped == 200
 
 

@@ -24,6 +24,7 @@ from busmaster.outputs.settings import MqttSettings
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
 from tests.outputs.brokers import Broker, needs_mosquitto, running
+from tests.patience import PATIENCE
 
 if TYPE_CHECKING:
     from aiomqtt import Client
@@ -55,7 +56,7 @@ class Plant:
 
     async def answers(self, count: int = 1) -> list[tuple[str, dict[str, Any]]]:
         found: list[tuple[str, dict[str, Any]]] = []
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(PATIENCE):
             async for message in self.client.messages:
                 found.append((str(message.topic), json.loads(bytes(message.payload))))
                 if len(found) == count:
@@ -81,7 +82,7 @@ async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncI
     async with bus, aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as client:
         await client.subscribe("line/status", qos=1)
         output.start()
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(PATIENCE):
             async for message in client.messages:
                 if message.payload == b"online":
                     break
@@ -91,7 +92,7 @@ async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncI
         try:
             yield Plant(bus, gate, output, client)
         finally:
-            await asyncio.to_thread(output.close, 5)
+            await asyncio.to_thread(output.close, PATIENCE)
 
 
 @pytest.mark.asyncio

@@ -19,6 +19,7 @@ from busmaster.outputs.settings import SqliteSettings
 from busmaster.outputs.sqlite import DATED, SqliteOutput, column
 from busmaster.protocols.msc.status import ProgramStatus
 from tests.outputs.cycles import cycle, settled, until
+from tests.patience import PATIENCE
 
 
 def test_a_column_holds_whatever_a_value_is() -> None:
@@ -34,7 +35,7 @@ def recording(path: Path, keep_days: float | None = None, keep_mb: float | None 
     try:
         yield output
     finally:
-        output.close(5)
+        output.close(PATIENCE)
 
 
 def query(path: Path, text: str) -> list[Any]:

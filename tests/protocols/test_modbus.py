@@ -14,27 +14,13 @@ import pytest
 from busmaster import Bus, InvalidCommand, MemoryPort, ModbusUnit, Refused, VerifyFailed
 from busmaster.contract.exchange import Done
 from busmaster.emulator.line import Line
-from busmaster.protocols.modbus.codec import (
-    EXCEPTIONS,
-    PROFILE,
-    ReadBits,
-    ReadRegisters,
-    WriteCoils,
-    WriteRegisters,
-    with_crc,
-)
+from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
 from busmaster.protocols.modbus.device import EmulatedModbus
 from busmaster.protocols.modbus.handle import is_whole
 from busmaster.protocols.modbus.numbers import Number
 from busmaster.testing import Case, Foreign, RoundTrip, answers_of, check_protocol
 from busmaster.testing.virtual_time import run_in_virtual_time
-
-UNIT = 0x11
-
-
-def frame(text: str) -> bytes:
-    return with_crc(bytes.fromhex(text))
-
+from tests.protocols.modbus_frames import UNIT, frame
 
 CASES = [
     Case(ReadRegisters(0x6B, 3), UNIT, [frame("11 03 06 022b 0000 0064")], (555, 0, 100)),
@@ -124,13 +110,6 @@ def test_modbus_keeps_the_contract() -> None:
     assert min(tally.values()) > 0
 
 
-@pytest.mark.parametrize(("code", "name"), [*EXCEPTIONS.items(), (7, "exception 7")])
-def test_an_exception_is_a_refusal_with_its_name(code: int, name: str) -> None:
-    exchange = ReadRegisters(7).open(UNIT, PROFILE.timings)
-    with pytest.raises(Refused, match=f"^refused: {name};"):
-        exchange.feed(with_crc(bytes((UNIT, 0x83, code))))
-
-
 def test_a_read_is_never_sent_to_all() -> None:
     for command in (ReadRegisters(0), ReadBits(0)):
         with pytest.raises(InvalidCommand, match="nobody answers"):
@@ -195,7 +174,7 @@ def told(story: Callable[[ModbusUnit, EmulatedModbus], Coroutine[Any, Any, None]
     """With the handle of a unit, and the unit."""
 
     async def main() -> None:
-        device = EmulatedModbus(UNIT, inputs=range(1000), read_only=frozenset({990}))
+        device = EmulatedModbus(UNIT, inputs=range(1000), coils=(False,) * 2000, read_only=frozenset({990}))
         async with Bus(MemoryPort(Line(PROFILE.line, [device, EmulatedModbus(3)]))) as bus:
             await story(ModbusUnit(bus, UNIT), device)
 
@@ -230,6 +209,24 @@ def test_many_values_go_in_as_many_exchanges_as_it_takes_and_no_number_is_torn()
     told(story)
 
 
+@pytest.mark.parametrize(("item", "most"), [("holding:0", 123), ("coil:0", 1968)])
+def test_a_run_is_written_whole_by_its_point_or_not_at_all(item: str, most: int) -> None:
+    async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
+        await unit.point(f"{item}:{most}").write((1,) * most)
+        stored = device.registers if item == "holding:0" else device.coils
+        assert [sum(stored), stored[most]] == [most, 0]
+        with pytest.raises(InvalidCommand, match="takes more than one exchange to write: use the handle's write"):
+            await unit.point(f"{item}:{most + 1}").write((0,) * (most + 1))
+        for wrong in (0, None, (0,) * (most - 1)):
+            with pytest.raises(InvalidCommand, match=f"takes {most} values"):
+                await unit.point(f"{item}:{most}").write(wrong)
+        assert sum(stored) == most
+        await unit.write(f"{item}:{most + 1}", *(1,) * (most + 1))
+        assert stored[most] == 1
+
+    told(story)
+
+
 def test_what_the_unit_does_not_have_or_take_is_refused_by_name() -> None:
     async def story(unit: ModbusUnit, device: EmulatedModbus) -> None:
         with pytest.raises(Refused, match="illegal data address"):
@@ -259,6 +256,9 @@ def test_a_write_to_all_reaches_every_unit() -> None:
         assert await unit.read("holding:100") == await ModbusUnit(unit.bus, 3).read("holding:100") == 5
         with pytest.raises(InvalidCommand):
             await everyone.read("holding:100")
+        with pytest.raises(InvalidCommand, match="modbus: a write to all cannot be verified"):
+            await everyone.write("holding:100", 6, verify=True)
+        assert device.registers[100] == 5
 
     told(story)
 
@@ -307,6 +307,3 @@ def test_only_floats_are_not_rounded_when_they_are_scaled() -> None:
     assert is_whole("holding:1")
     assert is_whole("holding:1:int32:swapped")
     assert not is_whole("holding:1:float64")
-
-
-# the emulated unit

@@ -9,54 +9,32 @@ import pytest
 
 from busmaster import InvalidCommand, Refused
 from busmaster.contract.exchange import MORE, Done, FrameError
-from busmaster.protocols.modbus.codec import (
-    EXCEPTIONS,
-    PROFILE,
-    ReadBits,
-    ReadRegisters,
-    WriteCoils,
-    WriteRegisters,
-    with_crc,
-)
-
-UNIT = 0x11
+from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
+from tests.protocols.modbus_frames import UNIT, frame
 
 
 @pytest.mark.parametrize(
-    ("code", "hint"),
+    ("reply", "name", "hint"),
     [
-        (1, None),
-        (2, None),
-        (3, None),
-        (4, None),
-        (5, "ask again later"),
-        (6, "ask again later"),
-        (8, None),
-        (10, "look at the gateway"),
-        (11, "look behind the gateway"),
-        (12, None),
+        ("11 83 01 81 35", "illegal function", None),
+        ("11 83 02 c1 34", "illegal data address", None),
+        ("11 83 03 00 f4", "illegal data value", None),
+        ("11 83 04 41 36", "device failure", None),
+        ("11 83 05 80 f6", "acknowledged, but it takes long", "ask again later"),
+        ("11 83 06 c0 f7", "device busy", "ask again later"),
+        ("11 83 07 01 37", "exception 7", None),
+        ("11 83 08 41 33", "memory parity error", None),
+        ("11 83 0a c0 f2", "gateway path unavailable", "look at the gateway"),
+        ("11 83 0b 01 32", "gateway target did not respond", "look behind the gateway"),
     ],
 )
-def test_a_refusal_says_what_to_do_where_something_can_be_done(code: int, hint: str | None) -> None:
-    with pytest.raises(Refused) as refusal:
-        ReadRegisters(7).open(UNIT, PROFILE.timings).feed(with_crc(bytes((UNIT, 0x83, code))))
-    plain = Refused("refused: it", confirm=False)
-    hinted = Refused("refused: it", confirm=False, hint=hint) if hint else plain
-    assert (refusal.value.hint, refusal.value.confirm) == (hinted.hint, False)
-
-
-def test_the_names_of_the_exceptions_are_the_specifications() -> None:
-    assert EXCEPTIONS == {
-        1: "illegal function",
-        2: "illegal data address",
-        3: "illegal data value",
-        4: "device failure",
-        5: "acknowledged, but it takes long",
-        6: "device busy",
-        8: "memory parity error",
-        10: "gateway path unavailable",
-        11: "gateway target did not respond",
-    }
+def test_an_exception_is_a_refusal_with_its_name_that_is_believed_at_once(
+    reply: str, name: str, hint: str | None
+) -> None:
+    with pytest.raises(Refused, match=f"^refused: {name};") as refusal:
+        ReadRegisters(7).open(UNIT, PROFILE.timings).feed(bytes.fromhex(reply))
+    usual = Refused("refused").hint
+    assert (refusal.value.hint, refusal.value.confirm) == (hint or usual, False)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +99,7 @@ def test_a_command_says_what_it_does(command: Any, text: str) -> None:
 
 @pytest.mark.parametrize("chunks", [1, 2, 3])
 def test_a_refusal_is_read_byte_by_byte_and_its_crc_is_looked_at(chunks: int) -> None:
-    refused = with_crc(bytes((UNIT, 0x83, 2)))
+    refused = frame("11 83 02")
     exchange = ReadRegisters(7).open(UNIT, PROFILE.timings)
     for start in range(0, 4, chunks):
         assert exchange.feed(refused[start : min(4, start + chunks)]) is MORE
@@ -134,7 +112,7 @@ def test_a_refusal_is_read_byte_by_byte_and_its_crc_is_looked_at(chunks: int) ->
 
 
 def test_a_bad_crc_is_a_whole_frame_unless_something_follows() -> None:
-    reply = with_crc(bytes.fromhex("11 03 02 02 2b"))
+    reply = frame("11 03 02 02 2b")
     damaged = reply[:-1] + bytes((reply[-1] ^ 1,))
     for heard, whole in ((damaged, True), (damaged + b"\0", False)):
         with pytest.raises(FrameError, match="bad CRC") as failure:

@@ -10,9 +10,9 @@ import select
 import socket
 import sys
 
+from tests.patience import PATIENCE
+
 CHUNK = 4096
-PATIENCE = 30.0
-"""Seconds within which the client must come."""
 
 
 def main(host: str, port: str) -> None:

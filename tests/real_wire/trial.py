@@ -18,6 +18,7 @@ from pathlib import Path
 from random import Random
 from typing import NamedTuple
 
+from tests.patience import PATIENCE
 from tests.real_wire.kinds import KINDS
 
 ROOT = Path(__file__).parents[2]
@@ -25,8 +26,6 @@ SETTLED = 60
 """Values before the first standstill."""
 BETWEEN = (20, 80)
 """Values from one standstill's end to the next."""
-PATIENCE = 30.0
-"""Seconds in which they must have come."""
 SHORTEST = 0.005
 CLOCK = 1e-5
 """Seconds: times are printed in microseconds."""

@@ -29,6 +29,7 @@ from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
 from busmaster.registry import NodeKind, Protocol, find, kinds, make_device, protocols
+from tests.patience import PATIENCE
 
 every_kind = pytest.mark.parametrize("kind", kinds().values(), ids=lambda kind: kind.name)
 every_protocol = pytest.mark.parametrize("protocol", protocols(), ids=lambda protocol: protocol.name)
@@ -196,5 +197,5 @@ def test_naming_the_protocols_loads_no_emulated_device() -> None:
         "print([name for name in sys.modules if name.startswith('busmaster.') and name.endswith('device') "
         "and '.protocols.' in name])"
     )
-    done = subprocess.run([sys.executable, "-c", code], check=True, timeout=30, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE, capture_output=True, text=True)
     assert done.stdout.strip() == "[]"

@@ -16,10 +16,10 @@ from typing import Any, cast
 
 from busmaster.testing.virtual_time import VirtualTimeLoop
 from busmaster.transport.serial_port import PortTransport, SerialPort
+from tests.patience import PATIENCE
 
-PATIENCE = 2.0
 VIRTUAL_PATIENCE = 1000.0
-"""Seconds after which something that should happen has not."""
+"""Virtual seconds after which something that should happen has not."""
 SO_ATTACH_FILTER, SO_DETACH_FILTER = 26, 27
 BPF_RETURN = 6
 """Linux: asm/socket.h, linux/bpf_common.h."""

@@ -15,6 +15,7 @@ import uvloop
 
 from busmaster import Bus, Hcp2Controller, LineState, NoReply, SerialPort
 from busmaster.wire.checks import xor
+from tests.patience import PATIENCE
 
 Runner = Callable[[Coroutine[Any, Any, None]], None]
 
@@ -51,7 +52,7 @@ class LateThenPrompt:
     def close(self) -> None:
         os.close(self._slave)
         os.close(self.fd)
-        self._thread.join(1.0)
+        self._thread.join(PATIENCE)
 
 
 @pytest.fixture

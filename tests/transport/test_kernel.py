@@ -18,7 +18,8 @@ from busmaster.arbiter.counters import DriverErrors
 from busmaster.transport import kernel
 from busmaster.transport.kernel import DELAYED_ACK, TIOCGICOUNT, Socket, open_port
 from busmaster.transport.tcp import TcpPort
-from tests.transport.fakes import PATIENCE, PtyMaster, Recorder, closed, opened, plugged, standing_still
+from tests.patience import PATIENCE
+from tests.transport.fakes import PtyMaster, Recorder, closed, opened, plugged, standing_still
 
 Runner = Callable[[Coroutine[Any, Any, None]], None]
 LATER = 60.0

@@ -22,6 +22,7 @@ from busmaster.registry import make_device
 from busmaster.transport.marks import Unescape
 from busmaster.transport.serial_port import PortTransport
 from busmaster.wire.checks import xor
+from tests.patience import PATIENCE
 from tests.transport.fakes import PtyMaster, Recorder, closed, opened, plugged
 
 HEARD = [
@@ -85,7 +86,7 @@ def readable(descriptor: int) -> None:
     """Return when what was written at the other end has come through."""
     poller = select.poll()
     poller.register(descriptor, select.POLLIN)
-    assert poller.poll(2000)
+    assert poller.poll(PATIENCE * 1000)
 
 
 # -- telling marks from data -----------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from serial.rs485 import RS485Settings
 from busmaster.errors import LineDown
 from busmaster.transport import serial_port
 from busmaster.transport.serial_port import SerialPort
+from tests.patience import PATIENCE
 from tests.transport.fakes import PtyMaster, Recorder, closed, opened, plugged
 
 TIOCGEXCL = 0x80045440
@@ -106,7 +107,7 @@ async def _is_released_in_the_end(path: str, slow_driver: threading.Event) -> No
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(serial_port, "_release", release)
         slow_driver.set()
-        assert await asyncio.to_thread(released.wait, 2)
+        assert await asyncio.to_thread(released.wait, PATIENCE)
     await closed(*await opened(path))
 
 
@@ -133,28 +134,38 @@ async def test_a_pty_opens_again_and_again_whatever_framing_the_protocol_has(pty
         await closed(transport, recorder)
 
 
-@pytest.mark.asyncio
-async def test_descriptors_above_1023_work() -> None:
+@pytest.fixture
+def high_descriptors(pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Opening the pty's port gives a descriptor above 1023, whichever are free below."""
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)
     if limit[1] != resource.RLIM_INFINITY and limit[1] < 1200:
         pytest.skip("the system allows this process no such descriptors")
     resource.setrlimit(resource.RLIMIT_NOFILE, (max(limit[0], 1200), limit[1]))
-    taken: list[int] = []
-    try:
-        while not taken or taken[-1] < 1030:
-            taken.append(os.open(os.devnull, os.O_RDONLY))
-        with plugged() as pty_master:
-            transport, recorder = await opened(pty_master.path)
-            assert transport.get_extra_info("serial").fileno() > 1023
-            transport.write(b"ping")
-            assert pty_master.read() == b"ping"
-            pty_master.write(b"pong")
-            await recorder.heard(b"pong")
-            await closed(transport, recorder)
-    finally:
-        for descriptor in taken:
-            os.close(descriptor)
-        resource.setrlimit(resource.RLIMIT_NOFILE, limit)
+    really_open = os.open
+
+    def open_high(path: Any, *how: Any, **more: Any) -> int:
+        low = really_open(path, *how, **more)
+        if path != pty_master.path:
+            return low
+        try:
+            return fcntl.fcntl(low, fcntl.F_DUPFD_CLOEXEC, 1024)
+        finally:
+            os.close(low)
+
+    monkeypatch.setattr(os, "open", open_high)
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, limit)
+
+
+@pytest.mark.asyncio
+async def test_descriptors_above_1023_work(pty_master: PtyMaster, high_descriptors: None) -> None:
+    transport, recorder = await opened(pty_master.path)
+    assert transport.get_extra_info("serial").fileno() > 1023
+    transport.write(b"ping")
+    assert pty_master.read() == b"ping"
+    pty_master.write(b"pong")
+    await recorder.heard(b"pong")
+    await closed(transport, recorder)
 
 
 # -- sole use --------------------------------------------------------------------------------------------------------

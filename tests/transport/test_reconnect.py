@@ -20,6 +20,7 @@ from busmaster.transport.identity import Identity
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
+from tests.patience import PATIENCE
 from tests.transport.fakes import PtyMaster, Recorder, plugged
 
 
@@ -32,7 +33,7 @@ async def kept(endpoint: Endpoint, recorder: Recorder, **options: Any) -> AsyncI
         yield connection
     finally:
         await connection.close()
-        async with asyncio.timeout(1):
+        async with asyncio.timeout(PATIENCE):
             await running
 
 

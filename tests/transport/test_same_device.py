@@ -24,10 +24,9 @@ from busmaster.transport import serial_port
 from busmaster.transport.identity import identify
 from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
+from tests.patience import PATIENCE
 from tests.transport.fakes import PtyMaster, Recorder, opened, plugged, plugged_high, with_the_number_of
 from tests.transport.usb import UsbTree
-
-PATIENCE = 5.0
 
 
 class Causes(list[str]):
@@ -76,7 +75,7 @@ async def kept(port: SerialPort) -> AsyncIterator[tuple[Connection, Recorder, Ca
         yield connection, recorder, causes
     finally:
         await connection.close()
-        async with asyncio.timeout(1):
+        async with asyncio.timeout(PATIENCE):
             await running
 
 

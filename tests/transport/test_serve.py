@@ -16,6 +16,7 @@ from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, TcpServer, serve_pty, serve_tcp
 from busmaster.protocols._comms.mint import EmulatedMint
+from tests.patience import PATIENCE
 
 WRITE = bytes.fromhex("07 30 32 02 30 31 31 32 33 2E 34 35 36 03 2B")  # AN00129: node 2, Comms(1) = 123.456
 READ = bytes.fromhex("07 30 32 02 30 31 05 04")
@@ -26,7 +27,7 @@ def mint_line(paced: bool = False, delay: float = 0.0) -> Line:
     return Line(LineSettings(57600), [EmulatedMint(2, delay=Delay(delay))], paced=paced)
 
 
-def ask(port: int, request: bytes, length: int, seconds: float = 2.0) -> bytes:
+def ask(port: int, request: bytes, length: int, seconds: float = PATIENCE) -> bytes:
     """Writes to an open descriptor and waits for `length` bytes."""
     os.write(port, request)
     end = time.monotonic() + seconds

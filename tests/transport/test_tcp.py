@@ -14,6 +14,7 @@ from busmaster.errors import InvalidCommand, LineDown
 from busmaster.transport import tcp
 from busmaster.transport.endpoints import is_paced
 from busmaster.transport.tcp import TcpPort
+from tests.patience import PATIENCE
 from tests.transport.fakes import Recorder
 
 
@@ -50,7 +51,7 @@ async def served() -> AsyncIterator[Server]:
 
 
 async def done(happening: Awaitable[Any]) -> None:
-    async with asyncio.timeout(2):
+    async with asyncio.timeout(PATIENCE):
         await happening
 
 

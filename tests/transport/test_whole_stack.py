@@ -27,8 +27,7 @@ from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, serve_pty, serve_tcp
 from busmaster.registry import make_device
 from busmaster.transport.endpoints import Endpoint
-
-PATIENCE = 5.0
+from tests.patience import PATIENCE
 
 
 def line() -> Line:

@@ -6,12 +6,11 @@ second digit is 0: that means a group, and 00 all drives.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
-from typing import Any, ClassVar
+from typing import Any, ClassVar, SupportsFloat
 
 from busmaster.contract.arguments import whole_number
 from busmaster.contract.exchange import FrameError, Sizes
@@ -95,11 +94,7 @@ class Write:
     def _format(self) -> str:
         if isinstance(self.value, bool):
             return str(int(self.value))
-        try:
-            finite = math.isfinite(self.value)
-        except (TypeError, OverflowError):
-            finite = False
-        if not finite:
+        if not is_sendable(self.value):
             raise InvalidCommand(f"{self.value!r} is no number that can be sent")
         text = f"{Decimal(str(self.value)):+f}"
         if "." in text:
@@ -118,6 +113,16 @@ class Write:
         body = b"%02d%02d%b" % (self.menu, self.number, self.text.encode()) + ETX
         request = reset(address) + STX + body + bytes((bcc(body),))
         return Writing(request, timings.write) if address else Broadcast(request, timings.write)
+
+
+def is_sendable(value: SupportsFloat) -> bool:
+    """Return whether it is a number that has room before its decimal point."""
+    try:
+        return (
+            hasattr(value, "__float__") and abs(float(value)) < 10**LONGEST_DATA
+        )  # text has none: float() would take it
+    except (ValueError, OverflowError):
+        return False
 
 
 PROFILE = Profile(

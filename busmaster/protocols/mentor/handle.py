@@ -42,7 +42,66 @@ class Place(NamedTuple):
         return Write(self.menu, self.number, to_line(value, decimals), wide, high_resolution)
 
 
-class MentorDrive(Handle):
+class ParameterHandle(Handle):
+    """A handle of a drive whose parameters are known by menu and number. Each protocol says how one and a run are read.
+
+    `decimals` is by parameter. Raises InvalidCommand for what are no digits, or two that differ for one parameter.
+    """
+
+    read_command: ClassVar[type[Read]] = Read
+    run_command: ClassVar[type[ReadRun]] = ReadRun
+
+    def __init__(
+        self,
+        bus: NodeSource,
+        address: int,
+        *,
+        decimals: Mapping[str, int] | None = None,
+        timings: Timings | Learned | None = None,
+        retries: int | None = None,
+        profile: Profile | None = None,
+    ) -> None:
+        super().__init__(bus, address, timings=timings, retries=retries, profile=profile)
+        self._decimals: dict[tuple[int, int], int] = {}
+        for text, digits in (decimals or {}).items():
+            digits = whole_number(digits, 0, MOST_DECIMALS, f"the decimals of {text}")
+            if (known := self._decimals.setdefault(self.place_of(text), digits)) != digits:
+                raise InvalidCommand(f"{text} has {known} decimals by another name, not {digits}")
+
+    @staticmethod
+    def place_of(text: str) -> tuple[int, int]:
+        """Return menu and number of "1.17" or "01.17". Raises InvalidCommand for anything else."""
+        return parse_parameter(text)
+
+    def values_of(self, run: ReadRun, sent: Sequence[Any]) -> tuple[float, ...]:
+        """Return the values of a run that was read."""
+        return tuple(sent)
+
+    async def read_run(
+        self, parameter: str, count: int, *, step: int = 1, chain: bool = False, **options: Unpack[ReadOptions]
+    ) -> tuple[float, ...]:
+        """Return `count` parameters of a menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
+
+        `step` 0 reads the same one again and again. With `chain` it takes one exchange, with one request byte for each
+        after the first: only where no other drive can take or send that byte for its own, that is where every node of
+        the line is a drive that forgets what it last sent when another is addressed. Raises NoSuchParameter where the
+        menu has a gap.
+        """
+        run = self.run_command(*self.place_of(parameter), count, step)
+        if chain:
+            return self.values_of(run, await self.node.request(run, **options))
+        requests = SeveralRequests(self.node, options)
+        return self.values_of(run, [await requests.request(self.read_command(*place)) for place in places_of(run)])
+
+    async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
+        """Do as `point(item).read()` does; read a run without `chain` parameter by parameter, which is always safe."""
+        parameter, _, count = item_text(item).partition(":")
+        if is_decimal(count) and not chain:
+            return await self.read_run(parameter, int(count))
+        return await self.point(item).read()
+
+
+class MentorDrive(ParameterHandle):
     """A Mentor II drive: addresses 1-99, and 0 to write to all drives at once.
 
         drive = MentorDrive(bus, 14, decimals={"1.17": 1})
@@ -69,12 +128,7 @@ class MentorDrive(Handle):
         retries: int | None = None,
     ) -> None:
         profile = mentor.CHAINED if chained else mentor.PROFILE
-        super().__init__(bus, address, timings=timings, retries=retries, profile=profile)
-        self._decimals: dict[tuple[int, int], int] = {}
-        for text, digits in (decimals or {}).items():
-            digits = whole_number(digits, 0, MOST_DECIMALS, f"the decimals of {text}")
-            if (known := self._decimals.setdefault(place_of(text), digits)) != digits:
-                raise InvalidCommand(f"{text} has {known} decimals by another name, not {digits}")
+        super().__init__(bus, address, decimals=decimals, timings=timings, retries=retries, profile=profile)
         if address and (address < 10 or address % 10 == 0):
             warnings.warn(
                 f"mentor: address {address} means a group to later Control Techniques products: "
@@ -124,32 +178,14 @@ class MentorDrive(Handle):
         return ScaledPoint(self.node, item, read, unit=unit, decode=decode, encode=encode, decimals=(decimals,))
 
     def _run_point(self, item: str, run: ReadRun) -> Point[tuple[float, ...]]:
-        decimals = tuple(self._decimals.get(parameter) for parameter in _parameters(run))
-        return ScaledPoint(self.node, item, run, decode=lambda sent: self._values(run, sent), decimals=decimals)
+        decimals = tuple(self._decimals.get(parameter) for parameter in places_of(run))
+        return ScaledPoint(self.node, item, run, decode=lambda sent: self.values_of(run, sent), decimals=decimals)
 
     async def read(self, parameter: str, **options: Unpack[ReadOptions]) -> float:
         """Return a parameter's value; a bit is 0 or 1. Raises NoSuchParameter, or InvalidCommand at address 0."""
-        self._check_readable()
         place = self._place(parameter)
         found = await self.node.request(Read(place.menu, place.number), **options)
         return from_line(found, place.decimals)
-
-    async def read_run(
-        self, parameter: str, count: int, *, step: int = 1, chain: bool = False, **options: Unpack[ReadOptions]
-    ) -> tuple[float, ...]:
-        """Return `count` parameters of a menu, from `parameter` on: the next ones, or with `step` -1 the previous ones.
-
-        `step` 0 reads the same one again and again. With `chain` it takes one exchange, with one request byte for each
-        after the first: only where no other drive can take or send that byte for its own, that is where every node of
-        the line is a drive that forgets what it last sent when another is addressed. Raises NoSuchParameter where the
-        menu has a gap.
-        """
-        self._check_readable()
-        run = ReadRun(*place_of(parameter), count, step)
-        if chain:
-            return self._values(run, await self.node.request(run, **options))
-        requests = SeveralRequests(self.node, options)
-        return self._values(run, [await requests.request(Read(*place)) for place in _parameters(run)])
 
     async def write(
         self,
@@ -170,8 +206,6 @@ class MentorDrive(Handle):
         place = self._place(parameter)
         command = place.write(value, wide=wide, high_resolution=high_resolution)
         requests = SeveralRequests(self.node, options)
-        if requests.verify:
-            self._check_readable()
         await requests.request(command)
         if requests.verify:
             check = Read(place.menu, place.number)
@@ -195,34 +229,31 @@ class MentorDrive(Handle):
         command = self._place(parameter).write(value, wide=wide, high_resolution=high_resolution)
         await self.bus.node(mentor.PROFILE, 0).request(command, **options)
 
-    async def read_item(self, item: str, *, chain: bool = False, **options: Any) -> Any:
-        """Do as `point(item).read()` does; read a run without `chain` parameter by parameter, which is always safe."""
-        parameter, _, count = item_text(item).partition(":")
-        if is_decimal(count) and not chain:
-            return await self.read_run(parameter, int(count))
-        return await self.point(item).read()
-
     def prepare_one(self, item: str, value: Any, **options: Unpack[WriteOptions]) -> Send:
         self.node.check(encoder(self.point(item))(value), stop=options.get("safe"))
         parameter, _, kind = item.partition(":")
         return lambda: self.write(parameter, value, wide=kind == "wide", high_resolution=kind == "hires", **options)
-
-    def _check_readable(self) -> None:
-        if self.node.address == self.profile.broadcast:
-            raise InvalidCommand("mentor: a read cannot go to all drives: they would answer at once")
 
     def _place(self, text: str) -> Place:
         """Return where a parameter is, by number or name.
 
         A name brings the guide's decimals unless others are declared.
         """
-        where = place_of(text)
+        where = self.place_of(text)
         decimals = NAMED[text].decimals if text in NAMED else 0
         return Place(*where, self._decimals.get(where, decimals or None))
 
-    def _values(self, run: ReadRun, sent: Sequence[int]) -> tuple[float, ...]:
-        parameters = _parameters(run)
-        return tuple(from_line(n, self._decimals.get(parameter)) for n, parameter in zip(sent, parameters, strict=True))
+    @staticmethod
+    def place_of(text: str) -> tuple[int, int]:
+        """Return menu and number of "1.17", "01.17", or a name that the guide gives.
+
+        Raises InvalidCommand for anything else.
+        """
+        named = NAMED.get(str(text))  # whatever it is: what is no text is refused below
+        return parse_parameter(text) if named is None else named.place
+
+    def values_of(self, run: ReadRun, sent: Sequence[Any]) -> tuple[float, ...]:
+        return tuple(from_line(n, self._decimals.get(place)) for n, place in zip(sent, places_of(run), strict=True))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,27 +263,20 @@ class ScaledPoint(Point[T]):
     decimals: tuple[int | None, ...]
 
 
-def place_of(text: str) -> tuple[int, int]:
-    """Return menu and number of "1.17", "01.17", or a name that the guide gives.
-
-    Raises InvalidCommand for anything else.
-    """
-    named = NAMED.get(str(text))  # whatever it is: what is no text is refused below
-    return parse_parameter(text) if named is None else named.place
-
-
-def _parameters(run: ReadRun) -> list[tuple[int, int]]:
+def places_of(run: ReadRun) -> list[tuple[int, int]]:
+    """Return the parameters of a run, each as menu and number."""
     return [(run.menu, run.number + run.step * i) for i in range(run.count)]
 
 
 def to_line(value: float, decimals: int | None) -> int:
     """Return the whole number that stands for a value, rounded half away from zero. True and False stay what they are.
 
-    Raises InvalidCommand for a fraction where no decimals are declared, and for NaN and infinity.
+    Raises InvalidCommand for a fraction where no decimals are declared, and for NaN, infinity and what is no number.
     """
     if isinstance(value, bool):
         return value
-    if not abs(value) < _BEYOND_ANY_FORM:
+    # a text has no __float__, and a NaN is unlike itself; a Decimal one cannot be compared otherwise
+    if not hasattr(value, "__float__") or value != value or not abs(value) < _BEYOND_ANY_FORM:
         raise InvalidCommand(f"{value!r} cannot be sent: a parameter has at most five digits")
     if decimals is None:
         if value != int(value):

@@ -148,19 +148,20 @@ class Conversation(Generic[T]):
 
 
 @dataclass(frozen=True, slots=True)
-class ReadRegisters:
-    """Read `count` registers, 1 to 125, from `first` on: a tuple of ints, 0 to 65535 each."""
-
+class _Read:
     first: int
     count: int = 1
-    table: str = "holding"
+    table: str = ""
 
+    tables: ClassVar[tuple[str, ...]]
+    most: ClassVar[int]
     writes: ClassVar[bool] = False
     idempotent: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        _check_table(self.table, ("holding", "input"))
-        _check_span(self.first, self.count, MOST_READ)
+        if self.table not in self.tables:
+            raise InvalidCommand(f"there is no table {self.table!r} to read here: use {' or '.join(self.tables)}")
+        _check_span(self.first, self.count, self.most)
 
     def __str__(self) -> str:
         return f"read {_span(self.table, self.first, self.count)}"
@@ -171,6 +172,16 @@ class ReadRegisters:
 
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return tuple(values[place] for place in self.places)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadRegisters(_Read):
+    """Read `count` registers, 1 to 125, from `first` on: a tuple of ints, 0 to 65535 each."""
+
+    table: str = "holding"
+
+    tables: ClassVar[tuple[str, ...]] = ("holding", "input")
+    most: ClassVar[int] = MOST_READ
 
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[int, ...]]:
         """Begin the read. Raises InvalidCommand for the broadcast address: nobody would answer."""
@@ -179,29 +190,13 @@ class ReadRegisters:
 
 
 @dataclass(frozen=True, slots=True)
-class ReadBits:
+class ReadBits(_Read):
     """Read `count` coils or discrete inputs, 1 to 2000, from `first` on: a tuple of bools."""
 
-    first: int
-    count: int = 1
     table: str = "coil"
 
-    writes: ClassVar[bool] = False
-    idempotent: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        _check_table(self.table, ("coil", "discrete"))
-        _check_span(self.first, self.count, MOST_BITS_READ)
-
-    def __str__(self) -> str:
-        return f"read {_span(self.table, self.first, self.count)}"
-
-    @property
-    def places(self) -> tuple[Hashable, ...]:
-        return _places(self.table, self.first, self.count)
-
-    def shown(self, values: Mapping[Hashable, Any]) -> Any:
-        return tuple(values[place] for place in self.places)
+    tables: ClassVar[tuple[str, ...]] = ("coil", "discrete")
+    most: ClassVar[int] = MOST_BITS_READ
 
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[bool, ...]]:
         """Begin the read. Raises InvalidCommand for the broadcast address."""
@@ -298,11 +293,6 @@ def _places(table: str, first: int, count: int) -> tuple[Hashable, ...]:
 
 def _nothing(_: bytes) -> None:
     return None
-
-
-def _check_table(table: str, known: Sequence[str]) -> None:
-    if table not in known:
-        raise InvalidCommand(f"there is no table {table!r} to read here: use {' or '.join(known)}")
 
 
 def _check_span(first: int, count: int, longest: int) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Unpack
 
@@ -80,6 +80,15 @@ class Place:
             return tuple(raw)
         return raw[0] if self.is_bit else self.number.decode(raw)
 
+    def write_at_once(self, value: Any, item: str) -> WriteCoils | WriteRegisters:
+        """Return the one command that writes its value, or the values of a run. Raises InvalidCommand."""
+        if self.count is not None and not isinstance(value, Iterable):
+            raise InvalidCommand(f"{item} takes {self.count} values, not {value!r}")
+        command, *further = self.write((value,) if self.count is None else tuple(value))
+        if further:  # the first of several alone would leave the rest as it was, and be confirmed
+            raise InvalidCommand(f"{item} takes more than one exchange to write: use the handle's write")
+        return command
+
     def write(self, values: Sequence[Any]) -> list[WriteCoils | WriteRegisters]:
         """Return what writes the values here and behind, in as many exchanges as it takes. Raises InvalidCommand."""
         if not values or (self.count is not None and len(values) != self.count):
@@ -116,11 +125,14 @@ class ModbusUnit(Handle):
     profile: ClassVar[Profile] = PROFILE
 
     def point(self, item: str) -> Point[Any]:
-        """Return the point that an item names. That of a run takes as many values as it has. Inputs are read-only."""
+        """Return the point that an item names. That of a run takes as many values as it has. Inputs are read-only.
+
+        A point is written in one exchange: a run of more than 123 registers or 1968 coils only by `write`.
+        """
         place = Place.parse(item)
 
         def encode(value: Any) -> WriteCoils | WriteRegisters:
-            return place.write((value,) if place.count is None else tuple(value))[0]
+            return place.write_at_once(value, item)
 
         return Point(
             self.node,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NoReturn, Unpack
 
@@ -140,11 +140,12 @@ class MscController(Handle):
 
     def prepare_write(self, item: str, values: Sequence[Any], **options: Unpack[WriteOptions]) -> list[Send]:
         """Prepare to write consecutive data addresses, in blocks and one by one."""
-        if len(values) == 1:
+        point = self.point(item)
+        if isinstance(point, Run):
+            point.check_length(values)
+        elif len(values) == 1:
             return super().prepare_write(item, values, **options)
-        name, _, count = item.partition(":")
-        if count and count != str(len(values)):
-            raise InvalidCommand(f"{item} takes {count} values, not {len(values)}")
+        name = item.partition(":")[0]
         encoder(self.point(name))
         parts = writes(self.address_of(name), values, self.address_step)
         self.node.check(*(command for command, _ in parts), stop=options.get("safe"))
@@ -372,6 +373,12 @@ class Run(Point[tuple[int, ...]]):
 
         Raises InvalidCommand unless there are as many values as in the run.
         """
-        if len(value) != self.count:
-            raise InvalidCommand(f"{self.node.label}: {self.item} takes {self.count} values, not {len(value)}")
+        self.check_length(value)
         await self.handle.write_block(self.address, value, **options)
+
+    def check_length(self, values: Any) -> None:
+        """Raise InvalidCommand unless there are as many values as in the run."""
+        count = len(values) if isinstance(values, Sized) else None
+        if count != self.count:
+            said = repr(values) if count is None else count
+            raise InvalidCommand(f"{self.node.label}: {self.item} takes {self.count} values, not {said}")
