@@ -118,7 +118,9 @@ class Subscriber:
             found[:] = [
                 heard.payload
                 for heard in self.heard[:]
-                if heard.topic.startswith("result") and isinstance(heard.payload, dict) and heard.payload.get("id") == mark
+                if heard.topic.startswith("result")
+                and isinstance(heard.payload, dict)
+                and heard.payload.get("id") == mark
             ]
             return bool(found)
 

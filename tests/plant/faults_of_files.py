@@ -169,7 +169,8 @@ FAULTS = {
         name="the disk of SQLite is full", make=full("sqlite"), site=Site(disk=1024, on_disk=("sqlite",))
     ),
     "read-only": Fault(
-        name="the disk becomes one that nobody may write to", make=read_only,
+        name="the disk becomes one that nobody may write to",
+        make=read_only,
         site=Site(folder="logs", in_folder=("csv", "jsonl")),
     ),
     "sqlite-locked": Fault(name="another process locks the database for 10 s", make=locked),

@@ -99,5 +99,7 @@ FAULTS = {
     "node-garbles": Fault(name="one node's replies have a flipped bit", make=node_garbles),
     "noise": Fault(name="noise of one node comes in bursts", make=noise),
     "port-missing": Fault(name="the port is missing at the start", make=missing_at_start, site=Site(starts=False)),
-    "another-master": Fault(name="another master uses the same serial server", make=another_master, site=Site(tcp=True)),
+    "another-master": Fault(
+        name="another master uses the same serial server", make=another_master, site=Site(tcp=True)
+    ),
 }

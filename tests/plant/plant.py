@@ -234,7 +234,9 @@ class Plant:
 
     def flows(self, since: float, holders: tuple[str, ...] = HOLDERS) -> dict[str, float]:
         """Wait until each output holds a good value of each node that was said since then; return when that was."""
-        return {holder: until(lambda: self._has_from(holder, since), f"{holder} holds new values") for holder in holders}
+        return {
+            holder: until(lambda: self._has_from(holder, since), f"{holder} holds new values") for holder in holders
+        }
 
     def _has_from(self, holder: str, since: float) -> bool:
         fresh: dict[str, int] = {}
@@ -253,7 +255,9 @@ class Plant:
         """The last values that an output holds."""
         try:
             if holder == "sqlite":
-                with closing(sqlite3.connect(f"file:{self.paths['sqlite']}?mode=ro", uri=True, timeout=5.0)) as database:
+                with closing(
+                    sqlite3.connect(f"file:{self.paths['sqlite']}?mode=ro", uri=True, timeout=5.0)
+                ) as database:
                     return database.execute(
                         "select node || '/' || item, value from samples join points on points.id = point"
                         " order by samples.rowid desc limit 60"
