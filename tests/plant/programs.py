@@ -14,7 +14,7 @@ from typing import IO, NamedTuple
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "", "MALLOC_ARENA_MAX": "2"}
-PATIENCE = 30.0
+PATIENCE = 25.0
 """Seconds after which a fact that was waited for will not come any more."""
 LOOK = 0.01
 """Seconds between two looks at a fact that nobody tells."""
