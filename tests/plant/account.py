@@ -18,6 +18,8 @@ USUAL = (
     *(" written, ", " answered, ", "uart: "),
 )
 """What stands on standard error without any fault."""
+POINTS = 3
+"""Of each group, where it was not printed."""
 FLOOD = 12
 """Lines told of one fault that are too many for a person."""
 
@@ -49,7 +51,7 @@ class Account:
 def account(plant: Plant, name: str, uncounted: Collection[str] = ()) -> Account:
     """Hold what the outputs hold against what was polled and said. Every run has ended."""
     found = Account(name)
-    polled = [of_stdout(run.printed(), PERIODS) for run in plant.runs if run.out is not None]
+    polled = [of_stdout(run.printed() if run.out is not None else (), PERIODS) for run in plant.runs]
     total = sum(map(samples_of, plant.runs, polled))
     found.unread = sum(one.errors for one in polled)
     found.missed = sum(one.missed for one in polled)
@@ -86,7 +88,7 @@ def samples_of(run: Program, polled: Polled) -> int:
     """How many samples were polled: by what was printed, and by the summary where that knows more."""
     total = polled.samples
     for group, cycles, _ in (match.groups() for match in map(CYCLES.match, run.told) if match):
-        total += max(0, int(cycles) - polled.cycles.get(group, 0)) * polled.points.get(group, 0)
+        total += max(0, int(cycles) - polled.cycles.get(group, 0)) * polled.points.get(group, POINTS)
     return total
 
 

@@ -5,24 +5,27 @@ from __future__ import annotations
 import http.client
 import json
 import os
+import pty
 import re
 import signal
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import IO, Any, Self
 
 from tests.disks import SmallDisk, small_disk
 from tests.outputs.brokers import free_port
 from tests.plant.brokers import PREFIX, Broker, Heard, Subscriber
 from tests.plant.gateway import Gateway
 from tests.plant.holdings import Holding, of_csv, of_jsonl, of_mqtt, of_sqlite
-from tests.plant.programs import ENVIRONMENT, ROOT, Line, Program, until
+from tests.plant.programs import ENVIRONMENT, Line, Program, until
 
 NODES = ("winder", "unwinder", "dancer")
 PERIODS = {"fast": 0.1, "slow": 0.5}
@@ -89,6 +92,11 @@ class Site:
     starts: bool = True
     """Whether drives and run are started, or only the rest is."""
     skewed: bool = False
+    """Whether the clock of `run` is ours to set."""
+    screen: bool = False
+    """Whether `run` has a terminal."""
+    stdout: str = ""
+    """The file that its standard output goes to, in place of us."""
 
 
 class Plant:
@@ -106,6 +114,8 @@ class Plant:
         self.metrics = free_port()
         self.statuses: list[int] = []
         self.fault_at = self.over_at = 0.0
+        self.terminal: int | None = None
+        """Our end of the terminal of `run`."""
         self._stack = ExitStack()
         self._others: list[Program] = []
 
@@ -120,7 +130,7 @@ class Plant:
                 (self.folder / "disk").mkdir()
                 self.disk: SmallDisk = stack.enter_context(small_disk(self.folder / "disk", self.site.disk))
             (self.folder / self.site.folder).mkdir(exist_ok=True)
-            places = {kind: "disk" for kind in self.site.on_disk} | dict.fromkeys(self.site.in_folder, self.site.folder)
+            places = dict.fromkeys(self.site.on_disk, "disk") | dict.fromkeys(self.site.in_folder, self.site.folder)
             self.paths = {kind: self.folder / places.get(kind, "") / f"plant.{kind}" for kind in FILES}
             port = f"socket://127.0.0.1:{free_port()}?baudrate=57600" if self.site.tcp else str(self.folder / "tty")
             self.port = port
@@ -179,10 +189,19 @@ class Plant:
 
     def start_run(self, *arguments: str, environment: dict[str, str] | None = None) -> Program:
         module = ("tests.plant.skewed", str(self.folder / "skew")) if self.site.skewed else ("busmaster",)
-        program = Program(
-            *module, "run", str(self.file), *self.site.arguments, *arguments,
-            environment=self.site.environment | (environment or {}), cwd=self.folder,
-        )  # fmt: skip
+        with ExitStack() as stack:
+            out: int | IO[str] | None = None
+            if self.site.screen:
+                self.terminal, out = pty.openpty()
+                stack.callback(os.close, out)
+                threading.Thread(target=drain, args=(self.terminal,), daemon=True).start()
+            elif self.site.stdout:
+                out = stack.enter_context((self.folder / self.site.stdout).open("a"))
+            program = Program(
+                *module, "run", str(self.file), *self.site.arguments, *arguments,
+                environment=self.site.environment | (environment or {}), cwd=self.folder,
+                out=out, terminal=self.site.screen,
+            )  # fmt: skip
         self.runs.append(program)
         return program
 
@@ -308,6 +327,15 @@ class Plant:
 
 CSV_HEAD = "time,group,cycle,node,item,value,unit,quality,error\n"
 TAIL = 8192
+
+
+def drain(terminal: int) -> None:
+    """Read what is drawn, as a terminal does, until it is closed."""
+    try:
+        while os.read(terminal, 65_536):
+            pass
+    except OSError:
+        pass
 
 
 def tail_of(path: Path) -> str:

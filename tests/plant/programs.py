@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import subprocess
 import sys
+import termios
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -61,6 +63,11 @@ class Lines:
         self._thread.join(PATIENCE)
 
 
+def own_terminal() -> None:
+    """Make standard input the terminal of this session: closing it sends SIGHUP."""
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+
 class Program:
     """A process with pipes, in a session of its own: signals for us do not reach it."""
 
@@ -70,17 +77,20 @@ class Program:
         cwd: Path = ROOT,
         environment: Mapping[str, str] | None = None,
         out: int | IO[str] | None = None,
+        terminal: bool = False,
     ) -> None:
+        """Start it. `out` is a `terminal`, perhaps, which is then that of its session, and its input too."""
         self.popen = subprocess.Popen(
             [sys.executable, "-m", *arguments],
             cwd=cwd,
-            env=ENVIRONMENT | (environment or {}),
-            stdin=subprocess.PIPE,
+            env={**ENVIRONMENT, **(environment or {})},
+            stdin=out if terminal else subprocess.PIPE,
             stdout=subprocess.PIPE if out is None else out,
             stderr=subprocess.PIPE,
             text=True,
             errors="backslashreplace",
             start_new_session=True,
+            preexec_fn=own_terminal if terminal else None,
         )
         assert self.popen.stderr is not None
         self.err = Lines(self.popen.stderr)
