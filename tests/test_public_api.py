@@ -73,6 +73,21 @@ def test_importing_it_needs_no_extra() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE)
 
 
+@pytest.mark.parametrize(
+    ("what", "unneeded"),
+    [
+        ("import busmaster", r"busmaster\.(emulator|protocols|registry|config|cli)\b"),
+        ("from busmaster.cli import main; main(['--help'])", r"rich\b|textual\b"),
+    ],
+)
+def test_what_is_not_needed_is_not_loaded(what: str, unneeded: str) -> None:
+    code = f"import sys; {what}; print('loaded:', *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, timeout=30, capture_output=True, text=True)
+    loaded = done.stdout.rpartition("loaded:")[2].split()
+    assert "busmaster" in loaded
+    assert [name for name in loaded if re.match(unneeded, name)] == []
+
+
 def test_the_command_line_without_its_extra_says_which_one_to_install() -> None:
     code = (
         "import importlib.util as u, sys; find = u.find_spec; "

@@ -1,4 +1,4 @@
-"""What a command reads or changes, place by place: what limits are held against.
+"""What a command reads or changes, place by place: what limits are held against, and what a listener learns of points.
 
 A place is the smallest thing that a node keeps: one element, one parameter, one register. Protocols whose frames reach
 the same nodes name their places alike.
@@ -25,9 +25,24 @@ class Placed(Protocol):
 
 
 @runtime_checkable
+class Telling(Protocol):
+    """A read whose values are told apart by their places: a block tells each value in it."""
+
+    def told(self, value: Any, profile: Profile, /) -> Mapping[Hashable, Any]:
+        """Return what each place held when it returned `value`, as far as that is known."""
+        ...
+
+
+@runtime_checkable
 class Changing(Protocol):
     """A write that says what it changes. One that does not is refused by a node that has limits."""
 
     def changes(self, profile: Profile, /) -> Mapping[Hashable, Any]:
         """Return what each place that it changes holds after it; None where that is not known."""
         ...
+
+
+__all__ = [
+    "Changing",
+    "Placed",
+]

@@ -11,10 +11,10 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeAlias
 
-from busmaster.bus.points import Point
 from busmaster.errors import InvalidCommand
 from busmaster.gate.record import WriteRecord
-from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
+from busmaster.outputs.base import Happening, Item, check_folder
+from busmaster.outputs.batches import BatchOutput
 from busmaster.outputs.growing_file import is_at
 from busmaster.outputs.retention import Retention
 from busmaster.outputs.settings import SqliteSettings
@@ -62,9 +62,9 @@ SampleRow: TypeAlias = tuple[float, int, Any, str, str | None]
 
 
 class Rows(NamedTuple):
-    """Of one cycle, one event, or one write: points whose number is not known yet, by their place in `samples`."""
+    """Of one cycle, one event, or one write. The number of a point is not known yet: a sample has its key and unit."""
 
-    samples: list[tuple[float, Point[Any], Any, str, str | None]]
+    samples: list[tuple[float, str, str, Any, str, str | None]]
     event: tuple[float, str | None, str] | None = None
     write: tuple[Any, ...] | None = None
 
@@ -98,7 +98,8 @@ class SqliteOutput(BatchOutput[Rows]):
         samples = [
             (
                 micros(sample.wall),
-                point,
+                point.key,
+                point.unit,
                 column(sample.value),
                 sample.quality.value,
                 sample.error.what if sample.error else None,
@@ -121,6 +122,12 @@ class SqliteOutput(BatchOutput[Rows]):
             writes = [rows.write for rows in batch if rows.write is not None]
             database.executemany(f"insert into audit values ({', '.join(12 * '?')})", writes)
 
+    def pack(self, formatted: Rows) -> str:
+        return json.dumps(formatted)
+
+    def unpack(self, text: str) -> Rows:
+        return Rows(*json.loads(text))
+
     def shut(self) -> None:
         if self._database is not None:
             self._database.close()
@@ -142,10 +149,10 @@ class SqliteOutput(BatchOutput[Rows]):
     def _samples(self, database: sqlite3.Connection, batch: list[Rows]) -> Iterator[SampleRow]:
         numbers = self._numbers
         for rows in batch:
-            for moment, point, value, quality, error in rows.samples:
-                number = numbers.get(point.key)
+            for moment, key, unit, value, quality, error in rows.samples:
+                number = numbers.get(key)
                 if number is None:
-                    number = numbers[point.key] = number_of(database, point)
+                    number = numbers[key] = number_of(database, key, unit)
                 yield moment, number, value, quality, error
 
     def _open(self) -> sqlite3.Connection:
@@ -164,13 +171,13 @@ class SqliteOutput(BatchOutput[Rows]):
         return self._database
 
 
-def number_of(database: sqlite3.Connection, point: Point[Any]) -> int:
-    """Return the number of the point's row. It is made if there is none, and gets the unit that the point has now."""
-    node, _, item = point.key.partition("/")
+def number_of(database: sqlite3.Connection, key: str, unit: str) -> int:
+    """Return the number of a point's row. It is made if there is none, and gets the unit that the point has now."""
+    node, _, item = key.partition("/")
     row = database.execute(
         "insert into points (node, item, unit) values (?, ?, ?)"
         " on conflict (node, item) do update set unit = excluded.unit returning id",
-        (node, item, point.unit),
+        (node, item, unit),
     ).fetchone()
     return int(row[0])
 

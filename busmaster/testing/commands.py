@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 from busmaster.contract.exchange import Command, Exchange
+from busmaster.contract.places import Changing, Placed
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
@@ -132,3 +133,18 @@ def check_addresses(profile: Profile) -> Iterator[str]:
         for address in (profile.addresses[0] - 1, profile.addresses[-1] + 1)
         if address != profile.broadcast
     )
+
+
+def check_places(write: Command[Any], read: Command[Any], value: Any, profile: Profile) -> Iterator[str]:
+    """Say whether a write names other places than a read of the same, or another value: no limit would hold it.
+
+    Of commands that name none nothing is said: where a node has limits they are refused.
+    """
+    if not isinstance(write, Changing) or not isinstance(read, Placed):
+        return
+    changes = write.changes(profile)
+    missing = [place for place in read.places if place not in changes]
+    if missing:
+        yield f"{write} does not say that it changes {missing}, which {read} reads"
+    elif all(changes[place] is not None for place in read.places) and read.shown(changes) != value:
+        yield f"{write} says that it changes what {read} reads to {read.shown(changes)!r}, which is {value!r} then"

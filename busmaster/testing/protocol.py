@@ -27,7 +27,7 @@ hold:
   one; the profile's `checks` are reads, and share none;
 - commands are immutable, hashable values with a text; bad arguments raise InvalidCommand (`invalid`);
 - every attempt sends the same bytes, and no two addresses do;
-- what is written to an emulated `device` is read back (`round_trips`).
+- what is written to an emulated `device` is read back (`round_trips`), and as what the write says that it changes.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from busmaster.contract.profile import Profile
 from busmaster.errors import Refused
 from busmaster.testing.answers import check_exchangeable, check_good_reply
 from busmaster.testing.cases import Case, Foreign, NotConformant, RoundTrip, Tally, Unseen
-from busmaster.testing.commands import check_addresses, check_checks, check_command, check_invalid
+from busmaster.testing.commands import check_addresses, check_checks, check_command, check_invalid, check_places
 from busmaster.testing.damage import MANY_BYTES, bytewise, flips, garbage_chunks, splits
 
 FINDINGS_EACH = 3
@@ -322,6 +322,7 @@ class _Kit:
             read = self._converse(trip.read, trip.address, device)
             if not read.delivered or read.value != trip.read_back(value):
                 yield f"{command}, then {trip.read} gives {read}"
+            yield from check_places(command, trip.read, trip.read_back(value), self.profile)
 
     def _converse(self, command: Command[Any], address: int, device: Callable[[bytes], bytes]) -> Ending:
         driver = self.listen(command, address)

@@ -18,8 +18,10 @@ from busmaster.emulator.memory import MemoryPort
 from busmaster.emulator.serve import TcpServer
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.registry import make_device
 from busmaster.transport.tcp import TcpPort
 from tests.patience import PATIENCE
+from tests.stories import in_virtual_time
 
 
 @asynccontextmanager
@@ -56,7 +58,7 @@ async def test_the_picture_has_every_point_its_age_and_its_nodes_health(controll
             ("node 2", "outputs", 0, True),
             ("node 2", "axis0.idle", 1, False),
         ]
-        assert all(row.age is not None and 0 <= row.age < 5 for row in frame.rows)
+        assert all(row.age is not None and 0 <= row.age < PATIENCE for row in frame.rows)
         frame = await seen(watch, lambda frame: [node.health for node in frame.nodes] == ["up", "up"])
         assert frame.port == f"{controllers.host}:{controllers.port}  57600 8N1"
         assert frame.line in ("ready", "settling")
@@ -110,6 +112,21 @@ async def test_pausing_stops_the_cycles_and_the_same_key_goes_on(controllers: Tc
         await watch.act(Action("pause"))
         frame = await seen(watch, lambda frame: frame.groups[0].cycles > cycles + 2)
         assert not frame.groups[0].paused
+
+
+@in_virtual_time
+async def test_the_time_for_which_it_was_paused_is_no_period() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)])))
+    async with bus, anyio.create_task_group() as tasks:
+        watch = Watch(bus, "test", View())
+        group = bus.poll_group("axes", period=0.1, points=[Hcp2Controller(bus, 1).point("1")])
+        watch.add(group)
+        tasks.start_soon(count_cycles, watch, group)
+        for pause in (1.0, 10.0, 1.0):
+            await anyio.sleep(pause)
+            await watch.act(Action("pause"))
+        assert watch.picture().groups[0].achieved == pytest.approx(0.1, abs=0.01)
+        tasks.cancel_scope.cancel()
 
 
 @pytest.mark.asyncio

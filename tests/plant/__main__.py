@@ -1,8 +1,8 @@
 """Faults of a plant, as real processes: `python -m tests.plant`, `--only NAME`, `--minutes 10`.
 
-Without `--minutes`, each fault is made in a plant of its own, and a table says what was lost, counted and told, and how
-long it took to recover. With it, the example's line runs for so long with everything on, a fault a minute. Exit status 1
-if anything was lost that was not counted, or wrong.
+Without `--minutes`, each fault is made in a plant of its own, and a table says what was lost, counted and told, and
+how long it took to recover. With it, the example's line runs for so long with everything on, a fault a minute. Exit
+status 1 if anything was lost that was not counted, or wrong.
 """
 
 from __future__ import annotations

@@ -15,8 +15,9 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from tests.outputs.brokers import MOSQUITTO, free_port
+from tests.outputs.brokers import MOSQUITTO
 from tests.plant.programs import until
+from tests.ports import free_port
 
 PREFIX = "plant"
 TOPICS = ("status", "line", "health/#", "values/#", "cycles/#", "events", "audit", "result/#")
@@ -78,7 +79,7 @@ class Subscriber:
         client.max_inflight_messages_set(1000)
         client.max_queued_messages_set(ALL)
         client.on_message = self._note
-        client.on_connect = lambda *_: client.subscribe([(f"{PREFIX}/{topic}", 1) for topic in TOPICS])
+        client.on_connect = self._subscribe
         client.on_subscribe = lambda *_: self._subscribed.set()
         until(self._connects, "the broker lets us in")
         client.loop_start()
@@ -91,6 +92,9 @@ class Subscriber:
         except OSError:
             return False
         return True
+
+    def _subscribe(self, client: Client, *_: object) -> None:
+        client.subscribe([(f"{PREFIX}/{topic}", 1) for topic in TOPICS])
 
     def _note(self, client: Client, data: object, message: MQTTMessage) -> None:
         if message.retain:
@@ -106,7 +110,7 @@ class Subscriber:
         assert self._client is not None
         properties = None
         if expires_in is not None:
-            properties = Properties(PacketTypes.PUBLISH)
+            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]  # the library's
             properties.MessageExpiryInterval = expires_in
         self._client.publish(topic or f"{PREFIX}/set/{name}", payload, qos=1, properties=properties)
 

@@ -1,7 +1,8 @@
 """The drives of a LINE.toml, in a process of their own: `python -m tests.plant.drives LINE.toml [telling]`.
 
-They are served as `busmaster emulate` serves them, at the file's port. With `telling`, each value is said only once, and
-is printed with the time at which it was said, as is each write that is taken: what the outputs hold is held against it.
+They are served as `busmaster emulate` serves them, at the file's port. With `telling`, each value is said only once,
+and is printed with the time at which it was said, as is each write that is taken: what the outputs hold is held
+against it.
 A line of input is an order:
 
     gone, back        the port, as when an adapter is pulled out

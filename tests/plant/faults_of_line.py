@@ -74,7 +74,14 @@ def another_master(plant: Plant) -> str:
     other.send(signal.SIGTERM)
     other.wait()
     plant.over()
-    return f"the other one heard {len(other.printed())} values"
+    return f"the other one heard {len(other.printed())} values; whose an answer is nobody can tell then"
+
+
+def same_port(plant: Plant) -> str:
+    other = plant.once("read", plant.port, "--protocol", "hcp2", "--node", "1", "1")
+    assert other.returncode, other
+    plant.over()
+    return f"the other one ends with {other.returncode}: {other.stderr.splitlines()[-1].removeprefix('busmaster: ')}"
 
 
 def all_nodes_off(plant: Plant) -> None:
@@ -99,7 +106,8 @@ FAULTS = {
     "node-garbles": Fault(name="one node's replies have a flipped bit", make=node_garbles),
     "noise": Fault(name="noise of one node comes in bursts", make=noise),
     "port-missing": Fault(name="the port is missing at the start", make=missing_at_start, site=Site(starts=False)),
+    "same-port": Fault(name="another busmaster is started on the same port", make=same_port),
     "another-master": Fault(
-        name="another master uses the same serial server", make=another_master, site=Site(tcp=True)
+        name="another master uses the same serial server", make=another_master, site=Site(tcp=True), beyond=True
     ),
 }

@@ -21,11 +21,11 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 from tests.disks import SmallDisk, small_disk
-from tests.outputs.brokers import free_port
 from tests.plant.brokers import PREFIX, Broker, Heard, Subscriber
 from tests.plant.gateway import Gateway
 from tests.plant.holdings import Holding, of_csv, of_jsonl, of_mqtt, of_sqlite
 from tests.plant.programs import ENVIRONMENT, Line, Program, until
+from tests.ports import free_port
 
 NODES = ("winder", "unwinder", "dancer")
 PERIODS = {"fast": 0.1, "slow": 0.5}
@@ -253,9 +253,7 @@ class Plant:
 
     def flows(self, since: float, holders: tuple[str, ...] = HOLDERS) -> dict[str, float]:
         """Wait until each output holds a good value of each node that was said since then; return when that was."""
-        return {
-            holder: until(lambda: self._has_from(holder, since), f"{holder} holds new values") for holder in holders
-        }
+        return {one: until(partial(self._has_from, one, since), f"{one} holds new values") for one in holders}
 
     def _has_from(self, holder: str, since: float) -> bool:
         fresh: dict[str, int] = {}

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import signal
 import subprocess
 import sys
-import termios
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -63,11 +61,6 @@ class Lines:
         self._thread.join(PATIENCE)
 
 
-def own_terminal() -> None:
-    """Make standard input the terminal of this session: closing it sends SIGHUP."""
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-
-
 class Program:
     """A process with pipes, in a session of its own: signals for us do not reach it."""
 
@@ -81,7 +74,7 @@ class Program:
     ) -> None:
         """Start it. `out` is a `terminal`, perhaps, which is then that of its session, and its input too."""
         self.popen = subprocess.Popen(
-            [sys.executable, "-m", *arguments],
+            [*(["setsid", "--ctty"] if terminal else []), sys.executable, "-m", *arguments],
             cwd=cwd,
             env={**ENVIRONMENT, **(environment or {})},
             stdin=out if terminal else subprocess.PIPE,
@@ -89,8 +82,7 @@ class Program:
             stderr=subprocess.PIPE,
             text=True,
             errors="backslashreplace",
-            start_new_session=True,
-            preexec_fn=own_terminal if terminal else None,
+            start_new_session=not terminal,
         )
         assert self.popen.stderr is not None
         self.err = Lines(self.popen.stderr)

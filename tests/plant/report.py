@@ -12,6 +12,8 @@ def row(found: Account) -> str:
     if found.unread or found.missed:
         lost.append(f"{found.unread} values not read, {found.missed} cycles not begun")
         counted.append("as errors, and as missed" if found.missed else "as errors")
+    if found.wrong:
+        lost.append(f"**{found.wrong} wrong**")
     for holder, number in found.lost.items():
         if number:
             lost.append(f"{holder}: {number}")

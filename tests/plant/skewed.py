@@ -1,7 +1,7 @@
 """busmaster with a clock that somebody sets: `python -m tests.plant.skewed FILE ARGUMENTS...`.
 
-FILE holds the seconds by which the time of day is ahead, and is looked at whenever that is asked for; the clock that only
-goes forward is left alone, as by `date --set`. Where the kernel's own clock may be set there is more than us.
+FILE holds the seconds by which the time of day is ahead, and is looked at whenever that is asked for; the clock that
+only goes forward is left alone, as by `date --set`, which would set it for everything else on this machine too.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def skew(path: str) -> float:
 
 def main(path: str, *arguments: str) -> int:
     time.time = lambda: TRUE_TIME() + skew(path)
-    time.strftime = lambda pattern, when=None: TRUE_STRFTIME(pattern, when or time.localtime(time.time()))  # type: ignore[assignment,misc]  # with the default that it has
+    time.strftime = lambda pattern: TRUE_STRFTIME(pattern, time.localtime(time.time()))  # type: ignore[assignment,misc]
     from busmaster.cli import main as busmaster
 
     return busmaster(arguments)

@@ -14,10 +14,10 @@ from tests.plant.plant import HOLDERS, Plant, Site
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """`make` begins it, waits for what is to be seen of it, and ends it; what is to be said of it in the table it returns.
+    """`make` begins it, waits for what is to be seen of it, ends it, and returns what the table is to say of it.
 
     `holders` are the outputs that have to come back. `uncounted` are those of which something is lost that nobody can
-    count. `status` is what the last run ends with.
+    count. `status` is what the last run ends with. `beyond` what is promised are those that may bring wrong values.
     """
 
     name: str
@@ -26,6 +26,7 @@ class Fault:
     holders: tuple[str, ...] = HOLDERS
     uncounted: tuple[str, ...] = ()
     status: int = 0
+    beyond: bool = False
 
 
 def trial(fault: Fault) -> Account:
@@ -40,7 +41,7 @@ def trial(fault: Fault) -> Account:
             back = {holder: when - over for holder, when in plant.flows(over, fault.holders).items()}
             status = status_told(plant)
             plant.end_run()
-        found = account(plant, fault.name, fault.uncounted)
+        found = account(plant, fault.name, fault.uncounted, fault.beyond)
         found.told += [f"MQTT: {', '.join(status)}"] if status else []
         found.back = back
         found.notes += [note] if note else []

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from itertools import count
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
 from busmaster.contract.exchange import Command, Done, Expect, FrameError, LaterLeg, Need, Sizes, no_reply
+from busmaster.contract.profile import Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import Refused
 from busmaster.testing import Foreign, NotConformant, RoundTrip, Unseen, answers_of, check_protocol
@@ -336,6 +337,46 @@ def test_a_value_that_is_not_read_back_is_found() -> None:
         round_trips=[round_trip([258], read_back=lambda value: value & 0xFF00)],
         device=answers,
     )
+
+
+class _Placed(ReadRegister):
+    @property
+    def places(self) -> tuple[Hashable, ...]:
+        return (self.register,)
+
+    def shown(self, values: Mapping[Hashable, Any]) -> Any:
+        return values[self.register]
+
+
+class _Changing(WriteRegister):
+    shift: ClassVar[int] = 0
+    factor: ClassVar[int] = 1
+
+    def changes(self, profile: Profile) -> Mapping[Hashable, Any]:
+        return {self.register + self.shift: self.value * self.factor}
+
+
+class _Elsewhere(_Changing):
+    shift = 1
+
+
+class _OtherValue(_Changing):
+    factor = 10
+
+
+@pytest.mark.parametrize(
+    ("write", "finding"),
+    [
+        (_Elsewhere, "does not say that it changes [7], which read register 7 reads"),
+        (_OtherValue, "says that it changes what read register 7 reads to 30, which is 3 then"),
+    ],
+)
+def test_a_write_that_says_wrongly_what_it_changes_is_found(write: type[_Changing], finding: str) -> None:
+    def trips(kind: type[_Changing]) -> list[RoundTrip]:
+        return [RoundTrip(17, lambda value: kind(7, value), _Placed(7), [3])]
+
+    check_protocol(MODBUS, CASES, names=named, round_trips=trips(_Changing), device=answers_of(Registers(17)))
+    assert finding in find(round_trips=trips(write), device=answers_of(Registers(17)))
 
 
 def test_a_device_that_does_not_answer_is_found() -> None:

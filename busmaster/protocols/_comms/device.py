@@ -74,7 +74,7 @@ class HostCommsDevice(Device):
     """A slave of either protocol. A kind of device says what its elements hold: `read_element`, `write_element`.
 
     `fixed_decimals` sends "12.5000" instead of "12.5". `all_or_nothing` refuses a multi-value write before it stores
-    any of it. With an `traceable` every element is the traceable's.
+    any of it. With a `traceable` every element is the traceable's.
     """
 
     def __init__(

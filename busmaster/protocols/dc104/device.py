@@ -32,7 +32,7 @@ class EmulatedDc104(Device):
     """The drive of a line. Parameters 1 to `maximum`; `allow_zero`: 0 too. `read_only` ones refuse writes.
 
     `eeprom` is the time that storing takes. `silent`: a read of what is not there gets no answer, in place of NAK,
-    since the document names none. `lively`: parameter 1 moves. With an `traceable` every value is the traceable's.
+    since the document names none. `lively`: parameter 1 moves. With a `traceable` every value is the traceable's.
     """
 
     def __init__(

@@ -80,7 +80,7 @@ class EmulatedMentor(Device):
 
     `acceleration` is in 0.1 % per second; `ripple` by how much of itself, 0 to 1, the feedback swings with the shaft.
     `short_after_write`: short commands work after a write too. `refuse_malformed`: a read request that is none is
-    answered by NAK, not by silence. With an `traceable` every parameter is the traceable's.
+    answered by NAK, not by silence. With a `traceable` every parameter is the traceable's.
     """
 
     def __init__(

@@ -44,7 +44,8 @@ class ModbusDialect:
 
     def size(self, data: bytes, sender: Direction, /, *, quiet: bool = False) -> int:
         # cut by what a frame says of its length, never by pauses: adapters and networks make pauses of their own
-        if data[0] > HIGHEST_UNIT or (len(data) > 1 and data[1] & ~REFUSED not in FUNCTIONS):
+        refusing = 0 if sender is Direction.HOST else REFUSED
+        if data[0] > HIGHEST_UNIT or (len(data) > 1 and data[1] & ~refusing not in FUNCTIONS):
             return -1
         lengths = self._lengths(data, sender)
         for length in lengths:

@@ -52,7 +52,7 @@ class EmulatedModbus(Device):
     """A unit, 1 to 247. Each table is as long as what it is given.
 
     `functions` are those that it has; any other is answered by exception 1. `read_only`: holding registers that refuse
-    writes, with exception 3. `lively`: register 0 of both tables moves. With an `traceable` every register is its.
+    writes, with exception 3. `lively`: register 0 of both tables moves. With a `traceable` every register is its.
     """
 
     def __init__(

@@ -65,7 +65,7 @@ class EmulatedMsc(Device):
     `address_step` is what data addresses grow by from one 32-bit value to the next: 4, 2 or 1, since the document does
     not say whether they count bytes. `addresses` of them exist. `read_only_flags` (inputs, timers) cannot be set or
     cleared. `battery`: data outlives a power failure and the program starts again. `packet_delay` is from the end of
-    an ACK to the packet that follows it. With an `traceable` every data value is the traceable's.
+    an ACK to the packet that follows it. With a `traceable` every data value is the traceable's.
 
     `naks_ahead`, `missing_acks_ahead` and `bad_packets_ahead` are for tests: so many of the next requests are refused
     unheeded, of the next ACKs left out, of the next packets sent with a wrong bit.
