@@ -14,7 +14,8 @@ import traceback
 import pytest
 
 from tests.plant.faults import FAULTS
-from tests.plant.report import HEAD, row
+from tests.plant.long_run import long_run
+from tests.plant.report import HEAD, long_report, row
 from tests.plant.trial import trial
 
 
@@ -27,6 +28,10 @@ def main() -> int:
     if arguments.list:
         _say("\n".join(f"{name:18}{fault.name}" for name, fault in FAULTS.items()))
         return 0
+    if arguments.minutes:
+        run = long_run(arguments.minutes, _tell)
+        _say(long_report(run))
+        return 1 if run.problems else 0
     bad = 0
     _say(HEAD)
     for name in arguments.only or FAULTS:
@@ -42,8 +47,12 @@ def main() -> int:
             _say(row(found))
             for problem in found.problems:
                 bad += 1
-                sys.stderr.write(f"{name}: {problem}\n")
+                _tell(f"{name}: {problem}")
     return 1 if bad else 0
+
+
+def _tell(text: str) -> None:
+    sys.stderr.write(f"{text}\n")
 
 
 def _say(text: str) -> None:

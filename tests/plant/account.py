@@ -77,7 +77,7 @@ def account(plant: Plant, name: str, uncounted: Collection[str] = (), beyond: bo
 
 
 def _hold_against(found: Account, holder: str, held: Holding, total: int, said: set[tuple[str, float]]) -> None:
-    found.lost[holder] = max(0, total - held.rows)
+    found.lost[holder] = max(0, total - len(held.samples))
     wrong = [(key, value) for key, value in held.values if (key.partition("/")[0], value) not in said]
     found.wrong = max(found.wrong, len(wrong))
     if wrong and not found.beyond:

@@ -44,23 +44,30 @@ def strange(make: Callable[[], str | bytes], topic: str = "") -> Callable[[Plant
     return made
 
 
-def flood(plant: Plant) -> str:
+def pour(plant: Plant, sent: threading.Event) -> None:
+    """Send a flood of commands that are refused."""
     client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTProtocolVersion.MQTTv5)
-    client.max_queued_messages_set(0)
     client.connect("127.0.0.1", plant.broker.port)
     client.loop_start()
+    try:
+        for number in range(FLOOD):
+            last = client.publish(f"{PREFIX}/set/nobody/1", str(number), qos=1)
+            if number % UNDER_WAY == UNDER_WAY - 1:
+                last.wait_for_publish(PATIENCE)
+    finally:
+        sent.set()
+        client.disconnect()
+        client.loop_stop()
+
+
+def poured(plant: Plant) -> None:
+    pour(plant, threading.Event())
+    plant.over()
+
+
+def flood(plant: Plant) -> str:
     sent = threading.Event()
-
-    def pour() -> None:
-        try:
-            for number in range(FLOOD):
-                last = client.publish(f"{PREFIX}/set/nobody/1", str(number), qos=1)
-                if number % UNDER_WAY == UNDER_WAY - 1:
-                    last.wait_for_publish(PATIENCE)
-        finally:
-            sent.set()
-
-    thread = threading.Thread(target=pour, daemon=True)
+    thread = threading.Thread(target=pour, args=(plant, sent), daemon=True)
     thread.start()
     took: list[float] = []
     while not sent.is_set():
@@ -69,8 +76,6 @@ def flood(plant: Plant) -> str:
         assert answer["ok"] or "no reply" in answer["error"], answer  # a machine that is busy enough loses replies
         took.append(time.monotonic() - asked)
     thread.join()
-    client.disconnect()
-    client.loop_stop()
     plant.over()
     half = f"half of them within {median(took):.1f} s"
     return f"{len(took)} allowed commands meanwhile, each done within {max(took):.1f} s, {half}"

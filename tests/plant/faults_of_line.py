@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 
-from tests.plant.plant import NODES, Plant, Site
+from tests.plant.plant import Plant, Site
 from tests.plant.trial import Fault
 
 
@@ -36,19 +36,19 @@ def still_for(seconds: float) -> Fault:
 
 
 def node_off(plant: Plant) -> None:
-    plant.order("off dancer")
-    plant.run.heard("dancer is down", plant.fault_at)
+    plant.order(f"off {plant.nodes[-1]}")
+    plant.run.heard(f"{plant.nodes[-1]} is down", plant.fault_at)
     plant.order("on")
     plant.over()
-    plant.run.heard("dancer is up", plant.over_at)
+    plant.run.heard(f"{plant.nodes[-1]} is up", plant.over_at)
 
 
 def node_garbles(plant: Plant) -> None:
-    plant.order("garble dancer")
-    plant.run.heard("dancer is down", plant.fault_at)
+    plant.order(f"garble {plant.nodes[-1]}")
+    plant.run.heard(f"{plant.nodes[-1]} is down", plant.fault_at)
     plant.order("calm")
     plant.over()
-    plant.run.heard("dancer is up", plant.over_at)
+    plant.run.heard(f"{plant.nodes[-1]} is up", plant.over_at)
 
 
 def noise(plant: Plant) -> None:
@@ -85,13 +85,13 @@ def same_port(plant: Plant) -> str:
 
 
 def all_nodes_off(plant: Plant) -> None:
-    for node in NODES:
+    for node in plant.nodes:
         plant.order(f"off {node}")
-    for node in NODES:
+    for node in plant.nodes:
         plant.run.heard(f"{node} is down", plant.fault_at)
     plant.order("on")
     plant.over()
-    for node in NODES:
+    for node in plant.nodes:
         plant.run.heard(f"{node} is up", plant.over_at)
 
 

@@ -23,23 +23,24 @@ Write = tuple[str, str]
 
 @dataclass
 class Holding:
-    """The good values, in their order, how many rows tell an error, the events, and the record of writes."""
+    """The good values, how many samples tell an error, the events, and the record of writes.
+
+    `twice` counts the samples that were there already.
+    """
 
     values: list[Value] = field(default_factory=list)
     errors: int = 0
+    twice: int = 0
     events: list[str] = field(default_factory=list)
     writes: list[Write] = field(default_factory=list)
+    samples: dict[tuple[str, Any], Any] = field(default_factory=dict)
+    """What each held, by key and by what tells it from the others of its point: its time, say."""
 
-    @property
-    def rows(self) -> int:
-        """Those that differ: what was sent twice is one."""
-        return len(set(self.values)) + self.errors
-
-    @property
-    def twice(self) -> int:
-        return len(self.values) - len(set(self.values))
-
-    def add(self, key: str, value: Any, error: object) -> None:
+    def add(self, key: str, mark: Any, value: Any, error: object) -> None:
+        if (key, mark) in self.samples:
+            self.twice += 1
+            return
+        self.samples[(key, mark)] = value
         if error:
             self.errors += 1
         else:
@@ -51,7 +52,7 @@ def of_csv(texts: Iterable[str]) -> Holding:
     for text in texts:
         for row in csv.DictReader(io.StringIO(text)):
             if row["error"] is not None:  # else a half line of a crash
-                held.add(f"{row['node']}/{row['item']}", number(row["value"]), row["error"])
+                held.add(f"{row['node']}/{row['item']}", row["time"], number(row["value"]), row["error"])
     return held
 
 
@@ -64,7 +65,7 @@ def of_jsonl(texts: Iterable[str]) -> Holding:
             held.events.append(fields["event"])
         else:
             for key, sample in fields["samples"].items():
-                held.add(key, sample["value"], sample["error"])
+                held.add(key, fields["due"], sample["value"], sample["error"])
     return held
 
 
@@ -72,11 +73,11 @@ def of_sqlite(paths: Iterable[Path]) -> Holding:
     held = Holding()
     for path in paths:
         with closing(sqlite3.connect(path, timeout=30.0)) as database:
-            for node, item, value, error in database.execute(
-                "select node, item, value, error from samples join points on points.id = samples.point"
+            for node, item, moment, value, error in database.execute(
+                "select node, item, time, value, error from samples join points on points.id = samples.point"
                 " order by samples.rowid"
             ):
-                held.add(f"{node}/{item}", value, error)
+                held.add(f"{node}/{item}", moment, value, error)
             held.events += [text for [text] in database.execute("select text from events order by rowid")]
             held.writes += [(str(mark), out) for mark, out in database.execute("select id, outcome from audit")]
     return held
@@ -84,14 +85,10 @@ def of_sqlite(paths: Iterable[Path]) -> Holding:
 
 def of_mqtt(heard: Iterable[Heard]) -> Holding:
     held = Holding()
-    known: set[tuple[str, Any]] = set()
     for message in heard:
         kind, _, name = message.topic.partition("/")
         if kind == "values":
-            # errors look alike: their time tells one from another that was sent twice
-            if not message.payload["error"] or (name, message.payload["time"]) not in known:
-                held.add(name, message.payload["value"], message.payload["error"])
-            known.add((name, message.payload["time"]))
+            held.add(name, message.payload["time"], message.payload["value"], message.payload["error"])
         elif kind == "events":
             held.events.append(message.payload["text"])
         elif kind == "audit":

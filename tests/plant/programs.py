@@ -71,10 +71,15 @@ class Program:
         environment: Mapping[str, str] | None = None,
         out: int | IO[str] | None = None,
         terminal: bool = False,
+        nice: int = 0,
     ) -> None:
         """Start it. `out` is a `terminal`, perhaps, which is then that of its session, and its input too."""
         self.popen = subprocess.Popen(
-            [*(["setsid", "--ctty"] if terminal else []), sys.executable, "-m", *arguments],
+            [
+                *(["nice", "--adjustment", str(nice)] if nice else []),
+                *(["setsid", "--ctty"] if terminal else []),
+                *(sys.executable, "-m", *arguments),
+            ],
             cwd=cwd,
             env={**ENVIRONMENT, **(environment or {})},
             stdin=out if terminal else subprocess.PIPE,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from tests.plant.account import Account
+from tests.plant.long_run import LongRun
+from tests.plant.plant import HOLDERS
 
 HEAD = "| fault | lost | counted | told | back after |\n|---|---|---|---|---:|"
 
@@ -33,3 +35,28 @@ def row(found: Account) -> str:
 
 def _cell(text: str) -> str:
     return text.replace("|", "\\|")
+
+
+def long_report(run: LongRun) -> str:
+    """Two tables, of the minutes and of the outputs, and what else was counted."""
+    lines = [
+        "| minute | fault | cycles not begun | values not read | back after |",
+        "|---:|---|---:|---:|---:|",
+        *(
+            f"| {number} | {_cell('; '.join(filter(None, (minute.fault, minute.note))))} |"
+            f" {', '.join(f'{group} {count}' for group, count in minute.missed.items() if count) or 0} |"
+            f" {minute.unread} | {'-' if minute.back is None else f'{minute.back:.1f} s'} |"
+            for number, minute in enumerate(run.minutes, 1)
+        ),
+        "",
+        "| output | polled | held | lost | counted | kept on disk | twice |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for holder in HOLDERS:
+        held, (_, dropped, kept) = run.held[holder], run.counted[holder]
+        lost = run.samples - len(held.samples)
+        lines.append(f"| {holder} | {run.samples} | {len(held.samples)} | {lost} | {dropped} | {kept} | {held.twice} |")
+    for name, counter in (("commands", run.commands), ("scrapes", run.scrapes), ("readings by sqlite3", run.reads)):
+        lines.append(f"\n{name}: {', '.join(f'{what} {count}' for what, count in counter.items())}")
+    lines += ["", "told:", *(f"    {text}" for text in run.told), *(f"PROBLEM: {text}" for text in run.problems)]
+    return "\n".join(lines)
