@@ -70,18 +70,17 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
     try:
         prepared = [(wish_of(line, name, values), prepare(line, name, values, verify)) for name, values in pairs]
         async with line.bus:
-            for wish, sends in prepared:
-                await pass_on(line, wish, sends)
+            for wish, send in prepared:
+                await pass_on(line, wish, send)
                 emit(json_line(point=wish.name, ok=True) if as_json else f"{wish.name} ok")
     finally:
         await keep(audit, records)
 
 
-async def pass_on(line: ConfiguredLine, wish: Wish, sends: Sequence[Send]) -> None:
+async def pass_on(line: ConfiguredLine, wish: Wish, send: Send) -> None:
     """Write one point, of which a record is kept."""
     with line.gate.begin(wish):
-        for send in sends:
-            await send()
+        await send()
 
 
 def wish_of(line: ConfiguredLine, name: str, values: Sequence[float]) -> Wish:
@@ -90,7 +89,7 @@ def wish_of(line: ConfiguredLine, name: str, values: Sequence[float]) -> Wish:
     return Wish(door="command line", by="busmaster write", name=name, point=line.point(name), value=value)
 
 
-def prepare(line: ConfiguredLine, name: str, values: Sequence[float], verify: bool) -> list[Send]:
+def prepare(line: ConfiguredLine, name: str, values: Sequence[float], verify: bool) -> Send:
     """Return what writes a point. Raises InvalidCommand, of which a record is kept, for what may not be written."""
     try:
         return line.prepare_write(name, values, verify=verify)

@@ -124,7 +124,7 @@ class ConfiguredLine:
             raise InvalidCommand(f"no such point {name!r}: use NODE/ITEM with one of {', '.join(self.nodes)}")
         return self._point(node, item)
 
-    def prepare_write(self, name: str, values: Sequence[float], **options: Unpack[WriteOptions]) -> list[Send]:
+    def prepare_write(self, name: str, values: Sequence[float], **options: Unpack[WriteOptions]) -> Send:
         """Return what writes a value to the point that the file calls so, or the values of a run, in the point's unit.
 
         `RequestOptions` says what the options are. Raises InvalidCommand for what cannot be sent, or is beyond a limit.
@@ -135,10 +135,12 @@ class ConfiguredLine:
         if point.encode is not None and len(values) > 1:
             try:
                 point.encode(tuple(values))
-            except (ArithmeticError, TypeError, ValueError):
-                raise InvalidCommand(f"{name} is one value: write the others by their own names") from None
+            except (ArithmeticError, TypeError, ValueError) as error:
+                raise InvalidCommand(f"{name} does not take {len(values)} values: {error}") from None
         handle = self.nodes[name.partition("/")[0]]
-        return handle.prepare_write(point.source.item, list(map(point.unscaled, values)), **options)
+        # one call, whatever it takes on the line: half of it must not be taken for nothing, or for the whole
+        [send] = handle.prepare_write(point.source.item, list(map(point.unscaled, values)), **options)
+        return send
 
     def audit(self, tell: Callable[[str], None] = lambda _: None) -> Distributor:
         """Return those outputs of the file that keep a record of writes, for a process that polls nothing.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import getpass
 import signal
 import sqlite3
@@ -15,7 +16,9 @@ from busmaster.config.line import ConfiguredLine
 from busmaster.emulator.serve import TcpServer
 from busmaster.gate.record import Outcome, WriteRecord
 from tests.cli.conftest import Command, started
-from tests.cli.test_leaving import SAFE, TEXT, force, polls, winder
+from tests.cli.test_leaving import SAFE, TEXT, drive_of, force, polls, winder
+from tests.outputs.brokers import Broker, needs_mosquitto, running
+from tests.outputs.test_mqtt import heard, listening
 from tests.patience import PATIENCE
 
 __all__ = ["winder"]  # a fixture
@@ -66,7 +69,7 @@ def test_a_point_is_written_by_its_name_in_its_unit_and_that_is_on_record(
         ("winder/force=51", "above its maximum of 50"),
         ("winder/10=9", "below its minimum of 1"),
         ("winder/axis0.idle=1", "is read-only"),
-        ("winder/force=2,3", "is one value"),
+        ("winder/force=2,3", "does not take 2 values"),
         ("winder/force=inf", "finite number"),
     ],
 )
@@ -79,8 +82,8 @@ def test_what_is_refused_is_on_record_and_nothing_is_sent(
     [(_, _, point, _, outcome, why)] = audit(path)
     assert (point, outcome) == (said.partition("=")[0], "refused")
     assert error in why
-    read = busmaster("read", winder.path, "--protocol", "hcp2", "--node", "1", "10", "12").out
-    assert read == "10 0\n12 0\n"
+    assert force(winder) == 0
+    assert winder.call(lambda line, now: drive_of(line).read_element(12, now)) == 0
 
 
 def test_a_write_that_is_not_answered_is_on_record_as_that(busmaster: Command, path: Path, winder: TcpServer) -> None:
@@ -167,3 +170,26 @@ async def test_what_was_sent_once_stays_unconfirmed_whatever_keeps_it_from_being
         outcomes = await line.safe_state.enter(line.gate, "a test")
     assert outcomes[write.point.key] is not None
     assert [(record.outcome, record.by) for record in records] == [(Outcome.UNCONFIRMED, "a test")]
+
+
+async def told_by_mqtt(broker: Broker, path: str) -> dict[str, Any]:
+    """What is published, by topic, while a point of this file is written."""
+    async with listening(broker, "busmaster/#") as client:
+        with started("write", path, "winder/force=12.5") as process:
+            out, err = await asyncio.to_thread(process.communicate, timeout=PATIENCE)
+        assert (process.returncode, out, err) == (0, "winder/force ok\n", "")
+        await client.publish("busmaster/over", "true", qos=1)
+        topics: dict[str, Any] = {}
+        while "busmaster/over" not in topics:
+            [(topic, payload, _)] = await heard(client, 1)
+            topics[topic] = payload
+    return topics
+
+
+@needs_mosquitto
+def test_mqtt_hears_of_the_write_and_nothing_of_a_line_that_another_process_may_run(path: Path, tmp_path: Path) -> None:
+    with running(tmp_path) as broker:
+        path.write_text(f'{path.read_text()}[outputs.mqtt]\nport = {broker.port}\nallow_commands = ["winder/force"]\n')
+        topics = asyncio.run(told_by_mqtt(broker, str(path)))
+    assert topics.pop("busmaster/audit")["door"] == "command line"
+    assert set(topics) <= {"busmaster/events", "busmaster/over"}
