@@ -286,9 +286,14 @@ class MqttOutput(SpillingOutput):
     # commands
 
     async def _listen(self, client: Client) -> None:
-        """Raise MqttError when the broker goes away, also while there is nothing to send."""
-        async for _ in client.messages:
-            raise AssertionError("messages are taken in as they arrive")
+        """Raise ConnectionError when the broker goes away, also while there is nothing to send."""
+        import aiomqtt
+
+        try:
+            async for _ in client.messages:
+                raise AssertionError("messages are taken in as they arrive")
+        except aiomqtt.MqttError:
+            raise ConnectionError(f"{self._settings.host}:{self._settings.port} ended the connection") from None
 
     async def _write(self, wish: Wish) -> WriteRecord:
         """Write it on the loop that owns the line."""

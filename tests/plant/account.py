@@ -20,8 +20,6 @@ USUAL = (
 """What stands on standard error without any fault."""
 POINTS = 3
 """Of each group, where it was not printed."""
-FLOOD = 12
-"""Lines told of one fault that are too many for a person."""
 
 
 @dataclass
@@ -70,8 +68,6 @@ def account(plant: Plant, name: str, uncounted: Collection[str] = (), beyond: bo
             found.problems.append(f"{holder}: {found.lost[holder]} lost, {found.counted[holder]} counted")
     found.problems += audit_problems(plant, held)
     found.told = told(plant)
-    if len(found.told) > FLOOD:
-        found.problems.append(f"{len(found.told)} lines were told")
     found.problems += [line for run in plant.runs for line in run.told if "Traceback" in line]
     return found
 

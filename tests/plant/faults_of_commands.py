@@ -12,9 +12,10 @@ from statistics import median
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
+from tests.patience import PATIENCE
 from tests.plant.brokers import PREFIX
 from tests.plant.plant import SETPOINT, Plant
-from tests.plant.programs import PATIENCE, until
+from tests.plant.programs import until
 from tests.plant.trial import Fault
 
 FLOOD = 70_000
@@ -38,7 +39,7 @@ def strange(make: Callable[[], str | bytes], topic: str = "") -> Callable[[Plant
     def made(plant: Plant) -> str:
         why = refusal(plant, make(), topic)
         plant.over()
-        assert plant.command("after")["ok"]
+        plant.obeys_commands()
         return f"answered: {why[:120]}"
 
     return made
@@ -70,15 +71,18 @@ def flood(plant: Plant) -> str:
     thread = threading.Thread(target=pour, args=(plant, sent), daemon=True)
     thread.start()
     took: list[float] = []
+    done = 0
     while not sent.is_set():
         asked = time.monotonic()
         answer = plant.command(f"in the flood {len(took)}", len(took) % 400)
-        assert answer["ok"] or "no reply" in answer["error"], answer  # a machine that is busy enough loses replies
         took.append(time.monotonic() - asked)
+        done += bool(answer["ok"])
     thread.join()
     plant.over()
-    half = f"half of them within {median(took):.1f} s"
-    return f"{len(took)} allowed commands meanwhile, each done within {max(took):.1f} s, {half}"
+    return (
+        f"{done} of {len(took)} allowed commands meanwhile carried out, the others refused; answered within"
+        f" {max(took):.1f} s, half of them within {median(took):.1f} s"
+    )
 
 
 def late(plant: Plant) -> str:
@@ -91,7 +95,7 @@ def late(plant: Plant) -> str:
     plant.over()
     answers = [plant.subscriber.answer(f"late {number}") for number in range(5)] + [plant.subscriber.answer("expired")]
     assert not any(answer["ok"] for answer in answers), answers
-    assert plant.command("after")["ok"]
+    plant.obeys_commands()
     return f"each answered: {answers[0]['error']}"
 
 
@@ -99,7 +103,7 @@ def beyond_a_limit(plant: Plant) -> str:
     answer = plant.command("too much", 501)
     assert not answer["ok"]
     plant.over()
-    assert plant.command("after")["ok"]
+    plant.obeys_commands()
     return f"answered: {answer['error']}"
 
 
@@ -111,7 +115,7 @@ def while_the_line_is_gone(plant: Plant) -> str:
     plant.order("back")
     plant.over()
     plant.run.heard("the line is up", plant.over_at)
-    assert plant.command("after")["ok"]
+    plant.obeys_commands()
     return f"answered: {answer['error']}"
 
 
@@ -123,7 +127,7 @@ def to_a_dead_node(plant: Plant) -> str:
     plant.order("on")
     plant.over()
     plant.run.heard("winder is up", plant.over_at)
-    assert plant.command("after")["ok"]
+    plant.obeys_commands()
     return f"answered: {answer['error']}"
 
 

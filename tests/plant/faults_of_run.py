@@ -51,13 +51,13 @@ def hangups(plant: Plant) -> None:
 
 def terminated(plant: Plant) -> str:
     """The drive has another setpoint then."""
-    assert plant.command("before the end", 125)["ok"]
+    plant.obeys_commands()
     status = plant.end_run()
     return f"exit status {status}; the drive was left at {setpoint(plant)} N"
 
 
 def terminated_with_a_dead_node(plant: Plant) -> str:
-    assert plant.command("before the end", 125)["ok"]
+    plant.obeys_commands()
     plant.order("off winder")
     status = plant.end_run()
     return f"exit status {status}"
@@ -70,7 +70,7 @@ def setpoint(plant: Plant) -> str:
 
 
 def killed(plant: Plant) -> str:
-    assert plant.command("before the crash", 125)["ok"]
+    plant.obeys_commands()
     plant.wait_for_cycles(ENOUGH)
     plant.run.send(signal.SIGKILL)
     plant.run.wait()
@@ -207,7 +207,9 @@ FAULTS = {
     "hup-broken": Fault(name="SIGHUP, the file broken", make=hangup_broken),
     "hup-twenty": Fault(name="twenty SIGHUPs at once", make=hangups),
     "term": Fault(name="SIGTERM, with [safe]", make=terminated),
-    "term-dead": Fault(name="SIGTERM, with a dead node in [safe]", make=terminated_with_a_dead_node, status=1),
+    "term-dead": Fault(
+        name="SIGTERM, with a dead node in [safe]", make=terminated_with_a_dead_node, status=1, site=Site(within=2.0)
+    ),
     "kill": Fault(name="SIGKILL, then `busmaster safe`", make=killed, uncounted=EVERYWHERE),
     "stopped": Fault(name="run stands still for 5 s", make=stopped),
     "terminal": Fault(

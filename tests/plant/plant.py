@@ -68,7 +68,7 @@ allow_commands = ["winder/setpoint"]
 port = {metrics}
 groups = ["fast"]
 [safe]
-within = 2.0
+within = {within}
 repeatable = ["winder/setpoint"]
 writes = {{ "winder/setpoint" = 0 }}
 [emulator]
@@ -88,8 +88,11 @@ class Site:
     on_disk: tuple[str, ...] = ()
     folder: str = ""
     in_folder: tuple[str, ...] = ()
+    within: float = 30.0
+    """Seconds for the safe state: the machine may be busy."""
     sqlite: str = ""
     mqtt: str = ""
+    """What more is said of these outputs."""
     arguments: tuple[str, ...] = ("--json",)
     environment: dict[str, str] = field(default_factory=dict)
     starts: bool = True
@@ -169,6 +172,7 @@ class Plant:
             broker=self.gateway.port,
             prefix=PREFIX,
             metrics=self.metrics,
+            within=self.site.within,
             sqlite_more=self.site.sqlite,
             mqtt_more=self.site.mqtt.format(folder=self.folder),
             **self.paths,
@@ -318,6 +322,10 @@ class Plant:
         """Have the setpoint written by MQTT, and return the answer."""
         self.subscriber.send(SETPOINT, json.dumps({"value": value, "id": mark, **more}))
         return self.subscriber.answer(mark)
+
+    def obeys_commands(self) -> None:
+        """Wait until one is carried out: a machine that is busy enough loses replies, and lets commands grow old."""
+        until(lambda: bool(self.command(f"try {time.monotonic()}")["ok"]), "a command is carried out")
 
     # accounts
 

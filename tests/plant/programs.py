@@ -12,10 +12,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, NamedTuple
 
+from tests.patience import PATIENCE
+
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "", "MALLOC_ARENA_MAX": "2"}
-PATIENCE = 25.0
-"""Seconds after which a fact that was waited for will not come any more."""
 LOOK = 0.01
 """Seconds between two looks at a fact that nobody tells."""
 
