@@ -19,7 +19,8 @@ within one of those replies, but 17 bytes at least. (A smoothed mean and deviati
 reply too closely: of 76,000 replies it missed 1236, the largest none.)
 
 A node that was later than three quarters of a learned window (one shorter than the document's), or whose reply came
-after it, has the document's times again for 200 replies.
+after it, has the document's times again for 20 replies: enough to tell one that has become slower from one that was
+late once. One that was away has them for 200, for it may be another device.
 
 Of times nothing is done here but to add, subtract, compare and multiply by a constant.
 """
@@ -33,9 +34,9 @@ from math import inf
 from busmaster.contract.timing import ReplyTiming, Timings
 
 TRUSTED_AFTER = 200
-"""Replies of a kind after which its times are trusted, and once more after each that was late."""
+"""Replies of a kind after which its times are trusted."""
 TRUSTED_AGAIN_AFTER = 20
-"""As many where times of an earlier run are known."""
+"""As many where times of an earlier run are known, or after one that was late."""
 EPOCH = 500
 """Replies after which an epoch ends: the largest of this one and the last count."""
 MARGIN = 0.002
@@ -172,9 +173,10 @@ class Kind:
             self._byte_time = byte_time
             self._given = None
 
-    def doubt(self) -> None:
-        """Go back to the document's times for a while."""
-        self.first.doubts = self.packet.doubts = TRUSTED_AFTER
+    def doubt(self, replies: int) -> None:
+        """Go back to the document's times for at least so many replies."""
+        for leg in (self.first, self.packet):
+            leg.doubts = max(leg.doubts, replies)
         self._given = None
 
     def _learned(self, own: Timings, patience: int) -> Timings:
@@ -207,12 +209,14 @@ class Learning:
         if kind is not None:
             kind.note(packet, begun, heard, pause, byte_time)
 
-    def doubt(self) -> None:
-        """Go back to the document's times until enough replies have come: the node was late, or has been away."""
-        self.returns += 1
+    def was_late(self) -> None:
+        """Go back to the document's times until it has shown whether it has become slower."""
+        self._doubt(TRUSTED_AGAIN_AFTER)
+
+    def was_away(self) -> None:
+        """Go back to the document's times until enough is known of what may be another device."""
         self._known = {}
-        for kind in self.kinds.values():
-            kind.doubt()
+        self._doubt(TRUSTED_AFTER)
 
     def times(self, document: Timings) -> tuple[LearnedTimes, ...]:
         """Return what is known, a leg at a time."""
@@ -234,6 +238,11 @@ class Learning:
         """Return what the next run may begin with: what is trusted, and what this one began with and never doubted."""
         trusted = {(times.kind, times.packet): times for times in self.times(document) if times.trusted}
         return tuple({**self._known, **trusted}.values())
+
+    def _doubt(self, replies: int) -> None:
+        self.returns += 1
+        for kind in self.kinds.values():
+            kind.doubt(replies)
 
     def _begin(self, name: str) -> Kind:
         kind = Kind()

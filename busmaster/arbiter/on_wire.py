@@ -80,7 +80,7 @@ class OnWire:
         document = transaction.node.timings
         longest = (document.packet if packet else document.write if transaction.writes else document.read).window
         if leg.timing.silence is not None and LATE_SHARE * leg.timing.window < heard and leg.timing.window < longest:
-            learning.doubt()
+            learning.was_late()
 
     def without_noise(self, data: bytes) -> bytes:
         """Return what is left of the first bytes of a reply where the profile tolerates noise before it."""

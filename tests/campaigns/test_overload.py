@@ -115,6 +115,7 @@ def test_r9_no_wait_exceeds_its_bound_whatever_was_learned_and_whenever_it_prove
 ) -> None:
     """Windows are learned from a few replies, of nodes that turn slow and quick again, with one frame in ten lost."""
     monkeypatch.setattr(learned, "TRUSTED_AFTER", 3)
+    monkeypatch.setattr(learned, "TRUSTED_AGAIN_AFTER", 3)
     monkeypatch.setattr(learned, "EPOCH", 10)
     devices = [make_device(profile.name, address) for address in profile.addresses[1:5]]
     line = Load(seed=seed, devices=devices, profile=profile, timings=LEARNED, faults=Faults(lost=0.1))
