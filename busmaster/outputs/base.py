@@ -62,7 +62,8 @@ class OutputStatistics:
     """Counts of values and events; of answers where it only answers (`what`: "answered").
 
     `error` is why it is down, "" while it is not. `spilled` is how many of those that wait do so on disk, where they
-    survive the end of the process.
+    survive the end of the process. `suppressed` counts the values that were not news by the meaning of their points:
+    they were never to be written.
     """
 
     kind: str
@@ -72,6 +73,7 @@ class OutputStatistics:
     waiting: int
     error: str
     spilled: int = 0
+    suppressed: int = 0
 
 
 def reason(error: BaseException) -> str:
@@ -119,6 +121,7 @@ class Output(ABC):
         self.groups = settings.groups
         self.error = ""
         self.offered = self.dropped = self.written = 0
+        self.suppressed = 0
         self.spilled = self.lost = 0
         """Values that wait on disk, and those that the thread had to drop from there."""
         self._capacity = settings.buffer
@@ -152,6 +155,10 @@ class Output(ABC):
         self.offered += values
         self.dropped += values
 
+    def suppress(self, values: int) -> None:
+        """Count so many values that are not offered, as they are no news."""
+        self.suppressed += values
+
     def reopen(self) -> None:
         """Have it let go of the file that is open, if there is one, and open it anew: it may have been moved away."""
         self._reopen.set()
@@ -161,12 +168,15 @@ class Output(ABC):
         self.offered += before.offered
         self.dropped += before.dropped
         self.written += before.written
+        self.suppressed += before.suppressed
 
     def statistics(self) -> OutputStatistics:
         """Return the counts of this output, and why it is down."""
         dropped = self.dropped + self.lost
         waiting = self.offered - self.written - dropped
-        return OutputStatistics(self.kind, self.what, self.written, dropped, waiting, self.error, self.spilled)
+        return OutputStatistics(
+            self.kind, self.what, self.written, dropped, waiting, self.error, self.spilled, self.suppressed
+        )
 
     # off the loop
 

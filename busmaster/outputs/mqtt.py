@@ -4,6 +4,7 @@
     PREFIX/cycles/GROUP       a whole cycle, as `busmaster run --json` prints it (messages = "cycle")
     PREFIX/health/NODE        {"time": ..., "health": "up"}, retained
     PREFIX/line               {"time": ..., "line": "ready"}, retained; "offline" while the port is gone
+    PREFIX/alarms/NODE/ITEM   {"time": ..., "alarm": "high"}, "low" or null, of points with limits; retained
     PREFIX/events             {"time": ..., "node": "winder", "text": "winder is down, was suspect"}
     PREFIX/status             online, or offline, which is also the last will; retained
 
@@ -58,6 +59,7 @@ TIMEOUT = 5.0
 KEEP_ALIVE = 15
 SPILL_EVERY = 0.2
 """Seconds between two movings of what waits to disk, while the broker is away."""
+ALARMS = "alarms/"
 HURRY = 2.0
 """Seconds from the wish to end until what could not be sent goes to disk."""
 
@@ -96,7 +98,9 @@ class MqttOutput(Output):
             self._spool = Spool(settings.spill, settings.spill_values, say)
             self.offered = self.spilled = self._spool.values  # of the last time
         self._spool_error = ""
-        self._published: dict[str, str] = {}
+        self._published: dict[str, str | None] = {}
+        self._alarms: object = None
+        """Those that were told last."""
         self._quiet = logging.getLogger("busmaster.mqtt")
         self._quiet.addHandler(logging.NullHandler())
         self._quiet.propagate = False
@@ -183,6 +187,7 @@ class MqttOutput(Output):
     async def _connected(self) -> None:
         async with self._client() as client, anyio.create_task_group() as tasks:
             self._published.clear()
+            self._alarms = None
             await self._send(client, [Outgoing(self._topic("status"), "online", True)])
             self.up()
             if self._commands:
@@ -269,11 +274,19 @@ class MqttOutput(Output):
 
     def _changes(self) -> Iterator[Outgoing]:
         """Yield what is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
-        now = {"line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")}
+        now: dict[str, tuple[str, str | None]] = {
+            "line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")
+        }
         for node in self._bus.nodes:
             now[f"health/{topic_part(node.label.removeprefix('node '))}"] = ("health", node.health.value)
+        alarms = self._bus.alarms
+        if alarms is not self._alarms:
+            self._alarms = alarms
+            now |= {topic: ("alarm", None) for topic in self._published if topic.startswith(ALARMS)}
+            for point, alarm in alarms.items():
+                now[f"{ALARMS}{topic_part(point.key)}"] = ("alarm", None if alarm is None else alarm.limit)
         for topic, (name, state) in now.items():
-            if self._published.get(topic) != state:
+            if self._published.get(topic, "") != state:
                 self._published[topic] = state
                 payload = json_line(**{"time": round(time.time(), 3), name: state})
                 yield Outgoing(self._topic(topic), payload, True)

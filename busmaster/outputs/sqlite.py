@@ -24,6 +24,10 @@ SCHEMA = """
 create table if not exists points (
     id integer primary key, node text not null, item text not null, unit text not null, unique (node, item)
 );
+create table if not exists labels (
+    point integer not null references points (id), value integer not null, label text not null,
+    primary key (point, value)
+);
 create table if not exists samples (
     time real not null,       -- seconds since 1970
     point integer not null references points (id),
@@ -50,7 +54,9 @@ create table if not exists audit (
 );
 create index if not exists audit_by_time on audit (time);
 create view if not exists history as
-    select time, node, item, value, unit, quality, error from samples join points on points.id = samples.point;
+    select time, node, item, samples.value, unit, quality, error, label
+    from samples join points on points.id = samples.point
+    left join labels on labels.point = samples.point and labels.value = samples.value;
 """
 BUSY = 1.0
 """Seconds for which a lock of another program is waited for, before the batch is kept for later."""
@@ -140,20 +146,27 @@ class SqliteOutput(BatchOutput[Rows]):
                 raise InvalidCommand(f"{self._path} is a database of something else")
             database.execute("pragma journal_mode = wal")  # others may read while it grows
             database.execute("pragma synchronous = normal")
+            history = database.execute("select sql from sqlite_master where name = 'history'").fetchone()
+            if history is not None and "label" not in history[0]:
+                database.execute("drop view history")  # of a version before labels
             database.executescript(SCHEMA)
             database.execute(f"pragma user_version = {VERSION}")
         return self._database
 
 
 def number_of(database: sqlite3.Connection, point: Point[Any]) -> int:
-    """Return the number of the point's row. It is made if there is none, and gets the unit that the point has now."""
+    """Return the number of the point's row, made if there is none. It gets the unit and the labels of the point."""
     node, _, item = point.key.partition("/")
     row = database.execute(
         "insert into points (node, item, unit) values (?, ?, ?)"
         " on conflict (node, item) do update set unit = excluded.unit returning id",
         (node, item, point.unit),
     ).fetchone()
-    return int(row[0])
+    number = int(row[0])
+    labels = ((number, value, label) for value, label in point.meaning.labels.items())
+    database.execute("delete from labels where point = ?", (number,))
+    database.executemany("insert into labels values (?, ?, ?)", labels)
+    return number
 
 
 def column(value: Any) -> Any:

@@ -73,6 +73,39 @@ def test_run_prints_a_line_a_value_and_a_summary_of_groups_nodes_and_outputs(lin
     assert found == 4
 
 
+MEANT = """
+[nodes.winder.points.pull]
+item = "11"
+unit = "N"
+precision = 2
+low = 1
+deadband = 0
+[nodes.winder.points.mode]
+item = "12"
+labels = { 0 = "off" }
+[groups.meant]
+period = 0.02
+points = ["winder/pull,mode"]
+"""
+
+
+def test_run_shows_people_what_points_mean_and_tells_an_alarm_once(busmaster: Command, line: Path) -> None:
+    line.write_text(line.read_text() + MEANT)
+    ran = busmaster("run", str(line), "--seconds", "0.6", "--plain")
+    values = {key: value for _, key, value in (text.split(" ", 2) for text in ran.lines)}
+    assert (values["winder/pull"], values["winder/mode"]) == ("0.00", "0 off")
+    assert ran.err.count("busmaster: winder/pull = 0 N is below its low of 1 N\n") == 1
+    assert " suppressed as no news" in ran.err.splitlines()[-1]
+
+
+def test_json_is_not_rounded_and_has_numbers_with_their_labels(busmaster: Command, line: Path) -> None:
+    line.write_text(line.read_text() + MEANT)
+    ran = busmaster("run", str(line), "--seconds", "0.6", "--json")
+    cycle = next(cycle for cycle in map(json.loads, ran.lines) if cycle["group"] == "meant")
+    assert cycle["samples"]["winder/pull"] == {"value": 0, "error": None, "late": False}
+    assert cycle["samples"]["winder/mode"] == {"value": 0, "error": None, "late": False, "label": "off"}
+
+
 def test_run_says_that_a_file_without_groups_polls_nothing(busmaster: Command, line: Path) -> None:
     line.write_text(line.read_text().partition("[groups")[0])
     ran = busmaster("run", str(line), "--seconds", "0.1", "--plain")

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 
 import anyio
 import pytest
 
 from busmaster.arbiter.counters import DriverErrors
 from busmaster.bus.bus import Bus
+from busmaster.bus.meaning import Meaning
+from busmaster.cli import watching
 from busmaster.cli.arguments import View
 from busmaster.cli.messages import Action, Frame
+from busmaster.cli.output import Level
 from busmaster.cli.watching import Watch, count_cycles
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
@@ -61,6 +65,28 @@ async def test_the_picture_has_every_point_its_age_and_its_nodes_health(controll
         assert frame.port == f"{controllers.host}:{controllers.port}  57600 8N1"
         assert frame.line in ("ready", "settling")
         assert 0 < frame.utilisation <= 1
+
+
+@pytest.mark.asyncio
+async def test_an_alarm_is_an_event_of_the_picture_and_a_warning_to_who_does_not_look(
+    controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[tuple[str, Level]] = []
+    monkeypatch.setattr(watching, "note", lambda line, level: said.append((line, level)))
+    async with watched(controllers, 1) as watch:
+        controller = Hcp2Controller(watch.bus, 1)
+        watch.groups[0].add(replace(controller.point("10"), meaning=Meaning(high=5, hysteresis=1)))
+        await controller.write(10, 6)
+        await seen(
+            watch, lambda frame: any("1/10 = 6 is above its high" in event for event in frame.events)
+        )
+        await controller.write(10, 4)
+        await seen(watch, lambda frame: any("1/10 is back at 4" in event for event in frame.events))
+    alarms = [(text, level) for text, level in said if text.startswith("1/10")]
+    assert alarms[:2] == [
+        ("1/10 = 6 is above its high of 5", Level.WARNING),
+        ("1/10 is back at 4, was above its high of 5", Level.NOTICE),
+    ]
 
 
 @pytest.mark.asyncio
