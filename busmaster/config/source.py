@@ -41,6 +41,7 @@ class Source:
     def __init__(self, name: str, text: str) -> None:
         """Read a TOML text. Raises FileError, with the line, for what is no TOML."""
         self.name = name
+        self.text = text
         try:
             self.data: dict[str, Any] = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
@@ -59,6 +60,10 @@ class Source:
         except UnicodeDecodeError as error:
             line = error.object[: error.start].count(b"\n") + 1
             raise FileError(f"{name}:{line}: this is no TOML: it is not written in UTF-8") from None
+
+    def beside(self, name: str) -> Path:
+        """Return the path of a file that this one names: from its own folder, where it is not absolute."""
+        return Path(self.name).parent / name
 
     def line(self, key: Key) -> int:
         """Return the line on which `key` stands, or what it would be part of."""
