@@ -103,7 +103,8 @@ def taken(file: LineFile, name: str, data: bytes) -> Taking:
 def write_beside(path: str, text: str) -> None:
     """Write a file anew, as whole as it was: beside it, and then in its place. Raises OSError, the file unchanged."""
     target = os.path.realpath(path)
-    before = os.stat(target)
+    with open(target, "r+b") as held:  # refused where it may not be written, though its folder may be
+        before = os.fstat(held.fileno())
     descriptor, beside = tempfile.mkstemp(prefix=f".{os.path.basename(target)}.", dir=os.path.dirname(target))
     try:
         with open(descriptor, "wb") as file:
@@ -208,7 +209,7 @@ class _Incoming:
             return
         self.own[where, name] = self._own(place, where, name, after)
         self._points.setdefault(where, {})[name] = self._section(node, Table(place, (name,), after))
-        self.changes.append(Change(where, name, held and before, after))
+        self.changes.append(Change(where, name, before if held else None, after))
 
     def _node(self, place: _RowPlace, where: str) -> NodeSection:
         if where in self._sections:

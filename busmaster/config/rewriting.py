@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeAlias
 
 from busmaster.config.source import FileError, Key, Source, Walk
@@ -93,7 +93,7 @@ class _Editing:
 
     # inside
 
-    def _append(self, table: Key, pairs: list[tuple[tuple[str, ...], Any]]) -> bool:
+    def _append(self, table: Key, pairs: Sequence[tuple[tuple[str, ...], Any]]) -> bool:
         """Add pairs to a table behind those that it has, and tell whether it is written down anywhere."""
         if table in self._walk.bodies:  # [nodes.winder.points]
             self._insert_lines(self._walk.bodies[table], [f"{key_text(*way)} = {toml_text(v)}" for way, v in pairs])

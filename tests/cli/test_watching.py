@@ -77,9 +77,7 @@ async def test_an_alarm_is_an_event_of_the_picture_and_a_warning_to_who_does_not
         controller = Hcp2Controller(watch.bus, 1)
         watch.groups[0].add(replace(controller.point("10"), meaning=Meaning(high=5, hysteresis=1)))
         await controller.write(10, 6)
-        await seen(
-            watch, lambda frame: any("1/10 = 6 is above its high" in event for event in frame.events)
-        )
+        await seen(watch, lambda frame: any("1/10 = 6 is above its high" in event for event in frame.events))
         await controller.write(10, 4)
         await seen(watch, lambda frame: any("1/10 is back at 4" in event for event in frame.events))
     alarms = [(text, level) for text, level in said if text.startswith("1/10")]
