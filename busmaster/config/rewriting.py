@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from typing import Any, TypeAlias
 
 from busmaster.config.source import FileError, Key, Source, Walk
@@ -39,16 +41,25 @@ def rewritten(source: Source, points: Mapping[tuple[str, str], Said]) -> str:
     Raises FileError for a point that is written in a way that this cannot change.
     """
     editing = _Editing(source)
+    wanted = deepcopy(source.data)
     added: dict[str, dict[str, Said]] = {}
     for (node, name), said in points.items():
         held = source.data["nodes"][node].get("points", {})
+        wanted["nodes"][node].setdefault("points", {})[name] = said
         if name in held:
             editing.change(("nodes", node, "points", name), held[name], said)
         else:
             added.setdefault(node, {})[name] = said
     for node, new in added.items():
         editing.add(("nodes", node, "points"), new)
-    return editing.text()
+    text = editing.text()
+    try:
+        as_wanted = tomllib.loads(text) == wanted
+    except tomllib.TOMLDecodeError:
+        as_wanted = False
+    if not as_wanted:
+        raise source.error(("nodes",), "points are written in a way that this cannot change: change them in the file")
+    return text
 
 
 class _Editing:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import re
 from collections.abc import Iterable
 
@@ -15,9 +14,17 @@ KEPT = re.compile(r"0|[1-9]\d{0,14}|[^\d\s.,'].*", re.DOTALL)
 
 def csv_lines(rows: Iterable[Iterable[object]]) -> bytes:
     """Return the rows as lines of CSV."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
+    lines = _Lines()
+    csv.writer(lines, lineterminator="\r\n").writerows(rows)  # a cell with one of these is put in quotes
+    return "".join(lines).encode()
+
+
+class _Lines(list[str]):
+    """Lines as they are written, each with a line end of one character."""
+
+    def write(self, line: str) -> None:
+        """Add a line."""
+        self.append(line.removesuffix("\r\n") + "\n")
 
 
 def no_formula(text: str) -> str:

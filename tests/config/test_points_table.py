@@ -8,14 +8,18 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from busmaster.config import FileError, LineFile, load
-from busmaster.config.points_table import COLUMNS, points_csv
+from busmaster.config.names import POINT_NAME
+from busmaster.config.points_table import COLUMNS, points_csv, rows
 from busmaster.config.points_taking import BadRows, Taking, taken, write_beside
+from busmaster.config.rewriting import key_text, toml_text
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.errors import InvalidCommand
-from busmaster.outputs.cells import text_cell, text_of
+from busmaster.outputs.cells import csv_lines, text_cell, text_of
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 HEAD = 'port = "/dev/ttyUSB0"\n[nodes.w]\nprotocol = "hcp2"\naddress = 5  # of winder 5\n'
@@ -81,6 +85,39 @@ def test_what_goes_out_gives_the_same_points_to_a_file_without_any() -> None:
     assert back.text.startswith(HEAD)
 
 
+@settings(max_examples=30)
+@given(
+    unit=st.text(st.characters(exclude_categories=["Cs"])),
+    name=st.from_regex(POINT_NAME, fullmatch=True),
+    label=st.text(min_size=1).filter(str.isprintable),
+    factor=st.floats(1e-12, 1e12) | st.integers(1, 10**9),
+)
+def test_any_text_and_any_number_goes_out_and_comes_in_to_the_letter(
+    unit: str, name: str, label: str, factor: float
+) -> None:
+    said = {name: {"item": "10", "unit": unit, "factor": factor}, "x": {"item": "11", "labels": {"-3": label}}}
+    held = file(
+        "\n".join(["[nodes.w.points]", *(f"{key_text(key)} = {toml_text(one)}" for key, one in said.items())]), ""
+    )
+    bare = file("", "")
+    back = taken(bare, "points.csv", points_csv(held))
+    assert tomllib.loads(back.text)["nodes"]["w"]["points"] == said
+    assert taken(held, "points.csv", points_csv(held)).changes == ()
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: str(path.name))
+def test_of_an_example_only_the_lines_of_what_changes_are_touched(path: Path) -> None:
+    held = load(path)
+    changed = [row for row in rows(held) if row.origin == ""]
+    table = csv_lines([("node", "point", "unit"), *((row.node, row.point, "=x") for row in changed)])
+    back = taken(held, "points.csv", table)
+    before, after = path.read_text().splitlines(), back.text.splitlines()
+    assert len(back.changes) == len(changed) == sum(one != other for one, other in zip(before, after, strict=True))
+    assert {
+        point.unit for node in read(Source(str(path), back.text)).nodes.values() for point in node.points.values()
+    } <= {"=x"}
+
+
 def test_every_key_of_a_point_is_a_column() -> None:
     assert {key for row in cells(points_csv(file(ALL_KEYS, ""))) for key, cell in row.items() if cell} | {
         "decimals",
@@ -89,9 +126,9 @@ def test_every_key_of_a_point_is_a_column() -> None:
 
 
 def test_no_text_is_a_formula_a_date_or_another_number_to_a_spreadsheet() -> None:
-    rows = cells(points_csv(file(ALL_KEYS.replace("two\\nlines", "m"), "")))
-    assert [row["point"] for row in rows] == ["a", "b", "c", "d", "'+e", "'@f", "g", "'4-8", "20", 'a"b']
-    assert [row["unit"] for row in rows][3:7] == ["'=cmd|' /C calc'!A0", "''", "'1.20", "'"]
+    told = cells(points_csv(file(ALL_KEYS.replace("two\\nlines", "m"), "")))
+    assert [row["point"] for row in told] == ["a", "b", "c", "d", "'+e", "'@f", "g", "'4-8", "20", 'a"b']
+    assert [row["unit"] for row in told][3:7] == ["'=cmd|' /C calc'!A0", "''", "'1.20", "'"]
 
 
 @pytest.mark.parametrize(
