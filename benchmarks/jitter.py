@@ -42,7 +42,7 @@ def run(options: Options) -> Outcome:
     outcome = Outcome()
     title = f"{UNITS} units polled every {PERIOD * 1000:g} ms, ten commands a second"
     table = Table(title, COLUMNS, notes=notes(options))
-    table.notes.append("not in time: of the values that the grid questions for, those after the next was due, or never")
+    table.notes.append("not in time: of the values that the grid asks for, those after the next was due, or never")
     cycles = options.pick(100, 5)
     for maker in masters(options):
         master = maker()

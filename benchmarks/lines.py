@@ -3,32 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import json
 import os
 import socket
-import subprocess
-import sys
 import tty
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from pathlib import Path
 from types import TracebackType
-from typing import Any
 
+from benchmarks.apart import Apart
 from busmaster.contract.profile import LineSettings
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.identity import Identity
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
-ROOT = Path(__file__).parent.parent
 FREE_BAUDRATE = 57600
 """Said of a line that is not paced: windows follow it, the bytes do not."""
 SPIN = 500e-6
 """Longer than a sleeping core takes to wake up, where one line has the responder to itself."""
-CORES = sorted(os.sched_getaffinity(0))
 
 
 class Kind(Enum):
@@ -96,7 +89,7 @@ class Lines:
                 for fd in self._far
             ],
         }
-        self._process: subprocess.Popen[bytes] | None = None
+        self._responder: Apart
 
     def _pair(self, kind: Kind) -> int:
         settings = self._settings or LineSettings(FREE_BAUDRATE)
@@ -116,58 +109,19 @@ class Lines:
         return theirs.detach()
 
     def __enter__(self) -> Lines:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.responder"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            pass_fds=self._far,
-            cwd=ROOT,
-        )
+        self._responder = Apart("benchmarks.responder", paced=self._settings is not None, pass_fds=self._far)
         for fd in self._far:
             os.close(fd)
-        part_from(self._process.pid, self._settings is not None)
-        self._tell(json.dumps(self._order))
-        self._hear()
+        self._responder.ask(self._order)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        assert self._process is not None
-        with self._process as process:
-            process.communicate(timeout=10)
-        os.sched_setaffinity(0, CORES)
+        self._responder.close()
         for fd in self._kept:
             os.close(fd)
 
     def dead_times(self) -> list[list[float]]:
         """Seconds between each reply and the next request, line by line, since this was asked last."""
-        self._tell("report")
-        return [line["dead"] for line in self._hear()]
-
-    def _tell(self, word: str) -> None:
-        assert self._process is not None
-        assert self._process.stdin is not None
-        self._process.stdin.write(word.encode() + b"\n")
-        self._process.stdin.flush()
-
-    def _hear(self) -> list[dict[str, Any]]:
-        assert self._process is not None
-        assert self._process.stdout is not None
-        report: list[dict[str, Any]] = json.loads(self._process.stdout.readline())
-        return report
-
-
-def part_from(responder: int, paced: bool) -> None:
-    """Give the responder a core of its own; where it keeps time, let nobody else interrupt it there, if we may.
-
-    It stands for the wire and the devices, which take no time of the master's and wait for no other program. One that
-    answers at once is a process like any other: waking each other up is part of what a ping-pong costs.
-    """
-    if len(CORES) == 1:
-        return
-    os.sched_setaffinity(responder, CORES[-1:])
-    os.sched_setaffinity(0, CORES[:-1])
-    if paced:
-        with contextlib.suppress(PermissionError):
-            os.sched_setscheduler(responder, os.SCHED_FIFO, os.sched_param(1))
+        return [line["dead"] for line in self._responder.ask("report")]

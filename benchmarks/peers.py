@@ -33,7 +33,7 @@ def run(options: Options) -> Outcome:
     outcome.tables.append(asyncio.run(_measure(paced, SETTINGS, options, outcome)))
     outcome.tables.append(asyncio.run(_measure("Not paced; ours without a silence", None, options, outcome)))
     outcome.tables[0].notes += notes(options)
-    outcome.tables[0].notes.append("Modbus questions for 1.75 ms of silence between frames; pymodbus does not keep it")
+    outcome.tables[0].notes.append("Modbus asks for 1.75 ms of silence between frames; pymodbus does not keep it")
     return outcome
 
 

@@ -8,16 +8,14 @@ the last time: (seconds, "host" or "line", bytes, seconds taken), {"faults": {"l
 from __future__ import annotations
 
 import json
-import os
 import random
-import subprocess
 import sys
 from collections.abc import Mapping
 from functools import partial
 from types import TracebackType
 from typing import Any
 
-from benchmarks.lines import CORES, ROOT, part_from
+from benchmarks.apart import Apart
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
@@ -72,43 +70,29 @@ class ServedLine:
     def __init__(self, units: int, *, delay: dict[str, Any] | None = None, seed: int = 1) -> None:
         self._order = {"units": units, "delay": delay or {}, "seed": seed}
         self.path = ""
-        self._process: subprocess.Popen[bytes] | None = None
+        self._server: Apart
 
     def __enter__(self) -> ServedLine:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.served_line"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
-        )
-        part_from(self._process.pid, paced=True)
-        self.path = self._ask(self._order)
+        self._server = Apart("benchmarks.served_line", paced=True)
+        self.path = self._server.ask(self._order)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        assert self._process is not None
-        with self._process as process:
-            process.communicate(timeout=10)
-        os.sched_setaffinity(0, CORES)
+        self._server.close()
 
     def kill(self, unit: int, dead: bool = True) -> None:
         """Take a unit off the line, or bring it back."""
-        self._ask({"unit": unit, "dead": dead})
+        self._server.ask({"unit": unit, "dead": dead})
 
     def spoil(self, **faults: float) -> None:
         """Have these faults strike each frame from now on: shares of them."""
-        self._ask({"faults": faults})
+        self._server.ask({"faults": faults})
 
     def log(self) -> list[tuple[float, str, int, float]]:
         """What passed since the last time."""
-        return [(start, who, length, taken) for start, who, length, taken in self._ask({"log": True})]
-
-    def _ask(self, order: dict[str, Any]) -> Any:
-        assert self._process is not None
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps(order).encode() + b"\n")
-        self._process.stdin.flush()
-        return json.loads(self._process.stdout.readline())
+        return [(start, who, length, taken) for start, who, length, taken in self._server.ask({"log": True})]
 
 
 def _obey(order: dict[str, Any], line: Line, now: float) -> Any:

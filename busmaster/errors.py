@@ -180,6 +180,15 @@ class BusClosed(BusError):
     hint = "use the bus inside `async with`"
 
 
+def cause_text(cause: Exception | None, otherwise: str) -> str:
+    """Return in words why a connection was lost: `otherwise` where there was no error, never an empty text."""
+    if cause is None:
+        return otherwise
+    if isinstance(cause, BusError):
+        return cause.what
+    return getattr(cause, "strerror", None) or str(cause) or type(cause).__name__
+
+
 __all__ = [
     "Addressed",
     "BacklogFull",

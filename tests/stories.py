@@ -1,9 +1,11 @@
-"""A story told on a bus with an emulated line, in virtual time."""
+"""Stories told in virtual time, on a bus with an emulated line or on one of their own."""
 
 from __future__ import annotations
 
 import random
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
+from functools import wraps
+from typing import Any, ParamSpec
 
 from busmaster.bus.bus import Bus
 from busmaster.bus.polling import PollGroup, Snapshot
@@ -14,7 +16,18 @@ from busmaster.emulator.memory import MemoryPort
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.testing.virtual_time import run_in_virtual_time
 
+P = ParamSpec("P")
 Story = Callable[[Bus], Awaitable[None]]
+
+
+def in_virtual_time(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
+    """Run a test on a loop of its own, which keeps virtual time."""
+
+    @wraps(test)
+    def run(*arguments: P.args, **options: P.kwargs) -> None:
+        run_in_virtual_time(test(*arguments, **options))
+
+    return run
 
 
 def on_a_bus(story: Story, *devices: Device, settings: LineSettings | None = None) -> None:

@@ -9,8 +9,6 @@ business.
 
 from __future__ import annotations
 
-from math import inf
-
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import Event
 from busmaster.arbiter.health import NodeRecord
@@ -103,12 +101,11 @@ class Arbiter(LineMachine):
 
         Returns False if it waits and nothing else has changed: then there is nothing to pump.
         """
-        waits = self.dispatcher.submit(transaction, now)
+        changed = self.dispatcher.submit(transaction, now)
         if self.state is READY:
             self._advance(now)
             return True
-        # A write may have superseded others, which is to be told, and a `start_by` sets a deadline.
-        return not waits or transaction.writes or transaction.start_by < inf
+        return changed
 
     def cancel(self, transaction: Transaction, now: float) -> None:
         """Cancel a transaction, synchronously and without ever touching the line (R6)."""
@@ -160,6 +157,11 @@ class Arbiter(LineMachine):
         data, output.waiting = output.waiting, b""
         return data or None
 
+    @property
+    def said_until(self) -> float:
+        """When all that was said is on the wire, in seconds on the caller's clock, if the port holds none of it."""
+        return self._leg.out
+
     def poll_event(self) -> Event | None:
         """Take out the next event, in the order of `events`, or return None."""
         if self.dispatcher.unnoted is not None:
@@ -169,17 +171,8 @@ class Arbiter(LineMachine):
     def poll_timeout(self) -> float:
         """Return when `handle_timeout` is to be called, in seconds on the caller's clock; inf if nothing is due."""
         # It is asked after every byte that comes. A call of `min` takes more than twice as long.
-        deadlines = self._deadlines
-        earliest = deadlines.line
-        if deadlines.schedule < earliest:
-            earliest = deadlines.schedule
-        if deadlines.expiry < earliest:
-            earliest = deadlines.expiry
-        if deadlines.failing < earliest:
-            earliest = deadlines.failing
-        if deadlines.health < earliest:
-            earliest = deadlines.health
-        return earliest
+        line, other = self._deadlines.line, self._deadlines.earliest_other
+        return line if line < other else other
 
     def reset_statistics(self, now: float) -> None:
         """Begin the counts of the line and of its nodes anew."""

@@ -78,7 +78,7 @@ class Choice:
         answers = exchange.answers
 
         def alike(other: Sequence[bytes], node: NodeRecord) -> bool:
-            return other == answers
+            return other == answers or in_step.clashes(other, now, node)
 
         # Only its first attempt: a late answer to that one is not the retry's, which needs proof as any other does.
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
@@ -211,27 +211,27 @@ class Choice:
         return None
 
     def _another(self, first: Chosen, now: float, unfit: Unfit, of: NodeRecord | None = None) -> Chosen | None:
-        """Take out one of the same class, `of` this node if one is given, or return None. No read overtakes a write to
-        its node, and no write anything that is for its node."""
+        """Take out a read of the same class, `of` this node if one is given, or return None. It overtakes no write to
+        its node. A write would prove less, for an ACK may be anybody's; and what spoils a read, which is repeated,
+        would leave a write unconfirmed."""
         opened: list[Exchange[Any]] = []
-        passed = {first[0].node}
         written = {first[0].node} if first[0].writes else set()
         in_step = self._in_step
         awaited = now < in_step.awaited_until(self._last_byte)
 
         def suits(other: Transaction) -> bool:
-            in_order = other.node not in (passed if other.writes else written)
-            if in_order and of in (None, other.node) and self._dispatcher.may_go(other, now):
-                exchange = _opened(other)
-                if exchange is not None and exchange.answered and not unfit(exchange.answers, other.node):
-                    spoilt = awaited and (_is_decisive((other, exchange)) or in_step.clashes(exchange.answers, now))
-                    if not spoilt:
-                        opened.append(exchange)
-                        return True
-            passed.add(other.node)
             if other.writes:
                 written.add(other.node)
-            return False
+                return False
+            if other.node in written or of not in (None, other.node) or not self._dispatcher.may_go(other, now):
+                return False
+            exchange = _opened(other)
+            if exchange is None or unfit(exchange.answers, other.node):
+                return False
+            if awaited and (_is_decisive((other, exchange)) or in_step.clashes(exchange.answers, now)):
+                return False
+            opened.append(exchange)
+            return True
 
         transaction = self._dispatcher.backlog.pick(first[0].priority, suits)
         return None if transaction is None else (transaction, opened[0])

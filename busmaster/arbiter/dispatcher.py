@@ -90,32 +90,34 @@ class Dispatcher:
     # requests
 
     def submit(self, transaction: Transaction, now: float) -> bool:
-        """Queue a transaction, or end it at once with the reason why not: then return False."""
+        """Queue a transaction, or end it at once with the reason why not. Returns False if nothing else has changed."""
         node, counters = transaction.node, self.counters
-        transaction.queued = now
+        transaction.queued, transaction.deadline = now, now + RETRY_PATIENCE
         transaction.exchanges_ahead = counters.exchanges  # as _waits does: this is done for every request
         transaction.settling_ahead = counters.spent[SETTLING]
         if self.fault is not None:
             self._end(transaction, now, name_error(self.fault(), transaction))
-            return False
+            return True
         if transaction.writes and transaction.priority is URGENT:  # even if it fails below: no enable may follow it
             self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
-        waiting = self.backlog.queues[transaction.priority].live
+        queue = self.backlog.queues[transaction.priority]
+        waiting = queue.live
         if transaction.writes:
             waiting = max(waiting, len(self.writes.queues[node]))  # those that are parked are in no class
         if waiting >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
-            return False
+            return True
         if (node.health is DOWN or now < node.suspended_until) and not self._may_ask(transaction, now):
-            return False
-        if transaction.writes:
+            return True
+        changed = transaction.writes  # it may have superseded others, which is to be told
+        if changed:
             self.writes.queues[node].append(transaction)
-        if transaction.deadline == inf:
-            transaction.deadline = now + RETRY_PATIENCE
         if transaction.start_by < inf:
             self._expiries.expect(transaction, len(self.backlog))
-        self.backlog.push(transaction)
-        return True
+            changed = True
+        transaction.phase = QUEUED  # as backlog.push does: this is done for every request
+        queue.push(transaction)
+        return changed
 
     def cancel(self, transaction: Transaction, now: float) -> None:
         """Note that a caller has gone: its transaction is not sent if still queued, unheard if on the wire (R6)."""
@@ -383,7 +385,7 @@ class Dispatcher:
         check = Transaction(node, command, priority=BACKGROUND, retries=0, probe=True)
         check.check = True
         check.wanted = False
-        check.queued = now
+        check.queued, check.deadline = now, inf
         self._waits(check)
         return check
 

@@ -9,11 +9,14 @@ class Echo:
     MSC's closing ACK echoes into the next exchange, so what is owed outlives an exchange.
     """
 
-    __slots__ = ("declared", "owed")
+    __slots__ = ("astray", "declared", "owed")
 
     def __init__(self, declared: bool) -> None:
         self.declared = declared
         self.owed = b""
+        self.astray = False
+        """An echo did not come whole, nor did one after it: what comes may be our own words, which can look like
+        somebody's reply."""
 
     def sent(self, data: bytes) -> None:
         """Expect what was sent to come back, if the line is `declared` to echo."""
@@ -27,11 +30,15 @@ class Echo:
         if data[:length] != owed[:length]:
             # Nothing after this can be told from echo: who else was talking changed, ate or added bytes. Looking for
             # where the echo goes on would be searching, and might find it in somebody's reply.
-            self.owed = b""
+            self.forget()
             return None
         self.owed = owed[length:]
+        if not self.owed:  # echoes come in order: nothing is to come of those before
+            self.astray = False
         return data[length:]
 
     def forget(self) -> None:
         """Expect no more echo: the line settles, and what is still owed would be discarded anyway."""
-        self.owed = b""
+        if self.owed:
+            self.owed = b""
+            self.astray = True

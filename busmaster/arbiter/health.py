@@ -140,7 +140,7 @@ class NodeRecord:
         # is what it must not forget.
         slowest = self.slowest
         self.slowest = took if took > slowest else slowest - SLOWEST_DECAY * (slowest - took)
-        if len(self.answered) < MOST_ANSWERED and answers not in self.answered and not command.writes:
+        if answers not in self.answered and len(self.answered) < MOST_ANSWERED and not command.writes:
             self.answered[answers] = command
 
     @property

@@ -153,14 +153,6 @@ class InStep:
         self._doubted += [(debt.key, debt.asked + LAPSE) for debt in forgiven]
         self.debts = [debt for debt in self.debts if not _could_be(debt, answers)]
 
-    def doubtful_answer(self, answers: Sequence[bytes]) -> None:
-        """Pay the oldest debt of this kind: its reply came, or the right answer, and one of the two is still owed."""
-        for place, debt in enumerate(self.debts):
-            # not where talkers may have met on the line: there, only a whole reply that came late pays
-            if debt.awaited is None and _could_be(debt, answers):
-                del self.debts[place]
-                return
-
     def answered(self, node: NodeRecord, asked: float, now: float, patience: float) -> None:
         """Note a right answer that could be nobody else's, to what `node` was asked at `asked`.
 

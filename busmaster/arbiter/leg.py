@@ -147,11 +147,13 @@ class Leg:
         if self.end > self.begun_at:
             self.end = self.out = self.begun_at
 
-    def came_unasked(self, now: float) -> None:
+    def came_unasked(self, now: float) -> float:
         """Note that something came: perhaps the reply that was given up, and its next leg begins here. Or it was noise,
-        and the next leg is still to come after that: what is known of it is kept until the line has settled."""
+        and the next leg is still to come after that: what is known of it is kept until the line has settled. Returns
+        `past`."""
         if self._follows is not None:
             self._follows_until = max(self._follows_until, self._past(now, self._follows))
+        return self.past()
 
     def settled(self) -> None:
         """Note that nothing of the leg can come any more."""

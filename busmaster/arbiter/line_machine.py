@@ -152,7 +152,8 @@ class LineMachine:
             leg = self._leg  # as leg.shift does: this is done for every request
             leg.end += late
             leg.out += late
-            leg.taint_until += late
+            if leg.paced:
+                leg.taint_until += late
             self._deadlines.line += late
             if self.state is SETTLING:
                 self._silent_at += late
@@ -182,15 +183,16 @@ class LineMachine:
     def handle_timeout(self, now: float, *, unread: bool = False) -> None:
         """Do what is due. If `unread`, bytes have come that were not handed over: the line's silence is not known."""
         deadlines = self._deadlines
-        if now >= deadlines.failing:
-            self.dispatcher.fail_more(now)
-        if now >= deadlines.schedule:
-            self.dispatcher.release_polls(now)
-        if now >= deadlines.expiry and not unread:
-            self.dispatcher.expire(now)
-        if now >= deadlines.health:
-            self._enter(self.state, now)
-            self.dispatcher.probe(now, self.state is READY)
+        if now >= deadlines.earliest_other:
+            if now >= deadlines.failing:
+                self.dispatcher.fail_more(now)
+            if now >= deadlines.schedule:
+                self.dispatcher.release_polls(now)
+            if now >= deadlines.expiry and not unread:
+                self.dispatcher.expire(now)
+            if now >= deadlines.health:
+                self._enter(self.state, now)
+                self.dispatcher.probe(now, self.state is READY)
         if now >= deadlines.line and not unread:
             if self.state is EXCHANGE:
                 if self._trust.held is None:
@@ -230,15 +232,14 @@ class LineMachine:
     def _begin_reply(self, data: bytes, now: float) -> bytes:
         """Take the first bytes of a leg. Returns those that may be its reply."""
         wire, leg = self._wire, self._leg
-        transaction, exchange = wire.transaction, wire.exchange
+        transaction = wire.transaction
         assert transaction is not None
-        assert exchange is not None
         if now < leg.taint_until or wire.output.held:
             self._counters.tainted += 1
             self._unasked.last_byte = now
             self._attempt_failed(FrameError(TOO_EARLY, heard=data), now)
             return b""
-        if not exchange.answered:
+        if not wire.answered:
             self._unasked.note(data, now, leg.quiet())
             wire.came_unasked = True
             return b""
@@ -284,9 +285,9 @@ class LineMachine:
         transaction, exchange = wire.transaction, wire.exchange
         assert transaction is not None
         assert exchange is not None
-        answered = exchange.answered
+        answered, rest = wire.answered, step.rest
         if answered:
-            if self._in_step.alert or step.rest:
+            if self._in_step.alert or rest:
                 verdict = self._trust.weigh(wire, step, now)
                 if isinstance(verdict, str):
                     self._disbelieve(verdict, step, now)  # before what follows: it proves not that its request left
@@ -304,9 +305,9 @@ class LineMachine:
         wire.transaction = wire.exchange = self._trust.held = None
         self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, step.value, now)
-        if step.rest:
-            self._unasked.note(step.rest, now, leg.quiet())
-        if step.rest or wire.came_unasked or (self._echo.owed and not answered):  # a broadcast's echo may never come
+        if rest:
+            self._unasked.note(rest, now, leg.quiet())
+        if rest or wire.came_unasked or (self._echo.owed and not answered):  # a broadcast's echo may never come
             self._settle(now)
             return
         self._unasked.unanswered_one = None
@@ -389,7 +390,7 @@ class LineMachine:
         if self._closed:
             self._go_offline(now)
         elif hold or not self._advance(now):  # behind a closing ACK, in the same write: waiting for it took a timer
-            free = max(self._leg.out, now) + hold
+            free = hold + (self._leg.out if self._leg.out > now else now)  # a call of `max` takes three times as long
             self._enter(HOLDOFF if free > now else READY, now)
             self._deadlines.line = free if free > now else inf
 
@@ -442,7 +443,7 @@ class LineMachine:
 
     def _hear_out(self, run: bytes, now: float) -> None:
         """Take what came before this silence: whoever said it, and owed it, is alive (R11, R15)."""
-        node = self._trust.hear(self._wire, run, self._unasked, now) if run else None
+        node = self._trust.hear(self._wire, run, self._unasked, now, self._echo.astray) if run else None
         if node is not None and node.health is DOWN:
             self.dispatcher.probes.alive(node, now)
 
@@ -459,6 +460,8 @@ class LineMachine:
         """Take the echo of what was sent off the front, byte for byte; a mismatch is a collision."""
         rest = self._echo.strip(data)
         self._unasked.last_byte = now  # where the echo is lost, this may be another's byte that looks like it
+        if self.state is SETTLING:  # an ACK, then, before its packet (MSC)
+            self._silent_at = max(self._silent_at, self._leg.came_unasked(now))
         if rest is None:
             self._counters.collisions += 1
             self.events.append(CameUnasked(data, collision=True))
@@ -470,8 +473,7 @@ class LineMachine:
         if not self._echo.owed and self.state is EXCHANGE and not self._leg.begun:
             self._wire.output.held = False  # it is heard, so it has left
             due = self._leg.echoed(now)
-            answered = self._wire.exchange is not None and self._wire.exchange.answered
-            self._deadlines.line = due if answered else now + self._leg.timing.turnaround
+            self._deadlines.line = due if self._wire.answered else now + self._leg.timing.turnaround
         return rest
 
     def _go_offline(self, now: float) -> None:
@@ -481,8 +483,7 @@ class LineMachine:
         self.noisy = False
         self._deadlines.line = inf
         self._echo.forget()
-        self._unasked.answered()
-        self._unasked.silent()
+        self._unasked.forget()
         if transaction is not None:
             self._wire.output.discard()
             self._trust.owe(self._wire, heard=True)

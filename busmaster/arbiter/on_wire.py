@@ -18,11 +18,23 @@ from busmaster.contract.exchange import Abandonable, Exchange, Expect, Step
 class OnWire:
     """Of one line. `transaction` and `exchange` are None while nothing is asked; `leg` and `output` outlive them."""
 
-    __slots__ = ("_deadlines", "_echo", "_urgent_waits", "came_unasked", "exchange", "leg", "output", "transaction")
+    __slots__ = (
+        "_deadlines",
+        "_echo",
+        "_urgent_waits",
+        "answered",
+        "came_unasked",
+        "exchange",
+        "leg",
+        "output",
+        "transaction",
+    )
 
     def __init__(self, leg: Leg, echo: Echo, deadlines: Deadlines, urgent_waits: Callable[[], bool]) -> None:
         self.transaction: Transaction | None = None
         self.exchange: Exchange[Any] | None = None
+        self.answered = True
+        """An answer to `exchange` is due: it is no broadcast."""
         self.leg = leg
         self.output = Output(leg, echo)
         self.came_unasked = False
@@ -35,13 +47,16 @@ class OnWire:
         """Say its request, and set the deadline of its first leg."""
         self.transaction = transaction
         self.exchange = exchange
+        self.answered = answered = exchange.answered
         self.came_unasked = False
-        self.leg.learns = transaction.node.learning is not None
+        leg = self.leg
+        leg.learns = transaction.node.learning is not None
         request, timing = exchange.request, exchange.timing
-        due = self.leg.begin(timing, len(request), exchange.sizes.longest, now)
-        self._deadlines.line = due if exchange.answered else self.leg.end + timing.turnaround
+        due = leg.begin(timing, len(request), exchange.sizes.longest, now)
+        self._deadlines.line = due if answered else leg.end + timing.turnaround
         output = self.output  # as output.add does: this is done for every request
-        output.waiting += request
+        # nearly always nothing waits, and to add to nothing takes longer than to ask
+        output.waiting = output.waiting + request if output.waiting else request
         output.said_at = now
         if self._echo.declared:
             self._echo.sent(request)
@@ -81,11 +96,10 @@ class OnWire:
 
     def due_anew(self, now: float) -> float:
         """Return the deadline of the leg, where what was said has left only now."""
-        leg, exchange = self.leg, self.exchange
+        leg = self.leg
         if leg.begun:
             return leg.gap_over(now)
-        answered = exchange is not None and exchange.answered
-        return now + (leg.timing.window + leg.latency if answered else leg.timing.turnaround)
+        return now + (leg.timing.window + leg.latency if self.answered else leg.timing.turnaround)
 
     def _next_leg(self, step: Expect, now: float) -> None:
         """Begin the next leg. Raises FrameError instead, where a repeat would hold the line past its limit or an urgent

@@ -104,6 +104,15 @@ class Transaction:
         "writes",
     )
 
+    queued: float
+    deadline: float
+    """By which it wants to be answered."""
+    exchanges_ahead: int
+    settling_ahead: float
+    late: bool
+    """The reply to its last attempt began after the nominal time."""
+    # These are set when it is queued, or sent, and not before: each costs, and this is done for every request.
+
     def __init__(
         self,
         node: NodeRecord,
@@ -114,7 +123,7 @@ class Transaction:
         idempotent: bool | None = None,
         probe: bool = False,
         finish_by: float = inf,
-        *,
+        touches: object = None,
         tag: Any = None,
         poll: Poll | None = None,
     ) -> None:
@@ -138,7 +147,7 @@ class Transaction:
         self.probe = probe
         self.check = False
         """It is asked for the sake of its answer's likeness alone (R15): nobody waits for it, nothing counts it."""
-        self.touches: object = None
+        self.touches = touches
         """What a write changes, for its owner to know."""
         self.refused_until = -inf
         self.refused_cycles = 0
@@ -155,14 +164,9 @@ class Transaction:
         self.superseded = False
         self.unsure = False
         """An attempt was sent whose outcome is not known: it may have been carried out (R7)."""
-        self.late = False
-        self.deadline = inf
         self.value: Any = None
         self.error: BusError | None = None
-        self.queued = 0.0
         self.started = self.first_byte = self.last_byte = self.ended_at = -inf
-        self.exchanges_ahead = 0
-        self.settling_ahead = 0.0
 
     def timings(self) -> Timings:
         """Return the times of the next attempt: a learned window only for a read that is repeated if it is over."""

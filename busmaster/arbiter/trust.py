@@ -46,15 +46,16 @@ class Trust:
         if any(step.rest.startswith(key) for key in answers):
             return TWO_ANSWERS
         if in_step.clashes(answers, now, transaction.node):
-            in_step.doubtful_answer(answers)
+            # It pays nothing: it may be this request's, and what was owed before is still to come.
             return "its answer may be an earlier request's, whose own never came"
         if in_step.is_doubtful(answers, now) and not held:
             latest = leg.end + transaction.node.latest(leg.timing.window) + leg.latency
             if step.rest or leg.begun_at > latest:
                 return "its answer may be another's, said late or twice"
-            may_wait = not step.send  # MSC says its packet again until that is acknowledged
-            if may_wait and in_step.doubts(now):
-                self.held = step
+            if in_step.doubts(now):
+                if step.send:  # at once: MSC says its packet again until that is acknowledged
+                    wire.say(step.send, now)
+                self.held = Done(step.value)
                 return max(now, latest) + 2 * leg.byte_time
         in_step.answered(transaction.node, transaction.started, now, leg.timing.nominal)
         in_step.said(answers, now)
@@ -80,8 +81,14 @@ class Trust:
             transaction.node.unheard += not heard
             self._in_step.owe(keys, transaction.node, leg.end, over, awaited)
 
-    def hear(self, wire: OnWire, run: bytes, unasked: UnaskedBytes, now: float) -> NodeRecord | None:
-        """Take what came before this silence of the line. Returns who owed it, if that is known."""
+    def hear(
+        self, wire: OnWire, run: bytes, unasked: UnaskedBytes, now: float, ours: bool = False
+    ) -> NodeRecord | None:
+        """Take what came before this silence of the line. Returns who owed it, if that is known. It pays nothing where
+        it may be `ours`, an echo that went astray: the end of a request can be a whole right reply of somebody's."""
+        if ours:
+            self._in_step.owe((ANY_BYTE,), None, now, now)
+            return None
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
         if paid is not None and node is not None and node.learning is not None and paid.awaited is not None:

@@ -18,7 +18,7 @@ STRAGGLER_SHARE = 0.75
 STRAGGLER_MARGIN = 1.6
 LONGEST_LATENESS = 0.5
 STRAGGLER_MEMORY = 1.0
-"""Seconds after which a unasked byte is no longer blamed on the last unanswered request."""
+"""Seconds after which an unasked byte is no longer blamed on the last unanswered request."""
 LOOKS = 10
 """In so many parts of a lateness the line is looked at while a straggler may come."""
 LOOK_SLACK = 0.005
@@ -71,6 +71,12 @@ class UnaskedBytes:
     def unanswered(self, node: NodeRecord, asked: float, lateness: float) -> None:
         """Note that a request, out since `asked`, got no reply in its window; what comes next may be its straggler."""
         self.unanswered_one = (node, asked, lateness)
+
+    def forget(self) -> None:
+        """Forget what came: the port is lost, and nothing that comes through the next one goes on with it."""
+        self.answered()
+        self.silent()
+        self.reply_to_silence()  # half a packet, which cannot be acknowledged any more
 
     def answered(self) -> None:
         """Note that no request is unanswered any more: what comes next is nobody's straggler."""

@@ -17,7 +17,7 @@ Side: TypeAlias = Literal["low", "high"]
 class AlarmChanged:
     """A polled value is above `high` or below `low` of its point (`active`), or no longer.
 
-    `limit` is the one that it crossed, `bound` that limit. `value` is None where it ended as the point is polled no
+    `limit` is the one that it crossed, `bound` that limit. `value` is None where it ended as the point is watched no
     more.
     """
 
@@ -33,7 +33,7 @@ class AlarmChanged:
         crossed = f"{'above' if self.limit == 'high' else 'below'} its {self.limit} of {self._text(self.bound)}"
         if self.active:
             return f"{self.point.key} = {self._text(self.value)} is {crossed}"
-        how = "is polled no more" if self.value is None else f"is back at {self._text(self.value)}"
+        how = "is watched no more" if self.value is None else f"is back at {self._text(self.value)}"
         return f"{self.point.key} {how}, was {crossed}"
 
     def _text(self, value: float | None) -> str:
@@ -64,14 +64,14 @@ class Alarms:
             if sample is None or sample.error is not None or not isinstance(sample.value, int | float):
                 continue
             before = self.states.get(point)
-            now = before
-            if before is not None and not _holds(before.limit, point, sample.value):
+            if before is not None and _holds(before.limit, point, sample.value):
+                continue
+            now = _begun(point, sample.value)
+            if before is not None:
                 told.append(replace(before, value=sample.value, active=False))
-                now = None
-            if now is None:
-                now = _begun(point, sample.value)
-                told += [now] if now is not None else []
-            if now is not before or point not in self.states:
+            if now is not None:
+                told.append(now)
+            if before is not None or now is not None or point not in self.states:
                 changed[point] = now
         self._become({**self.states, **changed} if changed else self.states, told)
 

@@ -127,6 +127,7 @@ class Bus:
         except BaseException as error:
             self._line.unbind()
             await connection.close()
+            self.pump.stop()
             if isinstance(error, BusError):
                 error.line = self.endpoint.name
             raise

@@ -77,10 +77,11 @@ class Limiter:
         """
         urgent = options.priority is Priority.URGENT
         reached = list(self._reached(node))
-        for one in reached:
-            one.urgent += urgent
         if not stop:
             self.check(node, command)
+        for one in reached:
+            one.urgent += urgent  # one that was just refused is not sent, and overtakes nothing
+        if not stop:
             reached = [one for one in reached if one.touched_by(_changes(node, command))]
         async with AsyncExitStack() as held:
             if not (urgent or stop) and any(limit.max_step for one in reached for limit in one.limits):

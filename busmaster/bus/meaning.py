@@ -150,11 +150,13 @@ class Meaning:
 
     def named(self, value: Any) -> Any:
         """Return the value with its names; as it is where it has none, or other ones from its protocol."""
-        if isinstance(value, Enum) or not isinstance(value, int | float) or value != value // 1:
+        if not isinstance(value, int | float) or value != value // 1:
             return value
         number = int(value)
         if self.labels:
             return Named(number, self.labels[number]) if number in self.labels else value
+        if isinstance(value, Enum):
+            return value
         return Named(number, "|".join(name for name, bit in self.bits.items() if number >> bit & 1))
 
 

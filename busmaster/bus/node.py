@@ -54,6 +54,8 @@ class Node:
         self.reply_time: float | None = None
         """Seconds from a request to its reply, as poll groups measured them; before, as somebody said, or None."""
         self._measured = 0
+        self._to_all = record.address == record.profile.broadcast
+        """Nobody answers at its address."""
         self.returning = asyncio.Lock()
         """Held while its hook runs."""
         self._on_return: Callable[[Node], Awaitable[None]] | None = None
@@ -166,10 +168,7 @@ class Node:
         self.shared.arbiter.change_profile(self.record, replace(self.record.profile, merge=merge))
 
     def limit(self, limit: Limit, /) -> None:
-        """Refuse, from now on, every write beyond a limit, whatever names what it writes; also of those to all nodes.
-
-        Raises InvalidCommand for what this node's line never reads so.
-        """
+        """Refuse, from now on, every write beyond a limit, whatever names it; writes to all nodes too."""
         line = self.shared
         line.limiter = line.limiter or Limiter()
         line.limiter.add(self, limit)
@@ -258,7 +257,7 @@ class Node:
         stops_seen: int | None = None,
     ) -> tuple[Transaction, asyncio.Future[Any]]:
         record, line = self.record, self.shared
-        if record.address == record.profile.broadcast and not command.writes:
+        if self._to_all and not command.writes:
             raise InvalidCommand(
                 f"{self.profile.name}: address {self.address} is for writes to all; nobody answers a read"
             )
@@ -283,8 +282,8 @@ class Node:
             options.idempotent,
             probe,
             inf if options.finish_within is None else line.now() + options.finish_within,
+            self if touches is None else (self, touches),
         )
-        transaction.touches = self if touches is None else (self, touches)
         return transaction, line.pump.transact(transaction)
 
     def _give_up(self, transaction: Transaction) -> None:

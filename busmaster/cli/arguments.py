@@ -8,10 +8,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
 from busmaster.cli.capturing import capture_option, capturing
+from busmaster.cli.lines import is_line_file
 from busmaster.cli.parsing import Whole, option_type, parse_nodes, parse_seconds, parse_window, parsed
 from busmaster.cli.protocols import handle_options, protocol_option, take_options
 from busmaster.contract.learning import Learned
@@ -23,6 +25,9 @@ from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+NOT_THE_FILES = ("capture", "capture_files", "capture_mb", "verify", "as_json")
+"""Options that say nothing of a line, and stand beside a LINE.toml."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,13 +135,16 @@ def checked(profile: Profile, nodes: Iterable[int]) -> tuple[int, ...]:
     return tuple(nodes)
 
 
-def slaves_of(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
-    """Return the addresses to emulate: those of --nodes, else 1, or the one drive. Raises UsageError."""
-    if nodes is None:
-        return (1,) if 1 in profile.addresses else (profile.addresses[0],)
+def single_nodes(profile: Profile, nodes: Sequence[int]) -> tuple[int, ...]:
+    """Return the nodes that were given. Raises UsageError as `checked`, and for the address that means all nodes."""
     if profile.broadcast in nodes:
         raise click.UsageError(f"{profile.name}: no node has address {profile.broadcast}, which means all of them")
     return checked(profile, nodes)
+
+
+def nodes_to_ask(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
+    """Return the addresses to ask: those of --nodes, else all. Raises UsageError for one that no node can have."""
+    return tuple(profile.addresses) if nodes is None else single_nodes(profile, nodes)
 
 
 def span(profile: Profile) -> str:
@@ -144,13 +152,16 @@ def span(profile: Profile) -> str:
     return f"{profile.addresses[0]}-{profile.addresses[-1]}"
 
 
-def connected(command: F) -> F:
-    """Give a command PORT, --protocol and the options of a port, as one `Connection` named `connection`."""
+def connected(command: F, *, or_file: bool = False) -> F:
+    """Give a command PORT, --protocol and the options of a port, as one `Connection` named `connection`.
+
+    `or_file`: PORT may be a LINE.toml, which says all of that; `connection.protocol` is then "".
+    """
 
     @functools.wraps(command)
     def gathered(
         port: str,
-        protocol: str,
+        protocol: str | None,
         baud: int | None,
         echo: bool,
         timeout: float | Learned | None,
@@ -158,13 +169,17 @@ def connected(command: F) -> F:
         capture: str | None,
         **options: Any,
     ) -> Any:
+        if or_file and is_line_file(port):
+            protocol = none_but_the_files(port)
+        elif protocol is None:
+            raise click.UsageError("say what is spoken there: --protocol P, or a LINE.toml in place of the port")
         own = take_options(handle_options(), protocol, options)
         connection = Connection(port, protocol, baud, echo, timeout, retries, capture, own)
         return command(connection=connection, **options)
 
     options = (
-        click.argument("port"),
-        protocol_option(),
+        click.argument("port", metavar="PORT|LINE.toml" if or_file else "PORT"),
+        protocol_option(required=not or_file),
         click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default."),
         click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire)."),
         click.option(
@@ -179,6 +194,17 @@ def connected(command: F) -> F:
     for option in reversed(options):  # the help lists first what was put on last
         gathered = option(gathered)
     return gathered  # type: ignore[return-value]  # the decorated function takes more than the one it wraps
+
+
+def none_but_the_files(path: str) -> str:
+    """Return "", the protocol of a whole file. Raises UsageError for an option that the file stands for."""
+    context = click.get_current_context()
+    for parameter in context.command.get_params(context):
+        name = parameter.name or ""
+        said = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        if said and isinstance(parameter, click.Option) and name not in NOT_THE_FILES:
+            raise click.UsageError(f"{path} says what is on the line: leave out {parameter.opts[0]}")
+    return ""
 
 
 def viewed(command: F) -> F:

@@ -20,6 +20,20 @@ LIMITS = "busmaster.capture"
 """Where the command's context keeps what is said of a capture beside its name."""
 
 
+def _limit(name: str, metavar: str, default: int, text: str) -> Callable[[F], F]:
+    """Return an option whose value goes to the command's context, and not to the command itself."""
+    return click.option(
+        name,
+        type=Whole(min=1),
+        default=default,
+        show_default=True,
+        metavar=metavar,
+        expose_value=False,
+        callback=_keep,
+        help=text,
+    )
+
+
 def _keep(context: click.Context, option: click.Parameter, value: int) -> None:
     context.meta[f"{LIMITS}.{option.name}"] = value
 
@@ -27,25 +41,12 @@ def _keep(context: click.Context, option: click.Parameter, value: int) -> None:
 def capture_option(command: F) -> F:
     """Give a command `capture`, the path or None; its limits reach `capturing` by the command's context."""
     options = (
-        click.option(
-            "--capture-files",
-            type=Whole(min=1),
-            default=COUNT,
-            show_default=True,
-            metavar="N",
-            expose_value=False,
-            callback=_keep,
-            help="Keep so many files of the capture, the newest.",
-        ),
-        click.option(
+        _limit("--capture-files", "N", COUNT, "Keep so many files of the capture, the newest."),
+        _limit(
             "--capture-mb",
-            type=Whole(min=1),
-            default=SIZE // MEGABYTE,
-            show_default=True,
-            metavar="MB",
-            expose_value=False,
-            callback=_keep,
-            help="Begin the next file of the capture, FILE-2 and so on, after so many megabytes.",
+            "MB",
+            SIZE // MEGABYTE,
+            "Begin the next file of the capture, FILE-2 and so on, after so many megabytes.",
         ),
         click.option(
             "--capture",

@@ -60,6 +60,7 @@ def emulated_line() -> Iterator[str]:
             yield path
         finally:
             process.stdin.close()
+            process.wait()  # Popen's own waits no longer than a quarter of a second for one that Ctrl-C ended
 
 
 async def demo(path: str, view: View) -> int:

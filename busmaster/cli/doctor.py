@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import click
 
-from busmaster.cli.arguments import Connection, checked, nodes_option, only_address
+from busmaster.cli.arguments import Connection, nodes_option, nodes_to_ask
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit_all, note
 from busmaster.cli.parsing import Whole, option_type, parse_window, parsed
 from busmaster.cli.protocols import protocol_option
 from busmaster.contract.learning import documented
-from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.profile import LineSettings
 from busmaster.doctor.adapters import Finding
 from busmaster.doctor.examination import Patient, examine
 from busmaster.transport.endpoints import endpoint
@@ -78,18 +78,6 @@ def patient_of(connection: Connection, nodes: Sequence[int] | None) -> Patient:
     settings = USUAL if connection.baud is None else replace(USUAL, baudrate=connection.baud)
     where = parsed(lambda port: endpoint(port, defaults=settings), connection.port)
     return Patient(replace(where, echo=True) if connection.echo else where, progress=Bar)
-
-
-def nodes_to_ask(profile: Profile, nodes: Sequence[int] | None) -> tuple[int, ...]:
-    """Return the addresses to ask: those of --nodes, else all.
-
-    Raises UsageError for addresses that no node can have.
-    """
-    if nodes is None:
-        return tuple(profile.addresses) if profile.addressed else (only_address(profile),)
-    if profile.broadcast in nodes:
-        raise click.UsageError(f"{profile.name}: no node has address {profile.broadcast}, which means all of them")
-    return checked(profile, nodes)
 
 
 def lines_of(finding: Finding) -> Iterator[str]:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import os
 import random
-import threading
+import time
+from collections.abc import Sequence
+from math import inf
 
 import click
 
-from busmaster.cli.arguments import line_settings, nodes_option, seconds_option, slaves_of
+from busmaster.cli.arguments import line_settings, nodes_option, seconds_option, single_nodes
 from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import emit
 from busmaster.cli.parsing import Whole, option_type, parse_host_port, parsed
 from busmaster.cli.protocols import protocol_option
 from busmaster.config import ConfiguredLine, LineFile, emulated_line
+from busmaster.contract.profile import Profile
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import NAMES, Faults
 from busmaster.emulator.line import Line
@@ -23,6 +26,9 @@ from busmaster.registry import find, make_device
 from busmaster.transport.identity import USB
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
+
+LOOK_FOR_SIGNALS = 0.2
+"""Seconds from one look to the next."""
 
 
 @click.command(short_help="Emulate drives on a pseudo-terminal or a TCP port.")
@@ -81,7 +87,17 @@ def command(
         line = drives(protocol, nodes, baud, reply_delay, faults, seed, paced)
     with serve(line, pty, tcp) as server:
         emit(server.path)
-        threading.Event().wait(seconds)
+        serve_for(seconds)
+
+
+def serve_for(seconds: float | None) -> None:
+    """Wait so many seconds, or for ever, while the line's own thread serves it.
+
+    A signal that the system hands to that thread wakes nobody here, so that it is looked for.
+    """
+    end = inf if seconds is None else time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        time.sleep(min(left, LOOK_FOR_SIGNALS))
 
 
 def line_of(file: LineFile, delay: Delay | None, faults: tuple[str, ...], seed: int | None, paced: bool) -> Line:
@@ -115,12 +131,19 @@ def drives(
     if protocol is None:
         raise click.UsageError("name a LINE.toml, or the drives: --protocol P")
     profile = find(protocol).profile
-    devices = [make_device(protocol, address, delay=delay) for address in slaves_of(profile, nodes)]
+    devices = [make_device(protocol, address, delay=delay) for address in nodes_to_emulate(profile, nodes)]
     wrong = parsed(Faults.parse, faults)
     for device in devices:
         device.faults = wrong
     chance = random.Random(1 if seed is None else seed)
     return Line(line_settings(profile, baud), devices, chance=chance, paced=paced)
+
+
+def nodes_to_emulate(profile: Profile, nodes: Sequence[int] | None) -> Sequence[int]:
+    """Return the addresses to emulate: those of --nodes, else 1, or the one drive. Raises UsageError."""
+    if nodes is not None:
+        return single_nodes(profile, nodes)
+    return (1,) if 1 in profile.addresses else profile.addresses[:1]
 
 
 def serve(line: Line, link: str | None, address: tuple[str, int] | None) -> LineServer:

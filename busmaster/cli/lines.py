@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
+import anyio
 import click
 
+from busmaster.cli.output import Level, note
 from busmaster.config import LineFile, line_settings, load
+from busmaster.gate.record import WriteRecord
+from busmaster.outputs.distributor import Distributor
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
+
+PATIENCE = 5.0
+"""Seconds in which outputs are to keep a record of what was written, and what waited before it."""
+LOOK = 0.02
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -36,4 +45,25 @@ def other_port(file: LineFile, port: str | None) -> SerialPort | TcpPort | None:
     return None if port is None else endpoint(port, defaults=line_settings(file))
 
 
-__all__ = ["file_argument", "load", "other_port", "port_option"]
+def is_line_file(port: str) -> bool:
+    """Tell whether PORT is a LINE.toml that is there."""
+    return port.endswith(".toml") and os.path.isfile(port)
+
+
+async def keep(audit: Distributor, records: Iterable[WriteRecord]) -> None:
+    """Have the outputs of a line keep these records of what was written; one that could not is named."""
+    audit.start(())
+    for record in records:
+        audit.record(record)
+    with anyio.move_on_after(PATIENCE):
+        # what waits on disk goes first, and would keep these there too if the outputs were closed at once
+        while any(counts.waiting and not counts.error for counts in audit.statistics()):  # noqa: ASYNC110  # by threads
+            await anyio.sleep(LOOK)
+    await audit.close()
+    for counts in audit.statistics():
+        if counts.dropped:
+            why = f": {counts.error}" if counts.error else " in time"
+            note(f"{counts.kind} could not keep the record of what was written{why}", Level.WARNING)
+
+
+__all__ = ["file_argument", "is_line_file", "keep", "load", "other_port", "port_option"]

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import time
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 import anyio
@@ -22,16 +21,17 @@ from busmaster.capture.recorder import Recorder
 from busmaster.cli.arguments import Connection
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
-from busmaster.cli.lines import load
+from busmaster.cli.lines import is_line_file, load
 from busmaster.cli.output import Level, emit, emit_all, json_line, note, value_text
 from busmaster.cli.overheard import Overheard, feed, only_protocol, silent
 from busmaster.cli.parsing import Whole
 from busmaster.cli.protocols import protocol_option
 from busmaster.cli.run import output_text
 from busmaster.config import ConfiguredLine, LineFile
-from busmaster.errors import BusError, LineDown
-from busmaster.outputs.values import cycle_fields
+from busmaster.errors import LineDown, cause_text
+from busmaster.outputs.values import cycle_fields, utc
 from busmaster.registry import find
+from busmaster.transport.endpoints import Endpoint
 
 ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 
@@ -68,11 +68,6 @@ def command(port: str, protocol: str | None, baud: int | None, as_json: bool, ca
         until_ended(listen, endpoint, decoder, lambda frame: emit(write(frame, names)), recorder)
 
 
-def is_line_file(port: str) -> bool:
-    """Tell whether PORT is a LINE.toml that is there."""
-    return port.endswith(".toml") and os.path.isfile(port)
-
-
 def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
     """Listen to the line of a file until Ctrl-C. Nothing is ever sent, whoever asks for it."""
     protocol = only_protocol(file)
@@ -104,10 +99,9 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
 
 
 def plain_values(snapshot: Snapshot) -> list[str]:
-    """Return a line a value, as `2026-11-22T14:02:11.485+00:00 winder/position 12.5`."""
+    """Return a line a value, as `2026-11-22T14:02:11.485Z winder/position 12.5`."""
     return [
-        f"{datetime.fromtimestamp(sample.wall, UTC).isoformat(timespec='milliseconds')} "
-        f"{point.key} {value_text(sample.value, point.meaning.precision)}"
+        f"{utc(sample.wall)} {point.key} {value_text(sample.value, point.meaning.precision)}"
         for point, sample in snapshot.samples.items()
     ]
 
@@ -139,7 +133,7 @@ class Listener(asyncio.Protocol):
         """Tell the last frame, and end `lost` with LineDown."""
         self._rest()
         if not self.lost.done():
-            what = cause.what if isinstance(cause, BusError) else str(cause or "the line was closed")
+            what = cause_text(cause, "the line was closed")
             self.lost.set_exception(LineDown(what, hint="start again when it is back"))
 
     def _rest(self) -> None:
@@ -159,7 +153,7 @@ class Listener(asyncio.Protocol):
 
 
 async def listen(
-    endpoint: Any, decoder: Decoder, tell: Callable[[Frame], None], recorder: Recorder | None = None
+    endpoint: Endpoint, decoder: Decoder, tell: Callable[[Frame], None], recorder: Recorder | None = None
 ) -> None:
     """Listen until the line is lost. Raises LineDown then, and the OSError of a frame that could not be told."""
     listener = Listener(decoder, tell, recorder)

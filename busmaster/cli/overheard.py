@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -20,7 +20,7 @@ from busmaster.capture.frames import Direction, Frame, Kind
 from busmaster.config import ConfiguredLine, LineFile
 from busmaster.contract.driver import Driver
 from busmaster.contract.exchange import Command
-from busmaster.contract.timing import ReplyTiming
+from busmaster.contract.places import Changing, Placed, Telling
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.outputs.settings import MqttSettings
 from busmaster.registry import Protocol, find
@@ -92,68 +92,83 @@ class HeardGroup:
 
 
 class Overheard:
-    """Makes samples of frames. An answer counts only where the reader of its request takes it, as in a master."""
+    """Makes samples of frames: of reads, and of writes that were confirmed, each of which may tell several points.
+
+    An answer counts only where the reader of its request takes it, as in a master.
+    """
 
     def __init__(self, protocol: Protocol, points: Iterable[Point[Any]]) -> None:
         self.groups: list[HeardGroup] = []
-        self._protocol = protocol
         self._profile = protocol.profile
         self._dialect = protocol.dialect()
-        self._points: dict[Question, list[Point[Any]]] = {}
+        self._nodes: dict[int, Node] = {}
+        self._by_command: dict[Question, list[Point[Any]]] = {}
+        self._by_place: dict[tuple[int, Hashable], list[Point[Any]]] = {}
         for point in points:
-            assert isinstance(point.node, Node)
-            self._points.setdefault((point.node.address, point.command), []).append(point)
-        self._asked: list[Point[Any]] = []
+            node = self._nodes[point.node.address] = Node.of(point)
+            self._by_command.setdefault((node.address, point.command), []).append(point)
+            for place in point.command.places if isinstance(point.command, Placed) else ():
+                self._by_place.setdefault((node.address, place), []).append(point)
+        self._asked: tuple[Node, Command[Any]] | None = None
         self._driver: Driver | None = None
-        self._timing: ReplyTiming | None = None
 
     def heard(self, frame: Frame) -> None:
         """Take the next frame that passed."""
         from_host = frame.sender is Direction.HOST
-        if from_host and frame.kind in (Kind.READ, Kind.WRITE) and not frame.continues:
+        if from_host and frame.kind in (Kind.READ, Kind.WRITE):  # a short command reads one more parameter
             self._ask(frame)
-        elif self._driver is not None and from_host:
-            self._go_on(self._driver)
+        elif from_host:
+            self._driver = None  # in the midst of an exchange, it has given that up
         elif self._driver is not None:
             self._answer(self._driver, frame)
 
     def _ask(self, frame: Frame) -> None:
         """Begin an exchange; a new request ends the exchange before."""
         self._driver = None
-        if frame.fault or frame.node is None or frame.kind is not Kind.READ:
+        address = frame.node if self._profile.addressed else self._profile.addresses[0]
+        node = None if address is None else self._nodes.get(address)
+        if frame.fault or node is None:
             return
         with suppress(InvalidCommand, KeyError, ValueError):
             command = self._dialect.command(frame, ())
-            self._asked = self._points.get((frame.node, command), [])
-            if self._asked:
-                exchange = command.open(frame.node, Node.of(self._asked[0]).timings)
-                self._timing = exchange.timing
-                self._driver = Driver(exchange, noise_tolerant=self._profile.noise_tolerant)
-
-    def _go_on(self, driver: Driver) -> None:
-        """Take what the host says in the midst: what the reader wants to say, or else it has given up."""
-        if not driver.said:
-            driver.expire()
-        driver.said.clear()
+            exchange = command.open(node.address, node.timings)
+            self._asked = node, command
+            self._driver = Driver(exchange, noise_tolerant=self._profile.noise_tolerant)
 
     def _answer(self, driver: Driver, frame: Frame) -> None:
-        timing, delay = self._timing, frame.delay or 0.0
-        if timing is None or frame.fault or frame.sender is not Direction.NODE or delay > timing.lateness:
+        timing, delay = driver.timing, frame.delay or 0.0
+        if frame.fault or frame.sender is not Direction.NODE or delay > timing.lateness:
             self._driver = None  # whatever still comes may be anybody's
             return
         driver.feed(frame.raw)
         if driver.ending is None:
             return
         self._driver = None
-        if driver.ending.delivered:
-            self._deliver(driver.ending.value, Quality.LATE if delay > timing.nominal else Quality.GOOD)
+        if driver.ending.delivered and self._asked is not None:
+            quality = Quality.LATE if delay > timing.nominal else Quality.GOOD
+            self._deliver(self._found(*self._asked, driver.ending.value), quality)
 
-    def _deliver(self, raw: Any, quality: Quality) -> None:
-        now = time.monotonic()
+    def _found(self, node: Node, command: Command[Any], value: Any) -> dict[Point[Any], Any]:
+        """Return what each point would have read, of all that the exchange tells."""
+        found: dict[Point[Any], Any] = dict.fromkeys(self._by_command.get((node.address, command), ()), value)
+        told: Mapping[Hashable, Any] = {}
+        if isinstance(command, Changing):
+            told = {place: now for place, now in command.changes(node.profile).items() if now is not None}
+        elif isinstance(command, Telling):
+            told = command.told(value, node.profile)
+        for place in told:
+            for point in self._by_place.get((node.address, place), ()):
+                assert isinstance(point.command, Placed)
+                with suppress(KeyError):  # a part of it alone was told
+                    found.setdefault(point, point.command.shown(told))
+        return found
+
+    def _deliver(self, found: Mapping[Point[Any], Any], quality: Quality) -> None:
+        now, wall = time.monotonic(), time.time()
         timeline = Timeline(now, now, now, now, 1, 0, 0.0)
-        for point in self._asked:
+        for point, raw in found.items():
             with suppress(BusError):  # it stands for no value of the point
-                sample = Sample(point.value_of(raw), None, now, now, now, quality, timeline, time.time())
+                sample = Sample(point.value_of(raw), None, now, now, now, quality, timeline, wall)
                 for group in self.groups:
                     group.take(point, sample)
 

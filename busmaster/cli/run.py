@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import asyncio
 import signal
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import anyio
 import click
-from anyio.streams.memory import MemoryObjectReceiveStream
 
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import View, viewed
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import Ending, until_ended
+from busmaster.cli.hangups import Hangups
 from busmaster.cli.lines import file_argument, load, other_port, port_option
 from busmaster.cli.output import Level, note, number_text
 from busmaster.cli.safe import tell_unsafe
@@ -47,6 +43,12 @@ def command(path: str, port: str | None, capture: str | None, view: View) -> int
     When it ends, however it ends, the writes of the file's [safe] are sent first. The exit status is 1 if one was not
     confirmed; else 0 after SIGTERM, 130 after Ctrl-C.
     """
+    with Hangups() as hangups:  # first of all: SIGHUP ends a process that does not hear it
+        return run(path, port, capture, view, hangups)
+
+
+def run(path: str, port: str | None, capture: str | None, view: View, hangups: Hangups) -> int:
+    """Run the line of a file until it is told to end, and return the exit status."""
     file = load(path)
     endpoint = other_port(file, port)
     where = endpoint or file.port
@@ -58,9 +60,12 @@ def command(path: str, port: str | None, capture: str | None, view: View) -> int
     sys.setswitchinterval(SWITCH_INTERVAL)
     with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
         running = Running(
-            ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only), path, view
+            ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only),
+            path,
+            view,
+            hangups,
+            ending := context.find_object(Ending),
         )
-        ending = context.find_object(Ending)
         if ending is not None:
             ending.patience = running.line.safe_state.within + FAREWELL
         try:
@@ -79,11 +84,13 @@ def command(path: str, port: str | None, capture: str | None, view: View) -> int
 class Running:
     """One line that runs as a file says, until it is told to end. `left_safely` says whether its safe state holds."""
 
-    def __init__(self, line: ConfiguredLine, path: str, view: View) -> None:
+    def __init__(self, line: ConfiguredLine, path: str, view: View, hangups: Hangups, ending: Ending | None) -> None:
         self.line = line
         self.left_safely = True
         self._leaving = False
         self._path = path
+        self._hangups = hangups
+        self._ending = ending
         self._watch = Watch(line.bus, line.file.title, view, gate=line.gate, steady=True)
         self._manager = ServiceManager()
 
@@ -92,19 +99,18 @@ class Running:
         entered = False
         self.line.outputs.tell = self._tell_of_output
         try:
-            with hangups() as heard:  # first of all: SIGHUP ends a process that does not hear it
-                async with self.line:
-                    entered = True
-                    try:
-                        return await self._poll(heard)
-                    finally:
-                        await self._leave()
+            async with self.line:
+                entered = True
+                try:
+                    return await self._poll()
+                finally:
+                    await self._leave()
         finally:
             for counts in self.line.outputs.statistics() if entered else ():
                 note(output_text(counts))
             self._manager.close()
 
-    async def _poll(self, hangups: MemoryObjectReceiveStream[None]) -> int:
+    async def _poll(self) -> int:
         for group in self.line.groups.values():
             self._watch.add(group)
         self._say_what_is_polled()
@@ -114,7 +120,8 @@ class Running:
             try:
                 async with anyio.create_task_group() as tasks:
                     tasks.start_soon(self._manager.show_life, self.line.bus)
-                    async for _ in hangups:
+                    while True:
+                        await self._hangups.next()
                         await self._read_again()
             finally:
                 await self._leave()  # at once: what is shown may take its time to end
@@ -163,6 +170,11 @@ class Running:
         down = any(counts.error for counts in self.line.outputs.statistics())
         self._watch.announce(text, Level.WARNING if down else Level.NOTICE)
 
+    def _why(self) -> str:
+        """Return what ends the run."""
+        number = self._ending.number if self._ending is not None else 0
+        return signal.Signals(number).name if number else "the end of the run"
+
     async def _leave(self) -> None:
         """Send the safe state, once: nothing else is written any more."""
         if self._leaving:
@@ -170,33 +182,10 @@ class Running:
         self._leaving = True
         self._manager.stopping()
         if self.line.safe_state:
-            outcomes = await self.line.safe_state.enter(self.line.bus)
+            outcomes = await self.line.safe_state.enter(self.line.gate, self._why())
             self.left_safely = tell_unsafe(outcomes) == OK
             if self.left_safely:
                 note(f"the safe state is confirmed: {', '.join(outcomes)}", Level.NOTICE)
-
-
-@contextmanager
-def hangups() -> Iterator[MemoryObjectReceiveStream[None]]:
-    """Yield a stream of what SIGHUP brings, from now on; several that come while one is served are one more."""
-    send, receive = anyio.create_memory_object_stream[None](1)
-
-    def heard() -> None:
-        try:
-            send.send_nowait(None)
-        except anyio.WouldBlock:
-            pass
-
-    ours = threading.current_thread() is threading.main_thread()  # asyncio hears signals nowhere else
-    loop = asyncio.get_running_loop()
-    with send, receive:
-        if ours:
-            loop.add_signal_handler(signal.SIGHUP, heard)
-        try:
-            yield receive
-        finally:
-            if ours:
-                loop.remove_signal_handler(signal.SIGHUP)
 
 
 def output_text(counts: OutputStatistics) -> str:

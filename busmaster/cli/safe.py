@@ -8,10 +8,11 @@ import click
 
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.ending import until_ended
-from busmaster.cli.lines import file_argument, load, other_port, port_option
+from busmaster.cli.lines import file_argument, keep, load, other_port, port_option
 from busmaster.cli.output import Level, emit, note
 from busmaster.config import ConfiguredLine
-from busmaster.errors import BusError
+from busmaster.errors import BusError, InvalidCommand
+from busmaster.gate.record import WriteRecord
 
 
 @click.command(short_help="Send the safe state of a file, and verify it.")
@@ -20,8 +21,8 @@ from busmaster.errors import BusError
 def command(path: str, port: str | None) -> int:
     """Send the writes that [safe] in LINE.toml lists, urgently, read each back, and print `POINT ok`.
 
-    Nothing is polled, and no output runs. What was not confirmed in the file's time is named on standard error, and
-    the exit status is 1. A port that is missing is waited for in that time.
+    Nothing is polled. The outputs keep a record of the writes, once those are over. What was not confirmed in the
+    file's time is named on standard error, and the exit status is 1. A port that is missing is waited for in that time.
     """
     file = load(path)
     line = ConfiguredLine(file, port=other_port(file, port), outputs=False, wait_for_port=True)
@@ -32,12 +33,20 @@ def command(path: str, port: str | None) -> int:
 
 async def leave(line: ConfiguredLine) -> int:
     """Send the safe state, print each point that was confirmed, and return the exit status."""
+    records: list[WriteRecord] = []
+    line.gate.record = records.append
     async with line.bus:
-        outcomes = await line.safe_state.enter(line.bus)
+        outcomes = await line.safe_state.enter(line.gate, "busmaster safe")
     for name, error in outcomes.items():
         if error is None:
             emit(f"{name} ok")
-    return tell_unsafe(outcomes)
+    status = tell_unsafe(outcomes)
+    # only now: no output, be it broken, is in the way of a stop
+    try:
+        await keep(line.audit(note), records)
+    except InvalidCommand as error:
+        note(f"no record is kept of what was written: {error}", Level.WARNING)
+    return status
 
 
 def tell_unsafe(outcomes: Mapping[str, BusError | None]) -> int:

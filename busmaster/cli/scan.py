@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from busmaster.bus.node import Node
-from busmaster.cli.arguments import Connection, connected, json_option, nodes_option
+from busmaster.cli.arguments import Connection, connected, json_option, nodes_option, nodes_to_ask
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit, json_line, json_value, value_text
 from busmaster.cli.protocols import NodeCommand
@@ -21,14 +21,7 @@ def command(connection: Connection, nodes: tuple[int, ...] | None, as_json: bool
 
     All addresses of the protocol are asked unless --nodes names some.
     """
-    profile = connection.profile
-    if nodes is None and profile.addressed:
-        nodes = tuple(profile.addresses)
-    if nodes is not None and profile.broadcast in nodes:
-        raise click.UsageError(
-            f"{profile.name}: address {profile.broadcast} is for writes to all: nobody answers there"
-        )
-    until_ended(scan, connection, connection.addresses(nodes), as_json)
+    until_ended(scan, connection, nodes_to_ask(connection.profile, nodes), as_json)
 
 
 async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool) -> None:

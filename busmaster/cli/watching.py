@@ -232,7 +232,7 @@ class Watch:
             self.tell(f"{name} = {action.value}: {error}")
             return
         write = await self.gate.write(Wish(door="screen", by="key w", name=point.key, point=point, value=value))
-        self.tell(f"{name} = {action.value} {'written' if write.ok else f': {write.error}'}".replace(" :", ":"))
+        self.tell(f"{name} = {action.value}{' written' if write.ok else f': {write.error}'}")
 
     def _utilisation(self, now: float, busy: float) -> float:
         self._loads.append((now, busy))
@@ -280,7 +280,7 @@ class Watch:
             text = f"{group.name}: {group.cycles} cycles, {group.missed} missed"
             if group.achieved is not None and group.p99 is not None:
                 text += f", period {group.achieved * 1000:.2f} ms mean, {group.p99 * 1000:.2f} ms p99"
-            note(f"{text}, line {self.bus.statistics().utilisation:.1%} busy")
+            note(f"{text}, line {counts.utilisation:.1%} busy")
         for node in self._nodes():
             note(
                 f"{node.label}: {node.requests} requests, {node.failed} failed, "

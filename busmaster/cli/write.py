@@ -1,18 +1,31 @@
-"""`busmaster write`: values of one node, acknowledged."""
+"""`busmaster write`: values of one node, or points of a file, acknowledged."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+
 import click
 
+from busmaster.bus.handle import Send
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
+from busmaster.cli.capturing import capturing
 from busmaster.cli.ending import until_ended
-from busmaster.cli.output import emit, json_line
+from busmaster.cli.lines import is_line_file, keep, load
+from busmaster.cli.output import emit, json_line, note
 from busmaster.cli.parsing import parse_assignment, parsed
 from busmaster.cli.protocols import ItemCommand
+from busmaster.config import ConfiguredLine
+from busmaster.errors import InvalidCommand
+from busmaster.gate.gate import Wish
+from busmaster.gate.record import WriteRecord
+
+Pairs = Sequence[tuple[str, tuple[float, ...]]]
+"""What is written, in its order: items, or points of a file, and their values."""
 
 
-@click.command(short_help="Write values of one node.", cls=ItemCommand)
-@connected
+@click.command(short_help="Write values of one node, or of a file's points.", cls=ItemCommand)
+@partial(connected, or_file=True)
 @node_option
 @click.argument("assignments", nargs=-1, required=True, metavar="ITEM=VALUE[,VALUE...]...")
 @click.option("--verify", is_flag=True, help="Read back and compare.")
@@ -24,14 +37,20 @@ def command(
 
     Several values go to ITEM and those after it. All values are checked before the first is sent; the first that
     fails ends it, with those before it written.
+
+    With a LINE.toml, ITEM is a point of it, as NODE/ITEM, and its value is in the point's unit. The file's limits
+    hold, and its outputs keep a record of each write, or of why it was refused.
     """
     pairs = [parsed(parse_assignment, text) for text in assignments]
-    until_ended(write, connection, connection.one_address(node), pairs, verify, as_json)
+    if not is_line_file(connection.port):
+        until_ended(write, connection, connection.one_address(node), pairs, verify, as_json)
+        return
+    file = load(connection.port)
+    with capturing(connection.capture, port=file.port.name, echo=file.port.echo) as recorder:
+        until_ended(write_points, ConfiguredLine(file, outputs=False, tap=recorder), pairs, verify, as_json)
 
 
-async def write(
-    connection: Connection, address: int, pairs: list[tuple[str, tuple[float, ...]]], verify: bool, as_json: bool
-) -> None:
+async def write(connection: Connection, address: int, pairs: Pairs, verify: bool, as_json: bool) -> None:
     """Write the pairs to one node, one after another, and print each; all are checked before the first is sent."""
     bus = connection.open_bus()
     handle = connection.open_handle(bus, address)
@@ -41,3 +60,39 @@ async def write(
             for send in sends:
                 await send()
             emit(json_line(node=connection.node_number(address), item=item, ok=True) if as_json else f"{item} ok")
+
+
+async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json: bool) -> None:
+    """Write the pairs to points of a line, as `write` does, and have its outputs keep a record of each."""
+    audit = line.audit(note)  # first: nothing is written of which no record can be kept
+    records: list[WriteRecord] = []
+    line.gate.record = records.append
+    try:
+        prepared = [(wish_of(line, name, values), prepare(line, name, values, verify)) for name, values in pairs]
+        async with line.bus:
+            for wish, send in prepared:
+                await pass_on(line, wish, send)
+                emit(json_line(point=wish.name, ok=True) if as_json else f"{wish.name} ok")
+    finally:
+        await keep(audit, records)
+
+
+async def pass_on(line: ConfiguredLine, wish: Wish, send: Send) -> None:
+    """Write one point, of which a record is kept."""
+    with line.gate.begin(wish):
+        await send()
+
+
+def wish_of(line: ConfiguredLine, name: str, values: Sequence[float]) -> Wish:
+    """Return what a person wants to have written. Raises InvalidCommand for what is no point of the line."""
+    value = values[0] if len(values) == 1 else tuple(values)
+    return Wish(door="command line", by="busmaster write", name=name, point=line.point(name), value=value)
+
+
+def prepare(line: ConfiguredLine, name: str, values: Sequence[float], verify: bool) -> Send:
+    """Return what writes a point. Raises InvalidCommand, of which a record is kept, for what may not be written."""
+    try:
+        return line.prepare_write(name, values, verify=verify)
+    except InvalidCommand as error:
+        line.gate.refuse(wish_of(line, name, values), str(error))
+        raise

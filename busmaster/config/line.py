@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from operator import is_
 from types import TracebackType
-from typing import Any
+from typing import Any, Unpack
 
 from busmaster.arbiter.tap import Tap
 from busmaster.bus.bus import Bus
-from busmaster.bus.handle import Handle
+from busmaster.bus.handle import Handle, Send
 from busmaster.bus.limits import Limit
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
+from busmaster.bus.requester import WriteOptions
 from busmaster.config.names import expanded, listed
 from busmaster.config.point_section import PointSection, check_suits, sort_of
 from busmaster.config.points import NamedPoint, Scale
@@ -28,6 +29,9 @@ from busmaster.outputs.distributor import Distributor, Wanted
 from busmaster.outputs.settings import MqttSettings
 from busmaster.planning import Plan, PlannedGroup
 from busmaster.transport.endpoints import Endpoint
+
+KEEPING_AUDIT = ("jsonl", "sqlite", "mqtt")
+"""The outputs that keep a record of writes."""
 
 
 class ConfiguredLine:
@@ -121,6 +125,37 @@ class ConfiguredLine:
         if not slash or node not in self.nodes:
             raise InvalidCommand(f"no such point {name!r}: use NODE/ITEM with one of {', '.join(self.nodes)}")
         return self._point(node, item)
+
+    def prepare_write(self, name: str, values: Sequence[float], **options: Unpack[WriteOptions]) -> Send:
+        """Return what writes a value to the point that the file calls so, or the values of a run, in the point's unit.
+
+        `RequestOptions` says what the options are. Raises InvalidCommand for what cannot be sent, or is beyond a limit.
+        """
+        point = self.point(name)
+        if not point.writable:
+            raise InvalidCommand(f"{name} is read-only")
+        if point.encode is not None and len(values) > 1:
+            try:
+                point.encode(tuple(values))
+            except (ArithmeticError, TypeError, ValueError) as error:
+                raise InvalidCommand(f"{name} does not take {len(values)} values: {error}") from None
+        handle = self.nodes[name.partition("/")[0]]
+        # one call, whatever it takes on the line: half of it must not be taken for nothing, or for the whole
+        [send] = handle.prepare_write(point.source.item, list(map(point.unscaled, values)), **options)
+        return send
+
+    def audit(self, tell: Callable[[str], None] = lambda _: None) -> Distributor:
+        """Return those outputs of the file that keep a record of writes, for a process that polls nothing.
+
+        They are not started, say nothing of the line's state, and take in no commands. Raises InvalidCommand if an
+        extra is missing.
+        """
+        audit = Distributor(self.bus, tell, in_charge=False)
+        for kind, settings in self.file.outputs.items():
+            if kind in KEEPING_AUDIT:
+                with self.file.table.table("outputs").table(kind).at():
+                    audit.add(kind, settings)
+        return audit
 
     def members(self, group: str) -> tuple[Point[Any], ...]:
         """Return the points of a poll group of the file."""

@@ -52,8 +52,7 @@ def _option(table: Table, option: Option) -> Any:
         case "addresses":
             return _addresses(table, option)
         case "tables":
-            tables = ((one, _fields(one, option.fields)) for one in table.tables(name))
-            return {each: fields for one, fields in tables for each in expanded(one.name)}
+            return {each: fields for one in table.tables(name) for each, fields in _named(one, option.fields)}
 
 
 def _addresses(table: Table, option: Option) -> Mapping[str, int]:
@@ -73,9 +72,12 @@ def _addresses(table: Table, option: Option) -> Mapping[str, int]:
             raise InvalidCommand(f"{path}: {error}") from None
 
 
-def _fields(table: Table, fields: Sequence[Option]) -> dict[str, Any]:
+def _named(table: Table, fields: Sequence[Option]) -> list[tuple[str, dict[str, Any]]]:
+    """Return what a table of `fields` says, under each name that its own stands for."""
     table.only(*(field.name for field in fields))
-    return read_options(table, fields)
+    said = read_options(table, fields)
+    with table.at():
+        return [(name, said) for name in expanded(table.name)]
 
 
 def read_delay(table: Table, key: str) -> Delay:

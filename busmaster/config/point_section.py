@@ -95,7 +95,10 @@ def _labels(table: Table, key: str) -> Mapping[int, str]:
     for number in named.data:
         if not is_decimal(number.removeprefix("-")):
             raise named.error(f'labels are of whole numbers: {{ 0 = "off" }}, not of {number!r}', number)
-    return {int(number): named.text(number) for number in named.data}
+    labels = {int(number): named.text(number) for number in named.data}
+    if len(labels) < len(named.data):
+        raise table.error("say twice what a number is called", key)
+    return labels
 
 
 def _named(table: Table, key: str, example: str) -> Table:
@@ -135,6 +138,8 @@ def _misfits(section: PointSection, point: Point[Any], kind: NodeKind) -> Iterat
     for key in ("bits", "labels"):
         if key not in said:
             continue
+        if sort == "set" and key == "labels":
+            yield key, f"cannot be said of {section.item}, which is a set of many: name them by bits"
         if sort == "float":
             yield key, f"are of whole numbers, and {section.item} has decimals"
         for scaled in ("factor", "offset", "decimals"):

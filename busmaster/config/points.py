@@ -132,10 +132,14 @@ class NamedPoint(Point[Any]):
         """Return the point of one bit of the word, under the file's name for the node."""
         return replace(cast("NamedPoint", Point.bit(self, name)), declared=False)
 
+    def unscaled(self, value: Any) -> Any:
+        """Return the protocol's own number for a value, or its run of numbers."""
+        return value if self.scale.trivial else self.scale.write(value)
+
     async def write(self, value: Any, **options: Unpack[CommandOptions]) -> None:
         """Write a value as `Point.write` does. A run is written in as many exchanges as it takes."""
         if self.writable and self.encode is None:
-            await self.source.write(value if self.scale.trivial else self.scale.write(value), **options)
+            await self.source.write(self.unscaled(value), **options)
         else:
             await Point.write(self, value, **options)
 

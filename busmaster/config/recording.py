@@ -28,7 +28,14 @@ def read_outputs(table: Table, groups: Iterable[str]) -> Outputs:
     Raises FileError, naming line and key, for what is wrong: also in one that is not enabled.
     """
     table.only(*KINDS)
-    return dict(_enabled(table, tuple(groups)))
+    outputs = dict(_enabled(table, tuple(groups)))
+    taken: dict[str, str] = {}
+    for kind, settings in outputs.items():
+        for key in ("path", "spill"):
+            path = getattr(settings, key, None)
+            if path is not None and taken.setdefault(path, f"{kind}.{key}") != f"{kind}.{key}":
+                raise table.table(kind).error(f"{taken[path]} is that file already", key)
+    return outputs
 
 
 def _enabled(outer: Table, groups: Collection[str]) -> Iterator[tuple[str, Settings]]:

@@ -23,6 +23,8 @@ from busmaster.bus.requester import Priority
 from busmaster.config.points import NamedPoint
 from busmaster.config.table import Table
 from busmaster.errors import BusClosed, BusError, InvalidCommand, NotStarted
+from busmaster.gate.gate import Gate, Wish, outcome_of
+from busmaster.gate.record import Outcome
 
 WITHIN = 2.0
 LONGEST = 60.0
@@ -89,7 +91,7 @@ class SafeWrite:
         node = Node.of(point)
         if node.address == node.profile.broadcast:
             raise InvalidCommand(f"{point.key} is for all nodes: nobody confirms it; write each node's own")
-        item, number = point.source.item, point.scale.write(value)
+        item, number = point.source.item, point.unscaled(value)
 
         def prepare(within: float) -> Send:
             [send] = handle.prepare_write(
@@ -117,51 +119,75 @@ class SafeState:
     def __bool__(self) -> bool:
         return bool(self.writes)
 
-    async def enter(self, bus: Bus) -> dict[str, BusError | None]:
+    async def enter(self, gate: Gate, by: str) -> dict[str, BusError | None]:
         """Send all, urgently, read them back, and return by point why it was not confirmed, None if it was.
 
         From now on the bus takes no other write. Nodes are served at the same time, each in the file's order; what
-        fails is tried again until the time is over.
+        fails is tried again until the time is over. `by` says for the record who wants it.
         """
-        outcomes: dict[str, BusError | None] = {
-            write.point.key: NotStarted("not sent in time", node=write.node) for write in self.writes
-        }
         if not self.writes:
-            return outcomes
+            return {}
+        bus = gate.bus
         bus.take_only_safe_writes()
         deadline = bus.now() + self.within
-        by_node: dict[Node, list[SafeWrite]] = {}
+        by_node: dict[Node, list[Leaving]] = {}
         for write in self.writes:
-            by_node.setdefault(write.node, []).append(write)
-        with anyio.CancelScope(shield=True):  # the signal that ends the line has cancelled this task
-            async with anyio.create_task_group() as tasks:
-                for node, writes in by_node.items():
-                    node.note_stop()  # what was decided before must not undo it
-                    node.suspend(0.0)  # also one that somebody has suspended
-                    tasks.start_soon(_leave, bus, writes, deadline, outcomes)
-        return outcomes
+            by_node.setdefault(write.node, []).append(Leaving(write, gate, by))
+        leaving = [one for ones in by_node.values() for one in ones]
+        try:
+            with anyio.CancelScope(shield=True):  # the signal that ends the line has cancelled this task
+                async with anyio.create_task_group() as tasks:
+                    for node, ones in by_node.items():
+                        node.suspend(0.0)  # also one that somebody has suspended
+                        tasks.start_soon(_leave, bus, ones, deadline)
+        finally:
+            for one in leaving:
+                one.end()
+        outcomes = {one.write.point.key: one.error for one in leaving}
+        return {write.point.key: outcomes[write.point.key] for write in self.writes}  # in the file's order
 
 
-async def _leave(bus: Bus, writes: Sequence[SafeWrite], deadline: float, outcomes: dict[str, BusError | None]) -> None:
+class Leaving:
+    """One write of the safe state on its way. `error` is why it is not confirmed yet, None once it is."""
+
+    def __init__(self, write: SafeWrite, gate: Gate, by: str) -> None:
+        self.write = write
+        self.error: BusError | None = NotStarted("not sent in time", node=write.node)
+        key = write.point.key
+        self._passage = gate.begin(Wish(door="safe", by=by, name=key, point=write.point, value=write.value))
+
+    async def try_once(self, within: float) -> bool:
+        """Write it and read it back, and return whether it is over: confirmed, or nothing can be sent any more."""
+        try:
+            await self.write.prepare(within)()
+        except BusError as error:
+            # one that was sent before may have arrived, whatever keeps this one from being sent
+            if not (self._was_sent and outcome_of(error)[0] is Outcome.NOT_STARTED):
+                self.error = error
+            return isinstance(error, BusClosed)
+        self.error = None
+        self.end()
+        return True
+
+    def end(self) -> None:
+        """Keep the record of it, once."""
+        if self._passage.record is None:
+            self._passage.end(self.error)
+
+    @property
+    def _was_sent(self) -> bool:
+        return outcome_of(self.error)[0] is not Outcome.NOT_STARTED
+
+
+async def _leave(bus: Bus, leaving: Sequence[Leaving], deadline: float) -> None:
     """Write what is left of one node's, round by round: one that fails does not keep the others from being sent."""
-    waiting = list(writes)
+    waiting = list(leaving)
     while waiting and bus.now() < deadline:
-        waiting = [write for write in waiting if not await _confirmed(bus, write, deadline, outcomes)]
+        left = []
+        for one in waiting:
+            within = deadline - bus.now()
+            if within <= 0 or not await one.try_once(within):
+                left.append(one)
+        waiting = left
         if waiting:
             await anyio.sleep(min(LOOK_AGAIN, max(0.0, deadline - bus.now())))
-
-
-async def _confirmed(bus: Bus, write: SafeWrite, deadline: float, outcomes: dict[str, BusError | None]) -> bool:
-    left = deadline - bus.now()
-    if left <= 0:
-        return False
-    try:
-        await write.prepare(left)()
-    except BusClosed as error:
-        outcomes[write.point.key] = error
-        return True  # nothing can be sent any more
-    except BusError as error:
-        outcomes[write.point.key] = error
-        return False
-    outcomes[write.point.key] = None
-    return True

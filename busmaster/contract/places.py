@@ -1,4 +1,4 @@
-"""What a command reads or changes, place by place: what limits are held against.
+"""What a command reads or changes, place by place: what limits are held against, and what a listener learns of points.
 
 A place is the smallest thing that a node keeps: one element, one parameter, one register. Protocols whose frames reach
 the same nodes name their places alike.
@@ -21,6 +21,15 @@ class Placed(Protocol):
 
     def shown(self, values: Mapping[Hashable, Any], /) -> Any:
         """Return what it would return where its places hold these. Raises KeyError for a place that is missing."""
+        ...
+
+
+@runtime_checkable
+class Telling(Protocol):
+    """A read whose values are told apart by their places: a block tells each value in it."""
+
+    def told(self, value: Any, profile: Profile, /) -> Mapping[Hashable, Any]:
+        """Return what each place held when it returned `value`, as far as that is known."""
         ...
 
 

@@ -85,9 +85,10 @@ def _existence(path: str) -> Finding:
         if os.path.islink(path):
             return Finding("port", False, f"{path} points to {os.readlink(path)}, which is gone", "plug it in again")
         return Finding("port", False, f"{path} does not exist", "see `python -m serial.tools.list_ports`")
-    if not stat.S_ISCHR(os.stat(path).st_mode):
+    status = os.stat(path)
+    if not stat.S_ISCHR(status.st_mode):
         return Finding("port", False, f"{path} is no device", "give the path of a serial port")
-    subsystem = _entry(path) / "subsystem"
+    subsystem = identity.entry(status.st_rdev) / "subsystem"
     if subsystem.exists() and subsystem.resolve().name != "tty":
         return Finding("port", False, f"{path} is no serial port", "see `python -m serial.tools.list_ports`")
     return Finding("port", True, f"{path} is {os.path.realpath(path)}" if os.path.islink(path) else f"{path} exists")
@@ -153,12 +154,6 @@ def _latency_timer(path: str) -> Iterator[Finding]:
     else:
         file = _device(path) / "latency_timer"
         yield Finding("latency", False, what, f"open it with low_latency=True, or write 1 to {file}")
-
-
-def _entry(path: str) -> Path:
-    """Return where the kernel describes this device; a pseudo-terminal is not there."""
-    number = os.stat(path).st_rdev
-    return identity.SYS / f"dev/char/{os.major(number)}:{os.minor(number)}"
 
 
 def _device(path: str) -> Path:

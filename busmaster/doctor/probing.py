@@ -24,7 +24,7 @@ from busmaster.contract.driver import Driver
 from busmaster.contract.exchange import Command, Exchange, FrameError
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
-from busmaster.errors import LineDown, Refused
+from busmaster.errors import LineDown, Refused, cause_text
 from busmaster.outputs.values import value_text
 from busmaster.transport.clock import clock_of
 from busmaster.transport.endpoints import Endpoint, is_paced
@@ -119,9 +119,7 @@ class Wire(asyncio.Protocol):
         return heard
 
     def _loss(self) -> LineDown:
-        cause = self._cause
-        what = cause.what if isinstance(cause, LineDown) else str(cause or "it was closed by the other end")
-        return LineDown(what, hint="start again when it is back")
+        return LineDown(cause_text(self._cause, "it was closed by the other end"), hint="start again when it is back")
 
 
 @asynccontextmanager

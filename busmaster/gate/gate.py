@@ -8,17 +8,29 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
-from typing import Any
+from types import TracebackType
+from typing import Any, TypeAlias
 
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
-from busmaster.errors import BusError, InvalidCommand, NodeDown, NotStarted, Refused, Superseded, WriteUnconfirmed
+from busmaster.errors import (
+    BusError,
+    InvalidCommand,
+    NodeDown,
+    NotStarted,
+    Refused,
+    Superseded,
+    VerifyFailed,
+    WriteUnconfirmed,
+)
 from busmaster.gate.record import Outcome, WriteRecord, this_user
 
 FRESH = 1.0
 """Seconds for which a command may wait that does not say until when it is meant."""
 MOST_AT_ONCE = 16
 """Commands of one door that may be on their way to their nodes."""
+NEVER_SENT = (ArithmeticError, TypeError, ValueError, RecursionError)
+"""What is raised of values of which no frame can be made, InvalidCommand among them."""
 LONGEST_SHOWN = 200
 """Characters of a value, or of an error, that are kept of a write."""
 
@@ -41,6 +53,54 @@ class Wish:
     id: str = ""
 
 
+Keep: TypeAlias = Callable[[Wish, Outcome, str, Any, float], WriteRecord]
+"""Keeps a record: of what was wished, what became of it and why, the value before, and the seconds that it took."""
+
+
+class Passage:
+    """One write on its way, in `with`: however that ends, a record is kept of it. What is raised is raised on."""
+
+    def __init__(self, wish: Wish, now: Callable[[], float], keep: Keep) -> None:
+        self.record: WriteRecord | None = None
+        """None until it has ended."""
+        self._wish = wish
+        self._now = now
+        self._keep = keep
+        self._began = now()
+        self._before = _before(wish.point)
+
+    def __enter__(self) -> Passage:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.end(error)
+
+    def end(self, error: BaseException | None) -> None:
+        """Keep its record: what it ended with, None for a write that is confirmed."""
+        outcome, text = outcome_of(error)
+        self.record = self._keep(self._wish, outcome, text, self._before, self._now() - self._began)
+
+
+def outcome_of(error: BaseException | None) -> tuple[Outcome, str]:
+    """Return what became of a write that ended so, and why."""
+    match error:
+        case None:
+            return Outcome.WRITTEN, ""
+        case InvalidCommand() | Refused():
+            return Outcome.REFUSED, str(error)
+        case NotStarted() | Superseded() | NodeDown():
+            return Outcome.NOT_STARTED, error.what
+        case BusError():
+            sent = error.attempts or isinstance(error, WriteUnconfirmed | VerifyFailed)
+            return Outcome.UNCONFIRMED if sent else Outcome.NOT_STARTED, error.what
+        case ArithmeticError() | TypeError() | ValueError() | RecursionError():
+            return Outcome.REFUSED, f"this cannot be sent: {error}"  # before a frame was made of it
+        case _:
+            return Outcome.UNCONFIRMED, "the program gave up before it was done"
+
+
 class Gate:
     """What all doors of one line pass. `read_only` lets no write through; `record` is told of every one.
 
@@ -50,7 +110,7 @@ class Gate:
     def __init__(self, bus: Bus, *, read_only: bool = False) -> None:
         self.read_only = read_only
         self.record: Callable[[WriteRecord], None] = lambda _: None
-        self._bus = bus
+        self.bus = bus
         self._log = logging.getLogger("busmaster.audit")
         self._log.addHandler(logging.NullHandler())
         self._user = this_user()
@@ -70,50 +130,46 @@ class Gate:
 
     async def write(self, wish: Wish) -> WriteRecord:
         """Write it, unless it is refused, and return what became of it."""
-        began, before = self._bus.now(), _before(wish.point)
-        outcome, error = Outcome.UNCONFIRMED, "the program gave up before it was done"
+        passage = self.begin(wish)
         try:
-            if error_now := self.refusal(wish):
-                outcome, error = Outcome.REFUSED, error_now
-            else:
-                outcome, error = await self._pass(wish)
-        finally:
-            record = self._keep(wish, outcome, error, before, self._bus.now() - began)
-        return record
+            with passage:
+                if refusal := self.refusal(wish):
+                    raise InvalidCommand(refusal)
+                await self._pass(wish)
+        except (BusError, *NEVER_SENT):
+            pass  # it is in the record
+        assert passage.record is not None
+        return passage.record
+
+    def begin(self, wish: Wish) -> Passage:
+        """Let pass what this process itself wishes: its safe state, or what a person writes on its command line.
+
+        Nothing of it is refused here. The write is for the caller to do, within `with`; a record is kept of it.
+        """
+        return Passage(wish, self.bus.now, self._keep)
 
     def refuse(self, wish: Wish, error: str) -> WriteRecord:
         """Keep a record of what was not even tried."""
         return self._keep(wish, Outcome.REFUSED, error, None, 0.0)
 
-    async def _pass(self, wish: Wish) -> tuple[Outcome, str]:
+    async def _pass(self, wish: Wish) -> None:
         assert wish.point is not None
         self._running[wish.door] = self._running.get(wish.door, 0) + 1
         try:
             left = self._left(wish)
             await wish.point.write(wish.value, start_within=None if left == inf else max(0.0, left))
-        except (NotStarted, Superseded, NodeDown) as error:
-            return Outcome.NOT_STARTED, error.what
-        except (InvalidCommand, Refused) as error:
-            return Outcome.REFUSED, str(error)
-        except WriteUnconfirmed as error:
-            return Outcome.UNCONFIRMED, error.what
-        except BusError as error:
-            return Outcome.UNCONFIRMED if error.attempts else Outcome.NOT_STARTED, error.what
-        except (ArithmeticError, TypeError, ValueError, RecursionError) as error:
-            return Outcome.REFUSED, f"this cannot be sent: {error}"  # before a frame was made of it
         finally:
             self._running[wish.door] -= 1
-        return Outcome.WRITTEN, ""
 
     def _left(self, wish: Wish) -> float:
         """Return for how many seconds it may still wait; inf for one of a person who waits for its end."""
         if wish.expires is not None:
             return wish.expires - time.time()
-        return inf if wish.arrived is None else wish.arrived + FRESH - self._bus.now()
+        return inf if wish.arrived is None else wish.arrived + FRESH - self.bus.now()
 
     def _keep(self, wish: Wish, outcome: Outcome, error: str, before: Any, took: float) -> WriteRecord:
         record = WriteRecord(
-            time=self._bus.wall_time(),
+            time=self.bus.wall_time(),
             door=wish.door,
             by=wish.by[:LONGEST_SHOWN],
             user=self._user,

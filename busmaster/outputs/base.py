@@ -5,7 +5,7 @@ into the queue every TICK, so that it is never woken by the line, takes what is 
 the interpreter after each piece. What it holds is bounded: when it cannot get rid of it, the oldest is dropped.
 
 Each count has one writer, the loop or the thread, so that they are exact without a lock:
-`offered` = `written` + `dropped` + `lost` + `spilled` + what waits in memory.
+`offered` + `found` = `written` + `dropped` + `lost` + `spilled` + what waits in memory.
 """
 
 from __future__ import annotations
@@ -14,26 +14,20 @@ import importlib.util
 import os
 import re
 import threading
-import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar
+from typing import ClassVar, NamedTuple, TypeAlias
 
-from busmaster.bus.points import Point
-from busmaster.bus.polling import Sample, Snapshot
+from busmaster.bus.polling import Snapshot
 from busmaster.errors import InvalidCommand
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.settings import Settings
 
-Formatted = TypeVar("Formatted")
-
 TICK = 0.05
 PAUSE = 0.0002
 """Seconds for which the thread lets go of the interpreter after each cycle that it has formatted."""
-PIECE = 100
-"""Values of one cycle after which it does so too."""
 BATCH = 2_000
 """Values that are written at once."""
 FIRST_RETRY, LAST_RETRY = 0.5, 10.0
@@ -124,6 +118,8 @@ class Output(ABC):
         self.suppressed = 0
         self.spilled = self.lost = 0
         """Values that wait on disk, and those that the thread had to drop from there."""
+        self.found = 0
+        """Values that were on disk when it began: of an earlier process, or of the output that this one replaces."""
         self._capacity = settings.buffer
         self._say = say
         self._waiting: deque[Item] = deque()  # loop and thread share it without a lock: what they do with it is atomic
@@ -143,7 +139,7 @@ class Output(ABC):
         """Hand it an item without ever waiting. The oldest are dropped where the output does not keep up."""
         self._waiting.append(item)
         self.offered += size_of(item)
-        while self.offered - self.dropped - self.written - self.spilled - self.lost > self._capacity:
+        while self._left() - self.spilled > self._capacity:
             try:
                 oldest = self._waiting.popleft()
             except IndexError:
@@ -164,19 +160,26 @@ class Output(ABC):
         self._reopen.set()
 
     def succeed(self, before: Output) -> None:
-        """Count on from the output that this one replaces, which is closed. Call this before the new one is started."""
-        self.offered += before.offered
+        """Count on from the output that this one replaces, which is closed. Call this before the new one is started.
+
+        What waits on disk is not counted on: it is found there.
+        """
+        self.offered += before.offered + before.found - before.spilled
         self.dropped += before.dropped
         self.written += before.written
         self.suppressed += before.suppressed
+        self.lost += before.lost
 
     def statistics(self) -> OutputStatistics:
         """Return the counts of this output, and why it is down."""
         dropped = self.dropped + self.lost
-        waiting = self.offered - self.written - dropped
         return OutputStatistics(
-            self.kind, self.what, self.written, dropped, waiting, self.error, self.spilled, self.suppressed
+            self.kind, self.what, self.written, dropped, self._left(), self.error, self.spilled, self.suppressed
         )
+
+    def _left(self) -> int:
+        """Return how many values wait, in memory and on disk."""
+        return self.offered + self.found - self.written - self.dropped - self.lost
 
     # off the loop
 
@@ -188,7 +191,7 @@ class Output(ABC):
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(within)
-        self.dropped = self.offered - self.written - self.spilled - self.lost
+        self.dropped += self._left() - self.spilled
 
     # on the thread
 
@@ -234,81 +237,3 @@ class Output(ABC):
                 return
             self.rest(self._retry)
             self._retry = min(2 * self._retry, LAST_RETRY)
-
-
-class BatchOutput(Output, Generic[Formatted]):
-    """An output that writes batch by batch: all of a batch, or nothing of it."""
-
-    def __init__(
-        self,
-        kind: str,
-        settings: Settings,
-        say: Callable[[str], None] = lambda _: None,
-    ) -> None:
-        super().__init__(kind, settings, say)
-        self._batch: list[Formatted] = []
-        self._size = 0
-
-    @abstractmethod
-    def format(self, item: Item) -> Formatted | None:
-        """Return the item as it is written; None for what is not written here."""
-
-    @abstractmethod
-    def commit(self, batch: list[Formatted]) -> None:
-        """Write the batch whole. It raises, having written nothing, where that fails."""
-
-    @abstractmethod
-    def shut(self) -> None:
-        """Let go of what `commit` opened. It never raises."""
-
-    def work(self) -> None:
-        """Write batch by batch until it is stopped, then the rest."""
-        try:
-            stopped = False
-            while not stopped:
-                # before the queue is emptied, so that what was offered until then is written
-                stopped = self._stop.wait(TICK)
-                if self._reopen.is_set():
-                    self._reopen.clear()
-                    self.shut()
-                while self._fill():
-                    self.commit(self._batch)
-                    self._batch = []
-                    self.written += self._size
-                    self._size = 0
-                    self.up()
-        finally:
-            self.shut()
-
-    def unhurried(self, snapshot: Snapshot) -> Iterator[tuple[Point[Any], Sample[Any]]]:
-        """Yield the points and samples of a cycle.
-
-        The thread lets go of the interpreter after each PIECE, so that a cycle of hundreds of points keeps the line's
-        loop no longer than one of a few.
-        """
-        for number, item in enumerate(snapshot.samples.items(), 1):
-            yield item
-            if number % PIECE == 0 and not self._stop.is_set():
-                time.sleep(PAUSE)
-
-    def _fill(self) -> bool:
-        """Format what waits, up to a batch, and return whether there is one.
-
-        A batch that could not be written goes first.
-        """
-        for item in self._items():
-            formatted = self.format(item)
-            if formatted is not None:
-                self._batch.append(formatted)
-            self._size += size_of(item)
-            if not self._stop.is_set():
-                time.sleep(PAUSE)
-        # What is not written here, as events in CSV, is no loss.
-        if not self._batch:
-            self.written += self._size
-            self._size = 0
-        return bool(self._batch)
-
-    def _items(self) -> Iterator[Item]:
-        while self._size < BATCH and (item := self.take()) is not None:
-            yield item

@@ -60,12 +60,21 @@ class Wanted(NamedTuple):
 class Distributor:
     """The outputs of one bus. `tell` is called, on the loop, with what happens to them.
 
-    `gate` is what the commands pass that they take in.
+    `gate` is what the commands pass that they take in. One that is not `in_charge` of the line says nothing of its
+    state: another process may be.
     """
 
-    def __init__(self, bus: Bus, tell: Callable[[str], None] = lambda _: None, *, gate: Gate | None = None) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        tell: Callable[[str], None] = lambda _: None,
+        *,
+        gate: Gate | None = None,
+        in_charge: bool = True,
+    ) -> None:
         self.tell = tell
         self.gate = gate or Gate(bus)
+        self._in_charge = in_charge
         self._bus = bus
         self._outputs: list[Output] = []
         self._feeding: dict[Source, asyncio.Task[None]] = {}
@@ -110,10 +119,14 @@ class Distributor:
         with anyio.CancelScope(shield=True):
             # Closing waits for a thread, and perhaps for a disk: never on the loop that owns the line.
             await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in leaving.values()))
-            for kind, output in fresh.items():
-                if kind in leaving:
-                    output.succeed(leaving[kind])
-                output.start()
+        for kind, output in fresh.items():
+            if kind in leaving:
+                output.succeed(leaving.pop(kind))
+            output.start()
+        for kind, output in leaving.items():
+            counts = output.statistics()
+            on_disk = f", {counts.spilled} kept on disk" if counts.spilled else ""
+            self.tell(f"{kind} is ended: {counts.written} {counts.what}, {counts.dropped} dropped{on_disk}")
 
     def record(self, write: WriteRecord) -> None:
         """Hand a write to all of them."""
@@ -192,7 +205,15 @@ class Distributor:
             case MqttSettings():
                 from busmaster.outputs.mqtt import MqttOutput
 
-                return MqttOutput(kind, settings, self._bus, self._say, commands=commands, gate=self.gate)
+                return MqttOutput(
+                    kind,
+                    settings,
+                    self._bus,
+                    self._say,
+                    commands=commands,
+                    gate=self.gate,
+                    in_charge=self._in_charge,
+                )
             case MetricsSettings():
                 from busmaster.outputs.metrics import MetricsOutput
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import UTC, datetime
 from typing import Any
 
 from busmaster.bus.polling import Sample, Snapshot
 from busmaster.gate.record import WriteRecord
-from busmaster.outputs.base import BatchOutput, Item, check_folder
+from busmaster.outputs.base import Item, check_folder
+from busmaster.outputs.batches import BatchOutput
 from busmaster.outputs.cells import csv_lines, no_formula
 from busmaster.outputs.growing_file import GrowingFile
 from busmaster.outputs.settings import FileSettings
-from busmaster.outputs.values import cycle_fields, json_line, micros, value_text, write_fields
+from busmaster.outputs.values import cycle_fields, json_line, micros, utc, value_text, write_fields
 
 COLUMNS = ("time", "group", "cycle", "node", "item", "value", "unit", "quality", "error")
 
@@ -41,6 +41,12 @@ class FileOutput(BatchOutput[bytes]):
 
     def commit(self, batch: list[bytes]) -> None:
         self._file.append(b"".join(batch))
+
+    def pack(self, formatted: bytes) -> str:
+        return formatted.decode()
+
+    def unpack(self, text: str) -> bytes:
+        return text.encode()
 
     def shut(self) -> None:
         self._file.close()
@@ -94,8 +100,3 @@ def value_cell(sample: Sample[Any]) -> str:
         return ""
     text = value_text(sample.value)
     return no_formula(text) if isinstance(sample.value, str) else text
-
-
-def utc(moment: float) -> str:
-    """Return a time in seconds since 1970 as UTC text, to the millisecond."""
-    return datetime.fromtimestamp(moment, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -22,12 +22,13 @@ and is sent by the next process if this one ends before.
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
-import sqlite3
 import ssl
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -40,10 +41,11 @@ from busmaster.bus.polling import Snapshot
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate, Wish
 from busmaster.gate.record import WriteRecord
-from busmaster.outputs.base import BATCH, PAUSE, TICK, Item, Output, check_extra, reason, size_of
+from busmaster.outputs.base import PAUSE, TICK, Item, check_extra, reason, size_of
 from busmaster.outputs.mqtt_commands import Answer, Commands, Inbox
 from busmaster.outputs.settings import MqttSettings
-from busmaster.outputs.spool import Record, Spool
+from busmaster.outputs.spilling import SpillingOutput
+from busmaster.outputs.spool import Record
 from busmaster.outputs.values import cycle_fields, json_line, micros, sample_fields, write_fields
 
 if TYPE_CHECKING:
@@ -57,9 +59,9 @@ BREATH = 0.002
 TIMEOUT = 5.0
 """Seconds in which a broker must answer."""
 KEEP_ALIVE = 15
-SPILL_EVERY = 0.2
-"""Seconds between two movings of what waits to disk, while the broker is away."""
 ALARMS = "alarms/"
+UNSUPPORTED_VERSION = 132
+"""What a broker says that knows MQTT 3.1.1 alone, or what the client makes of what that says."""
 HURRY = 2.0
 """Seconds from the wish to end until what could not be sent goes to disk."""
 
@@ -70,8 +72,11 @@ class Outgoing(NamedTuple):
     retain: bool = False
 
 
-class MqttOutput(Output):
-    """`commands` are the points, by their key, that may be written. Raises InvalidCommand if the extra is missing."""
+class MqttOutput(SpillingOutput):
+    """`commands` are the points, by their key, that may be written. Raises InvalidCommand if the extra is missing.
+
+    Without `in_charge` it says nothing of the state of the line and its nodes, nor that it is there.
+    """
 
     def __init__(
         self,
@@ -82,6 +87,7 @@ class MqttOutput(Output):
         *,
         commands: Mapping[str, Point[Any]] | None = None,
         gate: Gate | None = None,
+        in_charge: bool = True,
     ) -> None:
         check_extra("aiomqtt", "mqtt")
         super().__init__(kind, settings, say)
@@ -89,15 +95,11 @@ class MqttOutput(Output):
         self._secrets = secrets(settings)
         self._bus = bus
         self._gate = gate or Gate(bus)
+        self._in_charge = in_charge
         self._commands = {topic_part(key): point for key, point in (commands or {}).items()}
         self._arriving: Commands
         self._owner: asyncio.AbstractEventLoop | None = None
         self._held: list[Item] = []
-        self._spool: Spool | None = None
-        if settings.spill is not None:
-            self._spool = Spool(settings.spill, settings.spill_values, say)
-            self.offered = self.spilled = self._spool.values  # of the last time
-        self._spool_error = ""
         self._published: dict[str, str | None] = {}
         self._alarms: object = None
         """Those that were told last."""
@@ -109,38 +111,19 @@ class MqttOutput(Output):
         self._owner = asyncio.get_running_loop()
         super().start()
 
-    def close(self, within: float) -> None:
-        super().close(within)
-        # A thread that hangs may be in the midst of it.
-        if self._spool is not None and not self._thread.is_alive():
-            self._spool.close()
-
     # on the thread
 
     def work(self) -> None:
-        """Publish until it is stopped. What is left in memory then goes to disk, if it may."""
+        """Publish until it is stopped."""
+        self.open_spool()
         asyncio.run(self._in_time())
 
-    def rest(self, seconds: float) -> None:
-        """Wait so many seconds, or until it is stopped. What comes while the broker is away goes to disk, if it may."""
-        over = time.monotonic() + seconds
-        while not self._stop.is_set() and time.monotonic() < over:
-            self._put_by()
-            self._stop.wait(min(SPILL_EVERY, seconds))
-
     async def _in_time(self) -> None:
-        """Publish until it is stopped.
-
-        Whatever happens, what is left in memory is on disk when this ends, if it may: before the process does.
-        """
-        try:
-            async with anyio.create_task_group() as tasks:
-                if self._spool is not None:
-                    tasks.start_soon(self._hurry, tasks.cancel_scope)
-                await self._connected()
-                tasks.cancel_scope.cancel()
-        finally:
-            self._put_by()
+        async with anyio.create_task_group() as tasks:
+            if self._spool is not None:
+                tasks.start_soon(self._hurry, tasks.cancel_scope)
+            await self._connected()
+            tasks.cancel_scope.cancel()
 
     async def _hurry(self, scope: anyio.CancelScope) -> None:
         """Give up on a broker that does not answer when all is to end: it is not waited for to the last moment."""
@@ -149,46 +132,33 @@ class MqttOutput(Output):
         await anyio.sleep(HURRY)
         scope.cancel()
 
-    def _put_by(self) -> None:
-        """Move what waits from memory to disk. What the disk does not take stays where it is, which is told once."""
-        while self._spool is not None and self._fill(BATCH):
-            values = sum(map(size_of, self._held))
-            try:
-                lost = self._spool.put(self._records())
-            except sqlite3.Error as error:
-                if str(error) != self._spool_error:
-                    self._spool_error = str(error)
-                    self._say(f"{self.kind}: {self._spool.path}: {error}")
-                return
-            self._held.clear()
-            self.spilled += values - lost
-            self.lost += lost
-            self._spool_error = ""
-
-    def _records(self) -> Iterator[Record]:
+    def records(self) -> Iterator[Record]:
+        """Yield the messages of what is held, each as it is kept on disk."""
         for item in self._held:
             by_cycle = isinstance(item, Snapshot) and self._settings.messages == "cycle"
-            for topic, payload, retain in self._messages(item):
-                yield Record(topic, payload, retain, size_of(item) if by_cycle else 1)
+            for message in self._messages(item):
+                yield Record(json.dumps(message), size_of(item) if by_cycle else 1)
             if not self._stop.is_set():
                 time.sleep(PAUSE)
 
+    def let_go(self) -> int:
+        """Hold nothing any more, and return how many values were held."""
+        size = sum(map(size_of, self._held))
+        self._held.clear()
+        return size
+
     async def _send_spilled(self, client: Client) -> None:
-        """Send all that is on disk; what comes meanwhile goes behind it. When all is to end the rest stays there."""
+        """Send all that is on disk. When all is to end the rest stays there."""
         while self._spool is not None and self.spilled and not self._stop.is_set():
             up_to, records = self._spool.oldest(AT_ONCE)
-            await self._send(client, (Outgoing(topic, payload, retain) for topic, payload, retain, _ in records))
-            values = sum(record.values for record in records)
-            self._spool.remove(up_to, values)  # only now: what is lost before it was acknowledged is sent again
-            self.written += values
-            self.spilled = self._spool.values
-            self._put_by()
+            await self._send(client, (Outgoing(*json.loads(record.content)) for record in records))
+            self.forwarded(up_to, records)  # only now: what is lost before it was acknowledged is sent again
 
     async def _connected(self) -> None:
-        async with self._client() as client, anyio.create_task_group() as tasks:
+        async with self._connection() as client, anyio.create_task_group() as tasks:
             self._published.clear()
             self._alarms = None
-            await self._send(client, [Outgoing(self._topic("status"), "online", True)])
+            await self._send(client, self._status("online"))
             self.up()
             if self._commands:
                 await client.subscribe(self._topic("set/#"), qos=1)
@@ -200,13 +170,31 @@ class MqttOutput(Output):
                 await self._send(client, list(self._changes()))
                 await self._send_spilled(client)
                 # What is on disk is older: nothing in memory may overtake it.
-                while not self.spilled and self._fill(AT_ONCE):
+                while not self.spilled and self.hold(AT_ONCE):
                     await self._send(client, (message for item in self._held for message in self._messages(item)))
-                    self.written += sum(map(size_of, self._held))
-                    self._held.clear()
+                    self.written += self.let_go()
                 await anyio.sleep(0 if stopped else TICK)
-            await self._send(client, [Outgoing(self._topic("status"), "offline", True)])
+            await self._send(client, self._status("offline"))
             tasks.cancel_scope.cancel()
+
+    @asynccontextmanager
+    async def _connection(self) -> AsyncIterator[Client]:
+        """Connect for the block. Raises ConnectionError, in words, where there is no broker that will do."""
+        import aiomqtt
+
+        broker = f"{self._settings.host}:{self._settings.port}"
+        async with AsyncExitStack() as stack:
+            try:
+                client = await stack.enter_async_context(self._client())
+            except aiomqtt.MqttCodeError as error:
+                if getattr(error.rc, "value", error.rc) == UNSUPPORTED_VERSION:
+                    raise ConnectionError(f"{broker} does not speak MQTT 5, which this output needs") from None
+                raise
+            except aiomqtt.MqttError as error:
+                if "timed out" in str(error):
+                    raise ConnectionError(f"{broker} did not answer in {TIMEOUT:g} s; does it speak MQTT 5?") from None
+                raise
+            yield client
 
     def _client(self) -> Client:
         import aiomqtt
@@ -222,7 +210,7 @@ class MqttOutput(Output):
             username=username,
             password=password,
             tls_context=tls,
-            will=aiomqtt.Will(self._topic("status"), "offline", qos=1, retain=True),
+            will=aiomqtt.Will(self._topic("status"), "offline", qos=1, retain=True) if self._in_charge else None,
             keepalive=KEEP_ALIVE,
             timeout=TIMEOUT,
             max_inflight_messages=AT_ONCE,
@@ -249,7 +237,7 @@ class MqttOutput(Output):
                 task.cancel()
             await asyncio.gather(*under_way, return_exceptions=True)
 
-    def _fill(self, most: int) -> bool:
+    def hold(self, most: int) -> bool:
         """Hold up to `most` values, and return whether there are any. What was not acknowledged comes first."""
         size = sum(map(size_of, self._held))
         while size < most and (item := self.take()) is not None:
@@ -272,8 +260,13 @@ class MqttOutput(Output):
                 payload = json_line(time=micros(sample.wall), unit=point.unit, **sample_fields(sample))
                 yield Outgoing(self._topic("values", topic_part(point.key)), payload, settings.retain)
 
+    def _status(self, state: str) -> list[Outgoing]:
+        return [Outgoing(self._topic("status"), state, True)] if self._in_charge else []
+
     def _changes(self) -> Iterator[Outgoing]:
         """Yield what is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
+        if not self._in_charge:
+            return
         now: dict[str, tuple[str, str | None]] = {
             "line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")
         }

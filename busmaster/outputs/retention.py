@@ -88,7 +88,7 @@ def forget_oldest(database: sqlite3.Connection, tables: tuple[str, ...]) -> None
 
 
 def delete_oldest(database: sqlite3.Connection, table: str) -> None:
-    """Delete what was written first: a tenth, or a piece where that is more."""
+    """Delete what was written first: a tenth, a piece at most."""
     first, last = database.execute(f"select min(rowid), max(rowid) from {table}").fetchone()
     if first is not None:
         piece = min(AT_ONCE, 1 + (last - first) // 10)

@@ -28,7 +28,18 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FileSettings(Settings):
+class SpillingSettings(Settings):
+    """`spill` is a file for what waits while the output is down, which then survives a restart: `spill_values` at most.
+
+    It is best on another disk than what it stands in for.
+    """
+
+    spill: str | None = None
+    spill_values: Annotated[int, Between(1, MOST_SPILLED)] = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileSettings(SpillingSettings):
     """`path` may hold fields of a date (%Y/line-%m-%d.csv): a new file begins when the name changes.
 
     `mode` is what a new file may be used for and by whom, narrowed by the process's umask. `sync_every`: after so many
@@ -41,7 +52,7 @@ class FileSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SqliteSettings(Settings):
+class SqliteSettings(SpillingSettings):
     """What is older than `keep_days` is deleted, and the oldest of more than `keep_mb` megabytes; None keeps all.
 
     `mode` is that of a new file, narrowed by the process's umask.
@@ -60,11 +71,10 @@ class SqliteSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MqttSettings(Settings):
+class MqttSettings(SpillingSettings):
     """`messages`: one for each "point", or one for each "cycle". `qos` 0 may lose values unseen, 1 does not.
 
     `allow_commands` names the points ("winder/1") that commands may write; without any, no command is listened to.
-    `spill` is a file for what waits while the broker is away, which then survives a restart: `spill_values` at most.
     """
 
     host: str = "127.0.0.1"
@@ -77,8 +87,6 @@ class MqttSettings(Settings):
     password_file: str | None = None
     tls: bool = False
     ca_file: str | None = None
-    spill: str | None = None
-    spill_values: Annotated[int, Between(1, MOST_SPILLED)] = 1_000_000
     allow_commands: tuple[str, ...] = ()
 
 

@@ -11,10 +11,11 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeAlias
 
-from busmaster.bus.points import Point
+from busmaster.bus.meaning import Named
 from busmaster.errors import InvalidCommand
 from busmaster.gate.record import WriteRecord
-from busmaster.outputs.base import BatchOutput, Happening, Item, check_folder
+from busmaster.outputs.base import Happening, Item, check_folder
+from busmaster.outputs.batches import BatchOutput
 from busmaster.outputs.retention import Retention
 from busmaster.outputs.settings import SqliteSettings
 from busmaster.outputs.values import json_value, micros, write_fields
@@ -67,9 +68,12 @@ SampleRow: TypeAlias = tuple[float, int, Any, str, str | None]
 
 
 class Rows(NamedTuple):
-    """Of one cycle, one event, or one write: points whose number is not known yet, by their place in `samples`."""
+    """Of one cycle, one event, or one write.
 
-    samples: list[tuple[float, Point[Any], Any, str, str | None]]
+    The number of a point is not known yet: a sample has its key and unit; and last the label of its value, "" for none.
+    """
+
+    samples: list[tuple[float, str, str, Any, str, str | None, str]]
     event: tuple[float, str | None, str] | None = None
     write: tuple[Any, ...] | None = None
 
@@ -90,6 +94,7 @@ class SqliteOutput(BatchOutput[Rows]):
         self._retention = Retention(settings.keep_days, settings.keep_mb, lambda text: say(f"{kind}: {text}"))
         self._database: sqlite3.Connection | None = None
         self._numbers: dict[str, int] = {}
+        self._labels: dict[tuple[int, Any], str] = {}
 
     def format(self, item: Item) -> Rows:
         """Return the rows of one cycle or one event."""
@@ -100,10 +105,12 @@ class SqliteOutput(BatchOutput[Rows]):
         samples = [
             (
                 micros(sample.wall),
-                point,
+                point.key,
+                point.unit,
                 column(sample.value),
                 sample.quality.value,
                 sample.error.what if sample.error else None,
+                sample.value.label if isinstance(sample.value, Named) else "",
             )
             for point, sample in self.unhurried(item)
         ]
@@ -120,19 +127,29 @@ class SqliteOutput(BatchOutput[Rows]):
             writes = [rows.write for rows in batch if rows.write is not None]
             database.executemany(f"insert into audit values ({', '.join(12 * '?')})", writes)
 
+    def pack(self, formatted: Rows) -> str:
+        return json.dumps(formatted)
+
+    def unpack(self, text: str) -> Rows:
+        return Rows(*json.loads(text))
+
     def shut(self) -> None:
         if self._database is not None:
             self._database.close()
             self._database = None
         self._numbers.clear()  # of a transaction that was undone, perhaps
+        self._labels.clear()
 
     def _samples(self, database: sqlite3.Connection, batch: list[Rows]) -> Iterator[SampleRow]:
         numbers = self._numbers
         for rows in batch:
-            for moment, point, value, quality, error in rows.samples:
-                number = numbers.get(point.key)
+            for moment, key, unit, value, quality, error, label in rows.samples:
+                number = numbers.get(key)
                 if number is None:
-                    number = numbers[point.key] = number_of(database, point)
+                    number = numbers[key] = number_of(database, key, unit)
+                if label and self._labels.get((number, value)) != label:
+                    self._labels[number, value] = label
+                    database.execute("insert or replace into labels values (?, ?, ?)", (number, value, label))
                 yield moment, number, value, quality, error
 
     def _open(self) -> sqlite3.Connection:
@@ -154,19 +171,15 @@ class SqliteOutput(BatchOutput[Rows]):
         return self._database
 
 
-def number_of(database: sqlite3.Connection, point: Point[Any]) -> int:
-    """Return the number of the point's row, made if there is none. It gets the unit and the labels of the point."""
-    node, _, item = point.key.partition("/")
+def number_of(database: sqlite3.Connection, key: str, unit: str) -> int:
+    """Return the number of a point's row. It is made if there is none, and gets the unit that the point has now."""
+    node, _, item = key.partition("/")
     row = database.execute(
         "insert into points (node, item, unit) values (?, ?, ?)"
         " on conflict (node, item) do update set unit = excluded.unit returning id",
-        (node, item, point.unit),
+        (node, item, unit),
     ).fetchone()
-    number = int(row[0])
-    labels = ((number, value, label) for value, label in point.meaning.labels.items())
-    database.execute("delete from labels where point = ?", (number,))
-    database.executemany("insert into labels values (?, ?, ?)", labels)
-    return number
+    return int(row[0])
 
 
 def column(value: Any) -> Any:

@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Callable
 from collections.abc import Set as AbstractSet
+from datetime import UTC, datetime
 from decimal import Decimal
 from typing import Any
 
@@ -107,6 +108,11 @@ def json_line(**fields: Any) -> str:
 def micros(moment: float) -> float:
     """Round a time in seconds to the microsecond: what is behind that is noise."""
     return round(moment, 6)
+
+
+def utc(moment: float) -> str:
+    """Return a time in seconds since 1970 as UTC text, to the millisecond."""
+    return datetime.fromtimestamp(moment, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[str, Any]:

@@ -184,7 +184,7 @@ def identify(path: str) -> Identity:
     if is_pty(path):
         return PtyIdentity(path)
     # Where the kernel describes devices at all, one that it does not describe has just gone.
-    if stat.S_ISCHR(status.st_mode) and _entry(status.st_rdev).parent.is_dir() and not _entry(status.st_rdev).exists():
+    if stat.S_ISCHR(status.st_mode) and entry(status.st_rdev).parent.is_dir() and not entry(status.st_rdev).exists():
         raise OSError(errno.ENODEV, os.strerror(errno.ENODEV), path)
     return TtyIdentity(os.path.realpath(path), status.st_rdev)
 
@@ -202,7 +202,7 @@ def lasting_name(device: UsbDevice) -> str:
 
 def usb_device(number: int) -> UsbDevice | None:
     """Return the USB serial port with this device number; None if that is no such port. Raises OSError as it goes."""
-    return _described(_entry(number))
+    return _described(entry(number))
 
 
 def usb_devices() -> list[UsbDevice]:
@@ -220,7 +220,7 @@ def is_pty(device: int | str) -> bool:
     return major in UNIX98_PTYS or major == BSD_PTYS
 
 
-def _entry(number: int) -> Path:
+def entry(number: int) -> Path:
     """Return where the kernel describes the device with this number; a pseudo-terminal is not there."""
     return SYS / f"dev/char/{os.major(number)}:{os.minor(number)}"
 

@@ -1,7 +1,8 @@
 """What the kernel knows of an open port and asyncio does not tell.
 
 What lies unread, what has not left yet, and what a serial driver has counted. Nothing here waits, and nothing is asked
-on the hot path: of what lies unread or unsent when a deadline falls due, of the counts when somebody looks at them.
+on the hot path of a port that never held anything: of what lies unread or unsent when a deadline falls due, of the
+counts when somebody looks at them.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ class OpenPort:
     """A port without a descriptor that we know: all that can be asked is its transport's own buffer."""
 
     stuck_because = "the port does not take it; open it again"
+    flow_controlled = False
+    """The other end may stop what is sent, for as long as it likes."""
 
     def __init__(self, transport: asyncio.Transport) -> None:
         self._buffered = _buffer_of(transport)
@@ -87,8 +90,9 @@ class Tty(_Descriptor):
 
     stuck_because = "flow control holds it or the adapter is stuck; check CTS, replug"
 
-    def __init__(self, transport: asyncio.Transport, descriptor: int) -> None:
+    def __init__(self, transport: asyncio.Transport, descriptor: int, flow_controlled: bool = False) -> None:
         super().__init__(transport, descriptor)
+        self.flow_controlled = flow_controlled
         self.reset()
 
     def unsent(self, waited: float) -> int | None:
@@ -152,7 +156,7 @@ def open_port(transport: asyncio.Transport) -> OpenPort:
     """Return what can be asked of the port behind this transport."""
     device = transport.get_extra_info("serial")
     if device is not None:
-        return Tty(transport, device.fileno())
+        return Tty(transport, device.fileno(), device.rtscts)
     sock = transport.get_extra_info("socket")
     return OpenPort(transport) if sock is None else Socket(transport, sock)
 

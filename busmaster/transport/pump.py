@@ -22,7 +22,7 @@ from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Poll, Transaction
-from busmaster.errors import LineDown
+from busmaster.errors import cause_text
 from busmaster.transport.alarm import Alarm
 from busmaster.transport.clock import clock_of
 from busmaster.transport.kernel import OpenPort, open_port
@@ -65,6 +65,8 @@ class Pump(asyncio.Protocol):
         self._port: OpenPort | None = None
         self._written = -inf
         self._paused = False
+        self._may_hold = False
+        self._look: asyncio.TimerHandle | None = None
         self._held_since = inf
         self._gave_up = ""
         self._alarm: Alarm | None = None
@@ -103,8 +105,8 @@ class Pump(asyncio.Protocol):
             arbiter.transmitted(now)
             if self.tap is not None:
                 self.tap.transmitted(now, data, arbiter.attempt)
-            if self._paused:
-                self._check_output(now)
+            if self._may_hold:
+                self._look_after(now)
         event = arbiter.poll_event()
         while event is not None:
             if type(event) is Transaction:
@@ -159,6 +161,8 @@ class Pump(asyncio.Protocol):
         if self._alarm is not None:
             self._alarm.close()
             self._alarm = None
+        if self._look is not None:
+            self._look.cancel()
         self._loop = None
 
     # what asyncio calls
@@ -166,6 +170,7 @@ class Pump(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
         self._port = open_port(self._transport)
+        self._may_hold = self._may_hold or self._port.flow_controlled
         self._paused = False
         self._held_since = inf
         self.arbiter.line_up(self.clock(), paced=self._paced(transport))
@@ -190,20 +195,17 @@ class Pump(asyncio.Protocol):
 
     def pause_writing(self) -> None:
         """Note that the transport could not hand over all that was written: nothing runs out until it has."""
-        self._paused = True
+        self._paused = self._may_hold = True
 
     def resume_writing(self) -> None:
         """Note that the transport has handed over what was written."""
         self._paused = False
-        self._check_output(self.clock())
-        due = self.arbiter.poll_timeout()
-        if due < self._armed:
-            self._arm(due)
+        self._look_again()
 
     def connection_lost(self, cause: Exception | None) -> None:
         self._transport = None
         self._port = None
-        what = self._gave_up or (cause.what if isinstance(cause, LineDown) else str(cause or "it was closed"))
+        what = self._gave_up or cause_text(cause, "it was closed")
         self._gave_up = ""
         self.arbiter.line_down(what, self.clock())
         self.turn()
@@ -241,6 +243,22 @@ class Pump(asyncio.Protocol):
         self.arbiter.handle_timeout(now, unread=unread)
         self.turn()
 
+    def _look_after(self, now: float) -> None:
+        """See to it that what a port holds is noticed, be it let go before a deadline: it is asked when what was said
+        just now should have left."""
+        if self._paused:
+            self._check_output(now)
+        elif self._loop is not None:
+            if self._look is not None:
+                self._look.cancel()
+            self._look = self._loop.call_later(self.arbiter.said_until - now, self._look_again)
+
+    def _look_again(self) -> None:
+        self._check_output(self.clock())
+        due = self.arbiter.poll_timeout()
+        if due < self._armed:
+            self._arm(due)
+
     def _check_output(self, now: float) -> None:
         """Tell the arbiter how much has not left yet. On a bus that closes, nothing waits for that any more."""
         if self._port is None or self._run_out is not None:
@@ -253,6 +271,7 @@ class Pump(asyncio.Protocol):
             self._held_since = inf
         elif self._held_since == inf:
             self._held_since = now
+            self._may_hold = True
         elif now - self._held_since >= STUCK_AFTER:
             self._give_up(self._port)
 

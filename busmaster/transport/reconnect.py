@@ -7,7 +7,7 @@ import random
 from collections.abc import Callable, Hashable
 from typing import cast
 
-from busmaster.errors import LineDown
+from busmaster.errors import LineDown, cause_text
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.identity import Identity
 from busmaster.transport.marks import taker_of_marked_bytes
@@ -201,4 +201,4 @@ class _Link(asyncio.Protocol):
             return exc
         if exc is None:
             return LineDown(f"{self._name} was closed by the other end", hint="")
-        return LineDown(f"{self._name} was lost: {getattr(exc, 'strerror', None) or exc}", hint="")
+        return LineDown(f"{self._name} was lost: {cause_text(exc, 'it was closed')}", hint="")

@@ -8,6 +8,7 @@ byte. The first byte tells the two apart, and every request has one legal set of
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import ClassVar, Generic, NoReturn, TypeVar
 
 from busmaster.contract.exchange import MORE, Done, Expect, FrameError, LaterLeg, Need, Sizes, no_reply
@@ -35,26 +36,25 @@ _REFUSALS: Mapping[int, type[Refused]] = {NAK[0]: Refused}
 def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes], int]) -> int:
     """Return where the ETX of a whole and valid telegram is; 0 if more bytes are needed.
 
-    `header` is STX and the echo, `longest` the most data characters. Raises FrameError as soon as the bytes cannot
-    become such a telegram; `whole` only if nothing but the checksum is wrong, and nothing follows.
+    `header` is STX and the echo, without an ETX; `longest` the most data characters. Raises FrameError as soon as the
+    bytes cannot become such a telegram; `whole` only if nothing but the checksum is wrong, and nothing follows.
     """
     start = len(header)
-    if not buffer.startswith(header):
+    if buffer[:start] != header:
         if header.startswith(buffer):
             return 0
         raise FrameError(f"wrong echo: {buffer[:start].hex(' ')} in place of {header.hex(' ')}", heard=buffer)
-    etx = buffer.find(ETX, start, start + longest + 1)
-    field = buffer[start : etx if etx > 0 else start + longest + 1]
+    head, _, tail = buffer.partition(ETX)  # which takes two thirds of the time of looking for its place
+    field = head[start : start + longest + 1]
     if field.translate(_PRINTABLE) != field:
         raise FrameError("a control character within the data")
-    if etx < 0:
-        if len(field) > longest:
-            raise FrameError(f"more than {longest} characters of data")
+    if len(field) > longest:
+        raise FrameError(f"more than {longest} characters of data")
+    if not tail:
         return 0
-    if len(buffer) <= etx + 1:
-        return 0
-    if buffer[etx + 1] != check(buffer[1 : etx + 1]):
-        raise FrameError("bad checksum", whole=len(buffer) == etx + 2)
+    etx = len(head)
+    if tail[0] != check(buffer[1 : etx + 1]):
+        raise FrameError("bad checksum", whole=len(tail) == 1)
     return etx
 
 
@@ -85,13 +85,19 @@ class SingleLeg:
         raise FrameError(f"a reply cannot begin with {heard[0]:02x}", heard=heard)
 
 
+@lru_cache(maxsize=4096)
+def answers_to(echo: bytes) -> tuple[bytes, ...]:
+    """Return what a telegram with this echo begins with, as the `answers` of an exchange."""
+    return (STX + echo,)
+
+
 class TelegramReader(SingleLeg, Generic[T]):
     """One read: a telegram, or a refusal.
 
     A protocol sets the class attributes. `parse` makes the value of the data field, or raises FrameError.
     """
 
-    __slots__ = ("_buffer", "_header", "answers")
+    __slots__ = ("_buffer", "answers")
 
     check = staticmethod(xor)
     longest: ClassVar[int]
@@ -101,8 +107,7 @@ class TelegramReader(SingleLeg, Generic[T]):
     def __init__(self, request: bytes, echo: bytes, timing: ReplyTiming) -> None:
         self.request = request
         self.timing = timing
-        self._header = STX + echo
-        self.answers = (self._header,)
+        self.answers = answers_to(echo)
         self._buffer = b""
 
     @property
@@ -119,11 +124,12 @@ class TelegramReader(SingleLeg, Generic[T]):
             return MORE
         if buffer[0] != _STX:
             self.reject(buffer)
-        header = self._header
+        header = self.answers[0]
         etx = find_etx(buffer, header, self.longest, self.check)
         if not etx:
             return MORE
-        return Done(self.parse(buffer[len(header) : etx]), buffer[etx + 2 :])
+        value, end = self.parse(buffer[len(header) : etx]), etx + 2
+        return Done(value) if len(buffer) == end else Done(value, buffer[end:])
 
     def expired(self, started: bool) -> NoReturn:
         raise FrameError(f"reply cut short after {len(self._buffer)} bytes") if started else no_reply()

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority
 from busmaster.contract.timing import ReplyTiming, Timings
@@ -203,19 +204,19 @@ def test_r3_noise_before_a_request_is_out_does_not_bring_its_lateness_forward() 
 # MSC: an ACK, then a packet, then the host's ACK
 
 
-def msc_line(packet: float = 1.0) -> tuple[Bench, Timings]:
-    """A line at 9600 baud, and timings with that lateness of packets."""
-    bench = Bench()
+def msc_line(packet: float = 1.0, *, echo: bool = False) -> tuple[Bench, NodeRecord]:
+    """A line at 9600 baud that has rested, and its node, with that lateness of packets."""
+    bench = Bench(echo=echo)
     bench.arbiter.byte_time = MSC_TAU
     timings = msc.PROFILE.timings
-    return bench, replace(timings, packet=replace(timings.packet, lateness=packet))
+    node = bench.node(1, msc.PROFILE, replace(timings, packet=replace(timings.packet, lateness=packet)))
+    bench.wait(2.0)
+    return bench, node
 
 
 @pytest.mark.parametrize("packet", [1.0, 1.5])
 def test_r3_behind_an_ack_the_packets_lateness_counts_from_that_acks_end(packet: float) -> None:
-    bench, timings = msc_line(packet)
-    node = bench.node(1, msc.PROFILE, timings)
-    bench.wait(2.0)
+    bench, node = msc_line(packet)
     bench.ask(node, msc.DataRead(2008))
     bench.sent()
     bench.hear(ACK, after=MSC_REQUEST + 0.4)
@@ -223,24 +224,21 @@ def test_r3_behind_an_ack_the_packets_lateness_counts_from_that_acks_end(packet:
     bench.until_sent()
     assert bench.sent() == ACK, "whatever comes now is acknowledged already"
     bench.until_sent()
-    heard_again = 1.0 + MSC_TAU + timings.packet.byte_gap + MSC_TAU  # the window, our own ACK, and a silence behind it
+    gap = msc.PROFILE.timings.packet.byte_gap
+    heard_again = 1.0 + MSC_TAU + gap + MSC_TAU  # the window, our own ACK, and a silence behind it
     assert bench.now - acked == pytest.approx(max(packet + MSC_TAU, heard_again))
 
 
 @pytest.mark.parametrize("packet", [1.0, 1.5])
 def test_r3_where_the_ack_was_lost_its_packet_is_waited_for_from_the_requests_end(packet: float) -> None:
-    bench, timings = msc_line(packet)
-    node = bench.node(1, msc.PROFILE, timings)
-    bench.wait(2.0)
+    bench, node = msc_line(packet)
     bench.ask(node, msc.DataRead(2008))
     bench.sent()
     assert bench.until_sent() == pytest.approx(MSC_REQUEST + packet + MSC_TAU)
 
 
 def test_r3_an_unasked_byte_may_have_been_the_lost_ack_and_its_packet_is_waited_for_anew() -> None:
-    bench, timings = msc_line()
-    node = bench.node(1, msc.PROFILE, timings)
-    bench.wait(2.0)
+    bench, node = msc_line()
     bench.ask(node, msc.DataRead(2008))
     bench.sent()
     bench.hear("00", after=MSC_REQUEST + 0.8)
@@ -248,9 +246,7 @@ def test_r3_an_unasked_byte_may_have_been_the_lost_ack_and_its_packet_is_waited_
 
 
 def test_r3_a_damaged_byte_in_place_of_the_ack_may_have_been_it_and_its_packet_is_waited_for_anew() -> None:
-    bench, timings = msc_line()
-    node = bench.node(1, msc.PROFILE, timings)
-    bench.wait(2.0)
+    bench, node = msc_line()
     bench.ask(node, msc.DataRead(2008), retries=0)
     bench.ask(node, msc.DataRead(2012))
     bench.sent()
@@ -262,11 +258,24 @@ def test_r3_a_damaged_byte_in_place_of_the_ack_may_have_been_it_and_its_packet_i
     assert bench.now - heard == pytest.approx(1.0 + MSC_TAU)
 
 
+def test_r3_an_ack_that_is_taken_for_an_echo_may_be_followed_by_its_packet() -> None:
+    """On a line that echoes: a byte from nowhere for an ACK, the echo for a packet, whose ACK does not echo."""
+    bench, node = msc_line(echo=True)
+    bench.ask(node, msc.DataRead(2008), retries=0)
+    bench.ask(node, msc.DataRead(2012))
+    request = bench.sent()
+    bench.hear("FF", after=MSC_REQUEST)
+    bench.hear(request)
+    assert bench.sent() == ACK, "what looks like a packet is acknowledged"
+    bench.hear(ACK, after=0.002)
+    heard = bench.now
+    bench.until_sent()
+    assert bench.now - heard >= 1.0
+
+
 def test_r3_noise_does_not_use_up_the_knowledge_that_a_packet_follows_its_ack() -> None:
     """Noise at 0.6 s, the late ACK at 0.95 s, the packet 0.99 s after it: 18 bytes, and the line is not free before."""
-    bench, timings = msc_line()
-    node = bench.node(1, msc.PROFILE, timings)
-    bench.wait(2.0)
+    bench, node = msc_line()
     bench.ask(node, msc.DataRead(2008), retries=0)
     bench.ask(node, msc.DataRead(2012))
     bench.sent()
@@ -280,9 +289,7 @@ def test_r3_noise_does_not_use_up_the_knowledge_that_a_packet_follows_its_ack() 
 
 def test_r3_a_request_behind_two_acks_that_are_still_being_said_is_out_behind_both() -> None:
     """MSC: ACK for a stale packet, ACK for another, then the request: its window counts from the end of all three."""
-    bench, timings = msc_line()
-    node = bench.node(1, msc.PROFILE, timings)
-    bench.wait(2.0)
+    bench, node = msc_line()
     bench.arbiter.byte_time = slow = 0.100
     bench.hear(REPLY_1234)
     bench.hear(REPLY_1234)
@@ -299,9 +306,7 @@ def test_r3_a_request_behind_two_acks_that_are_still_being_said_is_out_behind_bo
 
 
 def test_a_closing_ack_is_over_when_it_is_out() -> None:
-    bench, timings = msc_line()
-    node = bench.node(1, msc.PROFILE, timings)
-    bench.wait(2.0)
+    bench, node = msc_line()
     bench.ask(node, msc.DataRead(2008))
     bench.sent()
     bench.hear(ACK + REPLY_1234, after=MSC_REQUEST + 0.05)
@@ -348,9 +353,7 @@ def test_a_broadcast_is_over_when_it_is_out_and_the_turnaround_later() -> None:
 
 
 def test_r1_what_is_said_behind_an_ack_is_reckoned_from_the_end_of_both() -> None:
-    bench, timings = msc_line()
-    node = bench.node(1, msc.PROFILE, timings)
-    bench.wait(2.0)
+    bench, node = msc_line()
     bench.ask(node, msc.DataRead(2008))
     bench.ask(node, msc.DataRead(2008))
     assert bench.sent() == READ_2008

@@ -9,7 +9,7 @@ from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import GarbledReply, NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
-from tests.arbiter.bench import ACK, NAK, TAU, WRITE_5, Bench, lost, reply_of, request_of, up
+from tests.arbiter.bench import ACK, NAK, TAU, WRITE_5, Bench, lost, reply_of, request_of, right_answer, up
 
 REQUEST = 8 * TAU
 URGENT, COMMAND, POLL, BACKGROUND = Priority
@@ -253,6 +253,53 @@ def test_r15_what_is_owed_outlives_a_lost_port() -> None:
     assert bench.sent() == request_of(1)
     bench.answer(7)
     assert read.value == 7.0
+
+
+def echoing() -> tuple[Bench, NodeRecord]:
+    """A line that echoes, and a node that has answered element 2 on it."""
+    bench = Bench(echo=True)
+    node = bench.node()
+    echoed(bench, bench.ask(node, hcp2.Read(2)), answered_after=0.004)
+    return bench, node
+
+
+def echoed(bench: Bench, asked: Transaction, answered_after: float) -> None:
+    """It is asked, its request echoes whole, and it is answered after so many seconds."""
+    request = bench.sent()
+    bench.hear(request, after=REQUEST)
+    bench.hear(right_answer(request), answered_after)
+    bench.until_ready()
+    assert bench.ended(asked)
+
+
+def test_r15_what_is_left_of_our_own_request_pays_nothing() -> None:
+    """The end of a write to element 1, whose echo was damaged, looks like a reply of element 1."""
+    bench, node = echoing()
+    bench.ask(node, retries=0)
+    bench.hear(bench.sent(), after=REQUEST)
+    bench.until_ready()
+    bench.ask(node, write(5))
+    assert bench.sent() == WRITE_5, "an ACK is not owed"
+    bench.hear("FF")
+    bench.hear(WRITE_5[3:], after=0.002)
+    following = bench.ask(node)
+    bench.until_sent()
+    assert bench.sent() == request_of(2), "a check: element 1 is owed still"
+    bench.hear(bench.asked, after=REQUEST)
+    bench.hear(reply_of(1, 55), after=0.002)
+    assert following.value is None
+
+
+def test_r15_replies_pay_again_once_an_echo_has_come_whole() -> None:
+    bench, node = echoing()
+    bench.ask(node, retries=0)
+    bench.sent()
+    bench.hear("FF", after=0.002)
+    bench.until_ready()
+    echoed(bench, bench.ask(node, hcp2.Read(3), retries=0), answered_after=0.120)
+    before = checks(bench)
+    bench.ask(node, hcp2.Read(3))
+    assert (bench.sent(), checks(bench)) == (request_of(3), before), "a straggler has paid for it"
 
 
 # a debt that another node's answer paid

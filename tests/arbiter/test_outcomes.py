@@ -13,6 +13,7 @@ from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, GarbledReply, NoReply, Refused, Superseded, WriteUnconfirmed
 from busmaster.protocols._comms.codec import Reading, Writing
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
 from tests.arbiter.bench import ACK, FIVE, LATENESS, NAK, QUIET, READ_1_OF_NODE_1, TAU, WRITE_5, Bench, request_of, up
 
 REQUEST = 8 * TAU
@@ -54,6 +55,17 @@ def test_r7_a_write_that_was_not_answered_and_then_refused_is_unconfirmed_not_re
             bench.hear(NAK, after=0.004)
     assert isinstance(asked.error, WriteUnconfirmed)
     assert not isinstance(asked.error, Refused)
+
+
+def test_r7_a_write_whose_ack_may_have_lost_a_bit_is_unconfirmed_and_sent_once() -> None:
+    """Mentor II's EOT is an ACK with one bit flipped."""
+    bench = Bench()
+    asked = bench.ask(bench.node(1, mentor.PROFILE), mentor.Write(1, 17, 100))
+    bench.sent()
+    bench.hear("04", after=0.030)
+    assert isinstance(asked.error, WriteUnconfirmed)
+    bench.until_ready()
+    assert bench.sent() == ""
 
 
 def test_r7_a_write_that_was_never_sent_is_superseded() -> None:

@@ -5,20 +5,21 @@ from __future__ import annotations
 import pytest
 
 from busmaster.arbiter.state import LineState
-from busmaster.arbiter.transaction import Priority
+from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import GarbledReply, NoReply, Refused
 from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import Bench
 
 READ_2008 = "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74"
+READ_2012 = "02 01 00 08 00 00 44 52 45 41 44 2C 07 DC 02 78"
 REPLY_1234 = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"
 BAD_REPLY = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D3 02 6D"
 ACK, NAK = "06", "15"
 TAU = 10 / 9600
 
 
-def bench() -> Bench:
-    made = Bench()
+def bench(*, strict: bool = False) -> Bench:
+    made = Bench(strict=strict)
     made.arbiter.byte_time = TAU
     return made
 
@@ -185,3 +186,48 @@ def test_r3_an_ack_that_lies_behind_a_lost_port_is_followed_by_its_packet_too() 
     line.hear(ACK, after=0.7)
     line.wait(0.95)
     assert line.sent() == ""
+
+
+def test_half_a_packet_from_before_the_port_was_lost_is_not_gone_on_with() -> None:
+    line = bench()
+    line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    line.hear(REPLY_1234[:20])
+    line.arbiter.line_down("unplugged", line.now)
+    line.arbiter.line_up(line.now)
+    line.hear(REPLY_1234, after=0.1)
+    assert line.sent() == ACK, "a whole packet, acknowledged at once"
+    line.until_ready()
+    assert line.sent() == "", "and the half one not at all"
+
+
+def asked_twice_alike() -> tuple[Bench, Transaction]:
+    """What is asked second of a unit could be answered by what its first answer was, said again."""
+    line = bench(strict=True)
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    line.ask(node, msc.DataRead(2008))
+    line.sent()
+    line.hear(ACK, after=0.030)
+    line.hear(REPLY_1234, after=0.010)
+    line.until_ready()
+    second = line.ask(node, msc.DataRead(2012), retries=0)
+    assert line.sent() == f"{ACK} {READ_2012}"
+    line.hear(ACK, after=0.030)
+    line.hear(REPLY_1234, after=0.010)
+    return line, second
+
+
+def test_r15_a_doubtful_packet_is_acknowledged_at_once_and_held() -> None:
+    """A unit says its packet again until it is acknowledged."""
+    line, second = asked_twice_alike()
+    assert (line.ended(second), line.sent()) == (0, ACK)
+    line.until_ready()
+    assert (line.ended(second), second.value, line.sent()) == (1, 1234, ""), "and acknowledged once"
+
+
+def test_r15_an_ack_behind_a_packet_that_was_held_takes_it_away() -> None:
+    """A unit that heard the first request twice answers it twice; only then comes the second one's answer."""
+    line, second = asked_twice_alike()
+    line.hear(ACK, after=0.003)
+    assert isinstance(second.error, GarbledReply)

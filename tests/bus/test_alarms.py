@@ -119,7 +119,7 @@ def test_the_bus_tells_what_is_polled_and_holds_what_is_active(caplog: pytest.Lo
         events.close()
         changes = [event async for event in events if isinstance(event, AlarmChanged)]
         assert [(change.active, change.value) for change in changes] == [(True, 30), (False, None)]
-        assert changes[1].text == "1/10 is polled no more, was above its high of 20"
+        assert changes[1].text == "1/10 is watched no more, was above its high of 20"
 
     on_a_bus(story)
     levels = [(record.levelno, record.message.partition(": ")[2]) for record in caplog.records]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import random
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from typing import Any, TypeAlias
@@ -11,11 +12,11 @@ import pytest
 
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
-from busmaster.bus.node import Node, Priority
-from busmaster.emulator.device import Device
+from busmaster.bus.node import Health, Node, Priority
+from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
-from busmaster.errors import InvalidCommand, NotStarted, Superseded
+from busmaster.errors import InvalidCommand, NotStarted, Superseded, WriteUnconfirmed
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
 from busmaster.protocols.dc104.handle import Dc104Drive
 from busmaster.protocols.hcp.handle import HcpController
@@ -29,12 +30,13 @@ from busmaster.protocols.modbus.codec import WriteRegisters
 from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.protocols.msc.handle import MscController
 from busmaster.registry import make_device
+from tests.stories import in_virtual_time
 
 Way: TypeAlias = Callable[[Any, float], Awaitable[None]]
 
 
 def bus_of(handle: type[Handle], *devices: Device) -> Bus:
-    return Bus(MemoryPort(Line(handle.profile.line, list(devices))))
+    return Bus(MemoryPort(Line(handle.profile.line, list(devices), chance=random.Random(1))))
 
 
 @asynccontextmanager
@@ -58,8 +60,8 @@ HCP2_WAYS: dict[str, Way] = {
 }
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("way", HCP2_WAYS.values(), ids=HCP2_WAYS)
+@in_virtual_time
 async def test_no_way_of_writing_goes_round_a_limit(way: Way) -> None:
     async with controller() as drive:
         drive.element(10).limit(minimum=-50, maximum=500)
@@ -73,7 +75,7 @@ async def test_no_way_of_writing_goes_round_a_limit(way: Way) -> None:
         assert await drive.read(10) == 500
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_what_may_not_be_written_is_refused_whatever_the_value() -> None:
     async with controller() as drive:
         drive.element(10).limit(writable=False)
@@ -95,8 +97,8 @@ PLACES: list[tuple[str, type[Handle], int, str, dict[str, Any]]] = [
 ]
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize(("kind", "handle", "address", "item", "options"), PLACES, ids=str)
+@in_virtual_time
 async def test_every_protocol_says_what_its_writes_change(
     kind: str, handle: type[Handle], address: int, item: str, options: dict[str, Any]
 ) -> None:
@@ -113,7 +115,7 @@ async def test_every_protocol_says_what_its_writes_change(
             await drive.prepare_write(item, [45])[0]()
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_a_number_of_two_registers_is_not_written_in_halves() -> None:
     bus = bus_of(ModbusUnit, make_device("modbus", 17))
     async with bus:
@@ -132,7 +134,7 @@ async def test_a_number_of_two_registers_is_not_written_in_halves() -> None:
             await unit.write("holding:39", 1, 0x4B00, 0)
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_a_block_of_an_msc_is_held_to_the_limit_of_each_of_its_values() -> None:
     bus = bus_of(MscController, make_device("msc", 3))
     async with bus:
@@ -156,12 +158,12 @@ async def test_a_block_of_an_msc_is_held_to_the_limit_of_each_of_its_values() ->
         assert await press.read("speed") == 3
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize(
     ("profile", "handle", "item", "first"),
     [(MENTOR, MentorDrive, "1.17", 14), (MODBUS, ModbusUnit, "holding:40", 14)],
     ids=["mentor", "modbus"],
 )
+@in_virtual_time
 async def test_a_write_to_all_is_held_to_the_limits_of_each(
     profile: Any, handle: type[Handle], item: str, first: int
 ) -> None:
@@ -181,7 +183,7 @@ async def test_a_write_to_all_is_held_to_the_limits_of_each(
         await drives[1].write(item, 100)
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_a_step_counts_from_the_last_confirmed_value_which_is_read_first_if_unknown() -> None:
     async with controller() as drive:
         await drive.write(10, 100.0)
@@ -204,7 +206,70 @@ async def test_a_step_counts_from_the_last_confirmed_value_which_is_read_first_i
         assert await drive.read(10) == 21
 
 
-@pytest.mark.asyncio
+@in_virtual_time
+async def test_a_step_counts_from_what_is_read_where_the_write_before_may_have_been_carried_out() -> None:
+    device = make_device("hcp2", 5)
+    async with bus_of(Hcp2Controller, device) as bus:
+        drive = Hcp2Controller(bus, 5)
+        drive.element(10).limit(max_step=20)
+        await drive.write(10, 20)
+        device.faults.lost = 1.0
+        with pytest.raises(WriteUnconfirmed):
+            await drive.write(10, 40, idempotent=False)
+        device.faults.lost = 0.0
+        await drive.write(10, 60)
+
+
+@in_virtual_time
+async def test_a_step_counts_from_what_is_read_where_the_node_was_away() -> None:
+    device = make_device("hcp2", 5)
+    async with bus_of(Hcp2Controller, device) as bus:
+        drive = Hcp2Controller(bus, 5)
+        drive.element(10).limit(max_step=20)
+        await drive.write(10, 20)
+        for state, dead in ((Health.DOWN, 1.0), (Health.UP, 0.0)):
+            device.faults.dead = dead
+            while Node.of(drive).health is not state:
+                await asyncio.gather(drive.read(1), asyncio.sleep(0.5), return_exceptions=True)
+        device.preset("10", 100)
+        with pytest.raises(InvalidCommand, match="30 is too far from 100"):
+            await drive.write(10, 30)
+
+
+@in_virtual_time
+async def test_the_time_of_a_write_counts_from_before_the_value_is_read_from_which_it_steps() -> None:
+    slow = 0.03
+    async with bus_of(Hcp2Controller, make_device("hcp2", 5, delay=Delay(slow, slow))) as bus:
+        drive = Hcp2Controller(bus, 5)
+        await drive.read(10)
+        drive.element(10).limit(max_step=20)
+        began = bus.now()
+        with pytest.raises(WriteUnconfirmed):
+            await drive.write(10, 20, finish_within=2 * slow)
+        assert bus.now() - began == pytest.approx(2 * slow, abs=0.001)
+
+
+@in_virtual_time
+async def test_a_write_to_all_is_held_to_the_limits_of_those_of_another_protocol_that_hear_it() -> None:
+    async with bus_of(MentorDrive, make_device("mentor", 14), make_device("ct-ansi", 15)) as bus:
+        CtAnsiDrive(bus, 15).point("1.21").limit(maximum=100)
+        with pytest.raises(InvalidCommand, match=r"node 15: .* maximum of 100"):
+            await MentorDrive(bus, 0).write("1.21", 101)
+
+
+@in_virtual_time
+async def test_an_urgent_write_that_is_refused_overtakes_nothing() -> None:
+    async with controller() as drive:
+        drive.element(10).limit(maximum=100, max_step=20)
+        waiting = asyncio.ensure_future(drive.write(10, 20))
+        await asyncio.sleep(0)
+        with pytest.raises(InvalidCommand, match="maximum of 100"):
+            await drive.element(10).write(101, priority=Priority.URGENT)
+        await waiting
+        assert await drive.read(10) == 20
+
+
+@in_virtual_time
 async def test_a_stop_passes_every_limit_and_what_waits_for_a_step_is_not_sent_after_it() -> None:
     bus = bus_of(MicroFlexDrive, make_device("microflex", 7))
     async with bus:

@@ -157,6 +157,21 @@ def test_a_write_that_could_not_be_read_back_in_time_was_not_left_undone() -> No
     on_a_bus(story, device)
 
 
+def test_a_read_back_without_a_reply_is_told_as_what_it_is() -> None:
+    async def story(bus: Bus) -> None:
+        axis = Hcp2Controller(bus, 1)
+        await axis.read(1)
+        writing = asyncio.ensure_future(axis.write(1, 5.0, verify=True))
+        await asyncio.sleep(0.5 * SLOW)
+        device.faults.dead = 1.0
+        with pytest.raises(NoReply, match="read element 1"):
+            await writing
+        assert device.comms[1] == 5.0
+
+    device = slow()
+    on_a_bus(story, device)
+
+
 def test_msc_blocks_and_their_verification_have_one_time_too() -> None:
     async def story(bus: Bus) -> None:
         press = MscController(bus, 3, address_step=4)

@@ -7,11 +7,7 @@ from typing import Any
 
 import pytest
 
-from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.in_step import InStep
-from busmaster.arbiter.leg import Leg
-from busmaster.arbiter.transaction import Transaction
-from busmaster.arbiter.unasked import QUIET
 from busmaster.contract.exchange import FrameError
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.msc import exchange as msc_exchange
@@ -19,6 +15,13 @@ from busmaster.wire import readers
 from tests.campaigns.hunt import Hunt
 from tests.campaigns.judge import Judge, Totals
 from tests.campaigns.kinds import KINDS
+from tests.planted import (
+    with_a_cancellation_that_clears_the_exchange,
+    without_lateness,
+    without_the_adapter_in_the_lateness,
+    without_the_adapter_in_the_silence,
+    without_the_byte_time,
+)
 
 SEEDS = range(1, 21)
 EACH = 2000
@@ -58,7 +61,7 @@ def excusing(feed: Callable[..., Any]) -> Callable[..., Any]:
 
 @EVERY_PROTOCOL
 def test_a_lateness_of_zero_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Leg, "past", lambda leg: leg.end)
+    without_lateness(monkeypatch)
     assert "WRONG" in caught(protocol, "late").problems[0]
 
 
@@ -71,16 +74,7 @@ def test_a_wrong_echo_that_does_not_settle_is_caught(protocol: str, monkeypatch:
 
 @EVERY_PROTOCOL
 def test_a_cancellation_that_clears_the_exchange_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    right = Arbiter.cancel
-
-    def cancel(arbiter: Arbiter, transaction: Transaction, now: float) -> None:
-        right(arbiter, transaction, now)
-        if arbiter._wire.transaction is transaction:
-            arbiter._end_exchange()
-            arbiter.dispatcher._end(transaction, now)
-            arbiter._release(0.0, now)
-
-    monkeypatch.setattr(Arbiter, "cancel", cancel)
+    with_a_cancellation_that_clears_the_exchange(monkeypatch)
     assert "WRONG" in caught(protocol, "cancelled").problems[0]
 
 
@@ -107,7 +101,7 @@ def test_without_r3_a_request_that_leaves_too_early_is_caught_before_it_does_har
     protocol: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.undo()
-    monkeypatch.setattr(Leg, "past", lambda leg: leg.end)
+    without_lateness(monkeypatch)
     assert "R3" in Hunt(protocol, "late", 1).run(EACH).problems[0]
 
 
@@ -132,19 +126,19 @@ NOT_MSC = pytest.mark.parametrize("protocol", ["hcp", "hcp2", "mentor", "dc104"]
 @NOT_MSC
 def test_a_byte_time_left_out_of_the_lateness_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
-    monkeypatch.setattr(Leg, "_past", lambda leg, end, timing: end + timing.lateness + leg.latency)
+    without_the_byte_time(monkeypatch)
     assert "R1" in broken(protocol, "edges")
 
 
 @NOT_MSC
 def test_an_adapter_left_out_of_the_lateness_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
-    monkeypatch.setattr(Leg, "_past", lambda leg, end, timing: end + timing.lateness + leg.byte_time)
+    without_the_adapter_in_the_lateness(monkeypatch)
     assert "R1" in broken(protocol, "edges, held back") or "R3" in broken(protocol, "edges, held back")
 
 
 @NOT_MSC
 def test_an_adapter_left_out_of_the_silence_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
-    monkeypatch.setattr(Leg, "quiet", lambda leg: max(QUIET, leg.timing.byte_gap) + leg.byte_time)
+    without_the_adapter_in_the_silence(monkeypatch)
     assert "adapter" in broken(protocol, "edges, pushed")

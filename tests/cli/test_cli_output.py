@@ -58,6 +58,8 @@ def test_a_printed_number_reads_back_as_itself_and_has_no_exponent(number: float
     [
         (12.5, "12.5"),
         (3.0, "3"),
+        (2.0**53 - 1, "9007199254740991"),
+        (1e17, "1e+17"),
         (float("nan"), "null"),
         (None, "null"),
         (Status(65), "65"),

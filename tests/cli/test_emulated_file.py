@@ -38,16 +38,24 @@ def emulated(path: Path, link: str, *options: str) -> Iterator[None]:
 
 
 def polled(path: Path, link: str | None = None) -> dict[str, Sample[Any]]:
-    """One cycle of every group, at the file's port or another. No node of the line has failed a request."""
+    """One cycle of every group, at the file's port or another, in which no node of the line has failed a request.
+
+    A few are tried: on a busy machine the emulator, a process of its own, may answer later than any drive.
+    """
     file = load(path)
 
-    async def poll() -> dict[str, Sample[Any]]:
+    async def poll() -> tuple[dict[str, Sample[Any]], int]:
         async with ConfiguredLine(file, port=other_port(file, link), outputs=False) as line:
             snapshots = [await anext(aiter(group)) for group in line.groups.values()]
-            assert [Node.of(handle).statistics().failed for handle in line.nodes.values()] == [0] * len(line.nodes)
-        return {getattr(point, "key", ""): sample for one in snapshots for point, sample in one.items()}
+            failed = sum(Node.of(handle).statistics().failed for handle in line.nodes.values())
+        return {getattr(point, "key", ""): sample for one in snapshots for point, sample in one.items()}, failed
 
-    return asyncio.run(asyncio.wait_for(poll(), PATIENCE))
+    for _ in range(5):
+        samples, failed = asyncio.run(asyncio.wait_for(poll(), PATIENCE))
+        if not failed:
+            break
+    assert not failed
+    return samples
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: str(path.name))

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import anyio
 import pytest
 
+from busmaster.cli.emulate import serve_for
 from busmaster.cli.ending import Ending
 from busmaster.emulator.serve import TcpServer
 from tests.cli.conftest import ENVIRONMENT, ROOT, Command, started
@@ -95,6 +96,27 @@ def test_a_signal_sent_twice_ends_a_poll_with_its_summary(
     assert process.returncode == status
     assert "cycles" in err
     assert "Traceback" not in err
+
+
+def test_a_signal_that_another_thread_takes_ends_an_emulated_line_too() -> None:
+    class Heard(BaseException):
+        """It was."""
+
+    def hear(*_: object) -> None:
+        raise Heard
+
+    def serve() -> None:
+        taking.start()
+        serve_for(None)
+
+    before = signal.signal(signal.SIGUSR1, hear)
+    taking = threading.Timer(0.1, lambda: signal.pthread_kill(threading.get_ident(), signal.SIGUSR1))
+    try:
+        with pytest.raises(Heard):
+            serve()
+    finally:
+        taking.join()
+        signal.signal(signal.SIGUSR1, before)
 
 
 @pytest.mark.parametrize("arguments", ["--help", "--version", "read --help"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import select
 import signal
 import subprocess
 import sys
@@ -133,7 +134,13 @@ class Terminal:
         deadline = time.monotonic() + PATIENCE
         while not seen(self.drawn):
             assert time.monotonic() < deadline, self.drawn[-2000:]
-            self.drawn += os.read(self.master, 65536)
+            if select.select([self.master], [], [], 0.05)[0]:
+                self.drawn += os.read(self.master, 65536)
+
+    def status(self) -> int:
+        """How the process ended, which it cannot while nobody reads what it draws."""
+        self.until(lambda _: self.process.poll() is not None)
+        return self.process.returncode
 
     def close(self) -> None:
         self.process.kill()
@@ -149,7 +156,7 @@ def test_the_demo_on_a_terminal_draws_and_gives_the_terminal_back(key: bytes, st
     try:
         terminal.until(lambda drawn: b"busmaster demo" in drawn and b"axis0.position" in drawn and b"speed" in drawn)
         os.write(terminal.master, key)
-        assert terminal.process.wait(PATIENCE) == status
+        assert terminal.status() == status
         terminal.until(lambda drawn: b"cycles" in drawn)
         assert b"Traceback" not in terminal.drawn
         assert tcgetattr(terminal.slave) == terminal.before

@@ -12,7 +12,7 @@ from busmaster.emulator.serve import TcpServer
 from tests.cli.conftest import ENVIRONMENT, ROOT
 from tests.patience import PATIENCE
 
-SCAN = ("scan", "--protocol", "hcp2", "--nodes", "6-9", "--timeout", "30")
+SCAN = ("scan", "--protocol", "hcp2", "--nodes", "6-9", "--timeout", "300")
 
 
 def scan_on_a_terminal(port: str, *, results_too: bool) -> tuple[bytes, bytes]:

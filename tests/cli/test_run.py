@@ -16,8 +16,10 @@ from pathlib import Path
 import pytest
 
 from busmaster.capture.pcapng import read_packets
+from busmaster.cli.run import output_text
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
+from busmaster.outputs.base import OutputStatistics
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from tests.cli.conftest import ROOT, Command, ended_once, started
@@ -73,37 +75,9 @@ def test_run_prints_a_line_a_value_and_a_summary_of_groups_nodes_and_outputs(lin
     assert found == 4
 
 
-MEANT = """
-[nodes.winder.points.pull]
-item = "11"
-unit = "N"
-precision = 2
-low = 1
-deadband = 0
-[nodes.winder.points.mode]
-item = "12"
-labels = { 0 = "off" }
-[groups.meant]
-period = 0.02
-points = ["winder/pull,mode"]
-"""
-
-
-def test_run_shows_people_what_points_mean_and_tells_an_alarm_once(busmaster: Command, line: Path) -> None:
-    line.write_text(line.read_text() + MEANT)
-    ran = busmaster("run", str(line), "--seconds", "0.6", "--plain")
-    values = {key: value for _, key, value in (text.split(" ", 2) for text in ran.lines)}
-    assert (values["winder/pull"], values["winder/mode"]) == ("0.00", "0 off")
-    assert ran.err.count("busmaster: winder/pull = 0 N is below its low of 1 N\n") == 1
-    assert " suppressed as no news" in ran.err.splitlines()[-1]
-
-
-def test_json_is_not_rounded_and_has_numbers_with_their_labels(busmaster: Command, line: Path) -> None:
-    line.write_text(line.read_text() + MEANT)
-    ran = busmaster("run", str(line), "--seconds", "0.6", "--json")
-    cycle = next(cycle for cycle in map(json.loads, ran.lines) if cycle["group"] == "meant")
-    assert cycle["samples"]["winder/pull"] == {"value": 0, "error": None, "late": False}
-    assert cycle["samples"]["winder/mode"] == {"value": 0, "error": None, "late": False, "label": "off"}
+def test_what_an_output_was_spared_is_told_apart_from_what_it_lost() -> None:
+    counts = OutputStatistics("csv", "written", 3, 1, 0, "", suppressed=5)
+    assert output_text(counts) == "csv: 3 written, 1 dropped, 5 suppressed as no news"
 
 
 def test_run_says_that_a_file_without_groups_polls_nothing(busmaster: Command, line: Path) -> None:
@@ -261,11 +235,11 @@ def test_r13_a_lost_port_and_why_it_does_not_come_back_are_told_on_standard_erro
         assert process.stdout is not None
         assert process.stderr is not None
         process.stdout.readline()
-        assert "no safe state" in process.stderr.readline()
+        of_the_line = (line for line in process.stderr if "the line is " in line or "cannot connect" in line)
         server.close()
-        told = [process.stderr.readline() for _ in range(2)]
+        told = [next(of_the_line) for _ in range(2)]
         with served():
-            told.append(process.stderr.readline())
+            told.append(next(of_the_line))
             process.send_signal(signal.SIGINT)
             _, err = process.communicate(timeout=PATIENCE)
     assert told == [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -16,14 +17,16 @@ from busmaster.cli import watching
 from busmaster.cli.arguments import View
 from busmaster.cli.messages import Action, Frame
 from busmaster.cli.output import Level
-from busmaster.cli.watching import Watch, count_cycles
+from busmaster.cli.watching import Watch, count_cycles, json_cycle, plain_cycle
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.emulator.serve import TcpServer
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.registry import make_device
 from busmaster.transport.tcp import TcpPort
 from tests.patience import PATIENCE
+from tests.stories import in_virtual_time
 
 
 @asynccontextmanager
@@ -60,11 +63,33 @@ async def test_the_picture_has_every_point_its_age_and_its_nodes_health(controll
             ("node 2", "outputs", 0, True),
             ("node 2", "axis0.idle", 1, False),
         ]
-        assert all(row.age is not None and 0 <= row.age < 5 for row in frame.rows)
+        assert all(row.age is not None and 0 <= row.age < PATIENCE for row in frame.rows)
         frame = await seen(watch, lambda frame: [node.health for node in frame.nodes] == ["up", "up"])
         assert frame.port == f"{controllers.host}:{controllers.port}  57600 8N1"
         assert frame.line in ("ready", "settling")
         assert 0 < frame.utilisation <= 1
+
+
+@pytest.mark.asyncio
+async def test_people_are_shown_digits_and_names_and_programs_all_digits_and_numbers(controllers: TcpServer) -> None:
+    async with watched(controllers, 1) as watch:
+        controller = Hcp2Controller(watch.bus, 1)
+        await controller.write(10, 1.25, 1)
+        pull = replace(controller.point("10"), meaning=Meaning(precision=3))
+        mode = replace(controller.point("11"), meaning=Meaning(labels={1: "on"}))
+        group = watch.bus.poll_group("meant", period=0.02, points=[pull, mode])
+        watch.add(group)
+        async for snapshot in group:
+            if all(sample.error is None for sample in snapshot.values()):
+                break
+        plain = [text.split(" ", 1)[1] for text in plain_cycle(watch, snapshot)]
+        assert plain == ["1/10 1.250", "1/11 1 on"]
+        samples = json.loads(json_cycle(watch, snapshot))["samples"]
+        assert (samples["1/10"]["value"], samples["1/11"]["value"], samples["1/11"]["label"]) == (1.25, 1, "on")
+        assert "label" not in samples["1/10"]
+        watch.saw(snapshot)
+        rows = {row.item: row for row in watch.picture().rows}
+        assert (rows["10"].value, rows["10"].precision, rows["11"].value) == (1.25, 3, "1 on")
 
 
 @pytest.mark.asyncio
@@ -134,6 +159,21 @@ async def test_pausing_stops_the_cycles_and_the_same_key_goes_on(controllers: Tc
         await watch.act(Action("pause"))
         frame = await seen(watch, lambda frame: frame.groups[0].cycles > cycles + 2)
         assert not frame.groups[0].paused
+
+
+@in_virtual_time
+async def test_the_time_for_which_it_was_paused_is_no_period() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)])))
+    async with bus, anyio.create_task_group() as tasks:
+        watch = Watch(bus, "test", View())
+        group = bus.poll_group("axes", period=0.1, points=[Hcp2Controller(bus, 1).point("1")])
+        watch.add(group)
+        tasks.start_soon(count_cycles, watch, group)
+        for pause in (1.0, 10.0, 1.0):
+            await anyio.sleep(pause)
+            await watch.act(Action("pause"))
+        assert watch.picture().groups[0].achieved == pytest.approx(0.1, abs=0.01)
+        tasks.cancel_scope.cancel()
 
 
 @pytest.mark.asyncio

@@ -274,6 +274,10 @@ def test_values_of_every_kind_of_node_can_be_said() -> None:
             "line.toml:8: emulator.nodes.n.parameters.7.05.hihg: no such key; did you mean 'high'?",
         ),
         (
+            node("mentor", 14, emulated="[emulator.nodes.n.parameters]\n'7.06-05' = { high = 5 }"),
+            "line.toml:8: emulator.nodes.n.parameters.7.06-05: a range goes upwards: 5-6, not 06-05",
+        ),
+        (
             node("hcp2", 1, emulated="[emulator.nodes.n.values]\n1 = 5\n'axis0.postion' = 1"),
             "line.toml:9: emulator.nodes.n.values.axis0.postion: an emulated controller's element 'axis0.postion'",
         ),

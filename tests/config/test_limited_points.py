@@ -6,15 +6,16 @@ import asyncio
 
 import pytest
 
-from busmaster.bus.node import Priority
+from busmaster.bus.node import Node, Priority
 from busmaster.config import ConfiguredLine, FileError, LineFile, emulated_line
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
-from busmaster.errors import InvalidCommand
+from busmaster.errors import InvalidCommand, NodeDown
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
+from tests.stories import in_virtual_time
 
 HEAD = 'port = "/dev/ttyUSB0?baudrate=57600"\n'
 NODE = '[nodes.winder]\nprotocol = "hcp2"\naddress = 5\n'
@@ -49,7 +50,7 @@ def emulated(points: str) -> ConfiguredLine:
     return ConfiguredLine(file(points), port=MemoryPort(line), outputs=False)
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_a_limit_is_in_the_points_unit_and_holds_under_every_alias() -> None:
     async with emulated(POINTS) as line:
         speed, pace = line.point("winder/speed"), line.point("winder/pace")
@@ -69,7 +70,7 @@ async def test_a_limit_is_in_the_points_unit_and_holds_under_every_alias() -> No
             await pace.write(650)
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_what_is_not_writable_is_so_under_every_name() -> None:
     async with emulated(POINTS) as line:
         assert not line.point("winder/ready").writable
@@ -78,7 +79,7 @@ async def test_what_is_not_writable_is_so_under_every_name() -> None:
                 await work
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_a_file_that_is_read_again_holds_its_limits_anew_and_those_of_the_program_stay() -> None:
     async with emulated(POINTS) as line:
         speed = line.point("winder/speed")
@@ -99,7 +100,7 @@ async def test_a_file_that_is_read_again_holds_its_limits_anew_and_those_of_the_
         await line.point("winder/11").write(1)
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_a_write_that_waits_for_its_value_before_is_held_to_the_limits_of_a_file_read_meanwhile() -> None:
     async with emulated(POINTS) as line:
         waiting = asyncio.ensure_future(line.point("winder/speed").write(50))
@@ -117,8 +118,8 @@ writes = { "winder/speed" = 0 }
 """
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize(("kind", "address", "item"), SAFE_PLACES, ids=str)
+@in_virtual_time
 async def test_no_limit_holds_the_safe_state(kind: str, address: str, item: str) -> None:
     node = f'[nodes.winder]\nprotocol = "{kind}"\n{address}\n[nodes.winder.points]\n'
     text = f'{node}speed = {{ item = "{item}", minimum = 5, maximum = 100, max_step = 1 }}\n{SAFE}'
@@ -127,8 +128,31 @@ async def test_no_limit_holds_the_safe_state(kind: str, address: str, item: str)
         await line.point("winder/speed").write(40, priority=Priority.URGENT)
         with pytest.raises(InvalidCommand, match="minimum of 5"):
             await line.point("winder/speed").write(0, priority=Priority.URGENT)
-        assert await line.safe_state.enter(line.bus) == {"winder/speed": None}
+        assert await line.safe_state.enter(line.gate, "a test") == {"winder/speed": None}
         assert await line.point("winder/speed").read() == 0
+
+
+@in_virtual_time
+async def test_a_node_that_somebody_has_suspended_is_left_safely_too() -> None:
+    async with emulated(f"{POINTS}{SAFE}") as line:
+        winder = Node.of(line.nodes["winder"])
+        winder.suspend(60.0)
+        with pytest.raises(NodeDown, match="suspended"):
+            await line.point("winder/speed").write(30)
+        assert await line.safe_state.enter(line.gate, "a test") == {"winder/speed": None}
+
+
+@in_virtual_time
+async def test_a_file_that_is_read_again_keeps_its_groups_but_those_whose_points_mean_something_else() -> None:
+    text = f"{POINTS}[groups.axes]\nperiod = 0.1\npoints = ['winder/speed']\n"
+    async with emulated(text) as line:
+        await line.point("winder/speed").write(60, priority=Priority.URGENT)
+        before = line.groups["axes"]
+        await line.take(file(text))
+        assert line.groups["axes"] is before
+        await line.take(file(text.replace("0.06", "0.6")))
+        [speed] = (await anext(line.groups["axes"].subscribe())).values()
+        assert speed.value == pytest.approx(600)
 
 
 @pytest.mark.parametrize(

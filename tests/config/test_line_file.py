@@ -230,6 +230,7 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         (HEAD, "line.toml: there are no nodes: describe each in a table of its own, [nodes.NAME]"),
         (f"{HEAD}prot = 1", "line.toml:2: prot: no such key; did you mean 'port'?"),
         ("port = 5", "line.toml:1: port: must be a table: [port], not 5"),
+        (f"{HEAD}{NODE}points.a = {{ factor = inf }}", "nodes.winder.points.a.factor: must be finite, not inf"),
         ('port = "rfc2217://h:1"', "line.toml:1: port: rfc2217:// does not work"),
         ('[port]\npath = "/dev/ttyS0"\nbaud = 9600', "line.toml:3: port.baud: no such key; did you mean 'baudrate'?"),
         (f'[port]\npath = "/dev/ttyS0"\nparity = "Q"\n{NODE}', "line.toml:1: port: no such framing: 8Q1"),

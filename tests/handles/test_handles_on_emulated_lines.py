@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import random
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 
 import pytest
 
@@ -36,17 +35,7 @@ from busmaster.protocols.msc import codec as msc_commands
 from busmaster.protocols.msc import device as msc
 from busmaster.protocols.msc.status import ProgramStatus
 from busmaster.testing.virtual_time import run_in_virtual_time
-
-Story = Callable[[], Coroutine[Any, Any, None]]
-
-
-def in_virtual_time(story: Story) -> Callable[[], None]:
-    def run() -> None:
-        run_in_virtual_time(story())
-
-    run.__name__ = story.__name__
-    run.__doc__ = story.__doc__
-    return run
+from tests.stories import in_virtual_time
 
 
 async def cycles(group: PollGroup, count: int) -> list[Snapshot]:

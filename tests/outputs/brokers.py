@@ -15,6 +15,7 @@ import pytest
 
 from tests.outputs.cycles import until
 from tests.patience import PATIENCE
+from tests.ports import free_port
 
 MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin")
 
@@ -22,12 +23,6 @@ needs_mosquitto = pytest.mark.skipif(
     MOSQUITTO is None or find_spec("aiomqtt") is None,
     reason="needs mosquitto (apt-get install mosquitto) and aiomqtt (the extra named mqtt)",
 )
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port: int = server.getsockname()[1]
-        return port
 
 
 class Broker:

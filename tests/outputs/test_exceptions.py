@@ -164,8 +164,9 @@ async def test_the_poll_and_its_consumers_have_every_value_and_what_outputs_do_n
     cycles = line.groups["fast"].statistics().cycles
     assert set(seen) == {4}
     told = {key: of(tmp_path, f"winder/{key}") for key in ("force", "status", "status.READY", "3")}
-    # each value once, and once more where it was late or stale, which is another quality
-    assert [list(dict.fromkeys(values)) for values in told.values()] == [[0], [0, 1], [0, 1], [0]]
+    # each value once, and once more where it was late, stale or not read, which is another quality
+    values = {key: [value for value in dict.fromkeys(found) if value is not None] for key, found in told.items()}
+    assert values == {"force": [0], "status": [0, 1], "status.READY": [0, 1], "3": [0]}
     assert len(told["3"]) == cycles
     [counts] = line.outputs.statistics()
     events = sum('"event"' in line for line in (tmp_path / "x.jsonl").read_text().splitlines())

@@ -22,14 +22,18 @@ from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import NoReply
+from busmaster.outputs import metrics as metrics_module
+from busmaster.outputs import scrapes
 from busmaster.outputs.base import OutputStatistics
 from busmaster.outputs.metrics import MetricsOutput, number_of
 from busmaster.outputs.settings import MetricsSettings
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
-from tests.outputs.brokers import free_port
+from busmaster.testing.virtual_time import run_in_virtual_time
 from tests.outputs.cycles import BUS, until
+from tests.patience import PATIENCE
+from tests.ports import free_port
 
 pytestmark = pytest.mark.skipif(
     find_spec("prometheus_client") is None, reason="needs prometheus-client (the extra named metrics)"
@@ -42,7 +46,7 @@ def scraped(port: int) -> Metrics:
     request = urllib.request.Request(
         f"http://127.0.0.1:{port}/metrics", headers={"Accept": "application/openmetrics-text; version=1.0.0"}
     )
-    with urllib.request.urlopen(request, timeout=10) as answer:
+    with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
         text = answer.read().decode()
     return {
         (sample.name, frozenset(sample.labels.items())): sample.value
@@ -55,8 +59,17 @@ def of(metrics: Metrics, name: str, **labels: str) -> float:
     return metrics[f"busmaster_{name}", frozenset(labels.items())]
 
 
-@pytest.mark.asyncio
-async def test_a_scrape_has_the_counts_of_nodes_groups_line_and_outputs() -> None:
+@pytest.fixture(autouse=True)
+def scrapes_have_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (metrics_module, scrapes):
+        monkeypatch.setattr(module, "PATIENCE", PATIENCE)
+
+
+def test_a_scrape_has_the_counts_of_nodes_groups_line_and_outputs() -> None:
+    run_in_virtual_time(count_and_scrape())
+
+
+async def count_and_scrape() -> None:
     bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
     controller, absent = Hcp2Controller(bus, 5), Hcp2Controller(bus, 6)
     counts = OutputStatistics("sqlite", "written", 10, 2, 3, "disk full")
@@ -72,7 +85,7 @@ async def test_a_scrape_has_the_counts_of_nodes_groups_line_and_outputs() -> Non
             await absent.read(1, retries=0)
         await asyncio.to_thread(until, lambda: output.port != 0)
         metrics = await asyncio.to_thread(scraped, output.port)
-        await asyncio.to_thread(output.close, 5)
+        await asyncio.to_thread(output.close, PATIENCE)
     assert of(metrics, "node_attempts_total", node="node 5") == 3
     assert of(metrics, "node_exchanges_total", node="node 5", outcome="ok") == 3
     assert of(metrics, "node_exchanges_total", node="node 6", outcome="no_reply") == 1
@@ -101,7 +114,7 @@ async def test_a_scrape_has_the_drivers_counts_where_there_are_any(monkeypatch: 
         without = await asyncio.to_thread(scraped, output.port)
         found = DriverErrors(framing=1, parity=2, breaks=3, overruns=4, buffer_overruns=5)
         metrics = await asyncio.to_thread(scraped, output.port)
-        await asyncio.to_thread(output.close, 5)
+        await asyncio.to_thread(output.close, PATIENCE)
     assert of(without, "line_damaged_total") == of(without, "line_breaks_total") == 0
     assert not any(name.startswith("busmaster_driver") for name, _ in without)
     names = ("framing", "parity", "breaks", "overruns", "buffer_overruns")
@@ -119,7 +132,7 @@ async def test_a_port_that_is_taken_is_told_and_tried_again() -> None:
         await asyncio.to_thread(until, lambda: bool(said))
     await asyncio.to_thread(until, lambda: said[-1] == "metrics is up again")
     await asyncio.to_thread(scraped, port)
-    await asyncio.to_thread(output.close, 5)
+    await asyncio.to_thread(output.close, PATIENCE)
     down, up = said
     assert down.startswith("metrics is down: Address already in use")
     assert up == "metrics is up again"
@@ -143,7 +156,7 @@ async def served(**options: Any) -> AsyncIterator[MetricsOutput]:
         try:
             yield output
         finally:
-            await asyncio.to_thread(output.close, 5)
+            await asyncio.to_thread(output.close, PATIENCE)
     assert not output._thread.is_alive()
 
 
@@ -164,21 +177,25 @@ def test_what_is_no_number_is_no_gauge(value: object, number: float | None) -> N
     assert number_of(value) == number
 
 
+def threads_of_ours() -> int:
+    return sum(thread.name.startswith("busmaster") for thread in threading.enumerate())
+
+
 @pytest.mark.asyncio
 async def test_a_thousand_half_open_connections_cost_no_threads_and_keep_no_scrape_out(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     async with served() as output:
         await asyncio.to_thread(scraped, output.port)
-        threads = threading.active_count()
+        threads, descriptors = threads_of_ours(), len(os.listdir("/proc/self/fd"))
         half_open = []
         try:
             for _ in range(700):
-                half_open.append(socket.create_connection(("127.0.0.1", output.port), 5))
+                half_open.append(socket.create_connection(("127.0.0.1", output.port), PATIENCE))
                 half_open[-1].sendall(b"GET /metrics HT")
             await asyncio.to_thread(scraped, output.port)
-            assert threading.active_count() <= threads + 2
-            assert len(os.listdir("/proc/self/fd")) < 700 + 256 + 100
+            assert threads_of_ours() <= threads
+            assert len(os.listdir("/proc/self/fd")) - descriptors < 700 + 256 + 100
         finally:
             for connection in half_open:
                 connection.close()
@@ -196,10 +213,11 @@ async def test_two_hundred_scrapes_at_once_are_all_answered_by_a_few_threads(cap
         return answer
 
     async with served() as output:
-        threads = threading.active_count()
-        async with asyncio.timeout(20):
+        await asyncio.to_thread(scraped, output.port)
+        threads = threads_of_ours()
+        async with asyncio.timeout(PATIENCE):
             answers = await asyncio.gather(*(scrape(output.port) for _ in range(200)))
-        assert threading.active_count() <= threads + 2
+        assert threads_of_ours() <= threads
     assert all(answer.startswith(b"HTTP/1.1 200 OK") and b"busmaster_line_busy" in answer for answer in answers)
     assert capfd.readouterr().err == ""
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
+import threading
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,15 +17,17 @@ from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand, NoReply
+from busmaster.gate import gate
 from busmaster.gate.payload import Payload, read_payload
 from busmaster.outputs.base import Happening
 from busmaster.outputs.mqtt import MqttOutput
 from busmaster.outputs.settings import MqttSettings
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
-from tests.outputs.brokers import Broker, free_port, needs_mosquitto, running
+from tests.outputs.brokers import Broker, needs_mosquitto, running
 from tests.outputs.cycles import BUS, cycle, until
 from tests.patience import PATIENCE
+from tests.ports import free_port
 
 if TYPE_CHECKING:
     from aiomqtt import Client
@@ -33,6 +36,11 @@ Heard = tuple[str, Any, bool]
 """Topic, payload, and whether it was retained."""
 
 pytestmark = needs_mosquitto
+
+
+@pytest.fixture(autouse=True)
+def commands_stay_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "FRESH", PATIENCE)
 
 
 @pytest.fixture
@@ -196,6 +204,59 @@ async def test_without_a_broker_the_oldest_are_dropped_and_counted() -> None:
     assert output.dropped == 200
 
 
+@contextmanager
+def answering(answer: bytes) -> Iterator[int]:
+    """Something that says this to who connects, and nothing else."""
+
+    def serve() -> None:
+        while True:
+            try:
+                connection, _ = server.accept()
+            except OSError:
+                return  # it was shut down
+            with connection:
+                connection.recv(1000)
+                connection.sendall(answer)
+                over.wait()
+
+    over = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield server.getsockname()[1]
+        finally:
+            over.set()
+            server.shutdown(socket.SHUT_RDWR)
+            thread.join()
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (b"\x20\x02\x00\x01", "does not speak MQTT 5, which this output needs"),  # by 3.1.1
+        (b"\x20\x03\x00\x84\x00", "does not speak MQTT 5, which this output needs"),
+        (b"\x20\x03\x00\x87\x00", "Not authorized"),
+        (b"", "did not answer in 0.1 s; does it speak MQTT 5?"),
+    ],
+)
+async def test_a_broker_that_will_not_do_is_told_in_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, answer: bytes, said: str
+) -> None:
+    if not answer:
+        monkeypatch.setattr("busmaster.outputs.mqtt.TIMEOUT", 0.1)
+    told: list[str] = []
+
+    with answering(answer) as port:
+        output = MqttOutput("mqtt", MqttSettings(port=port), BUS, told.append)
+        output.start()
+        await asyncio.to_thread(until, lambda: bool(told))
+        await asyncio.to_thread(output.close, 5)
+    assert told[0].startswith("mqtt is down: ")
+    assert said in told[0]
+
+
 @pytest.mark.asyncio
 async def test_a_command_is_obeyed_where_the_file_allows_it_and_every_one_is_answered(broker: Broker) -> None:
     bus = emulated(Hcp2Controller, 5)
@@ -250,7 +311,15 @@ def test_a_command_is_a_number_or_a_list_of_numbers_perhaps_with_its_id_and_end(
 
 NO_COMMANDS = [
     *(b"", b"on", b"true", b"null", b"NaN", b"[]", b"{}", b'["1"]', b"[true]", b"\xff", None),
-    *(b"1e308", b"1" * 400, b"9" * 5000, b"[" * 4000, b'{"value": 1, "x": 2}', b'{"value": 1, "expires": "soon"}'),
+    *(
+        b"1e308",
+        b"1" * 400,
+        b"9" * 5000,
+        b"1" + b" " * 4096,
+        b"[" * 4000,
+        b'{"value": 1, "x": 2}',
+        b'{"value": 1, "expires": "soon"}',
+    ),
     *(b'{"value": 1e999}', b'{"value": 1, "id": []}', b'{"value": 1, "expires": 1e999}'),
 ]
 

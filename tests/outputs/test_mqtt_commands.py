@@ -16,6 +16,7 @@ from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BusError
+from busmaster.gate import gate
 from busmaster.gate.gate import Gate
 from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.outputs import mqtt_commands
@@ -30,6 +31,11 @@ if TYPE_CHECKING:
     from aiomqtt import Client
 
 pytestmark = needs_mosquitto
+
+
+@pytest.fixture(autouse=True)
+def commands_stay_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "FRESH", PATIENCE)
 
 
 @pytest.fixture
@@ -74,11 +80,11 @@ async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncI
     import aiomqtt
 
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)])))
-    gate = Gate(bus, read_only=read_only)
+    door = Gate(bus, read_only=read_only)
     controller = Hcp2Controller(bus, 5)
     controller.element(1).limit(maximum=500)
     settings = MqttSettings(port=broker.port, prefix="line")
-    output = MqttOutput("mqtt", settings, bus, commands={"5/1": controller.point("1")}, gate=gate)
+    output = MqttOutput("mqtt", settings, bus, commands={"5/1": controller.point("1")}, gate=door)
     async with bus, aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as client:
         await client.subscribe("line/status", qos=1)
         output.start()
@@ -90,7 +96,7 @@ async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncI
         for topic in topics or ("line/result/#",):
             await client.subscribe(topic, qos=1)
         try:
-            yield Plant(bus, gate, output, client)
+            yield Plant(bus, door, output, client)
         finally:
             await asyncio.to_thread(output.close, PATIENCE)
 
@@ -129,9 +135,9 @@ async def test_an_old_command_is_not_executed_late(broker: Broker, monkeypatch: 
     async with plant(broker) as there:
         answer = await there.ask(json.dumps({"value": 1, "expires": time.time() - 0.1}))
         assert "too old" in answer["error"]
-        answer = await there.ask(json.dumps({"value": 2, "expires": time.time() + 60}))
+        answer = await there.ask(json.dumps({"value": 2, "expires": time.time() + PATIENCE}))
         assert answer["ok"]
-        there.output._arriving._looked -= 5  # as if this process had stood still for five seconds
+        there.output._arriving._looked -= PATIENCE + 1  # as if this process had stood still for so long
         answer = await there.ask("3")
         assert "too old" in answer["error"]
         assert await there.controller.read(1) == 2
@@ -145,8 +151,8 @@ async def test_the_expiry_of_an_mqtt_message_is_kept(broker: Broker, monkeypatch
     monkeypatch.setattr(mqtt_commands, "LOOK", 3600.0)
     async with plant(broker) as there:
         properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]  # paho has no types
-        properties.MessageExpiryInterval = 2
-        there.output._arriving._looked -= 5
+        properties.MessageExpiryInterval = int(PATIENCE)
+        there.output._arriving._looked -= PATIENCE + 1
         answer = await there.ask("4", properties=properties)
         assert "too old" in answer["error"]
         there.output._arriving._looked = there.bus.now()
@@ -177,14 +183,15 @@ async def test_whatever_is_sent_is_refused_and_answered_and_the_output_stays_up(
 
 
 @pytest.mark.asyncio
-async def test_refused_commands_do_not_starve_those_that_are_allowed(broker: Broker) -> None:
+async def test_refused_commands_do_not_starve_those_that_are_allowed(
+    broker: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mqtt_commands, "BREATH", PATIENCE)  # from the first refusal that is answered to the next
     async with plant(broker, "line/result/5/1") as there:
         for number in range(1000):
             await there.client.publish("line/set/5/2", str(number), qos=0)
-        began = time.monotonic()
-        answer = await there.ask('{"value": 8, "expires": %f}' % (time.time() + 30))
+        answer = await there.ask('{"value": 8, "expires": %f}' % (time.time() + PATIENCE))
         assert answer["ok"]
-        assert time.monotonic() - began < 10
         assert there.output._arriving.refused == 1000
         assert there.output._arriving.unanswered > 500
         assert len(there.records) < 500
@@ -194,7 +201,7 @@ async def test_refused_commands_do_not_starve_those_that_are_allowed(broker: Bro
 async def test_more_commands_than_the_line_takes_are_refused_not_kept(broker: Broker) -> None:
     async with plant(broker) as there:
         for number in range(200):
-            await there.send(json.dumps({"value": 1, "expires": time.time() + 30, "id": number}))
+            await there.send(json.dumps({"value": 1, "expires": time.time() + PATIENCE, "id": number}))
         answers = await there.answers(200)
         written = [answer for _, answer in answers if answer["ok"]]
         assert 0 < len(written) <= 200

@@ -7,7 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,40 +18,46 @@ from busmaster.outputs.mqtt import MqttOutput
 from busmaster.outputs.settings import MqttSettings
 from busmaster.outputs.spool import Record, Spool
 from tests.disks import small_disk
-from tests.outputs.brokers import Broker, free_port, needs_mosquitto
+from tests.outputs.brokers import Broker, needs_mosquitto
 from tests.outputs.cycles import BUS, cycle, until
 from tests.outputs.test_mqtt import heard, listening
+from tests.patience import PATIENCE
+from tests.ports import free_port
 
 
 def record(number: int, values: int = 1) -> Record:
-    return Record("line/values/5/1", str(number), False, values)
+    return Record(str(number), values)
+
+
+def spool_at(folder: Path, most: int, kind: str = "mqtt", say: Callable[[str], None] = lambda _: None) -> Spool:
+    return Spool(str(folder / "spool"), most, kind, say)
 
 
 def numbers(spool: Spool) -> list[int]:
-    return [int(record.payload) for record in spool.oldest(1_000_000)[1]]
+    return [int(record.content) for record in spool.oldest(1_000_000)[1]]
 
 
 def test_the_oldest_come_first_and_only_what_has_arrived_is_forgotten(tmp_path: Path) -> None:
-    spool = Spool(str(tmp_path / "spool"), 100)
+    spool = spool_at(tmp_path, 100)
     assert spool.put(record(number) for number in range(10)) == 0
     up_to, first = spool.oldest(4)
-    assert [record.payload for record in first] == ["0", "1", "2", "3"]
+    assert [record.content for record in first] == ["0", "1", "2", "3"]
     assert numbers(spool) == list(range(10))
     spool.remove(up_to, 4)
     assert (numbers(spool), spool.values) == (list(range(4, 10)), 6)
 
 
 def test_it_is_all_there_again_after_a_restart(tmp_path: Path) -> None:
-    spool = Spool(str(tmp_path / "spool"), 100)
+    spool = spool_at(tmp_path, 100)
     spool.put([record(1, 3), record(2)])
     spool.close()
-    again = Spool(str(tmp_path / "spool"), 100)
+    again = spool_at(tmp_path, 100)
     assert again.values == 4
     assert again.oldest(10)[1] == [record(1, 3), record(2)]
 
 
 def test_it_is_bounded_in_values_and_says_how_many_had_to_go(tmp_path: Path) -> None:
-    spool = Spool(str(tmp_path / "spool"), 50)
+    spool = spool_at(tmp_path, 50)
     assert sum(spool.put([record(number, 5)]) for number in range(30)) == 100
     assert (spool.values, numbers(spool)) == (50, list(range(20, 30)))
     assert spool.put(record(number) for number in range(3_000)) == 3_000
@@ -59,17 +65,17 @@ def test_it_is_bounded_in_values_and_says_how_many_had_to_go(tmp_path: Path) -> 
 
 
 def test_two_processes_cannot_share_one(tmp_path: Path) -> None:
-    spool = Spool(str(tmp_path / "spool"), 100)
+    spool = spool_at(tmp_path, 100)
     with pytest.raises(InvalidCommand, match="does another process use it"):
-        Spool(str(tmp_path / "spool"), 100)
+        spool_at(tmp_path, 100)
     spool.close()
-    Spool(str(tmp_path / "spool"), 100).close()
+    spool_at(tmp_path, 100).close()
 
 
 def test_a_file_that_is_no_spool_is_kept_aside(tmp_path: Path) -> None:
     said: list[str] = []
     (tmp_path / "spool").write_text("not a database at all " * 100)
-    spool = Spool(str(tmp_path / "spool"), 100, said.append)
+    spool = spool_at(tmp_path, 100, "mqtt", said.append)
     assert spool.put([record(1)]) == 0
     assert (tmp_path / "spool.damaged").read_text().startswith("not a database")
     assert "begun anew" in said[0]
@@ -91,7 +97,7 @@ async def values_heard(broker: Broker, output: MqttOutput, count: int) -> list[i
         output.start()
         found = await heard(client, count)
     await asyncio.to_thread(until, lambda: output.statistics().waiting == 0)
-    await asyncio.to_thread(output.close, 5)
+    await asyncio.to_thread(output.close, PATIENCE)
     return [payload["value"] for _, payload, _ in found]
 
 
@@ -108,7 +114,7 @@ async def test_what_a_broker_that_is_away_misses_is_sent_in_order_when_it_is_bac
             await asyncio.to_thread(until, lambda: output.spilled == output.offered)
     counts = output.statistics()
     assert (counts.dropped, counts.waiting, counts.spilled) == (0, 500, 500)
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(PATIENCE):
         await asyncio.to_thread(broker.start)
         try:
             async with listening(broker, "line/values/#") as client:
@@ -117,7 +123,7 @@ async def test_what_a_broker_that_is_away_misses_is_sent_in_order_when_it_is_bac
                 while found[-1] != 500:
                     found += [payload["value"] for _, payload, _ in await heard(client, 1)]
         finally:
-            await asyncio.to_thread(output.close, 5)
+            await asyncio.to_thread(output.close, PATIENCE)
             await asyncio.to_thread(broker.stop)
     assert found == sorted(found)
     assert output.statistics() == type(counts)("mqtt", "written", 500, 0, 0, "", 0)
@@ -134,23 +140,25 @@ async def test_values_at_the_end_with_the_broker_away_are_kept_for_the_next_star
         output.start()
         for number in range(1, 301):
             output.offer(cycle(number, number))
-        started = time.monotonic()
-        await asyncio.to_thread(output.close, 5)
-        assert time.monotonic() - started < 5.5
+        await asyncio.to_thread(output.close, PATIENCE)
+    assert not output._thread.is_alive()
     counts = output.statistics()
     assert (counts.written, counts.dropped, counts.spilled) == (0, 0, 300)
-    await asyncio.to_thread(until, lambda: not output._thread.is_alive())
-    assert output._spool is not None
-    output._spool.close()
     broker = Broker(tmp_path)
     await asyncio.to_thread(broker.start)
     try:
         again = output_to(broker.port, tmp_path)
-        assert again.statistics().spilled == 300
         assert await values_heard(broker, again, 300) == list(range(1, 301))
     finally:
         await asyncio.to_thread(broker.stop)
     assert (again.statistics().written, again.statistics().dropped) == (300, 0)
+
+
+def spooled(folder: Path) -> int:
+    """How many values an output that is closed has left on disk."""
+    spool = spool_at(folder, 1_000_000)
+    spool.close()
+    return spool.values
 
 
 PUBLISH = """
@@ -193,7 +201,7 @@ async def test_a_process_that_is_killed_loses_nothing_that_it_had_put_on_disk(tm
     await asyncio.to_thread(broker.start)
     try:
         again = output_to(broker.port, tmp_path)
-        kept = again.spilled
+        kept = spooled(tmp_path)
         assert kept >= spilled
         assert await values_heard(broker, again, kept) == list(range(1, kept + 1))
     finally:
@@ -215,7 +223,7 @@ async def test_a_full_disk_under_the_spool_is_told_once_and_memory_holds_what_it
         await asyncio.to_thread(until, lambda: any("full" in text for text in said))
         disk.clear()
         await asyncio.to_thread(until, lambda: output.spilled == output.statistics().waiting > 0)
-        await asyncio.to_thread(output.close, 5)
+        await asyncio.to_thread(output.close, PATIENCE)
     counts = output.statistics()
     assert counts.spilled + counts.dropped == 1000
     assert counts.spilled > 0

@@ -122,7 +122,7 @@ class AnyStep:
     def nothing(self, *arguments: Any) -> None:
         pass
 
-    owe = lapse = forgive = doubtful_answer = answered = said = said_twice = heard = nothing
+    owe = lapse = forgive = answered = said = said_twice = heard = nothing
 
     def perhaps(self, *arguments: Any) -> bool:
         return bool(choose(2))

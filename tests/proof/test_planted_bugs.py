@@ -16,9 +16,15 @@ from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.output import Output
 from busmaster.arbiter.transaction import Transaction
-from busmaster.arbiter.unasked import QUIET
 from busmaster.contract.exchange import FrameError
 from busmaster.wire import readers
+from tests.planted import (
+    with_a_cancellation_that_clears_the_exchange,
+    without_lateness,
+    without_the_adapter_in_the_lateness,
+    without_the_adapter_in_the_silence,
+    without_the_byte_time,
+)
 from tests.proof.explore import Explorer
 from tests.proof.history import as_test, retell, told
 from tests.proof.instants import seconds, set_unit
@@ -51,25 +57,9 @@ def tick() -> float:
     return seconds(1)
 
 
-def without_lateness(patch: Any) -> None:
-    patch.setattr(Leg, "past", lambda leg: leg.end)
-
-
 def with_lateness_a_tick_short(patch: Any) -> None:
     right, short = Leg._past, tick()
     patch.setattr(Leg, "_past", lambda leg, end, timing: right(leg, end, timing) - short)
-
-
-def without_the_byte_time(patch: Any) -> None:
-    patch.setattr(Leg, "_past", lambda leg, end, timing: end + timing.lateness + leg.latency)
-
-
-def without_the_adapter_in_the_lateness(patch: Any) -> None:
-    patch.setattr(Leg, "_past", lambda leg, end, timing: end + timing.lateness + leg.byte_time)
-
-
-def without_the_adapter_in_the_silence(patch: Any) -> None:
-    patch.setattr(Leg, "quiet", lambda leg: max(QUIET, leg.timing.byte_gap) + leg.byte_time)
 
 
 def with_a_silence_a_tick_short(patch: Any) -> None:
@@ -101,19 +91,6 @@ def without_settling_at_the_start(patch: Any) -> None:
         line._settle(now)
 
     patch.setattr(Arbiter, "line_up", line_up)
-
-
-def with_a_cancellation_that_clears_the_exchange(patch: Any) -> None:
-    right = Arbiter.cancel
-
-    def cancel(arbiter: Arbiter, transaction: Transaction, now: float) -> None:
-        right(arbiter, transaction, now)
-        if arbiter._wire.transaction is transaction:
-            arbiter._end_exchange()
-            arbiter.dispatcher._end(transaction, now)
-            arbiter._release(0.0, now)
-
-    patch.setattr(Arbiter, "cancel", cancel)
 
 
 def with_a_whole_frame_that_releases(patch: Any) -> None:
@@ -171,15 +148,6 @@ def with_an_end_that_any_answer_moves(patch: Any) -> None:
 def without_the_turnaround(patch: Any) -> None:
     right = LineMachine._release
     patch.setattr(LineMachine, "_release", lambda line, hold, now: right(line, 0.0, now))
-
-
-def with_any_echo(patch: Any) -> None:
-    right = readers.find_etx
-
-    def find_etx(buffer: bytes, header: bytes, *others: Any) -> int:
-        return right(buffer, buffer[: len(header)], *others) if len(buffer) >= len(header) else 0
-
-    patch.setattr(readers, "find_etx", find_etx)
 
 
 def without_the_time_of_the_write(patch: Any) -> None:

@@ -72,8 +72,7 @@ def lines() -> Iterator[Setup]:
         hit = MARKS if kind == "mentor" else FLIPS
         for faults in ((), (ECHO_FAULTS,), (ECHO_FAULTS, hit)):
             yield replace(_line(kind, *faults), echo=True)
-        if kind != "msc":
-            yield replace(_line(kind, ECHO_FAULTS, STRAYS), echo=True)
+        yield replace(_line(kind, ECHO_FAULTS, STRAYS), echo=True)
         yield replace(_line(kind, ECHO_FAULTS), echo=True, receive_latency=0.016)
         yield replace(_line(kind, hit), assumptions=Assumptions("received byte", "received byte"))
     for kind in ("hcp2", "mentor", "msc"):

@@ -85,13 +85,6 @@ def within(inner: Zone, outer: Zone) -> bool:
     return True
 
 
-def loosen(zone: Zone, i: int) -> None:
-    """Forget all that is known of x_i, in place."""
-    for j, row in enumerate(zone):
-        if j != i:
-            row[i] = zone[i][j] = FREE
-
-
 def widened(zone: Zone, longest: int) -> Zone:
     """Return a zone that holds all of this one, in which no bound is longer than so many ticks: so there are finitely
     many. What is added may be no more than what is possible: a proof stays one, a violation is looked at again."""

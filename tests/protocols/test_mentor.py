@@ -75,9 +75,15 @@ def test_a_reply_is_read_through_its_parity_bits() -> None:
 
 
 def test_eot_means_that_there_is_no_such_parameter() -> None:
-    for command in (Read(17, 23), Write(17, 23, 5), ReadRun(17, 23, 2)):
+    for command in (Read(17, 23), ReadRun(17, 23, 2)):
         with pytest.raises(NoSuchParameter):
             command.open(12, TIMINGS).feed(b"\x04")
+
+
+@pytest.mark.parametrize("heard", ["04", "84"])
+def test_eot_in_place_of_an_ack_may_be_one_with_a_flipped_bit(heard: str) -> None:
+    """Where the port does not check parity, the write may have been carried out: it is neither refused nor repeated."""
+    assert outcome(Write(17, 23, 5).open(12, TIMINGS), [bytes.fromhex(heard)]) is FrameError
 
 
 def test_nak_is_a_refusal_worth_confirming() -> None:

@@ -91,7 +91,7 @@ def test_the_command_line_reads_writes_and_finds_its_nodes(served: TcpServer, bu
     assert busmaster("read", served.path, *TALLY, "--node", "3", "a", "d").lines == ["a 7", "d 65535"]
     assert busmaster("write", served.path, *TALLY, "--node", "3", "a=65536").status == 2
     assert busmaster("read", served.path, *TALLY, "--node", "3", "A").status == 2
-    found = busmaster("scan", served.path, *TALLY, "--timeout", "20")
+    found = busmaster("scan", served.path, *TALLY, "--nodes", "1-3", "--timeout", "300")
     assert found.lines == ["1 read counter a: 0", "3 read counter a: 7"]
 
 

@@ -10,6 +10,7 @@ import anyio
 import pytest
 
 from busmaster.testing.virtual_time import DeadlockError, VirtualTimeLoop, run_in_virtual_time
+from tests.patience import PATIENCE
 
 DAY = 86400.0
 
@@ -21,7 +22,7 @@ def test_a_week_of_sleep_takes_no_time() -> None:
 
     begun = time.monotonic()
     assert run_in_virtual_time(main()) == pytest.approx(7 * DAY)
-    assert time.monotonic() - begun < 1.0
+    assert time.monotonic() - begun < PATIENCE
 
 
 def test_timers_run_in_order_and_at_their_times() -> None:

@@ -14,7 +14,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
+import pytest
+
 from busmaster.testing.virtual_time import VirtualTimeLoop
+from busmaster.transport import serial_port
 from busmaster.transport.serial_port import PortTransport, SerialPort
 from tests.patience import PATIENCE
 
@@ -147,8 +150,10 @@ async def opened(path: str, **options: Any) -> tuple[PortTransport, Recorder]:
 
 
 async def closed(transport: PortTransport, recorder: Recorder) -> None:
-    """Close it, and wait until it is."""
-    transport.close()
+    """Close it, and wait until the driver has let go of it, however long that takes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(serial_port, "CLOSE_DEADLINE", 2 * PATIENCE)
+        transport.close()
     await recorder.lost()
 
 

@@ -6,6 +6,7 @@ import asyncio
 import socket
 import termios
 from collections.abc import Iterator
+from random import Random
 from typing import Any
 
 import pytest
@@ -21,6 +22,7 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.transport import pump as pump_module
+from busmaster.transport.kernel import OpenPort
 from busmaster.transport.pump import STUCK_AFTER, Pump
 from tests.arbiter.bench import TAU
 from tests.transport.fakes import PtyMaster, plugged, standing_still
@@ -32,7 +34,7 @@ LATENESS = hcp2.PROFILE.timings.read.lateness
 
 def line(delay: float = 0.002) -> Line:
     devices = [make_device("hcp2", address, delay=Delay(delay)) for address in (1, 2)]
-    return Line(hcp2.PROFILE.line, devices, paced=True)
+    return Line(hcp2.PROFILE.line, devices, paced=True, chance=Random(1))
 
 
 def transport_of(bus: Bus) -> MemoryTransport:
@@ -220,6 +222,61 @@ def test_a_window_runs_from_when_the_request_has_left() -> None:
     run_in_virtual_time(main())
 
 
+class Driver:
+    """What the driver of a port says that it still holds; unlike a transport, it tells nobody when that has left."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, flow_controlled: bool) -> None:
+        self.holds = 0
+        monkeypatch.setattr(OpenPort, "unsent", lambda _port, _waited: self.holds)
+        monkeypatch.setattr(OpenPort, "flow_controlled", flow_controlled)
+
+    async def awaited(self, bus: Bus, emulated: Line, *, held: float) -> float:
+        """Have a request held for so long, and its reply be lost. Returns how long its caller waited then."""
+        axis, device = Hcp2Controller(bus, 1), emulated.devices[0]
+        await axis.read(1)
+        device.faults.lost = 1.0
+        self.holds = 8
+        reading = asyncio.ensure_future(axis.read(1, retries=0))
+        await asyncio.sleep(held)
+        self.holds = 0
+        released = bus.now()
+        with pytest.raises(NoReply):
+            await reading
+        device.faults.lost = 0.0
+        return bus.now() - released
+
+
+def test_r2_output_let_go_within_its_window_is_noticed_on_a_port_that_was_found_holding_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    driver, emulated = Driver(monkeypatch, flow_controlled=False), line()
+
+    async def main() -> None:
+        async with Bus(MemoryPort(emulated)) as bus:
+            unseen = await driver.awaited(bus, emulated, held=0.5 * WINDOW)
+            assert unseen == pytest.approx(0.5 * WINDOW, abs=0.01), "a port that never held is not asked"
+            for held in (2 * WINDOW, 0.5 * WINDOW):
+                assert await driver.awaited(bus, emulated, held=held) == pytest.approx(WINDOW, abs=0.01)
+            transport_of(bus).abort()
+            await asyncio.sleep(3.0)
+            waited = await driver.awaited(bus, emulated, held=0.5 * WINDOW)
+            assert waited == pytest.approx(WINDOW, abs=0.01), "it is the same device that is opened again"
+
+    run_in_virtual_time(main())
+
+
+def test_r2_output_let_go_within_its_window_is_noticed_on_a_port_with_flow_control(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    driver, emulated = Driver(monkeypatch, flow_controlled=True), line()
+
+    async def main() -> None:
+        async with Bus(MemoryPort(emulated)) as bus:
+            assert await driver.awaited(bus, emulated, held=0.5 * WINDOW) == pytest.approx(WINDOW, abs=0.01)
+
+    run_in_virtual_time(main())
+
+
 def test_output_that_never_leaves_takes_the_line_down_and_is_discarded() -> None:
     async def main() -> None:
         emulated = line()
@@ -376,6 +433,8 @@ async def test_a_network_that_stands_still_for_good_takes_the_line_down_in_words
     [
         (None, "it was closed"),
         (OSError("gone"), "gone"),
+        (OSError(), "OSError"),
+        (OSError(5, "Input/output error"), "Input/output error"),
         (LineDown("the adapter is gone"), "the adapter is gone"),
     ],
 )

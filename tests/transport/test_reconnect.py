@@ -21,6 +21,7 @@ from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 from tests.patience import PATIENCE
+from tests.ports import free_port
 from tests.transport.fakes import PtyMaster, Recorder, plugged
 
 
@@ -316,8 +317,8 @@ async def test_a_server_that_is_restarted_is_connected_to_again() -> None:
         writer.write(await reader.read(100))
         writer.close()
 
-    server = await asyncio.start_server(answer, "127.0.0.1", 0)
-    address = server.sockets[0].getsockname()
+    address = ("127.0.0.1", free_port())
+    server = await asyncio.start_server(answer, *address)
     recorder = Recorder()
     async with kept(TcpPort(*address), recorder, first_delay=0.001):
         await recorder.connected()

@@ -17,6 +17,7 @@ from busmaster.emulator.line import Line
 from busmaster.emulator.serve import LineServer, TcpServer, serve_pty, serve_tcp
 from busmaster.protocols._comms.mint import EmulatedMint
 from tests.patience import PATIENCE
+from tests.ports import free_port
 
 WRITE = bytes.fromhex("07 30 32 02 30 31 31 32 33 2E 34 35 36 03 2B")  # AN00129: node 2, Comms(1) = 123.456
 READ = bytes.fromhex("07 30 32 02 30 31 05 04")
@@ -110,7 +111,7 @@ def test_a_tcp_port_answers_several_clients_one_after_another() -> None:
 
 
 def test_a_closed_tcp_port_can_be_served_again_at_once() -> None:
-    with serve_tcp(mint_line()) as server, connected(server) as client:
+    with serve_tcp(mint_line(), port=free_port()) as server, connected(server) as client:
         assert ask(client.fileno(), WRITE, 1) == b"\x06"
         server.close()
         assert client.recv(1) == b""
@@ -134,15 +135,16 @@ def client_of(server: LineServer) -> Iterator[int]:
 def test_a_paced_line_takes_its_time_and_not_much_more(serve: Callable[[Line], LineServer]) -> None:
     line = mint_line(paced=True, delay=0.002)
     need = (len(READ) + len(REPLY)) * line.tau + 0.002
-    times = []
     with serve(line) as server, client_of(server) as port:
         ask(port, WRITE, 1)
-        for _ in range(20):
+        for _ in range(1000):  # the quickest of many: what a busy machine adds is not the line's
             start = time.monotonic()
             assert ask(port, READ, len(REPLY)) == REPLY
-            times.append(time.monotonic() - start)
-    assert min(times) >= need
-    assert sorted(times)[len(times) // 2] < need + 0.002
+            took = time.monotonic() - start
+            assert took >= need
+            if took < need + 0.002:
+                return
+    pytest.fail(f"not one of 1000 replies came within {need + 0.002} s")
 
 
 @pytest.mark.parametrize("serve", [serve_pty, serve_tcp])
@@ -168,10 +170,12 @@ def test_a_tcp_client_that_vanishes_leaves_the_port_to_others() -> None:
 
 
 def test_an_idle_line_does_not_burn_the_processor() -> None:
-    with serve_pty(mint_line(paced=True)):
-        before = time.process_time()
+    with serve_pty(mint_line(paced=True)) as server:
+        assert server._thread.ident is not None
+        clock = time.pthread_getcpuclockid(server._thread.ident)
+        before = time.clock_gettime(clock)
         time.sleep(0.2)
-        assert time.process_time() - before < 0.05
+        assert time.clock_gettime(clock) - before < 0.05
 
 
 def test_the_thread_of_the_line_can_be_asked_to_change_it() -> None:

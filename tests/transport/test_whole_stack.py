@@ -28,6 +28,7 @@ from busmaster.emulator.serve import LineServer, serve_pty, serve_tcp
 from busmaster.registry import make_device
 from busmaster.transport.endpoints import Endpoint
 from tests.patience import PATIENCE
+from tests.transport.test_alarm import open_timers
 
 
 def line() -> Line:
@@ -152,10 +153,12 @@ async def test_r13_a_vanished_port_fails_callers_at_once_and_polling_resumes_by_
 
 
 @pytest.mark.asyncio
-async def test_a_port_that_does_not_exist_is_named(tmp_path: Path) -> None:
+async def test_a_port_that_does_not_exist_is_named_and_leaves_nothing_open(tmp_path: Path) -> None:
+    before = open_timers()
     with pytest.raises(LineDown, match="nowhere"):
         async with Bus(SerialPort(str(tmp_path / "nowhere"), baudrate=57600)):
             pass
+    assert open_timers() <= before
 
 
 @pytest.mark.asyncio

@@ -49,6 +49,9 @@ class ReadElement:
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return values[self.element]
 
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        return {self.element: value}
+
     @staticmethod
     def encode(address: int, element: int) -> tuple[bytes, bytes]:
         """Return the request, and the element as its reply echoes it."""

@@ -1,7 +1,8 @@
 """Mentor II (ANSI x3.28-2.5-A4): addresses 1-99, each of their two digits sent twice; parameters as menu and number.
 
     read    EOT a a a a m m p p ENQ                 answered by STX m m p p data ETX BCC; EOT: no such parameter
-    write   EOT a a a a STX m m p p data ETX BCC    answered by ACK or NAK; by nothing when it goes to address 0
+    write   EOT a a a a STX m m p p data ETX BCC    answered by ACK or NAK; by nothing when it goes to address 0.
+                                                    An EOT may be an ACK with one bit flipped: it says nothing
     then    ACK, BS or NAK alone                    the drive read last sends the next, previous or same parameter
 
 Values are whole numbers: where the decimal point belongs is for a table to say. The line has 7 bits and even parity;
@@ -45,7 +46,7 @@ T = TypeVar("T")
 
 _SHORT_COMMANDS = {1: ACK, 0: NAK, -1: _BS}
 _SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))  # a port that knows only 8N1 brings the parity in bit 7
-# to reads and writes alike: some other makers' nodes say NAK to a read
+# of a read: some other makers' nodes say NAK
 _REFUSALS = {NAK[0]: Refused, EOT[0]: NoSuchParameter}
 _PARAMETER = re.compile(r"(\d{1,2})\.(\d{1,2})", re.ASCII)
 _VALUE = re.compile(rb"[+-]?\d+")
@@ -95,6 +96,9 @@ class Read:
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return values[self.menu, self.number]
 
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        return {(self.menu, self.number): value}
+
     def open(self, address: int, timings: Timings) -> Reading:
         """Begin the read. Raises InvalidCommand for the broadcast address: every drive would answer at once."""
         request, echo = read_request(address, self.menu, self.number)
@@ -129,6 +133,9 @@ class ReadRun:
         first = f"read {self.menu:02d}.{self.number:02d}"
         last = self.number + self.step * (self.count - 1)
         return f"{first} to {self.menu:02d}.{last:02d}" if self.step else f"{first}, {self.count} times"
+
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        return {(self.menu, self.number + self.step * i): one for i, one in enumerate(value)}
 
     def open(self, address: int, timings: Timings) -> RunReading:
         """Begin the read. Raises InvalidCommand for the broadcast address."""
@@ -259,10 +266,12 @@ class Writing(AcknowledgeReader):
     __slots__ = ()
 
     starts: ClassVar[bytes] = with_parity(ACK + NAK + EOT)
-    refusals = _REFUSALS
 
     def feed(self, data: bytes) -> Need | Expect | Done[None]:
-        return super().feed(data.translate(_SEVEN_BITS))
+        data = data.translate(_SEVEN_BITS)
+        if data.startswith(EOT):  # not every port checks parity: the write may have been carried out
+            raise FrameError("EOT came: there is no such parameter, or it was an ACK with a flipped bit", heard=data)
+        return super().feed(data)
 
 
 class Broadcast(SingleLeg):

@@ -173,6 +173,9 @@ class _Read:
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return tuple(values[place] for place in self.places)
 
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        return dict(zip(self.places, value, strict=True))
+
 
 @dataclass(frozen=True, slots=True)
 class ReadRegisters(_Read):

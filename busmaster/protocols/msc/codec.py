@@ -78,6 +78,9 @@ class DataRead(_Reading, _AtAddress):
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return values["data", self.address]
 
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        return {("data", self.address): value}
+
     def open(self, address: int, timings: Timings, /) -> PacketExchange[int]:
         return _ask(address, timings, b"DREAD,", self.address.to_bytes(2, "big"), 4, _value_of)
 
@@ -108,6 +111,11 @@ class BlockRead(_Reading, _AtAddress):
 
     def __str__(self) -> str:
         return f"read {BLOCK} values from data {self.address}"
+
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        """Return its values by their addresses: the first alone where the address step is not known."""
+        step = _step_of(profile)
+        return {("data", self.address + i * (step or 0)): one for i, one in enumerate(value if step else value[:1])}
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[tuple[int, ...]]:
         return _ask(address, timings, b"BREAD,", self.address.to_bytes(2, "big"), 4 * BLOCK, _block_of)
@@ -177,6 +185,9 @@ class ReadFlag(_Reading, _OfFlag):
     def shown(self, values: Mapping[Hashable, Any]) -> Any:
         return values["flag", self.flag]
 
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        return {("flag", self.flag): value}
+
     def open(self, address: int, timings: Timings, /) -> PacketExchange[bool]:
         return _ask(address, timings, b"RFLAG,", self.flag.to_bytes(2, "big"), 2, _state_of)
 
@@ -187,6 +198,9 @@ class ReadFlags(_Reading):
 
     def __str__(self) -> str:
         return "read all flags"
+
+    def told(self, value: Any, profile: Profile) -> Mapping[Hashable, Any]:
+        return {("flag", flag): flag in value for flag in range(FLAGS)}
 
     def open(self, address: int, timings: Timings, /) -> PacketExchange[frozenset[int]]:
         return _ask(address, timings, b"RFLAGS,", b"", FLAGS // 8, _flags_of)
@@ -269,13 +283,18 @@ class Merging:
         return batches
 
 
+def _step_of(profile: Profile) -> int | None:
+    """Return what the address grows by from one value to the next; None where that is not known."""
+    return profile.merge.address_step if isinstance(profile.merge, Merging) else None
+
+
 def _data_changes(profile: Profile, first: int, values: Sequence[int]) -> Mapping[Hashable, Any]:
     """Return what data addresses hold after a write. Where the address step is not known, nor is what a block changes.
 
     Between two values that are more than an address apart lie parts of the first, and before the first of the one
     before it.
     """
-    step = profile.merge.address_step if isinstance(profile.merge, Merging) else None
+    step = _step_of(profile)
     widest = step or (1 if len(values) == 1 else WIDEST_STEP)
     places = range(first - widest + 1, first + len(values) * widest)
     changed: dict[Hashable, Any] = {("data", address): None for address in places}

@@ -1,0 +1,50 @@
+"""SIGHUP: what ends a process that does not hear it is, to one that does, the wish to read its file again."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import threading
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+
+class Hangups:
+    """Hears SIGHUP, in `with`: enter it before anything that takes time, as loading a file does.
+
+    What comes before somebody waits is not lost; several that come meanwhile are one.
+    """
+
+    def __init__(self) -> None:
+        self._heard = False
+        self._wake: Callable[[], object] | None = None
+        self._before: Any = None
+
+    def __enter__(self) -> Hangups:
+        if threading.current_thread() is threading.main_thread():  # signals are heard nowhere else
+            self._before = signal.signal(signal.SIGHUP, self._hear)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGHUP, self._before)
+
+    def _hear(self, _number: int, _frame: object) -> None:
+        self._heard = True
+        if self._wake is not None:
+            self._wake()
+
+    async def next(self) -> None:
+        """Return when there is one that was not returned for yet."""
+        loop, came = asyncio.get_running_loop(), asyncio.Event()
+        # threadsafe, though it is this thread: nothing else wakes a loop that waits in select
+        self._wake = lambda: loop.call_soon_threadsafe(came.set)
+        try:
+            if not self._heard:
+                await came.wait()
+        finally:
+            self._wake = None
+        self._heard = False
