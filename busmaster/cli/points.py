@@ -35,9 +35,11 @@ def command(path: str, as_csv: bool, table: str | None) -> int:
     """
     if as_csv and table is not None:
         raise click.UsageError("--csv and --from exclude each other: one is out, the other in")
-    file = load(path)
     if table is not None:
-        return take(file, path, table)
+        # read to its end first: whoever edits it in a pipe may edit the file too
+        data = sys.stdin.buffer.read() if table == "-" else Path(table).read_bytes()
+        return take(load(path), path, "standard input" if table == "-" else table, data)
+    file = load(path)
     if as_csv:
         print_csv(points_csv(file))
     else:
@@ -69,11 +71,10 @@ def print_csv(data: bytes) -> None:
     sys.stdout.flush()
 
 
-def take(file: LineFile, path: str, table: str) -> int:
-    """Write what a CSV says into the file, tell what changes, and return the exit status."""
-    data = sys.stdin.buffer.read() if table == "-" else Path(table).read_bytes()
+def take(file: LineFile, path: str, name: str, data: bytes) -> int:
+    """Write what a CSV of that name says into the file, tell what changes, and return the exit status."""
     try:
-        taking = taken(file, "standard input" if table == "-" else table, data)
+        taking = taken(file, name, data)
     except BadRows as bad:
         for fault in bad.faults:
             note(fault, Level.ERROR)
