@@ -4,6 +4,7 @@
     PREFIX/cycles/GROUP       a whole cycle, as `busmaster run --json` prints it (messages = "cycle")
     PREFIX/health/NODE        {"time": ..., "health": "up"}, retained
     PREFIX/line               {"time": ..., "line": "ready"}, retained; "offline" while the port is gone
+    PREFIX/alarms/NODE/ITEM   {"time": ..., "alarm": "high"}, "low" or null, of points with limits; retained
     PREFIX/events             {"time": ..., "node": "winder", "text": "winder is down, was suspect"}
     PREFIX/status             online, or offline, which is also the last will; retained
 
@@ -65,6 +66,7 @@ BREATH = 0.002
 TIMEOUT = 5.0
 """Seconds in which a broker must answer."""
 KEEP_ALIVE = 15
+ALARMS = "alarms/"
 UNSUPPORTED_VERSION = 132
 """What a broker says that knows MQTT 3.1.1 alone, or what the client makes of what that says."""
 HURRY = 2.0
@@ -105,7 +107,9 @@ class MqttOutput(SpillingOutput):
         self._arriving: Commands
         self._owner: asyncio.AbstractEventLoop | None = None
         self._held: list[Item] = []
-        self._published: dict[str, str] = {}
+        self._published: dict[str, str | None] = {}
+        self._alarms: object = None
+        """Those that were told last."""
         self._quiet = logging.getLogger("busmaster.mqtt")
         self._quiet.addHandler(logging.NullHandler())
         self._quiet.propagate = False
@@ -160,6 +164,7 @@ class MqttOutput(SpillingOutput):
     async def _connected(self) -> None:
         async with self._connection() as client, anyio.create_task_group() as tasks:
             self._published.clear()
+            self._alarms = None
             await self._send(client, self._status("online"))
             self.up()
             if self._commands:
@@ -271,11 +276,19 @@ class MqttOutput(SpillingOutput):
         """Yield what is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
         if not self._in_charge:
             return
-        now = {"line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")}
+        now: dict[str, tuple[str, str | None]] = {
+            "line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")
+        }
         for node in self._bus.nodes:
             now[f"health/{topic_part(node.label.removeprefix('node '))}"] = ("health", node.health.value)
+        alarms = self._bus.alarms
+        if alarms is not self._alarms:
+            self._alarms = alarms
+            now |= {topic: ("alarm", None) for topic in self._published if topic.startswith(ALARMS)}
+            for point, alarm in alarms.items():
+                now[f"{ALARMS}{topic_part(point.key)}"] = ("alarm", None if alarm is None else alarm.limit)
         for topic, (name, state) in now.items():
-            if self._published.get(topic) != state:
+            if self._published.get(topic, "") != state:
                 self._published[topic] = state
                 payload = json_line(**{"time": round(time.time(), 3), name: state})
                 yield Outgoing(self._topic(topic), payload, True)
