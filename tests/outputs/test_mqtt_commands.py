@@ -22,7 +22,7 @@ from busmaster.gate.gate import Gate
 from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.outputs import mqtt_commands
 from busmaster.outputs.mqtt import MqttOutput
-from busmaster.outputs.mqtt_commands import LEAST, Commands
+from busmaster.outputs.mqtt_commands import LEAST, MOST_WAITING, Commands
 from busmaster.outputs.settings import MqttSettings
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
@@ -269,3 +269,21 @@ def test_a_flood_does_not_make_what_comes_behind_it_look_old() -> None:
         for _ in range(40):
             commands.arrive(cast("Message", Arrived(b"0")))
     assert clock[0] - commands._looked <= 0.05
+
+
+@pytest.mark.asyncio
+async def test_refusals_that_were_counted_alone_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt_commands, "TOLD_EVERY", 0.01)
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    gate = Gate(bus)
+    said: asyncio.Queue[str] = asyncio.Queue()
+    commands = Commands("line", gate, {}, lambda: 0.0, said.put_nowait)
+    for _ in range(MOST_WAITING + 7):
+        commands.arrive(cast("Message", Arrived(b"1")))
+    answers: asyncio.Queue[object] = asyncio.Queue()
+    serving = asyncio.ensure_future(commands.serve(gate.write, gate.refuse, answers.put, lambda: 0))
+    try:
+        assert await said.get() == "7 refused commands were neither answered nor put on record"
+    finally:
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
