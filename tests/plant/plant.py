@@ -331,6 +331,7 @@ class Plant:
 
     def holdings(self) -> dict[str, Holding]:
         """What the outputs hold, once every run has ended."""
+        self.order("calm")  # once it is obeyed, we have all that the drives have told before
         if self.broker.runs:
             self.subscriber.catch_up()
         texts = {kind: [*self.removed.get(kind, ())] for kind in ("csv", "jsonl")}
