@@ -81,7 +81,7 @@ class Plant:
 async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncIterator[Plant]:
     import aiomqtt
 
-    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)])))
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)], paced=False)))
     door = Gate(bus, read_only=read_only)
     controller = Hcp2Controller(bus, 5)
     controller.element(1).limit(maximum=500)
