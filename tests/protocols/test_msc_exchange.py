@@ -6,7 +6,7 @@ import pytest
 
 from busmaster.contract.exchange import MORE, Done, Expect, FrameError, Refused
 from busmaster.protocols.msc.codec import PROFILE, BlockRead, DataRead, DataWrite, ReadFlag, ReadStatus
-from busmaster.protocols.msc.exchange import PacketExchange, StalePacketListener, packet
+from busmaster.protocols.msc.exchange import PacketExchange, StalePacketListener, packet, packet_size
 
 ACK, NAK = b"\x06", b"\x15"
 TIMINGS = PROFILE.timings
@@ -286,6 +286,22 @@ def test_a_naked_request_that_must_not_be_repeated_now_is_refused_until_it_is_co
     failure = exchange.abandon()
     assert isinstance(failure, Refused)
     assert failure.confirm
+
+
+@pytest.mark.parametrize(
+    ("heard", "size"),
+    [
+        ("02 01 00 05", 13),
+        ("02 0F 00 F0", 248),
+        ("02 0F 00 F1", None),
+        ("02 00 00 05", None),
+        ("02 10 00 05", None),
+        ("06 01 00 05", None),
+        ("02 01 00", 0),
+    ],
+)
+def test_a_packet_begins_with_stx_a_unit_and_the_length_of_its_body(heard: str, size: int | None) -> None:
+    assert packet_size(bytes.fromhex(heard)) == size
 
 
 # while nothing is asked

@@ -70,6 +70,12 @@ def test_the_addresses_are_the_documents_and_no_other_is_taken(
                 profile.check_address(address)
 
 
+def test_an_address_is_known_by_its_number() -> None:
+    """Large numbers that are equal need not be the same object."""
+    profile = replace(hcp2.PROFILE, broadcast=1000)
+    profile.check_address(int("1000"))
+
+
 @pytest.mark.parametrize(
     ("profile", "timings"),
     [
