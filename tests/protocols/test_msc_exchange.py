@@ -243,6 +243,13 @@ def test_a_damaged_packet_before_the_ack_ends_the_attempt_when_the_line_pauses()
     assert error.value.send == ACK
 
 
+def test_bytes_that_are_no_packet_are_told_by_their_number_and_the_first_of_them() -> None:
+    exchange = reading()
+    exchange.feed(b"\x41\x42\x43")
+    with pytest.raises(FrameError, match="3 bytes that are no packet, the first of them 41"):
+        exchange.expired(True)
+
+
 def test_a_packet_before_the_ack_that_is_cut_short_ends_the_attempt() -> None:
     exchange = writing()
     assert exchange.feed(STALE[:5]) is MORE
