@@ -92,10 +92,10 @@ def test_replies_are_awaited_as_long_as_the_documents_say(profile: Profile, timi
 
 def test_msc_and_dc104_await_each_leg_in_its_own_time() -> None:
     first, packet = msc.PROFILE.timings.read, msc.PROFILE.timings.packet
-    assert (first.window, packet) == (0.5, ReplyTiming(0.5, 1.0, 1.0, 0.1))
+    assert (first, packet) == (ReplyTiming(0.05, 0.5, 1.0, 0.1), ReplyTiming(0.5, 1.0, 1.0, 0.1))
     assert (msc.PROFILE.timings.write, msc.PROFILE.exchange_limit) == (first, 2.0)
     assert dc104.PROFILE.timings.read == dc104.PROFILE.timings.packet == ReplyTiming(0.05, 0.1, 0.2, 0.02)
-    assert dc104.PROFILE.timings.write.window == 0.5
+    assert dc104.PROFILE.timings.write == ReplyTiming(0.5, 0.5, 0.6, 0.02)
 
 
 @pytest.mark.parametrize(
