@@ -57,7 +57,10 @@ OPEN: dict[str, set[str]] = {
         ),
         *("tap", "transaction", "unasked"),
     },
-    "bus": {"bus", "handle", "limits", "node", "points", "polling", "requester", "samples", "snapshots", "suitability"},
+    "bus": {
+        *("alarms", "bus", "handle", "limits", "meaning", "node", "points", "polling", "requester", "samples"),
+        *("snapshots", "suitability"),
+    },
     "capture": {"decode", "files", "frames", "pcapng", "recorder", "replay", "telegrams"},
     "cli": {""},
     "config": {""},

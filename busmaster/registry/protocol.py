@@ -80,6 +80,11 @@ def everywhere(item: str) -> bool:
     return True
 
 
+def usual_width(item: str) -> int:
+    """Return 32, whatever the item."""
+    return 32
+
+
 def nowhere(item: str) -> bool:
     """Return False, whatever the item."""
     return False
@@ -108,6 +113,8 @@ class NodeKind:
     unless it is said there."""
     whole_numbers: Callable[[str], bool] = nowhere
     """Whether the line carries whole numbers for an item: a value scaled by LINE.toml is then rounded to one."""
+    width: Callable[[str], int] = usual_width
+    """How many bits the whole number of an item has, so that LINE.toml can give them names; 0 for a run of several."""
     takes_decimals: bool = False
     """Its handle has an argument `decimals`, digits by item, and scales or rounds by it: LINE.toml does not."""
     capture_id: int = 0

@@ -6,7 +6,7 @@ from busmaster.protocols.msc import codec
 from busmaster.protocols.msc.capture import MscDialect
 from busmaster.protocols.msc.codec import PROFILE
 from busmaster.protocols.msc.handle import MscController
-from busmaster.protocols.msc.items import ITEMS
+from busmaster.protocols.msc.items import ITEMS, width_of
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
 ADDRESS_STEP = Option("address_step", "whole", "addresses from one value to the next")
@@ -36,6 +36,7 @@ PROTOCOL = Protocol(
                 Option("packet_delay", "delay"),
             ),
             whole_numbers=everywhere,
+            width=width_of,
             capture_id=4,
         ),
     ),
