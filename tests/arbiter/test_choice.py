@@ -91,6 +91,19 @@ def test_r15_before_one_that_was_held_back_go_two_that_wait_anyway_and_a_check_o
     assert bench.sent() == request_of(1), "in vain: it goes, and its answer will be doubted"
 
 
+def test_r15_nothing_is_picked_for_a_node_that_rests() -> None:
+    """Its on_return hook runs since it was asked."""
+    bench = Bench()
+    node, other, third = up(bench), up(bench, 2), up(bench, 3)
+    lost(bench, other)
+    bench.hear("FF")
+    bench.ask(node)
+    resting = bench.ask(third, hcp2.Read(3))
+    third.holds = 1
+    bench.until_sent()
+    assert (bench.sent(), resting.attempts) == (request_of(2, 2), 0)
+
+
 def test_r12_what_has_waited_too_long_is_not_picked_either() -> None:
     bench = Bench()
     node = up(bench)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 
 from busmaster.arbiter.state import LineState
@@ -178,9 +176,3 @@ def test_a_bug_in_a_protocols_reader_fails_its_transaction_and_not_the_line() ->
     assert bench.sent() == READ_1_OF_NODE_1
     bench.hear(FIVE, after=0.004)
     assert sound.value == 5.0
-
-
-def test_the_utilisation_of_a_line_is_the_share_of_the_time_in_which_it_was_in_use() -> None:
-    statistics = Bench().arbiter.statistics(1.0)
-    for busy, settling, elapsed, share in ((0.25, 0.5, 1.5, 0.5), (0.0, 0.0, 0.0, 0.0), (0.6, 0.5, 1.0, 1.0)):
-        assert replace(statistics, busy=busy, settling=settling, elapsed=elapsed).utilisation == share

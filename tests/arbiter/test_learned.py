@@ -104,6 +104,15 @@ def test_reads_and_writes_and_packets_are_kept_apart() -> None:
     assert node.timings(hcp2.Read(2), TIMINGS, NEVER) == TIMINGS
 
 
+def test_the_silence_that_ends_a_reply_follows_the_baud_rate() -> None:
+    node = Learning()
+    node.timings(hcp2.Read(1), TIMINGS, AT_FIRST)
+    for byte_time in (TAU, 2 * TAU, TAU):
+        for _ in range(TRUSTED_AFTER):
+            node.note(hcp2.Read(1), False, 0.001, 0.001, 0.0, byte_time)
+        assert node.timings(hcp2.Read(1), TIMINGS, AT_FIRST).read.silence == pytest.approx(LEAST_SILENCE * byte_time)
+
+
 def test_what_an_earlier_run_has_learned_is_trusted_after_fewer_replies() -> None:
     node = Learning()
     node.begin_with([LearnedTimes("Read", False, 0.003, 0.004, 0.0, 0.008, True)])

@@ -244,6 +244,8 @@ def test_a_value_between_the_steps_or_beyond_the_block_stays_alone() -> None:
 
 def test_no_block_runs_beyond_the_last_address() -> None:
     assert merge([DataRead(65535), DataRead(65534)], address_step=1) == []
+    assert merge([DataRead(65505), DataRead(65506)], address_step=1) == []
+    assert len(merge([DataRead(65504), DataRead(65505)], address_step=1)) == 1
 
 
 def test_an_address_step_leaves_room_for_a_block() -> None:
