@@ -16,6 +16,7 @@ from busmaster.errors import InvalidCommand
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Happening, Item, check_folder
 from busmaster.outputs.batches import BatchOutput
+from busmaster.outputs.growing_file import is_at
 from busmaster.outputs.retention import Retention
 from busmaster.outputs.settings import SqliteSettings
 from busmaster.outputs.values import json_value, micros, write_fields
@@ -91,8 +92,11 @@ class SqliteOutput(BatchOutput[Rows]):
         check_folder(settings.path)
         self._path = settings.path
         self._mode = settings.mode
-        self._retention = Retention(settings.keep_days, settings.keep_mb, lambda text: say(f"{kind}: {text}"))
+        self._tell: Callable[[str], None] = lambda text: say(f"{kind}: {text}")
+        self._retention = Retention(settings.keep_days, settings.keep_mb, self._tell)
         self._database: sqlite3.Connection | None = None
+        self._file: int | None = None
+        """The database's file, to see whether it is still where it was. Closed after it: closing gives up all locks."""
         self._numbers: dict[str, int] = {}
         self._labels: dict[tuple[int, Any], str] = {}
 
@@ -117,6 +121,9 @@ class SqliteOutput(BatchOutput[Rows]):
         return Rows(samples)
 
     def commit(self, batch: list[Rows]) -> None:
+        if self._file is not None and not is_at(self._path, self._file):
+            self._tell(f"{self._path} was moved or removed: another is begun")
+            self._leave()
         database = self._open()
         with database:
             self._retention.apply(database, DATED)
@@ -137,8 +144,20 @@ class SqliteOutput(BatchOutput[Rows]):
         if self._database is not None:
             self._database.close()
             self._database = None
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
         self._numbers.clear()  # of a transaction that was undone, perhaps
         self._labels.clear()
+
+    def _leave(self) -> None:
+        """Let go of a database that is not here any more, with all that it was given in its one file."""
+        try:
+            if self._database is not None:
+                self._database.execute("pragma wal_checkpoint(truncate)").fetchall()
+        except sqlite3.Error:
+            pass  # the disk is full: what was to go there stays in its log
+        self.shut()
 
     def _samples(self, database: sqlite3.Connection, batch: list[Rows]) -> Iterator[SampleRow]:
         numbers = self._numbers
@@ -155,7 +174,7 @@ class SqliteOutput(BatchOutput[Rows]):
     def _open(self) -> sqlite3.Connection:
         if self._database is None:
             # SQLite would make the file with a mode of its own.
-            os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, self._mode))
+            self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, self._mode)
             database = self._database = sqlite3.connect(self._path, timeout=BUSY)
             [version] = database.execute("pragma user_version").fetchone()
             [tables] = database.execute("select count(*) from sqlite_master").fetchone()
