@@ -148,6 +148,16 @@ def test_a_lost_reply_costs_its_learned_window_and_a_check_of_its_node() -> None
     assert trusted(node)
 
 
+def test_a_read_of_the_node_that_waits_anyway_goes_in_place_of_a_check_whatever_its_class() -> None:
+    bench = Bench()
+    node = trained(bench)
+    bench.ask(node)
+    bench.ask(node, hcp2.Read(3), priority=Priority.BACKGROUND)
+    assert bench.sent() == request_of(1)
+    bench.until_sent()
+    assert (bench.sent(), bench.arbiter.statistics(bench.now).checks) == (request_of(3), 0)
+
+
 def test_another_node_that_answers_with_another_echo_is_asked_at_once() -> None:
     bench = Bench()
     node, other = trained(bench, 1), trained(bench, 2)

@@ -269,6 +269,7 @@ def test_no_offset_is_quieter_than_the_one_chosen(others: list[tuple[float, floa
         polls[-1].base = phase * other_period
     poll = Poll("new", period, cost=0.01)
     offset = at_once(quietest_offset(poll, polls, 0.0))
+    assert 0 <= offset < period
     chosen = overlap(poll, offset, polls, 2.0)
     tried = [overlap(poll, n / 40 * period, polls, 2.0) for n in range(40)]
     assert chosen <= min(tried) + 1e-6
