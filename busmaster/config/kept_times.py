@@ -47,6 +47,7 @@ class KeptTimes:
         self._trouble = self._told = ""
         self._keeping: asyncio.Task[None] | None = None
         self._thread: threading.Thread | None = None
+        self._one_at_a_time = threading.Lock()
 
     async def start(self, path: str | None, nodes: Mapping[str, Node]) -> None:
         """Begin with what the file says of these nodes, and keep from now on what they learn; None keeps nothing."""
@@ -107,15 +108,15 @@ class KeptTimes:
 
     def _do(self, without: str, work: Callable[..., None], path: str, *arguments: Any) -> None:
         """Read or write, in a thread of its own: a disk that hangs must not keep the process from ending."""
-        before = self._thread
-        if before is not None:
-            before.join(PATIENCE)
-        if before is None or not before.is_alive():
-            self._thread = threading.Thread(target=work, args=(path, *arguments), name="busmaster learned", daemon=True)
-            self._thread.start()
+        with self._one_at_a_time:  # a line that is closed leaves a writer behind that was cancelled
+            if self._thread is None or not self._thread.is_alive():
+                self._thread = threading.Thread(
+                    target=work, args=(path, *arguments), name="busmaster times", daemon=True
+                )
+                self._thread.start()
             self._thread.join(PATIENCE)
-        if self._thread is not None and self._thread.is_alive():
-            self._trouble = f"{path}: no answer for {PATIENCE:g} s: {without}"
+            if self._thread.is_alive():
+                self._trouble = f"{path}: no answer for {PATIENCE:g} s: {without}"
 
     def _read(self, path: str) -> None:
         try:

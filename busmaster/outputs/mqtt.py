@@ -209,7 +209,9 @@ class MqttOutput(SpillingOutput):
 
         settings = self._settings
         username, password, tls = self._secrets
-        self._arriving = Commands(settings.prefix, self._gate, self._commands, self._bus.now)
+        self._arriving = Commands(
+            settings.prefix, self._gate, self._commands, self._bus.now, lambda text: self._say(f"{self.kind}: {text}")
+        )
         client = aiomqtt.Client(
             settings.host,
             settings.port,

@@ -27,6 +27,8 @@ MOST_WAITING = 100
 """Commands that may wait for their turn, and refusals that may wait to be answered. What is more is counted alone."""
 BREATH = 0.005
 """Seconds between two refusals that are answered: a flood of them costs the line nothing."""
+TOLD_EVERY = 10.0
+"""Seconds, at least, between two lines that tell how many refusals were counted alone."""
 LONGEST_NAME = 256
 """Characters of a point's name; a longer one is answered without it."""
 EXPIRY = "MessageExpiryInterval"
@@ -51,13 +53,24 @@ Say: TypeAlias = Callable[[Answer], Awaitable[None]]
 
 
 class Commands:
-    """What may be written, by topic, and what waits to be. All of it is on the thread of the output."""
+    """What may be written, by topic, and what waits to be. All of it is on the thread of the output.
 
-    def __init__(self, prefix: str, gate: Gate, points: Mapping[str, Point[Any]], now: Callable[[], float]) -> None:
+    `tell` is told how many commands were refused without an answer.
+    """
+
+    def __init__(
+        self,
+        prefix: str,
+        gate: Gate,
+        points: Mapping[str, Point[Any]],
+        now: Callable[[], float],
+        tell: Callable[[str], object] = lambda _: None,
+    ) -> None:
         self.refused = 0
         """Commands that were refused, those that nobody was told of included."""
         self.unanswered = 0
         self.queued: deque[Wish] = deque()
+        self._tell = tell
         self._prefix = prefix
         self._gate = gate
         self._points = points
@@ -132,6 +145,7 @@ class Commands:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(self._keep_looking, unread)
             tasks.start_soon(self._answer_refusals, keep, say)
+            tasks.start_soon(self._tell_unanswered)
             for _ in range(MOST_AT_ONCE):
                 tasks.start_soon(self._obey, write, say)
 
@@ -169,6 +183,14 @@ class Commands:
                 await anyio.sleep(BREATH)
             else:
                 await self._wait()
+
+    async def _tell_unanswered(self) -> None:
+        told = 0
+        while True:
+            await anyio.sleep(TOLD_EVERY)
+            if self.unanswered > told:
+                self._tell(f"{self.unanswered - told} refused commands were neither answered nor put on record")
+                told = self.unanswered
 
     async def _wait(self) -> None:
         self._something.clear()

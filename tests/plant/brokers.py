@@ -20,7 +20,9 @@ from tests.plant.programs import until
 from tests.ports import free_port
 
 PREFIX = "plant"
-TOPICS = ("status", "line", "health/#", "values/#", "cycles/#", "events", "audit", "result/#")
+MARKER = "marker"
+"""What the subscriber says to itself: it has then heard all that was said before."""
+TOPICS = ("status", "line", "health/#", "values/#", "cycles/#", "events", "audit", "result/#", MARKER)
 ALL = 0
 """Stands for no limit in mosquitto's settings."""
 
@@ -50,6 +52,10 @@ class Broker:
         self._process = subprocess.Popen(
             [MOSQUITTO, "-c", str(self._config)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
+
+    @property
+    def runs(self) -> bool:
+        return self._process is not None
 
     def send(self, number: signal.Signals) -> None:
         assert self._process is not None
@@ -130,6 +136,12 @@ class Subscriber:
 
         until(answered, f"command {mark} is answered")
         return found[0]
+
+    def catch_up(self) -> None:
+        """Return when all is heard that the broker had by now."""
+        since = time.monotonic()
+        self.send("", "", topic=f"{PREFIX}/{MARKER}")
+        until(lambda: bool(self.since(since, MARKER)), "what we say comes back to us")
 
     def since(self, moment: float, topic: str = "") -> list[Heard]:
         return [heard for heard in self.heard[:] if heard.when >= moment and heard.topic.startswith(topic)]

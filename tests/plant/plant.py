@@ -330,6 +330,10 @@ class Plant:
     # accounts
 
     def holdings(self) -> dict[str, Holding]:
+        """What the outputs hold, once every run has ended."""
+        self.order("calm")  # once it is obeyed, we have all that the drives have told before
+        if self.broker.runs:
+            self.subscriber.catch_up()
         texts = {kind: [*self.removed.get(kind, ())] for kind in ("csv", "jsonl")}
         paths = {kind: [*self.old.get(kind, ()), path] for kind, path in self.paths.items()}
         for kind in ("csv", "jsonl"):
