@@ -24,7 +24,10 @@ LIMITS = ("minimum", "maximum", "max_step")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointSection:
-    """What a point is called, what its number on the line means, and what may be written to it, in its unit."""
+    """What a point is called, what its number on the line means, and what may be written to it, in its unit.
+
+    `template`: the name of the template that says something of it, "" where the node's own section says all.
+    """
 
     name: str
     item: str
@@ -37,6 +40,7 @@ class PointSection:
     max_step: float | None = None
     writable: bool = True
     meaning: Meaning
+    template: str = field(default="", compare=False)
     table: Table = field(compare=False, repr=False)
 
     @property
@@ -45,15 +49,18 @@ class PointSection:
         return not self.writable or any(getattr(self, limit) is not None for limit in LIMITS)
 
 
-NOT_SAID = ("name", "meaning", "table")
+NOT_SAID = ("name", "meaning", "template", "table")
 """Fields of a section that are no keys of the file."""
 MEANINGS = tuple(part.name for part in fields(Meaning))
 POINT_KEYS = (*(part.name for part in fields(PointSection) if part.name not in NOT_SAID), *MEANINGS)
 """All that a file can say of a point."""
 
 
-def read_point(table: Table, kind: NodeKind) -> PointSection:
-    """Read one point. Raises FileError, naming line and key, for what is wrong in it."""
+def read_point(table: Table, kind: NodeKind, template: str = "") -> PointSection:
+    """Read one point, of which that template says something.
+
+    Raises FileError, naming line and key, for what is wrong in it.
+    """
     if not POINT_NAME.fullmatch(table.name):
         raise table.error(f"a point's name has no spaces, commas or slashes: {table.name!r} has")
     said = table.typed(PointSection, *MEANINGS, without=NOT_SAID, optional=("item",))
@@ -62,7 +69,9 @@ def read_point(table: Table, kind: NodeKind) -> PointSection:
         meaning = Meaning(**meant)
     except MeansNothing as error:
         raise table.error(error.fault, error.field) from None
-    section = PointSection(**{"item": table.name, **said}, name=table.name, meaning=meaning, table=table)
+    section = PointSection(
+        **{"item": table.name, **said}, name=table.name, meaning=meaning, template=template, table=table
+    )
     if not section.factor:
         raise table.error("a factor of 0 makes every value the same", "factor")
     if section.decimals and not kind.takes_decimals:

@@ -12,12 +12,13 @@ from busmaster.bus.suitability import check_company
 from busmaster.config.emulator import EmulatorSection, read_emulator
 from busmaster.config.names import NODE_NAME, expanded
 from busmaster.config.options import check_keys, read_options
-from busmaster.config.point_section import PointSection, read_point
+from busmaster.config.point_section import PointSection
 from busmaster.config.ports import read_port
 from busmaster.config.recording import Outputs, read_outputs
 from busmaster.config.safe import SafeSection, read_safe
 from busmaster.config.source import Source
 from busmaster.config.table import Table
+from busmaster.config.templates import read_points
 from busmaster.config.timing import LEARNED_WORD, read_timings, reads_learned
 from busmaster.contract.arguments import is_decimal
 from busmaster.contract.learning import Learned
@@ -28,7 +29,7 @@ from busmaster.registry import NodeKind, find, kinds
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
-NODE_KEYS = ("protocol", "address", "timing", "retries", "reply_time", "points")
+NODE_KEYS = ("protocol", "address", "timing", "retries", "reply_time", "template", "points")
 """What every node's table may say; its kind's options come to it."""
 PRIORITIES = {"poll": Priority.POLL, "background": Priority.BACKGROUND}
 
@@ -167,7 +168,7 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
     retries = table.whole("retries", default.whole("retries", None, most=100), most=100)
     reply_time = table.seconds("reply_time", default.seconds("reply_time", None))
     options = {**read_options(default, own), **read_options(table, own)}
-    points = {point.name: read_point(point, find(protocol)) for point in table.tables("points")}
+    points = read_points(table, find(protocol))
     for name, address in zip(names, addresses, strict=True):
         if not NODE_NAME.fullmatch(name):
             raise table.error(f"a node's name is of letters, digits, _, . and -, not {name!r}")

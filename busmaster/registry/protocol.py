@@ -51,6 +51,9 @@ class Option:
     """All texts that it can be; () if it can be any."""
     fields: tuple[Option, ...] = ()
     """What each of its tables may say."""
+    reader: Callable[[str], Mapping[str, int]] | None = None
+    """Of "addresses": reads them from the text of a file, which LINE.toml may name in place of the table. Raises
+    InvalidCommand, naming the lines that it cannot read: none is guessed."""
 
 
 class DeviceMaker(typing.Protocol):

@@ -6,6 +6,7 @@ from math import inf
 
 import pytest
 
+from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.health import (
     BUDGET_CAPACITY,
     FIRST_PROBE_DELAY,
@@ -16,6 +17,7 @@ from busmaster.arbiter.health import (
     note_failure,
     note_success,
 )
+from busmaster.arbiter.probes import Probes
 from busmaster.contract.profile import Profile
 from busmaster.errors import NodeDown, NoReply
 from busmaster.protocols._comms.codec import CHECKED
@@ -195,6 +197,19 @@ def test_r11_a_quarter_of_a_pause_is_earned_as_far_as_it_is_longer_than_a_probe(
     assert budget.tokens == pytest.approx(0.1)
 
 
+def test_r11_pauses_of_a_line_that_are_shorter_than_a_probe_earn_nothing_however_many_they_are() -> None:
+    bench = Bench()
+    live, budget = up(bench), bench.arbiter.dispatcher.probes.budget
+    budget.tokens, budget.probe = 0.0, PROBE_COST
+    for element in range(1, 11):
+        bench.wait(0.9 * PROBE_COST)
+        bench.served(bench.ask(live, hcp2.Read(element)))
+    assert budget.tokens == 0.0
+    bench.wait(2 * PROBE_COST)
+    bench.served(bench.ask(live))
+    assert budget.tokens > 0.0
+
+
 @pytest.mark.parametrize("looks", [1, 2, 11])
 def test_r11_a_pause_earns_as_much_however_often_it_is_looked_at(looks: int) -> None:
     budget = ProbeBudget(0.0)
@@ -249,6 +264,17 @@ def test_r11_a_request_to_a_dead_node_is_tried_once_while_the_budget_allows_and_
         attempts.append(read.attempts)
         assert isinstance(read.error, NodeDown if fails_at_once else NoReply)
     assert attempts == [1, 1, 1, 0, 0, 0]
+
+
+def test_r11_a_request_to_a_dead_node_leaves_what_the_probe_that_is_due_costs() -> None:
+    due, now = node(), 7.0
+    due.health, due.probe_at = DOWN, now
+    probes = Probes(Deadlines(), [due, node()], now)
+    probes.budget.tokens = 1.9 * PROBE_COST
+    assert not probes.spare(PROBE_COST, now)
+    due.probe_at = now + 0.001
+    assert probes.spare(PROBE_COST, now)
+    assert probes.budget.tokens == pytest.approx(0.9 * PROBE_COST)
 
 
 def test_r11_an_owner_may_probe_at_any_time() -> None:
