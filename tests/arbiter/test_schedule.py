@@ -472,6 +472,16 @@ def test_a_demand_waits_until_the_poll_is_prepared() -> None:
     assert schedule.next_due() == pytest.approx(5.0)
 
 
+def test_a_demand_runs_one_cycle_at_once_and_leaves_the_grid_alone() -> None:
+    poll = Poll("a", 10.0, phase=5.0)
+    [member] = members(1)
+    set_members(poll, [member])
+    schedule = running(poll)
+    schedule.demand(poll)
+    assert schedule.begin(1.0) == [member]
+    assert schedule.next_due() == pytest.approx(5.0)
+
+
 def test_a_cycle_has_begun_when_its_first_request_went_out() -> None:
     bench = Bench()
     poll = bench.poll(up(bench), 10.0, 1, 2)
