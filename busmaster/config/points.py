@@ -61,12 +61,15 @@ class Scale:
         return read
 
     def write(self, value: Any) -> Any:
-        """Return the line's number, or run of numbers, for a value."""
+        """Return the line's number, or run of numbers, for a value. Raises InvalidCommand for one that is too large."""
         if isinstance(value, list | tuple):
             return tuple(map(self.write, value))
         if type(value) is int or (type(value) is float and math.isfinite(value)):  # inf is the protocol's to refuse
             exact = (Fraction(repr(value)) - self.offset) / self.factor
-            return rounded(exact) if self.whole else float(exact)
+            try:
+                return rounded(exact) if self.whole else float(exact)
+            except OverflowError:
+                raise InvalidCommand(f"{value!r} is too large") from None
         return value
 
 

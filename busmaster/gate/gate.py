@@ -150,7 +150,7 @@ class Gate:
 
     def refuse(self, wish: Wish, error: str) -> WriteRecord:
         """Keep a record of what was not even tried."""
-        return self._keep(wish, Outcome.REFUSED, error, None, 0.0)
+        return self._keep(wish, Outcome.REFUSED, error, _before(wish.point), 0.0)
 
     async def _pass(self, wish: Wish) -> None:
         assert wish.point is not None
@@ -195,4 +195,6 @@ def _before(point: Point[Any] | None) -> Any:
 
 def _shown(value: Any) -> Any:
     """Return the value as it fits into a record."""
+    if isinstance(value, bytes):  # a command that was not read: as it came, but for what could harm a terminal
+        return repr(value.decode(errors="replace"))[1:-1][:LONGEST_SHOWN]
     return value if isinstance(value, int | float) and abs(value) < 1e300 else repr(value)[:LONGEST_SHOWN]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 
 import pytest
 
@@ -84,6 +85,19 @@ def test_what_this_process_wishes_itself_is_on_record_and_raises_on() -> None:
             ("5/1", Outcome.WRITTEN),
             ("5/2", Outcome.REFUSED),
         ]
+
+    at_a_gate(story)
+
+
+def test_what_is_refused_unread_is_on_record_as_it_came_with_the_value_before_it() -> None:
+    async def story(gate: Gate, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        point = controller.point("1")
+        await point.write(5)
+        await anext(aiter(gate.bus.poll_group("all", period=1, points=[point])))
+        for sent in (b"true", "ä".encode(), b"\x1b[2J", b"\xff"):
+            gate.refuse(replace(wish(controller, 1), value=sent), "it is no number")
+        assert [record.value for record in records] == ["true", "ä", r"\x1b[2J", "\ufffd"]
+        assert {record.before for record in records} == {5}
 
     at_a_gate(story)
 
