@@ -12,6 +12,8 @@ LONGEST = 4096
 LONGEST_ID = 100
 LARGEST = 1e15
 """Beyond it no quantity is meant, and no protocol has a way to send it."""
+LATEST = 1e11
+"""Seconds since 1970: what is said to be later, some thousand years from now, is in milliseconds."""
 
 
 class Payload(NamedTuple):
@@ -41,6 +43,8 @@ def read_payload(payload: object) -> Payload:
         raise InvalidCommand(f"an id is a text of {LONGEST_ID} characters at most, or a whole number")
     if expires is not None and not _is_number(expires):
         raise InvalidCommand("expires is a time in seconds since 1970")
+    if expires is not None and expires > LATEST:
+        raise InvalidCommand("expires is a time in seconds since 1970, not in milliseconds")
     return Payload(_numbers(said["value"], text), str(mark), expires)
 
 

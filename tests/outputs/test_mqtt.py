@@ -330,6 +330,11 @@ def test_anything_else_is_refused(payload: bytes | None) -> None:
         read_payload(payload)
 
 
+def test_an_end_in_milliseconds_is_refused_since_it_would_never_come() -> None:
+    with pytest.raises(InvalidCommand, match="not in milliseconds"):
+        read_payload(b'{"value": 1, "expires": 1767225600000}')
+
+
 def test_a_password_file_that_is_not_there_is_said_at_once(tmp_path: Path) -> None:
     with pytest.raises(InvalidCommand, match="No such file"):
         MqttOutput("mqtt", MqttSettings(password_file=str(tmp_path / "none")), BUS)
