@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 from busmaster.errors import InvalidCommand
 
@@ -52,8 +52,10 @@ def _numbers(value: Any, text: str) -> Any:
     numbers = value if isinstance(value, list) else [value]
     if not numbers or not all(map(_is_number, numbers)):
         raise InvalidCommand(f"{text[:40]!r} is neither a number nor a list of numbers")
+    if any(abs(number) > LARGEST for number in numbers):
+        raise InvalidCommand(f"{text[:40]!r} is beyond {LARGEST:g}: nobody means that much")
     return value
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+def _is_number(value: object) -> TypeGuard[int | float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
