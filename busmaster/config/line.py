@@ -342,12 +342,12 @@ class ConfiguredLine:
 def check_same_line(before: LineFile, after: LineFile) -> None:
     """Raise InvalidCommand where a file says of the port, or of a node, what a line that runs cannot change."""
     if (before.port, before.strict) != (after.port, after.strict):
-        raise InvalidCommand("other settings of the port need a restart: nothing of the file was taken")
+        raise InvalidCommand("other settings of the port need a restart")
     own = {_address(node): node for node in before.nodes.values()}
     for node in after.nodes.values():
         known = before.nodes.get(node.name) or own.get(_address(node))  # renamed, it has other settings
         if known is not None and _settings(known) != _settings(node):
-            raise InvalidCommand(f"other settings of node {node.name!r} need a restart: nothing of the file was taken")
+            raise InvalidCommand(f"other settings of node {node.name!r} need a restart")
 
 
 def _address(node: NodeSection) -> tuple[str, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 from busmaster.errors import InvalidCommand
 
@@ -12,6 +12,8 @@ LONGEST = 4096
 LONGEST_ID = 100
 LARGEST = 1e15
 """Beyond it no quantity is meant, and no protocol has a way to send it."""
+LATEST = 1e11
+"""Seconds since 1970: what is said to be later, some thousand years from now, is in milliseconds."""
 
 
 class Payload(NamedTuple):
@@ -41,6 +43,8 @@ def read_payload(payload: object) -> Payload:
         raise InvalidCommand(f"an id is a text of {LONGEST_ID} characters at most, or a whole number")
     if expires is not None and not _is_number(expires):
         raise InvalidCommand("expires is a time in seconds since 1970")
+    if expires is not None and expires > LATEST:
+        raise InvalidCommand("expires is a time in seconds since 1970, not in milliseconds")
     return Payload(_numbers(said["value"], text), str(mark), expires)
 
 
@@ -48,8 +52,10 @@ def _numbers(value: Any, text: str) -> Any:
     numbers = value if isinstance(value, list) else [value]
     if not numbers or not all(map(_is_number, numbers)):
         raise InvalidCommand(f"{text[:40]!r} is neither a number nor a list of numbers")
+    if any(abs(number) > LARGEST for number in numbers):
+        raise InvalidCommand(f"{text[:40]!r} is beyond {LARGEST:g}: nobody means that much")
     return value
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+def _is_number(value: object) -> TypeGuard[int | float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)

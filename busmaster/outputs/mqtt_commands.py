@@ -94,15 +94,15 @@ class Commands:
             by=str(message.topic)[:LONGEST_NAME],
             name=shown or name[:40],
             point=self._points.get(name),
-            value=bytes(message.payload[:LONGEST]),
+            value=bytes(message.payload[:LONGEST]).decode(errors="replace"),
             arrived=self._looked,
         )
         try:
+            wish = self._read(wish, message)  # first: whatever becomes of it, its value and its id are told
             if wish.point is None:
                 raise InvalidCommand(self._gate.refusal(wish))
             if message.retain:
                 raise InvalidCommand("a retained command is not obeyed: nobody knows how old it is")
-            wish = self._read(wish, message)
             if len(self.queued) >= MOST_WAITING:
                 raise InvalidCommand(f"{MOST_WAITING} commands are waiting already")
         except InvalidCommand as error:

@@ -330,6 +330,16 @@ def test_anything_else_is_refused(payload: bytes | None) -> None:
         read_payload(payload)
 
 
+def test_a_number_that_is_too_large_is_not_said_to_be_none() -> None:
+    with pytest.raises(InvalidCommand, match=r"^'\[1, 1e308\]' is beyond 1e\+15"):
+        read_payload(b"[1, 1e308]")
+
+
+def test_an_end_in_milliseconds_is_refused_since_it_would_never_come() -> None:
+    with pytest.raises(InvalidCommand, match="not in milliseconds"):
+        read_payload(b'{"value": 1, "expires": 1767225600000}')
+
+
 def test_a_password_file_that_is_not_there_is_said_at_once(tmp_path: Path) -> None:
     with pytest.raises(InvalidCommand, match="No such file"):
         MqttOutput("mqtt", MqttSettings(password_file=str(tmp_path / "none")), BUS)

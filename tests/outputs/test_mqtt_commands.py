@@ -184,6 +184,16 @@ async def test_whatever_is_sent_is_refused_and_answered_and_the_output_stays_up(
 
 
 @pytest.mark.asyncio
+async def test_a_command_to_what_the_file_does_not_allow_is_told_with_its_value_and_its_id(broker: Broker) -> None:
+    async with plant(broker) as there:
+        answer = await there.ask('{"value": 80, "id": "a7"}', "5/2")
+        assert "allow_commands" in answer["error"]
+        assert answer["id"] == "a7"
+        await there.ask("on", "5/2")
+    assert [(record.value, record.id) for record in there.records] == [(80, "a7"), ("'on'", "")]
+
+
+@pytest.mark.asyncio
 async def test_refused_commands_do_not_starve_those_that_are_allowed(
     broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:

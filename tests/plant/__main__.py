@@ -26,7 +26,8 @@ def main() -> int:
     parser.add_argument("--list", action="store_true", help="name the faults")
     arguments = parser.parse_args()
     if arguments.list:
-        _say("\n".join(f"{name:18}{fault.name}" for name, fault in FAULTS.items()))
+        width = max(map(len, FAULTS))
+        _say("\n".join(f"{name:{width}}  {fault.name}" for name, fault in FAULTS.items()))
         return 0
     if arguments.minutes:
         run = long_run(arguments.minutes, _tell)
