@@ -192,9 +192,8 @@ class _Incoming:
     def _row(self, place: _RowPlace, number: int, head: Sequence[str], cells: Sequence[str]) -> None:
         """Read one row. Raises FileError for what is wrong in it."""
         if len(cells) != len(head):
-            raise place.error(
-                (), f"it has {len(cells)} cells and not {len(head)}: is there a comma in one that is not in quotes?"
-            )
+            more = ": is there a comma in one that is not in quotes?" if len(cells) > len(head) else ""
+            raise place.error((), f"it has {len(cells)} cells and not {len(head)}{more}")
         given = dict(zip(head, cells, strict=True))
         where, name = text_of(given[NODE]), text_of(given[POINT])
         node = self._node(place, where)
