@@ -1,0 +1,206 @@
+"""Where the sockets of lines are, and whose they are.
+
+Beside each socket NAME.sock is NAME.line, which its owner has locked: it says which process serves which port. The
+lock, and not the socket, says who may listen, so that of two that start at once one alone succeeds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import re
+import socket
+import stat
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+
+from busmaster.errors import InvalidCommand
+
+SYSTEM = Path("/run/busmaster")
+"""Where the lines are that systemd runs."""
+LONGEST_NAME = 60
+LONGEST_PATH = 107
+"""Bytes of a Unix socket's path that the kernel takes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Owner:
+    """Who serves a line: its name, its port, the socket, and the process."""
+
+    name: str
+    port: str
+    socket: str
+    pid: int
+
+    @property
+    def address(self) -> str:
+        """Return what `connect` takes."""
+        return f"unix:{self.socket}"
+
+
+def line_name(text: str) -> str:
+    """Return what a line is called after its file or its port: /dev/ttyUSB0 is "ttyUSB0"."""
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", os.path.basename(text.rstrip("/")) or text).strip(".-")[:LONGEST_NAME]
+    return name or "line"
+
+
+def runtime_folder() -> Path:
+    """Return this user's folder for sockets, which nobody else may enter. Raises InvalidCommand where it is not so."""
+    if given := os.environ.get("RUNTIME_DIRECTORY"):
+        return Path(given.split(":")[0])
+    if given := os.environ.get("XDG_RUNTIME_DIR"):
+        folder = Path(given, "busmaster")
+    else:
+        folder = Path("/tmp", f"busmaster-{os.getuid()}")
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise InvalidCommand(f"{folder} cannot be made: {error.strerror}; set XDG_RUNTIME_DIR") from None
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise InvalidCommand(f"{folder} is not this user's alone: others could pose as its lines; remove it")
+    return folder
+
+
+def owners() -> Iterator[Owner]:
+    """Yield the lines that are served in this user's folder, and by systemd, as far as this user may see them."""
+    folders = [SYSTEM, *_inside(SYSTEM)]
+    with contextlib.suppress(InvalidCommand):
+        folders.insert(0, runtime_folder())
+    seen: set[str] = set()
+    for folder in folders:
+        for path in sorted(folder.glob("*.line")):
+            owner = _read(path)
+            if owner is not None and owner.socket not in seen and _listens(owner):
+                seen.add(owner.socket)
+                yield owner
+
+
+def find_owner(port: str) -> Owner | None:
+    """Return who serves the line that has this name, or whose port this is, however the port is written."""
+    wanted = port.partition("?")[0]
+    device = os.path.realpath(wanted) if wanted.startswith("/") else wanted
+    for owner in owners():
+        theirs = os.path.realpath(owner.port) if owner.port.startswith("/") else owner.port
+        if owner.name == port or theirs == device:
+            return owner
+    return None
+
+
+def socket_path(address: str) -> str:
+    """Return the socket that `unix:PATH`, or a line's or a port's name, stands for. Raises InvalidCommand."""
+    if address.startswith("unix:"):
+        return address.removeprefix("unix:").removeprefix("//")
+    owner = find_owner(address)
+    if owner is None:
+        names = ", ".join(owner.name for owner in owners()) or "none"
+        raise InvalidCommand(f"no program of this user serves {address!r}; use unix:PATH, or the name of: {names}")
+    return owner.socket
+
+
+class ServedSocket:
+    """The socket of one line, listening, in `with`. Raises InvalidCommand, naming the process, where one serves it.
+
+    What a process that has died left there is replaced. `mode` is the socket's; `group` is a group's number.
+    """
+
+    def __init__(self, path: Path, name: str, port: str, *, mode: int = 0o600, group: int | None = None) -> None:
+        self.owner = Owner(name, port, str(path), os.getpid())
+        self.socket: socket.socket
+        self._path = path
+        self._mode = mode
+        self._group = group
+        self._lock = -1
+
+    def __enter__(self) -> ServedSocket:
+        if len(os.fsencode(self._path)) > LONGEST_PATH:
+            raise InvalidCommand(f"{self._path} is too long for a socket: {LONGEST_PATH} bytes at most")
+        try:
+            self._take_lock()
+            try:
+                self._listen()
+            except BaseException:
+                os.close(self._lock)
+                raise
+        except OSError as error:
+            raise InvalidCommand(f"{self._path} cannot be served: {error.strerror}") from None
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.socket.close()
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+        with contextlib.suppress(OSError):
+            self._line.unlink()
+        os.close(self._lock)  # last: until then nobody else begins
+
+    @property
+    def _line(self) -> Path:
+        return self._path.with_suffix(".line")
+
+    def _take_lock(self) -> None:
+        while True:
+            self._lock = os.open(self._line, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # One that is just leaving has unlinked it: another might lock a new file of that name.
+                if os.path.exists(self._line) and os.path.samestat(os.fstat(self._lock), os.stat(self._line)):
+                    break
+            except BlockingIOError:
+                os.close(self._lock)
+                other = _read(self._line)
+                who = f"process {other.pid}, for {other.port}" if other is not None else "another process"
+                raise InvalidCommand(f"{self._path} is served already by {who}: use it, or end that first") from None
+            os.close(self._lock)
+        os.ftruncate(self._lock, 0)
+        os.write(self._lock, json.dumps(asdict(self.owner)).encode())
+
+    def _listen(self) -> None:
+        with contextlib.suppress(FileNotFoundError):
+            if not stat.S_ISSOCK(self._path.lstat().st_mode):
+                raise InvalidCommand(f"{self._path} is no socket: it is left alone")
+            self._path.unlink()
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        before = os.umask(0o177)
+        try:
+            self.socket.bind(str(self._path))
+        finally:
+            os.umask(before)
+        if self._group is not None:
+            os.chown(self._path, -1, self._group)
+        os.chmod(self._path, self._mode)
+        self.socket.listen()
+
+
+def _read(path: Path) -> Owner | None:
+    try:
+        said = json.loads(path.read_text())
+        return Owner(str(said["name"]), str(said["port"]), str(said["socket"]), int(said["pid"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _listens(owner: Owner) -> bool:
+    """Return whether somebody listens there; True too where this user may not ask."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(owner.socket)
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except OSError:
+            return True
+    return True
+
+
+def _inside(folder: Path) -> list[Path]:
+    try:
+        return sorted(entry for entry in folder.iterdir() if entry.is_dir())
+    except OSError:
+        return []

@@ -1,0 +1,92 @@
+"""What is to be said to one client, in its order: bounded, so that one that does not read loses its own messages."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Awaitable, Callable, Hashable
+
+from busmaster.service.messages import MOST_UNREAD
+
+
+class _Letter:
+    __slots__ = ("key", "text")
+
+    def __init__(self, text: str | None, key: Hashable = None) -> None:
+        self.text = text
+        """None of one that was dropped."""
+        self.key = key
+
+
+class Outbox:
+    """Messages that wait until the one before them is sent.
+
+    Answers are bounded by the requests that a client may make; of news, which come unasked, the oldest are dropped
+    beyond MOST_UNREAD. `on_drop` is told whose that was.
+    """
+
+    def __init__(self, send: Callable[[str], Awaitable[None]], on_drop: Callable[[Hashable], None]) -> None:
+        self._send = send
+        self._on_drop = on_drop
+        self._letters: deque[_Letter] = deque()
+        self._news: deque[_Letter] = deque()
+        self._latest: dict[Hashable, _Letter] = {}
+        self._something = asyncio.Event()
+        self._flushed = asyncio.Event()
+        self._sending = False
+
+    @property
+    def empty(self) -> bool:
+        """Whether all that was put in has been handed over."""
+        return not (self._letters or self._sending)
+
+    def put(self, text: str) -> None:
+        """Say this: it is never dropped."""
+        self._add(_Letter(text))
+
+    def put_latest(self, key: Hashable, text: str) -> None:
+        """Say this in place of what was to be said of the same thing, if that still waits."""
+        letter = self._latest.get(key)
+        if letter is not None:
+            letter.text = text
+            return
+        self._latest[key] = letter = _Letter(text, key)
+        self._add(letter)
+
+    def put_news(self, key: Hashable, text: str) -> None:
+        """Say this of one of its streams, unless it does not keep up."""
+        while len(self._news) >= MOST_UNREAD:
+            oldest = self._news.popleft()
+            oldest.text = None
+            self._on_drop(oldest.key)
+        letter = _Letter(text, key)
+        self._news.append(letter)
+        self._add(letter)
+
+    def _add(self, letter: _Letter) -> None:
+        self._letters.append(letter)
+        self._something.set()
+
+    async def flushed(self) -> None:
+        """Return when all that was put in has been handed over."""
+        while not self.empty:
+            self._flushed.clear()
+            await self._flushed.wait()
+
+    async def run(self) -> None:
+        """Send what is put in, one after the other, until the connection is lost."""
+        while True:
+            while self._letters:
+                letter = self._letters.popleft()
+                if letter.text is None:
+                    continue
+                if self._news and self._news[0] is letter:
+                    self._news.popleft()
+                elif self._latest.get(letter.key) is letter:
+                    del self._latest[letter.key]
+                self._sending = True
+                await self._send(letter.text)
+                self._sending = False
+            self._flushed.set()
+            self._something.clear()
+            await self._something.wait()
