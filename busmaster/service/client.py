@@ -46,11 +46,18 @@ class Client:
         self._line = line
         self._number = number
         self._nodes: dict[NodeKey, Node] = {}
+        self._refused: dict[NodeKey, str] = {}
+        """Why a node that it named may not be asked as it said; its requests are refused until it names it rightly."""
         self._running: dict[int, asyncio.Task[None]] = {}
         self._errands: dict[int, Errand] = {}
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
         self._log = logging.getLogger("busmaster.service")
+
+    @property
+    def errands(self) -> tuple[Errand, ...]:
+        """Return what it asked for that is not done yet."""
+        return tuple(self._errands.values())
 
     # what is said to it
 
@@ -135,11 +142,20 @@ class Client:
     # nodes
 
     def _name_node(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        node = self.node(params["protocol"], params["address"], params.get("timings"), params.get("retries"))
+        key = params["protocol"], params["address"]
+        self._refused.pop(key, None)
+        try:
+            node = self.node(*key, params.get("timings"), params.get("retries"))
+        except InvalidCommand as error:
+            if len(self._refused) < MOST_NODES:
+                self._refused[key] = str(error)
+            raise
         return {"label": node.label, "stops": node.stops, "health": node.health.value}
 
     def node(self, name: str, address: int, timings: Any = None, retries: int | None = None) -> Node:
         """Return a node, which this client has until it leaves. Raises InvalidCommand as `Bus.node` does."""
+        if refused := self._refused.get((name, address)):
+            raise InvalidCommand(refused)
         known = self._nodes.get((name, address))
         protocol = protocol_of(name)
         if known is not None and timings is None and retries is None:
@@ -157,7 +173,7 @@ class Client:
 
     def _begin(self, number: int, params: Mapping[str, Any]) -> None:
         try:
-            priority = checked_priority(params.get("options", {}).get("priority") or Priority.COMMAND)
+            priority = checked_priority(params.get("options", {}).get("priority", Priority.COMMAND))
             if len(self._running) >= MOST_REQUESTS + (MOST_URGENT if priority is Priority.URGENT else 0):
                 raise BacklogFull(f"{len(self._running)} requests of this program are not answered yet")
             errand = Errand.of(params, self.node, self._line, self.peer)

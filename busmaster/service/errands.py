@@ -159,7 +159,7 @@ class Errand:
         return Wish(door=DOOR, by=str(self._peer), name=f"{point.key}", point=point, value=value)
 
 
-def _value(command: Command[Any], touches: Command[Any] | None, point: Point[Any]) -> Any:
+def _value(command: object, touches: object, point: Point[Any]) -> Any:
     """Return what is written, in the point's unit where that is known; else the command in words."""
     if isinstance(command, Changing) and isinstance(touches, Placed):
         try:

@@ -118,7 +118,9 @@ class Link:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         if self._connection is not None:
-            await self._connection.close()
+            # Where it was lost while something was sent, the library aborts a transport that asyncio has let go of.
+            with contextlib.suppress(AttributeError):
+                await self._connection.close()
 
     def tell(self, method: str, params: Mapping[str, Any]) -> None:
         """Say something that is not answered; nothing once the connection is lost."""
@@ -227,7 +229,10 @@ class Link:
 
 
 def _websockets() -> tuple[Any, type[Exception], type[Exception]]:
-    """Return what connects, and what it raises when that fails, and when the connection is over. Raises InvalidCommand, with what to install, where it is missing."""
+    """Return what connects, and what it raises when that fails, and when the connection is over.
+
+    Raises InvalidCommand, with what to install, where it is missing.
+    """
     try:
         from websockets.asyncio.client import unix_connect
         from websockets.exceptions import ConnectionClosed, WebSocketException

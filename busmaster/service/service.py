@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
@@ -130,16 +131,17 @@ class Service:
         finally:
             for connection in self._clients.values():
                 connection.transport.abort()
-            self._server.close()
-            self._served.__exit__(None, None, None)
-            await self._server.wait_closed()
+            try:
+                await self._server.wait_closed()
+            finally:
+                self._served.__exit__(None, None, None)
 
     # what clients share
 
     def broadcast_of(self, group: PollGroup) -> Broadcast:
         """Return what tells the cycles of a poll group."""
         if group not in self._groups:
-            self._groups[group] = GroupBroadcast(group, lambda: self._groups.pop(group, None))
+            self._groups[group] = GroupBroadcast(group, partial(self._forget_group, group))
         return self._groups[group]
 
     def events(self) -> Broadcast:
@@ -155,6 +157,9 @@ class Service:
             self._points_of = groups
             self._points = {point.quantity: point for group in self.bus.groups for point in group.points}
         return self._points.get((node, command)) or Point(node, str(command), command)
+
+    def _forget_group(self, group: PollGroup) -> None:
+        self._groups.pop(group, None)
 
     def _end_events(self) -> None:
         self._events = None
@@ -173,9 +178,7 @@ class Service:
             return connection.respond(HTTPStatus.FORBIDDEN, f"no such host: {host[:40]!r}\n")
         if len(self._clients) >= MOST_CLIENTS:
             self.refused += 1
-            return connection.respond(
-                HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_CLIENTS} programs are connected already\n"
-            )
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_CLIENTS} programs are here already\n")
         return None
 
     async def _serve(self, connection: ServerConnection) -> None:
@@ -203,10 +206,12 @@ class Service:
         except _closed():
             pass
         finally:
-            del self._clients[client]
             sending.cancel()
-            await client.leave()
-            await asyncio.gather(sending, return_exceptions=True)
+            try:
+                await client.leave()
+                await asyncio.gather(sending, return_exceptions=True)
+            finally:
+                del self._clients[client]
 
     def _welcome(self, client: Client, said: dict[str, Any]) -> None:
         params = said.get("params", {})
