@@ -11,7 +11,9 @@ from busmaster.arbiter.health import Health
 from busmaster.arbiter.learned import LearnedTimes
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Timeline
+from busmaster.bus.alarms import AlarmChanged
 from busmaster.bus.bus import Bus
+from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import GroupStatistics, PollGroup, Quality, Sample, Snapshot, Stream
@@ -59,6 +61,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LEARNED",
+    "AlarmChanged",
     "BacklogFull",
     "Bus",
     "BusClosed",
@@ -86,6 +89,7 @@ __all__ = [
     "LineSettings",
     "LineState",
     "LineStatistics",
+    "Meaning",
     "MemoryPort",
     "MentorDrive",
     "MicroFlexDrive",

@@ -82,7 +82,7 @@ def test_importing_it_needs_no_extra() -> None:
 )
 def test_what_is_not_needed_is_not_loaded(what: str, unneeded: str) -> None:
     code = f"import sys; {what}; print('loaded:', *sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], check=True, timeout=30, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE, capture_output=True, text=True)
     loaded = done.stdout.rpartition("loaded:")[2].split()
     assert "busmaster" in loaded
     assert [name for name in loaded if re.match(unneeded, name)] == []

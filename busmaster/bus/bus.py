@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Callable, Coroutine, Generator, Iterable, Sequence
+from collections.abc import Callable, Coroutine, Generator, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, TypeVar
@@ -14,12 +14,13 @@ import anyio._backends._asyncio  # now, not when a line runs: it takes 30 ms
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineStatistics
-from busmaster.arbiter.events import CameUnasked, Event, NodeChanged, PortFailed
+from busmaster.arbiter.events import CameUnasked, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import SLICE
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Tap
 from busmaster.arbiter.transaction import Phase, Priority
+from busmaster.bus.alarms import AlarmChanged, Alarms, BusEvent
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup, Sample, Stream
@@ -86,6 +87,7 @@ class Bus:
         )
         self._arbiter.name = endpoint.name
         self._line = line = SharedLine(endpoint.name, self._arbiter)
+        line.alarms = Alarms(self._on_event)
         self.pump = line.pump = Pump(
             self._arbiter,
             on_sample=lambda poll, transaction: poll.group.sampled(transaction),
@@ -100,7 +102,7 @@ class Bus:
         self._profiles: dict[str, Profile] = {}
         """Of the protocols on this line, by name."""
         self._groups: dict[str, PollGroup] = {}
-        self._streams: list[Stream[Event]] = []
+        self._streams: list[Stream[BusEvent]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._connection: Connection | None = None
 
@@ -383,8 +385,20 @@ class Bus:
         longest = max((poll.patience for poll in polls if poll.results), default=1.0)
         return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
 
-    def events(self) -> Stream[Event]:
-        """Return a stream of what happens to line and nodes from now on (NodeChanged, LineChanged, PortFailed, ...)."""
+    @property
+    def alarms(self) -> Mapping[Point[Any], AlarmChanged | None]:
+        """What each polled point whose meaning has limits has left and is not back from; None for those within."""
+        return self._line.alarms.states
+
+    def overheard(self, samples: Mapping[Point[Any], Sample[Any]]) -> None:
+        """Take values that another master's requests have brought for what they begin and end of alarms."""
+        self._line.alarms.look([point for point in samples if point.meaning.watched], samples)
+
+    def events(self) -> Stream[BusEvent]:
+        """Return a stream of what happens from now on.
+
+        Line and nodes tell NodeChanged, LineChanged, PortFailed and others, what is polled tells AlarmChanged.
+        """
         self.check_loop()
         self._check_not_closed()
         return Stream(self._streams, EVENT_BUFFER)
@@ -403,7 +417,7 @@ class Bus:
         if self._groups.get(group.name) is group:
             del self._groups[group.name]
 
-    def _on_event(self, event: Event) -> None:
+    def _on_event(self, event: BusEvent) -> None:
         if isinstance(event, NodeChanged):
             node = self._nodes.get((event.node.profile.name, event.node.address))
             if node is None or node.record is not event.node:

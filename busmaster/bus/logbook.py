@@ -7,7 +7,6 @@ from collections.abc import Hashable
 
 from busmaster.arbiter.events import (
     CameUnasked,
-    Event,
     LatenessLowered,
     LatenessRaised,
     LineChange,
@@ -16,6 +15,7 @@ from busmaster.arbiter.events import (
     PortFailed,
 )
 from busmaster.arbiter.health import Health
+from busmaster.bus.alarms import AlarmChanged, BusEvent
 
 logger = logging.getLogger("busmaster")
 
@@ -30,8 +30,8 @@ class Logbook:
         self._name = name
         self._written: dict[Hashable, tuple[float, int]] = {}
 
-    def note(self, event: Event, now: float) -> None:
-        """Write a line for a change of a node or of the line, for a collision, a raised lateness, a failed opening."""
+    def note(self, event: BusEvent, now: float) -> None:
+        """Write a line for a change of node or line, a collision, another lateness, a failed opening, an alarm."""
         if isinstance(event, NodeChanged):
             level = logging.WARNING if event.after is Health.DOWN else logging.INFO
             text = f"{event.node.label} is {event.after.value} (was {event.before.value})"
@@ -54,6 +54,9 @@ class Logbook:
         elif isinstance(event, PortFailed):
             text = f"cannot connect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
             self._write((PortFailed, event.cause), logging.WARNING, text, now, event.bug)
+        elif isinstance(event, AlarmChanged):
+            level = logging.WARNING if event.active else logging.INFO
+            self._write((AlarmChanged, event.point.key, event.limit, event.active), level, event.text, now)
         elif isinstance(event, CameUnasked) and event.collision:
             text = f"the echo differs from what was sent: a collision ({event.data.hex(' ')})"
             self._write(CameUnasked, logging.WARNING, text, now)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 from typing import Any, Generic, TypeVar, Unpack
 
 from busmaster.bus.limits import Limit
+from busmaster.bus.meaning import PLAIN, Meaning, bit_of
 from busmaster.bus.requester import CommandOptions, ReadOptions, Requester
-from busmaster.contract.arguments import seconds
+from busmaster.contract.arguments import meant, seconds
 from busmaster.contract.exchange import Command
 from busmaster.errors import GarbledReply, InvalidCommand
 
@@ -23,6 +24,7 @@ class Point(Generic[T]):
     `item` names it as the command line does ("axis0.position", "1.17"); `command` is the exchange behind it;
     `decode` makes its value of what the command returns (a number into an IntFlag, a scaled integer into a
     float); `encode` builds the write command of a value and raises InvalidCommand for one out of range.
+    `meaning` says what the value means to people, outputs and alarms.
     Two points are equal if node, item and command are, so a point may be made anew each time it is asked for.
     """
 
@@ -32,6 +34,7 @@ class Point(Generic[T]):
     unit: str = field(default="", compare=False)
     decode: Callable[[Any], T] | None = field(default=None, compare=False, repr=False)
     encode: Callable[[T], Command[None]] | None = field(default=None, compare=False, repr=False)
+    meaning: Meaning = field(default=PLAIN, compare=False, repr=False)
 
     @property
     def key(self) -> str:
@@ -45,19 +48,44 @@ class Point(Generic[T]):
 
     def value_of(self, raw: Any) -> T:
         """Return the value that stands for what its command returned. Raises GarbledReply for what means nothing."""
-        if self.decode is None:
-            value: T = raw
-            return value
-        try:
-            return self.decode(raw)
-        except Exception as bad:  # a decoder may be the application's own
-            raise GarbledReply(
-                f"{raw!r} is no value of {self.item}: {bad}", node=self.node, command=str(self.command)
-            ) from bad
+        value: T = raw
+        if self.decode is not None:
+            try:
+                value = self.decode(raw)
+            except Exception as bad:  # a decoder may be the application's own
+                raise GarbledReply(
+                    f"{raw!r} is no value of {self.item}: {bad}", node=self.node, command=str(self.command)
+                ) from bad
+        if self.meaning.names:
+            value = self.meaning.named(value)
+        return value
 
     @property
     def writable(self) -> bool:
         return self.encode is not None
+
+    @property
+    def bits(self) -> tuple[Point[bool], ...]:
+        """Return the points of the bits that its meaning names: "status.READY".
+
+        They read what it reads, so that they are polled with it at no cost. They are read-only: no telegram writes one
+        bit and leaves the others as they are by then.
+        """
+        return tuple(self.bit(name) for name in self.meaning.bits)
+
+    def bit(self, name: str) -> Point[bool]:
+        """Return the point of one bit that its meaning names. Raises InvalidCommand for another name."""
+        if name not in self.meaning.bits:
+            raise InvalidCommand(f"{self.item} has no bit {name!r}; {meant(name, self.meaning.bits)}")
+        number, of_word = self.meaning.bits[name], self.decode
+
+        def decode(raw: Any) -> bool:
+            return bit_of(raw if of_word is None else of_word(raw), number)
+
+        told = Meaning(deadband=self.meaning.deadband, heartbeat=self.meaning.heartbeat)
+        word: Any = self
+        bit: Point[bool] = replace(word, item=f"{self.item}.{name}", unit="", decode=decode, encode=None, meaning=told)
+        return bit
 
     def limit(
         self,

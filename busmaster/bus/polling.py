@@ -78,6 +78,7 @@ class PollGroup:
         self._poll = Poll(name, period, phase=phase)
         self._poll.group = self
         self._points: dict[Point[Any], Node] = {}
+        self._watched: tuple[Point[Any], ...] = ()
         self._consumers: list[Stream[Snapshot]] = []
         self._tally = Tally(self._poll)
         # the cycle that runs
@@ -125,14 +126,14 @@ class PollGroup:
             if point not in self._points:
                 fresh[point] = node
         self._points.update(fresh)
-        self._choose()
+        self._points_changed()
 
     def remove(self, *points: Point[Any]) -> None:
         """Read these no more, from the next cycle on; with hundreds of points, some milliseconds later."""
         self._line.check_loop()
         for point in points:
             self._points.pop(point, None)
-        self._choose()
+        self._points_changed()
 
     def pause(self) -> None:
         """Start no cycle, and count none missed, until `resume`."""
@@ -151,6 +152,7 @@ class PollGroup:
         self._line.check_loop()
         if self._poll.active:
             self._on_close(self)
+            self._line.alarms.forget(self._watched)
             self._line.latest_of.pop(self.name, None)
             self._line.remove_poll(self._poll)
         for consumer in list(self._consumers):
@@ -228,6 +230,7 @@ class PollGroup:
         self.latest = self._line.latest_of[self.name] = snapshot
         for consumer in self._consumers:
             consumer.put(snapshot)
+        self._line.alarms.look(self._watched, self._samples)
         # Once: choosing anew whenever a mean moves would make the cycles differ for ever.
         if poll.cycles == WEIGHED_AGAIN:
             self._choose()
@@ -265,6 +268,11 @@ class PollGroup:
                     self._samples[point] = sample._replace(quality=Quality.STALE)
 
     # which exchanges bring the values
+
+    def _points_changed(self) -> None:
+        self._line.alarms.forget(point for point in self._watched if point not in self._points)
+        self._watched = tuple(point for point in self._points if point.meaning.watched)
+        self._choose()
 
     def _choose(self) -> None:
         """Choose the exchanges anew: a piece at a time, so that the line goes on (see Schedule.prepare)."""

@@ -12,6 +12,7 @@ from typing import Any
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Poll, Transaction
+from busmaster.bus.alarms import Alarms
 from busmaster.bus.limiter import Limiter
 from busmaster.bus.logbook import Logbook
 from busmaster.bus.points import Point
@@ -32,6 +33,7 @@ class SharedLine:
         self.name = name
         self.arbiter = arbiter
         self.pump: Pump
+        self.alarms: Alarms
         self.logbook = Logbook(name)
         self.limiter: Limiter | None = None
         """None while nothing is limited."""

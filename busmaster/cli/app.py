@@ -31,6 +31,7 @@ COMMANDS = (
     "run",
     "safe",
     "plan",
+    "points",
     "monitor",
     "doctor",
     "replay",

@@ -300,7 +300,7 @@ def point_cells(row: Row, trend: list[float | None], old: float, widths: dict[st
     style = "red" if row.error else "magenta" if row.late else "bold"
     return {
         "ITEM": Text(fit(row.item, widths["ITEM"])),
-        "VALUE": right(value_text(row.value), widths["VALUE"], style),
+        "VALUE": right(value_text(row.value, row.precision), widths["VALUE"], style),
         "UNIT": Text(fit(row.unit, widths["UNIT"])),
         "TREND": Text(sparkline(trend), style="blue"),
         "AGE": right(age_text(row.age), widths["AGE"], "red" if row.age is not None and row.age > old else ""),

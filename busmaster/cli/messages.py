@@ -16,6 +16,8 @@ from busmaster.cli.terminal import printable
 class Row(msgspec.Struct, array_like=True, frozen=True):
     """One point. `value` is a number, which the screen formats and draws a trend of, or a text; `age` in seconds.
 
+    `precision` is how many digits it shows behind the point of a number, None for all.
+
     With an `error`, the value and its age are those of the last good one.
     """
 
@@ -27,6 +29,7 @@ class Row(msgspec.Struct, array_like=True, frozen=True):
     late: bool = False
     error: str = ""
     writable: bool = False
+    precision: int | None = None
 
 
 class NodeRow(msgspec.Struct, array_like=True, frozen=True):

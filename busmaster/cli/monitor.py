@@ -12,7 +12,8 @@ from typing import Any
 import anyio
 import click
 
-from busmaster.bus.snapshots import Snapshot
+from busmaster.bus.alarms import AlarmChanged, BusEvent
+from busmaster.bus.snapshots import Snapshot, Stream
 from busmaster.bus.suitability import check_settings
 from busmaster.capture.decode import DEFAULT_GAP, Decoder
 from busmaster.capture.frames import Direction, Frame, Kind
@@ -21,7 +22,7 @@ from busmaster.cli.arguments import Connection
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import is_line_file, load
-from busmaster.cli.output import emit, emit_all, json_line, note, value_text
+from busmaster.cli.output import Level, emit, emit_all, json_line, note, value_text
 from busmaster.cli.overheard import Overheard, feed, only_protocol, silent
 from busmaster.cli.parsing import Whole
 from busmaster.cli.protocols import protocol_option
@@ -78,9 +79,15 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
     def show(snapshot: Snapshot) -> None:
         emit_all([json_line(**cycle_fields(snapshot, snapshot.wall_at))] if as_json else plain_values(snapshot))
 
+    async def tell(events: Stream[BusEvent]) -> None:
+        async for event in events:
+            if isinstance(event, AlarmChanged):
+                note(event.text, Level.WARNING if event.active else Level.NOTICE)
+
     async def run(recorder: Recorder | None) -> None:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(feed, line, overheard, show)
+            tasks.start_soon(tell, line.bus.events())
             await listen(file.port, Decoder(kind.protocol.dialect()), overheard.heard, recorder)
 
     with capturing(capture, port=file.port.name, protocol=protocol) as recorder:
@@ -93,7 +100,10 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
 
 def plain_values(snapshot: Snapshot) -> list[str]:
     """Return a line a value, as `2026-11-22T14:02:11.485Z winder/position 12.5`."""
-    return [f"{utc(sample.wall)} {point.key} {value_text(sample.value)}" for point, sample in snapshot.samples.items()]
+    return [
+        f"{utc(sample.wall)} {point.key} {value_text(sample.value, point.meaning.precision)}"
+        for point, sample in snapshot.samples.items()
+    ]
 
 
 class Listener(asyncio.Protocol):

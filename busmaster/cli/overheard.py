@@ -188,6 +188,7 @@ async def feed(line: ConfiguredLine, overheard: Overheard, show: Callable[[Snaps
                     snapshot = group.turn(time.monotonic(), time.time())
                     if snapshot is not None:
                         show(snapshot)
+                        line.bus.overheard(snapshot.samples)
     finally:
         for group in overheard.groups:  # what the last period heard, before the outputs end
             group.turn(time.monotonic(), time.time())

@@ -38,21 +38,20 @@ async def read(
     """Read the items of one node and print each; all are checked before the first is asked for."""
     bus = connection.open_bus()
     handle = connection.open_handle(bus, address)
-    for item in items:
-        handle.point(item)
+    points = [handle.point(item) for item in items]
     async with bus:
-        for item in items:
+        for item, point in zip(items, points, strict=True):
             value = await handle.read_item(item, **how)
             if as_json:
                 emit(json_line(node=connection.node_number(address), item=item, value=json_value(value)))
             else:
-                emit_all(plain_lines(handle, item, value))
+                emit_all(plain_lines(handle, item, value, point.meaning.precision))
 
 
-def plain_lines(handle: Handle, item: str, value: Any) -> Iterator[str]:
+def plain_lines(handle: Handle, item: str, value: Any, precision: int | None) -> Iterator[str]:
     """Yield a line, or for a run a line a value."""
     if not isinstance(value, tuple):
-        yield f"{item} {value_text(value)}"
+        yield f"{item} {value_text(value, precision)}"
         return
     for name, one in zip(handle.run_items(item, len(value)), value, strict=True):
-        yield f"{name} {value_text(one)}"
+        yield f"{name} {value_text(one, precision)}"

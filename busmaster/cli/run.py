@@ -191,6 +191,8 @@ class Running:
 def output_text(counts: OutputStatistics) -> str:
     """Return the line that says what an output has written and dropped, and what it is down with."""
     text = f"{counts.kind}: {counts.written} {counts.what}, {counts.dropped} dropped"
+    if counts.suppressed:
+        text += f", {counts.suppressed} suppressed as no news"
     if counts.spilled:
         text += f", {counts.spilled} kept on disk for the next time"
     return f"{text}, down: {counts.error}" if counts.error else text

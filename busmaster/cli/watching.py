@@ -14,9 +14,10 @@ from typing import Any
 import anyio
 from anyio.abc import TaskGroup
 
-from busmaster.arbiter.events import Event, LineChange, LineChanged, NodeChanged, PortFailed
+from busmaster.arbiter.events import LineChange, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.state import LineState
+from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup, Quality, Sample, Snapshot
@@ -122,7 +123,7 @@ class Watch:
             elif text:
                 self.tell(text)
 
-    def _level(self, event: Event) -> Level | None:
+    def _level(self, event: BusEvent) -> Level | None:
         """Return how much an event matters to whoever is not looking: a loss, and its end, once each.
 
         None stands for the rest.
@@ -131,6 +132,8 @@ class Watch:
             case PortFailed():
                 self._troubles.add(LINE)
                 return Level.ERROR
+            case AlarmChanged():
+                return Level.WARNING if event.active else Level.NOTICE
             case LineChanged():
                 lost = event.change in (LineChange.DOWN, LineChange.NOISY)
                 return self._turn(LINE, Level.ERROR if lost else None)
@@ -253,12 +256,13 @@ class Watch:
             point.node.label,
             point.item,
             # by its exact type: words and flags are ints, too, and are shown by their names
-            value if type(value) in (int, float) or value is None else value_text(value),
+            value if type(value) in (int, float) or value is None else value_text(value, point.meaning.precision),
             short_unit(point.unit),
             good.age(now) if good else None,
             good is not None and good.quality is Quality.LATE,
             sample.error.what if sample and sample.error else "",
             point.writable,
+            point.meaning.precision,
         )
 
     def _group(self, group: PollGroup) -> GroupRow:
@@ -305,7 +309,7 @@ def json_cycle(watch: Watch, snapshot: Snapshot) -> str:
 def plain_cycle(watch: Watch, snapshot: Snapshot) -> Iterator[str]:
     """Yield a line a sample: seconds since the start, node and item, the value, or what went wrong."""
     for point, sample in snapshot.samples.items():
-        value = error_text(sample.error) if sample.error else value_text(sample.value)
+        value = error_text(sample.error) if sample.error else value_text(sample.value, point.meaning.precision)
         yield f"{snapshot.finished - watch.start:.3f} {point.key} {value}"
 
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 from busmaster.config.line import decimals_of
 from busmaster.config.names import expanded
+from busmaster.config.point_section import PointSection
 from busmaster.config.points import Scale
-from busmaster.config.sections import LineFile, NodeSection, PointSection
+from busmaster.config.sections import LineFile, NodeSection
 from busmaster.contract.arguments import guess
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Device

@@ -17,9 +17,11 @@ from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import WriteOptions
 from busmaster.config.names import expanded, listed
+from busmaster.config.point_section import PointSection, check_suits, sort_of
 from busmaster.config.points import NamedPoint, Scale
+from busmaster.config.recording import check_takes
 from busmaster.config.safe import SafeState, SafeWrite
-from busmaster.config.sections import GroupSection, LineFile, NodeSection, PointSection, load
+from busmaster.config.sections import GroupSection, LineFile, NodeSection, load
 from busmaster.contract.arguments import guess, is_decimal, meant
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
@@ -204,7 +206,9 @@ class ConfiguredLine:
                 own.rename(node.name)  # what messages and the screen call it
         for point in node.points.values():
             with point.table.at(*(["item"] if "item" in point.table else [])):
-                handle.point(point.item)  # looked up for its complaint, which has the line here
+                source = handle.point(point.item)  # looked up for its complaint, which has the line here
+            check_suits(point, source, node.kind)
+            _check_bits(node, point, handle)
         return handle
 
     def _held_limits(self) -> Iterator[tuple[Node, Limit]]:
@@ -229,6 +233,7 @@ class ConfiguredLine:
                     point = self._point(*name)
                     point.command.open(point.node.address, Node.of(point).timings)  # refused here, not while it runs
                     yield point
+                    yield from (self._point(name[0], bit.item) for bit in point.bits)
 
     def _names(self, text: str) -> Iterator[tuple[str, str]]:
         """Yield nodes and items of `drive4-8/speed_measured,current`.
@@ -242,7 +247,9 @@ class ConfiguredLine:
             if node not in self.nodes:
                 raise InvalidCommand(f"no such node {node!r}; {meant(node, self.nodes)}")
             section = self.file.nodes[node]
-            known = {*section.points, *section.options.get("symbols", ())}  # a1-3 may be a name, and then is no range
+            bits = (f"{point.name}.{bit}" for point in section.points.values() for bit in point.meaning.bits)
+            # a1-3 may be a name, and then is no range
+            known = {*section.points, *section.options.get("symbols", ()), *bits}
             for item in (name for part in listed(items) for name in expanded(part, known)):
                 yield node, item
 
@@ -256,14 +263,25 @@ class ConfiguredLine:
         node = self.file.nodes[where]
         section = node.points.get(name)
         handle = self.nodes[where]
+        if section is None and (word := _word_of(node, name)) is not None:
+            return self._point(where, word.name).bit(name.removeprefix(f"{word.name}."))
         if section is None:
-            source = _known(handle, name, node.points)
+            bits = (f"{point.name}.{bit}" for point in node.points.values() for bit in point.meaning.bits)
+            source = _known(handle, name, (*node.points, *bits))
             return NamedPoint.of(source, where=where, name=name, unit="", scale=Scale.of())
         rounds = node.kind.takes_decimals and (section.decimals or node.kind.decimals(section.item))
         whole = not rounds and node.kind.whole_numbers(section.item)  # else the handle rounds, to its decimals
         scale = Scale.of(section.factor, section.offset, whole=whole)
         source = handle.point(section.item)
-        return NamedPoint.of(source, where=where, name=name, unit=section.unit, scale=scale, declared=section.writable)
+        return NamedPoint.of(
+            source,
+            where=where,
+            name=name,
+            unit=section.unit,
+            scale=scale,
+            declared=section.writable,
+            meaning=section.meaning,
+        )
 
     def _safe_writes(self) -> Iterator[SafeWrite]:
         """Yield the writes of `[safe]`, in their order there."""
@@ -290,12 +308,18 @@ class ConfiguredLine:
     def _wanted_outputs(self) -> Iterator[tuple[str, Wanted]]:
         for kind, settings in self.file.outputs.items():
             table = self.file.table.table("outputs").table(kind)
+            for group in settings.groups or self._wanted:
+                check_takes(table, settings, group, {point.key: self._sort(point) for point in self._wanted[group]})
             writable: dict[str, Point[Any]] = {}
             if isinstance(settings, MqttSettings):
                 for number, text in enumerate(settings.allow_commands):
                     with table.at("allow_commands", number):
                         writable |= {point.key: point for point in map(self._writable, self._names(text))}
             yield kind, Wanted(settings, writable)
+
+    def _sort(self, point: NamedPoint) -> str:
+        node = self.file.nodes[point.where]
+        return sort_of(point.source, node.kind) if _word_of(node, point.item) is None else "bit"
 
     def _writable(self, name: tuple[str, str]) -> Point[Any]:
         point = self._point(*name)
@@ -325,12 +349,36 @@ def _settings(node: NodeSection) -> tuple[object, ...]:
 
 
 def _section(file: LineFile, name: str) -> PointSection | None:
-    """Return what a file says of the point that it calls so.
+    """Return what a file says of the point that it calls so, or of the word of which that is a bit.
 
     None stands for a point that goes by its item, and for one of a node that the file has not.
     """
     node, _, point = name.partition("/")
-    return file.nodes[node].points.get(point) if node in file.nodes else None
+    section = file.nodes.get(node)
+    return None if section is None else section.points.get(point) or _word_of(section, point)
+
+
+def _word_of(node: NodeSection, name: str) -> PointSection | None:
+    """Return the word of which `name` is a bit; None where it is none."""
+    word, dot, bit = name.rpartition(".")
+    section = node.points.get(word) if dot else None
+    return section if section is not None and bit in section.meaning.bits else None
+
+
+def _check_bits(node: NodeSection, word: PointSection, handle: Handle) -> None:
+    """Raise FileError for a bit whose name is that of something else."""
+    for bit in word.meaning.bits:
+        name = f"{word.name}.{bit}"
+        if name in node.points or _has(handle, name):
+            raise word.table.error(f"{node.name} has something else that is called {name}", "bits", bit)
+
+
+def _has(handle: Handle, item: str) -> bool:
+    try:
+        handle.point(item)
+    except InvalidCommand:
+        return False
+    return True
 
 
 def _known(handle: Handle, item: str, points: Iterable[str]) -> Point[Any]:

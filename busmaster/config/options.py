@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from busmaster.config.names import expanded
 from busmaster.config.table import Table
 from busmaster.emulator.device import Delay
+from busmaster.errors import InvalidCommand
 from busmaster.registry import NodeKind, Option, kinds
 
 HIGHEST_ADDRESS = 0xFFFF_FFFF
@@ -49,10 +50,26 @@ def _option(table: Table, option: Option) -> Any:
         case "numbers":
             return frozenset(table.wholes(name, most=HIGHEST_ADDRESS))
         case "addresses":
-            named = table.table(name)
-            return {key: named.whole(key, most=HIGHEST_ADDRESS) for key in named.data}
+            return _addresses(table, option)
         case "tables":
             return {each: fields for one in table.tables(name) for each, fields in _named(one, option.fields)}
+
+
+def _addresses(table: Table, option: Option) -> Mapping[str, int]:
+    """Read `symbols = { count = 2008 }`, or `symbols = "press.lst"` where the protocol can read such a file."""
+    if option.reader is None or not isinstance(table.data[option.name], str):
+        named = table.table(option.name)
+        return {key: named.whole(key, most=HIGHEST_ADDRESS) for key in named.data}
+    path = table.source.beside(table.text(option.name))
+    with table.at(option.name):
+        try:
+            text = path.read_text(encoding="latin-1")  # from a computer of then: any byte is some character
+        except OSError as error:
+            raise InvalidCommand(f"{path} cannot be read: {error.strerror or error}") from None
+        try:
+            return option.reader(text)
+        except InvalidCommand as error:
+            raise InvalidCommand(f"{path}: {error}") from None
 
 
 def _named(table: Table, fields: Sequence[Option]) -> list[tuple[str, dict[str, Any]]]:

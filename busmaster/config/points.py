@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
+from busmaster.bus.meaning import PLAIN, Meaning
 from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions
 from busmaster.contract.exchange import Command
@@ -89,9 +90,17 @@ class NamedPoint(Point[Any]):
 
     @classmethod
     def of(
-        cls, source: Point[Any], *, where: str, name: str, unit: str, scale: Scale, declared: bool = True
+        cls,
+        source: Point[Any],
+        *,
+        where: str,
+        name: str,
+        unit: str,
+        scale: Scale,
+        declared: bool = True,
+        meaning: Meaning = PLAIN,
     ) -> NamedPoint:
-        """Return the point under the file's names, with its unit and scale."""
+        """Return the point under the file's names, with its unit, scale and meaning."""
         decode, encode = source.decode, source.encode if declared else None
         if not scale.trivial:
             decode = _after(source.decode, scale.reader())
@@ -103,6 +112,7 @@ class NamedPoint(Point[Any]):
             unit=unit or source.unit,
             decode=decode,
             encode=encode,
+            meaning=meaning,
             where=where,
             source=source,
             scale=scale,
@@ -117,6 +127,10 @@ class NamedPoint(Point[Any]):
     @property
     def writable(self) -> bool:
         return self.declared and self.source.writable
+
+    def bit(self, name: str) -> NamedPoint:
+        """Return the point of one bit of the word, under the file's name for the node."""
+        return replace(cast("NamedPoint", Point.bit(self, name)), declared=False)
 
     def unscaled(self, value: Any) -> Any:
         """Return the protocol's own number for a value, or its run of numbers."""

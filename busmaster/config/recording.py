@@ -16,6 +16,8 @@ from busmaster.outputs.settings import (
     SqliteSettings,
 )
 
+LONGEST_TOPIC = 65535 // 3
+"""Bytes: the most that a topic has, were each of them written as three."""
 Outputs: TypeAlias = dict[str, Settings]
 """Those that are enabled, by their kind."""
 
@@ -47,6 +49,27 @@ def _enabled(outer: Table, groups: Collection[str]) -> Iterator[tuple[str, Setti
             yield table.name, settings
 
 
+def check_takes(table: Table, settings: Settings, group: str, points: Mapping[str, str]) -> None:
+    """Raise FileError for a group that an output could not take: what its points are, by their keys."""
+    match settings:
+        case MqttSettings(messages="cycle"):
+            _check_topic(table, settings, group, f"the group {group}")
+        case MqttSettings():
+            for key in points:
+                _check_topic(table, settings, key, key)
+        case MetricsSettings() if settings.groups:
+            for key, sort in points.items():
+                if sort in ("run", "set", "text"):
+                    raise table.error(f"cannot take {key}: it is a {sort}, and a gauge is one number", "groups")
+
+
+def _check_topic(table: Table, settings: MqttSettings, name: str, what: str) -> None:
+    if not name.isprintable():
+        raise table.error(f"cannot take {what!r}: a topic has no control characters")
+    if len(f"{settings.prefix}/cycles/{name}".encode()) > LONGEST_TOPIC:
+        raise table.error(f"cannot take {what[:40]}...: its name is longer than a topic may be")
+
+
 def _groups(table: Table, key: str, known: Collection[str]) -> tuple[str, ...]:
     chosen = table.texts(key, ())
     for number, name in enumerate(chosen):
@@ -73,8 +96,8 @@ def _limit(table: Table, key: str) -> float:
 
 def _topic(table: Table, key: str) -> str:
     topic = table.text(key)
-    if not topic or set(topic) & set("+#") or topic.startswith("/") or topic.endswith("/"):
-        raise table.error("a topic has neither + nor #, nor a slash at an end", key)
+    if not topic or set(topic) & set("+#") or topic.startswith("/") or topic.endswith("/") or not topic.isprintable():
+        raise table.error("a topic has neither + nor # nor control characters, nor a slash at an end", key)
     return topic
 
 

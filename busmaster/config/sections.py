@@ -10,13 +10,15 @@ from typing import Any
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.suitability import check_company
 from busmaster.config.emulator import EmulatorSection, read_emulator
-from busmaster.config.names import NODE_NAME, POINT_NAME, expanded
+from busmaster.config.names import NODE_NAME, expanded
 from busmaster.config.options import check_keys, read_options
+from busmaster.config.point_section import PointSection
 from busmaster.config.ports import read_port
 from busmaster.config.recording import Outputs, read_outputs
 from busmaster.config.safe import SafeSection, read_safe
 from busmaster.config.source import Source
 from busmaster.config.table import Table
+from busmaster.config.templates import read_points
 from busmaster.config.timing import LEARNED_WORD, read_timings, reads_learned
 from busmaster.contract.arguments import is_decimal
 from busmaster.contract.learning import Learned
@@ -27,32 +29,9 @@ from busmaster.registry import NodeKind, find, kinds
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
-NODE_KEYS = ("protocol", "address", "timing", "retries", "reply_time", "points")
+NODE_KEYS = ("protocol", "address", "timing", "retries", "reply_time", "template", "points")
 """What every node's table may say; its kind's options come to it."""
-LIMITS = ("minimum", "maximum", "max_step")
 PRIORITIES = {"poll": Priority.POLL, "background": Priority.BACKGROUND}
-
-
-@dataclass(frozen=True, slots=True)
-class PointSection:
-    """What a point is called, what its number on the line means, and what may be written to it, in its unit."""
-
-    name: str
-    item: str
-    unit: str
-    factor: float
-    offset: float
-    decimals: int
-    minimum: float | None
-    maximum: float | None
-    max_step: float | None
-    writable: bool
-    table: Table = field(compare=False, repr=False)
-
-    @property
-    def limited(self) -> bool:
-        """Whether anything holds it back."""
-        return not self.writable or any(limit is not None for limit in (self.minimum, self.maximum, self.max_step))
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +168,7 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
     retries = table.whole("retries", default.whole("retries", None, most=100), most=100)
     reply_time = table.seconds("reply_time", default.seconds("reply_time", None))
     options = {**read_options(default, own), **read_options(table, own)}
-    points = {point.name: _point(point, find(protocol)) for point in table.tables("points")}
+    points = read_points(table, find(protocol))
     for name, address in zip(names, addresses, strict=True):
         if not NODE_NAME.fullmatch(name):
             raise table.error(f"a node's name is of letters, digits, _, . and -, not {name!r}")
@@ -228,34 +207,6 @@ def _addresses(table: Table, profile: Profile) -> Sequence[int]:
 
 def _no_address(text: str) -> int:
     raise InvalidCommand(f'an address is a number, or a range such as "4-8", not {text!r}')
-
-
-def _point(table: Table, kind: NodeKind) -> PointSection:
-    table.only("item", "unit", "factor", "offset", "decimals", *LIMITS, "writable")
-    if not POINT_NAME.fullmatch(table.name):
-        raise table.error(f"a point's name has no spaces, commas or slashes: {table.name!r} has")
-    factor = table.number("factor", 1)
-    if not factor:
-        raise table.error("a factor of 0 makes every value the same", "factor")
-    decimals = table.whole("decimals", 0, most=9)
-    if decimals and not kind.takes_decimals:
-        raise table.error(
-            f"{kind.name} has no implied decimals: write factor = {10**-decimals:.{decimals}f} to scale what is sent",
-            "decimals",
-        )
-    return PointSection(
-        name=table.name,
-        item=table.text("item", table.name),
-        unit=table.text("unit", ""),
-        factor=factor,
-        offset=table.number("offset", 0),
-        decimals=decimals,
-        minimum=table.number("minimum", None),
-        maximum=table.number("maximum", None),
-        max_step=table.number("max_step", None),
-        writable=table.flag("writable", True),
-        table=table,
-    )
 
 
 # groups

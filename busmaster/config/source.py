@@ -10,6 +10,7 @@ import os
 import re
 import tomllib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -41,6 +42,7 @@ class Source:
     def __init__(self, name: str, text: str) -> None:
         """Read a TOML text. Raises FileError, with the line, for what is no TOML."""
         self.name = name
+        self.text = text
         try:
             self.data: dict[str, Any] = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
@@ -60,6 +62,10 @@ class Source:
             line = error.object[: error.start].count(b"\n") + 1
             raise FileError(f"{name}:{line}: this is no TOML: it is not written in UTF-8") from None
 
+    def beside(self, name: str) -> Path:
+        """Return the path of a file that this one names: from its own folder, where it is not absolute."""
+        return Path(self.name).parent / name
+
     def line(self, key: Key) -> int:
         """Return the line on which `key` stands, or what it would be part of."""
         while key and key not in self._places:
@@ -74,21 +80,39 @@ class Source:
 
 def places(text: str) -> dict[Key, int]:
     """Return the line, from 1, on which each table, key and array element of a valid TOML text begins."""
-    return _Walk(text).places
+    return Walk(text).places
 
 
-class _Walk:
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Where `key = value` stands in a text, and where its value begins. `section` is the table that it stands in."""
+
+    section: Key
+    start: int
+    value: int
+    end: int
+
+
+class Walk:
+    """What one walk through a valid TOML text finds."""
+
     def __init__(self, text: str) -> None:
         self.places: dict[Key, int] = {}
-        self._tokens: list[tuple[str, str, int]] = []
+        """The line of each table, key and array element, from 1."""
+        self.pairs: dict[Key, Pair] = {}
+        """Where each key with a value stands; those of inline tables too."""
+        self.bodies: dict[Key, int] = {(): 0}
+        """Where each table that has a header ends: behind the last pair below that, else behind the header."""
+        self._tokens: list[tuple[str, str, int, int]] = []
         self._next = 0
+        self._end = 0
         line = 1
         for match in TOKEN.finditer(text):
             kind, token = str(match.lastgroup), match[0]
             if kind != "comment":
-                self._tokens.append((kind, token, line))
+                self._tokens.append((kind, token, line, match.start()))
             line += token.count("\n")
-        self._tokens.append(("mark", "", line))
+        self._tokens.append(("mark", "", line, len(text)))
         self._arrays: dict[Key, int] = {}
         self._file()
 
@@ -99,6 +123,7 @@ class _Walk:
                 table = self._header()
             else:
                 self._pair(table)
+            self.bodies[table] = self._end
 
     def _header(self) -> Key:
         """Take `[table]`, or one more `[[element]]`, and return its key."""
@@ -128,12 +153,14 @@ class _Walk:
         return key + names[-1:]
 
     def _pair(self, table: Key) -> None:
-        line = self._line()
+        line, start = self._line(), self._start()
         names = self._names("=")
         self._take()
         for depth in range(len(names)):
             self.places.setdefault((*table, *names[: depth + 1]), line)
+        value = self._start()
         self._value((*table, *names))
+        self.pairs[(*table, *names)] = Pair(table, start, value, self._end)
 
     def _value(self, key: Key) -> None:
         opening = self._peek()
@@ -182,7 +209,11 @@ class _Walk:
     def _line(self) -> int:
         return self._tokens[self._next][2]
 
+    def _start(self) -> int:
+        return self._tokens[self._next][3]
+
     def _take(self) -> tuple[str, str]:
-        kind, token, _ = self._tokens[self._next]
+        kind, token, _, start = self._tokens[self._next]
+        self._end = start + len(token)
         self._next += 1
         return kind, token

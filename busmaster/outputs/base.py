@@ -56,7 +56,8 @@ class OutputStatistics:
     """Counts of values and events; of answers where it only answers (`what`: "answered").
 
     `error` is why it is down, "" while it is not. `spilled` is how many of those that wait do so on disk, where they
-    survive the end of the process.
+    survive the end of the process. `suppressed` counts the values that were not news by the meaning of their points:
+    they were never to be written.
     """
 
     kind: str
@@ -66,6 +67,7 @@ class OutputStatistics:
     waiting: int
     error: str
     spilled: int = 0
+    suppressed: int = 0
 
 
 def reason(error: BaseException) -> str:
@@ -113,6 +115,7 @@ class Output(ABC):
         self.groups = settings.groups
         self.error = ""
         self.offered = self.dropped = self.written = 0
+        self.suppressed = 0
         self.spilled = self.lost = 0
         """Values that wait on disk, and those that the thread had to drop from there."""
         self.found = 0
@@ -148,6 +151,10 @@ class Output(ABC):
         self.offered += values
         self.dropped += values
 
+    def suppress(self, values: int) -> None:
+        """Count so many values that are not offered, as they are no news."""
+        self.suppressed += values
+
     def reopen(self) -> None:
         """Have it let go of the file that is open, if there is one, and open it anew: it may have been moved away."""
         self._reopen.set()
@@ -160,12 +167,15 @@ class Output(ABC):
         self.offered += before.offered + before.found - before.spilled
         self.dropped += before.dropped
         self.written += before.written
+        self.suppressed += before.suppressed
         self.lost += before.lost
 
     def statistics(self) -> OutputStatistics:
         """Return the counts of this output, and why it is down."""
         dropped = self.dropped + self.lost
-        return OutputStatistics(self.kind, self.what, self.written, dropped, self._left(), self.error, self.spilled)
+        return OutputStatistics(
+            self.kind, self.what, self.written, dropped, self._left(), self.error, self.spilled, self.suppressed
+        )
 
     def _left(self) -> int:
         """Return how many values wait, in memory and on disk."""

@@ -10,12 +10,14 @@ from typing import Any, NamedTuple, Protocol
 import anyio
 
 from busmaster.arbiter.events import LatenessRaised, NodeChanged
+from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import Snapshot, Stream
 from busmaster.gate.gate import Gate
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Happening, Output, OutputStatistics
+from busmaster.outputs.exceptions import News
 from busmaster.outputs.files import CsvOutput, JsonlOutput
 from busmaster.outputs.settings import FileSettings, MetricsSettings, MqttSettings, Settings, SqliteSettings
 from busmaster.outputs.sqlite import SqliteOutput
@@ -76,6 +78,7 @@ class Distributor:
         self._bus = bus
         self._outputs: list[Output] = []
         self._feeding: dict[Source, asyncio.Task[None]] = {}
+        self._news: dict[Source, News] = {}
         self._watching: asyncio.Task[None] | None = None
         self._wanted: dict[str, Wanted] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -111,6 +114,8 @@ class Distributor:
         for output in kept:
             output.reopen()
         self._take_in(groups)
+        for news in self._news.values():
+            news.forget()  # what is made or opened anew knows nothing yet
         with anyio.CancelScope(shield=True):
             # Closing waits for a thread, and perhaps for a disk: never on the loop that owns the line.
             await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in leaving.values()))
@@ -160,13 +165,18 @@ class Distributor:
 
     def _fed(self, group: Source, _: asyncio.Task[None]) -> None:
         self._feeding.pop(group, None)
+        self._news.pop(group, None)
 
     async def _feed(self, cycles: Stream[Snapshot], group: Source) -> None:
         lost = 0
+        news = self._news[group] = News()
         async for snapshot in cycles:
+            told = news.of(snapshot)
             for output in self._outputs:
                 if not output.groups or group.name in output.groups:
-                    output.offer(snapshot)
+                    output.suppress(len(snapshot) - len(told))
+                    if told:
+                        output.offer(told)
                     # cycles for which the loop was too busy count as well
                     output.miss((cycles.dropped - lost) * len(group.points))
             lost = cycles.dropped
@@ -175,9 +185,8 @@ class Distributor:
         async for event in self._bus.events():
             text = event_text(event)
             if text:
-                node = event.node.label if isinstance(event, NodeChanged | LatenessRaised) else ""
                 for output in self._outputs:
-                    output.offer(Happening(micros(self._bus.wall_time()), node, text))
+                    output.offer(Happening(micros(self._bus.wall_time()), label_of(event), text))
 
     def _say(self, text: str) -> None:
         """Hand a text from any thread to the loop; when that is gone nobody listens any more."""
@@ -211,3 +220,14 @@ class Distributor:
                 return MetricsOutput(kind, settings, self._bus, self._say, self.statistics)
             case _:
                 raise AssertionError(settings)
+
+
+def label_of(event: BusEvent) -> str:
+    """Return the label of the node that an event is of, "" for one of the line."""
+    match event:
+        case NodeChanged() | LatenessRaised():
+            return event.node.label
+        case AlarmChanged():
+            return event.point.node.label
+        case _:
+            return ""

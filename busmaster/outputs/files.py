@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 from busmaster.bus.polling import Sample, Snapshot
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Item, check_folder
 from busmaster.outputs.batches import BatchOutput
+from busmaster.outputs.cells import csv_lines, no_formula
 from busmaster.outputs.growing_file import GrowingFile
 from busmaster.outputs.settings import FileSettings
 from busmaster.outputs.values import cycle_fields, json_line, micros, utc, value_text, write_fields
 
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What a spreadsheet takes for the beginning of a formula."""
 COLUMNS = ("time", "group", "cycle", "node", "item", "value", "unit", "quality", "error")
 
 
@@ -97,21 +94,9 @@ class JsonlOutput(FileOutput):
         return json_line(**fields).encode() + b"\n"
 
 
-def csv_lines(rows: Iterable[Iterable[object]]) -> bytes:
-    """Return the rows as lines of CSV."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
-
-
 def value_cell(sample: Sample[Any]) -> str:
     """Return a value as text. Only one that is a text itself could be taken for a formula."""
     if sample.error:
         return ""
     text = value_text(sample.value)
     return no_formula(text) if isinstance(sample.value, str) else text
-
-
-def no_formula(text: str) -> str:
-    """Return the text, behind an apostrophe where a spreadsheet would otherwise compute it."""
-    return f"'{text}" if text[:1] in FORMULA else text

@@ -98,6 +98,9 @@ class MetricsOutput(Output):
     def miss(self, values: int) -> None:
         """Ignore the count: nothing waits here, so nothing is lost."""
 
+    def suppress(self, values: int) -> None:
+        """Ignore the count: what is asked for is always the last value."""
+
     # on threads
 
     def work(self) -> None:
@@ -208,7 +211,13 @@ class MetricsOutput(Output):
                     node, _, item = point.key.partition("/")
                     values.add_metric([group.name, node, item, point.unit], number)
                     times.add_metric([group.name, node, item, point.unit], micros(sample.wall))
-        yield from (values, times)
+        alarms = GaugeMetricFamily(
+            "busmaster_alarm", "1 while a value is above its high, -1 below its low, else 0", labels=["node", "item"]
+        )
+        for point, alarm in self._bus.alarms.items():
+            node, _, item = point.key.partition("/")
+            alarms.add_metric([node, item], 0.0 if alarm is None else 1.0 if alarm.limit == "high" else -1.0)
+        yield from (values, times, alarms)
 
     def _of_outputs(self) -> Iterator[Metric]:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -217,14 +226,18 @@ class MetricsOutput(Output):
         dropped = CounterMetricFamily("busmaster_output_dropped", "Values and events dropped", labels=["output"])
         waiting = GaugeMetricFamily("busmaster_output_waiting", "Values and events that wait", labels=["output"])
         spilled = GaugeMetricFamily("busmaster_output_spilled", "Of those, on disk", labels=["output"])
+        suppressed = CounterMetricFamily(
+            "busmaster_output_suppressed", "Values that were no news, by deadband and heartbeat", labels=["output"]
+        )
         up = GaugeMetricFamily("busmaster_output_up", "1 while the output works", labels=["output"])
         for counts in self._others():
             written.add_metric([counts.kind], counts.written)
             dropped.add_metric([counts.kind], counts.dropped)
             waiting.add_metric([counts.kind], counts.waiting)
             spilled.add_metric([counts.kind], counts.spilled)
+            suppressed.add_metric([counts.kind], counts.suppressed)
             up.add_metric([counts.kind], float(not counts.error))
-        yield from (written, dropped, waiting, spilled, up)
+        yield from (written, dropped, waiting, spilled, suppressed, up)
 
 
 def number_of(value: object) -> float | None:

@@ -4,6 +4,7 @@
     PREFIX/cycles/GROUP       a whole cycle, as `busmaster run --json` prints it (messages = "cycle")
     PREFIX/health/NODE        {"time": ..., "health": "up"}, retained
     PREFIX/line               {"time": ..., "line": "ready"}, retained; "offline" while the port is gone
+    PREFIX/alarms/NODE/ITEM   {"time": ..., "alarm": "high"}, "low" or null, of points with limits; retained
     PREFIX/events             {"time": ..., "node": "winder", "text": "winder is down, was suspect"}
     PREFIX/status             online, or offline, which is also the last will; retained
 
@@ -21,9 +22,13 @@ and is sent by the next process if this one ends before.
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import json
 import logging
+import socket
 import ssl
+import struct
+import termios
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
@@ -52,12 +57,16 @@ if TYPE_CHECKING:
 
 AT_ONCE = 100
 """Messages on their way to the broker, not yet acknowledged."""
+UNREAD = 32_768
+"""Bytes that wait in our socket, some: what is more waits at the broker. Behind a flood of refused commands in a socket
+of megabytes, those that are allowed would grow too old."""
 PIECE = 10
 BREATH = 0.002
 """Seconds for which the interpreter is let go of after so many messages: when a broker returns, thousands may wait."""
 TIMEOUT = 5.0
 """Seconds in which a broker must answer."""
 KEEP_ALIVE = 15
+ALARMS = "alarms/"
 UNSUPPORTED_VERSION = 132
 """What a broker says that knows MQTT 3.1.1 alone, or what the client makes of what that says."""
 HURRY = 2.0
@@ -98,7 +107,9 @@ class MqttOutput(SpillingOutput):
         self._arriving: Commands
         self._owner: asyncio.AbstractEventLoop | None = None
         self._held: list[Item] = []
-        self._published: dict[str, str] = {}
+        self._published: dict[str, str | None] = {}
+        self._alarms: object = None
+        """Those that were told last."""
         self._quiet = logging.getLogger("busmaster.mqtt")
         self._quiet.addHandler(logging.NullHandler())
         self._quiet.propagate = False
@@ -153,12 +164,14 @@ class MqttOutput(SpillingOutput):
     async def _connected(self) -> None:
         async with self._connection() as client, anyio.create_task_group() as tasks:
             self._published.clear()
+            self._alarms = None
             await self._send(client, self._status("online"))
             self.up()
             if self._commands:
                 await client.subscribe(self._topic("set/#"), qos=1)
             tasks.start_soon(self._listen, client)
-            tasks.start_soon(self._arriving.serve, self._write, self._keep, partial(self._answer, client))
+            answer = partial(self._answer, client)
+            tasks.start_soon(self._arriving.serve, self._write, self._keep, answer, partial(unread, client))
             stopped = False
             while not stopped:
                 stopped = self._stop.is_set()  # looked at first, so that a last round sends what waits
@@ -196,7 +209,9 @@ class MqttOutput(SpillingOutput):
 
         settings = self._settings
         username, password, tls = self._secrets
-        self._arriving = Commands(settings.prefix, self._gate, self._commands, self._bus.now)
+        self._arriving = Commands(
+            settings.prefix, self._gate, self._commands, self._bus.now, lambda text: self._say(f"{self.kind}: {text}")
+        )
         client = aiomqtt.Client(
             settings.host,
             settings.port,
@@ -207,6 +222,7 @@ class MqttOutput(SpillingOutput):
             tls_context=tls,
             will=aiomqtt.Will(self._topic("status"), "offline", qos=1, retain=True) if self._in_charge else None,
             keepalive=KEEP_ALIVE,
+            socket_options=[(socket.SOL_SOCKET, socket.SO_RCVBUF, UNREAD)],
             timeout=TIMEOUT,
             max_inflight_messages=AT_ONCE,
             logger=self._quiet,
@@ -262,11 +278,19 @@ class MqttOutput(SpillingOutput):
         """Yield what is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
         if not self._in_charge:
             return
-        now = {"line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")}
+        now: dict[str, tuple[str, str | None]] = {
+            "line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")
+        }
         for node in self._bus.nodes:
             now[f"health/{topic_part(node.label.removeprefix('node '))}"] = ("health", node.health.value)
+        alarms = self._bus.alarms
+        if alarms is not self._alarms:
+            self._alarms = alarms
+            now |= {topic: ("alarm", None) for topic in self._published if topic.startswith(ALARMS)}
+            for point, alarm in alarms.items():
+                now[f"{ALARMS}{topic_part(point.key)}"] = ("alarm", None if alarm is None else alarm.limit)
         for topic, (name, state) in now.items():
-            if self._published.get(topic) != state:
+            if self._published.get(topic, "") != state:
                 self._published[topic] = state
                 payload = json_line(**{"time": round(time.time(), 3), name: state})
                 yield Outgoing(self._topic(topic), payload, True)
@@ -277,9 +301,14 @@ class MqttOutput(SpillingOutput):
     # commands
 
     async def _listen(self, client: Client) -> None:
-        """Raise MqttError when the broker goes away, also while there is nothing to send."""
-        async for _ in client.messages:
-            raise AssertionError("messages are taken in as they arrive")
+        """Raise ConnectionError when the broker goes away, also while there is nothing to send."""
+        import aiomqtt
+
+        try:
+            async for _ in client.messages:
+                raise AssertionError("messages are taken in as they arrive")
+        except aiomqtt.MqttError:
+            raise ConnectionError(f"{self._settings.host}:{self._settings.port} ended the connection") from None
 
     async def _write(self, wish: Wish) -> WriteRecord:
         """Write it on the loop that owns the line."""
@@ -294,6 +323,15 @@ class MqttOutput(SpillingOutput):
     async def _answer(self, client: Client, answer: Answer) -> None:
         topic = self._topic("result", answer.name) if answer.name else self._topic("result")
         await self._send(client, [Outgoing(topic, json_line(**answer.fields))])
+
+
+def unread(client: Client) -> int:
+    """Return how many bytes have come from the broker, and are not read yet; what an encryption adds is counted too."""
+    connection = client._client.socket()
+    if connection is None or connection.fileno() < 0:
+        return 0
+    [waiting] = struct.unpack("i", fcntl.ioctl(connection, termios.FIONREAD, bytes(4)))
+    return int(waiting) + (connection.pending() if isinstance(connection, ssl.SSLSocket) else 0)
 
 
 def topic_part(name: str) -> str:

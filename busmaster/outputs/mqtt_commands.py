@@ -20,11 +20,15 @@ if TYPE_CHECKING:
     from aiomqtt import Message
 
 LOOK = 0.02
-"""Seconds between two looks at the clock: what arrives came after the last one, our own stalls included."""
+"""Seconds between two looks at the clock, and at what has come and is not read yet."""
+LEAST = 5
+"""Bytes of a message beside its topic and its payload, at least."""
 MOST_WAITING = 100
 """Commands that may wait for their turn, and refusals that may wait to be answered. What is more is counted alone."""
 BREATH = 0.005
 """Seconds between two refusals that are answered: a flood of them costs the line nothing."""
+TOLD_EVERY = 10.0
+"""Seconds, at least, between two lines that tell how many refusals were counted alone."""
 LONGEST_NAME = 256
 """Characters of a point's name; a longer one is answered without it."""
 EXPIRY = "MessageExpiryInterval"
@@ -49,23 +53,40 @@ Say: TypeAlias = Callable[[Answer], Awaitable[None]]
 
 
 class Commands:
-    """What may be written, by topic, and what waits to be. All of it is on the thread of the output."""
+    """What may be written, by topic, and what waits to be. All of it is on the thread of the output.
 
-    def __init__(self, prefix: str, gate: Gate, points: Mapping[str, Point[Any]], now: Callable[[], float]) -> None:
+    `tell` is told how many commands were refused without an answer.
+    """
+
+    def __init__(
+        self,
+        prefix: str,
+        gate: Gate,
+        points: Mapping[str, Point[Any]],
+        now: Callable[[], float],
+        tell: Callable[[str], object] = lambda _: None,
+    ) -> None:
         self.refused = 0
         """Commands that were refused, those that nobody was told of included."""
         self.unanswered = 0
         self.queued: deque[Wish] = deque()
+        self._tell = tell
         self._prefix = prefix
         self._gate = gate
         self._points = points
         self._now = now
         self._looked = now()
+        """What is read next came after this look."""
+        self._bytes_read = 0
+        """Bytes that were read, at least."""
+        self._looks: deque[tuple[float, int]] = deque()
+        """Later looks, each with what will have been read when all is that lay there then."""
         self._answers: deque[tuple[Wish, Answer]] = deque()
         self._something = asyncio.Event()
 
     def arrive(self, message: Message) -> None:
         """Take in one message. Never waits, never raises."""
+        self._bytes_read += LEAST + len(str(message.topic)) + len(message.payload)
         name = str(message.topic).removeprefix(f"{self._prefix}/set/")
         shown = name if len(name) <= LONGEST_NAME else ""
         wish = Wish(
@@ -114,17 +135,34 @@ class Commands:
         else:
             self.unanswered += 1
 
-    async def serve(self, write: Write, keep: Callable[[Wish, str], object], say: Say) -> None:
-        """Write what is allowed and answer everything, until cancelled. `keep` is told of what was refused, and why."""
+    async def serve(
+        self, write: Write, keep: Callable[[Wish, str], object], say: Say, unread: Callable[[], int]
+    ) -> None:
+        """Write what is allowed and answer everything, until cancelled.
+
+        `keep` is told of what was refused, and why. `unread` returns how many bytes have come and are not read yet.
+        """
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(self._look)
+            tasks.start_soon(self._keep_looking, unread)
             tasks.start_soon(self._answer_refusals, keep, say)
+            tasks.start_soon(self._tell_unanswered)
             for _ in range(MOST_AT_ONCE):
                 tasks.start_soon(self._obey, write, say)
 
-    async def _look(self) -> None:
+    def look(self, unread: int) -> None:
+        """Note when so many bytes had come and were not read yet: what is read behind them came later.
+
+        What lies there after a standstill, ours or the machine's, is as old as the last look before it.
+        """
+        if not unread:
+            self._looks.clear()
+        self._looks.append((self._now(), self._bytes_read + unread))
+        while self._looks and self._looks[0][1] <= self._bytes_read:
+            self._looked, _ = self._looks.popleft()
+
+    async def _keep_looking(self, unread: Callable[[], int]) -> None:
         while True:
-            self._looked = self._now()
+            self.look(unread())
             await anyio.sleep(LOOK)
 
     async def _obey(self, write: Write, say: Say) -> None:
@@ -145,6 +183,14 @@ class Commands:
                 await anyio.sleep(BREATH)
             else:
                 await self._wait()
+
+    async def _tell_unanswered(self) -> None:
+        told = 0
+        while True:
+            await anyio.sleep(TOLD_EVERY)
+            if self.unanswered > told:
+                self._tell(f"{self.unanswered - told} refused commands were neither answered nor put on record")
+                told = self.unanswered
 
     async def _wait(self) -> None:
         self._something.clear()

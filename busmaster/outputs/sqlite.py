@@ -11,10 +11,12 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeAlias
 
+from busmaster.bus.meaning import Named
 from busmaster.errors import InvalidCommand
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Happening, Item, check_folder
 from busmaster.outputs.batches import BatchOutput
+from busmaster.outputs.growing_file import is_at
 from busmaster.outputs.retention import Retention
 from busmaster.outputs.settings import SqliteSettings
 from busmaster.outputs.values import json_value, micros, write_fields
@@ -23,6 +25,10 @@ VERSION = 1
 SCHEMA = """
 create table if not exists points (
     id integer primary key, node text not null, item text not null, unit text not null, unique (node, item)
+);
+create table if not exists labels (
+    point integer not null references points (id), value integer not null, label text not null,
+    primary key (point, value)
 );
 create table if not exists samples (
     time real not null,       -- seconds since 1970
@@ -50,7 +56,9 @@ create table if not exists audit (
 );
 create index if not exists audit_by_time on audit (time);
 create view if not exists history as
-    select time, node, item, value, unit, quality, error from samples join points on points.id = samples.point;
+    select time, node, item, samples.value, unit, quality, error, label
+    from samples join points on points.id = samples.point
+    left join labels on labels.point = samples.point and labels.value = samples.value;
 """
 BUSY = 1.0
 """Seconds for which a lock of another program is waited for, before the batch is kept for later."""
@@ -61,9 +69,12 @@ SampleRow: TypeAlias = tuple[float, int, Any, str, str | None]
 
 
 class Rows(NamedTuple):
-    """Of one cycle, one event, or one write. The number of a point is not known yet: a sample has its key and unit."""
+    """Of one cycle, one event, or one write.
 
-    samples: list[tuple[float, str, str, Any, str, str | None]]
+    The number of a point is not known yet: a sample has its key and unit; and last the label of its value, "" for none.
+    """
+
+    samples: list[tuple[float, str, str, Any, str, str | None, str]]
     event: tuple[float, str | None, str] | None = None
     write: tuple[Any, ...] | None = None
 
@@ -81,9 +92,13 @@ class SqliteOutput(BatchOutput[Rows]):
         check_folder(settings.path)
         self._path = settings.path
         self._mode = settings.mode
-        self._retention = Retention(settings.keep_days, settings.keep_mb, lambda text: say(f"{kind}: {text}"))
+        self._tell: Callable[[str], None] = lambda text: say(f"{kind}: {text}")
+        self._retention = Retention(settings.keep_days, settings.keep_mb, self._tell)
         self._database: sqlite3.Connection | None = None
+        self._file: int | None = None
+        """The database's file, to see whether it is still where it was. Closed after it: closing gives up all locks."""
         self._numbers: dict[str, int] = {}
+        self._labels: dict[tuple[int, Any], str] = {}
 
     def format(self, item: Item) -> Rows:
         """Return the rows of one cycle or one event."""
@@ -99,12 +114,16 @@ class SqliteOutput(BatchOutput[Rows]):
                 column(sample.value),
                 sample.quality.value,
                 sample.error.what if sample.error else None,
+                sample.value.label if isinstance(sample.value, Named) else "",
             )
             for point, sample in self.unhurried(item)
         ]
         return Rows(samples)
 
     def commit(self, batch: list[Rows]) -> None:
+        if self._file is not None and not is_at(self._path, self._file):
+            self._tell(f"{self._path} was moved or removed: another is begun")
+            self._leave()
         database = self._open()
         with database:
             self._retention.apply(database, DATED)
@@ -125,21 +144,37 @@ class SqliteOutput(BatchOutput[Rows]):
         if self._database is not None:
             self._database.close()
             self._database = None
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
         self._numbers.clear()  # of a transaction that was undone, perhaps
+        self._labels.clear()
+
+    def _leave(self) -> None:
+        """Let go of a database that is not here any more, with all that it was given in its one file."""
+        try:
+            if self._database is not None:
+                self._database.execute("pragma wal_checkpoint(truncate)").fetchall()
+        except sqlite3.Error:
+            pass  # the disk is full: what was to go there stays in its log
+        self.shut()
 
     def _samples(self, database: sqlite3.Connection, batch: list[Rows]) -> Iterator[SampleRow]:
         numbers = self._numbers
         for rows in batch:
-            for moment, key, unit, value, quality, error in rows.samples:
+            for moment, key, unit, value, quality, error, label in rows.samples:
                 number = numbers.get(key)
                 if number is None:
                     number = numbers[key] = number_of(database, key, unit)
+                if label and self._labels.get((number, value)) != label:
+                    self._labels[number, value] = label
+                    database.execute("insert or replace into labels values (?, ?, ?)", (number, value, label))
                 yield moment, number, value, quality, error
 
     def _open(self) -> sqlite3.Connection:
         if self._database is None:
             # SQLite would make the file with a mode of its own.
-            os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, self._mode))
+            self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, self._mode)
             database = self._database = sqlite3.connect(self._path, timeout=BUSY)
             [version] = database.execute("pragma user_version").fetchone()
             [tables] = database.execute("select count(*) from sqlite_master").fetchone()
@@ -147,6 +182,9 @@ class SqliteOutput(BatchOutput[Rows]):
                 raise InvalidCommand(f"{self._path} is a database of something else")
             database.execute("pragma journal_mode = wal")  # others may read while it grows
             database.execute("pragma synchronous = normal")
+            history = database.execute("select sql from sqlite_master where name = 'history'").fetchone()
+            if history is not None and "label" not in history[0]:
+                database.execute("drop view history")  # of a version before labels
             database.executescript(SCHEMA)
             database.execute(f"pragma user_version = {VERSION}")
         return self._database

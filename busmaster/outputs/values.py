@@ -11,8 +11,10 @@ from datetime import UTC, datetime
 from decimal import Decimal
 from typing import Any
 
-from busmaster.arbiter.events import Event, LatenessRaised, LineChanged, NodeChanged, PortFailed
+from busmaster.arbiter.events import LatenessRaised, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health
+from busmaster.bus.alarms import AlarmChanged, BusEvent
+from busmaster.bus.meaning import Named
 from busmaster.bus.polling import Quality, Sample, Snapshot
 from busmaster.gate.record import WriteRecord
 
@@ -32,6 +34,12 @@ def number_text(value: float) -> str:
     return "0" if text == "-0" else text
 
 
+def rounded_text(value: float, precision: int) -> str:
+    """Return the number as people are shown it, with so many digits behind the point; zero without a sign."""
+    text = f"{value:.{precision}f}"
+    return text.removeprefix("-") if text.startswith("-") and not text.strip("-0.") else text
+
+
 def word_text(word: enum.Flag) -> str:
     """Return the number and the names of the bits that are set: `65 PROGRAM_RUNNING|AUTO_START_ENABLED`."""
     number: int = word.value
@@ -45,21 +53,26 @@ def word_text(word: enum.Flag) -> str:
     return f"{number} {'|'.join(names)}" if names else str(number)
 
 
-def value_text(value: Any) -> str:
-    """Return one value on one line. A set of numbers (flags that are on) becomes `0,5,31`, or `none`."""
+def value_text(value: Any, precision: int | None = None) -> str:
+    """Return one value on one line, a number with so many digits behind the point, all if `precision` is None.
+
+    A set of numbers (flags that are on) becomes `0,5,31`, or `none`; what has names is followed by them.
+    """
     match value:
         case None:
             return "-"
+        case Named():
+            return str(value)
         case enum.Flag():
             return word_text(value)
         case enum.Enum():
             return f"{number_text(value.value)} {value.name}"
         case int() | float():
-            return number_text(value)
+            return number_text(value) if precision is None else rounded_text(value, precision)
         case AbstractSet():
             return ",".join(str(number) for number in sorted(value)) or "none"
         case list() | tuple():
-            return ",".join(value_text(item) for item in value)
+            return ",".join(value_text(item, precision) for item in value)
         case _:
             return str(value)
 
@@ -120,12 +133,13 @@ def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[
 
 
 def sample_fields(sample: Sample[Any]) -> dict[str, Any]:
-    """Return a value, or what went wrong, and whether it is late."""
-    return {
+    """Return a value, or what went wrong, and whether it is late; the label of a number that has one."""
+    fields = {
         "value": json_value(sample.value),
         "error": None if sample.error is None else sample.error.what,
         "late": sample.quality is Quality.LATE,
     }
+    return {**fields, "label": sample.value.label} if isinstance(sample.value, Named) else fields
 
 
 def write_fields(record: WriteRecord) -> dict[str, Any]:
@@ -142,7 +156,7 @@ def write_fields(record: WriteRecord) -> dict[str, Any]:
     }
 
 
-def event_text(event: Event) -> str:
+def event_text(event: BusEvent) -> str:
     """Return what a person wants to know of an event, in a sentence; "" for the rest."""
     match event:
         case NodeChanged() if event.before is not Health.UNKNOWN or event.after is not Health.UP:
@@ -154,6 +168,8 @@ def event_text(event: Event) -> str:
             )
         case LineChanged():
             return f"the line is {event.change.value}" + (f": {event.cause}" if event.cause else "")
+        case AlarmChanged():
+            return event.text
         case PortFailed():
             return f"cannot connect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
         case _:

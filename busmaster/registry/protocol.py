@@ -51,6 +51,9 @@ class Option:
     """All texts that it can be; () if it can be any."""
     fields: tuple[Option, ...] = ()
     """What each of its tables may say."""
+    reader: Callable[[str], Mapping[str, int]] | None = None
+    """Of "addresses": reads them from the text of a file, which LINE.toml may name in place of the table. Raises
+    InvalidCommand, naming the lines that it cannot read: none is guessed."""
 
 
 class DeviceMaker(typing.Protocol):
@@ -78,6 +81,11 @@ def device_of(module: str) -> DeviceMaker:
 def everywhere(item: str) -> bool:
     """Return True, whatever the item."""
     return True
+
+
+def usual_width(item: str) -> int:
+    """Return 32, whatever the item."""
+    return 32
 
 
 def nowhere(item: str) -> bool:
@@ -108,6 +116,8 @@ class NodeKind:
     unless it is said there."""
     whole_numbers: Callable[[str], bool] = nowhere
     """Whether the line carries whole numbers for an item: a value scaled by LINE.toml is then rounded to one."""
+    width: Callable[[str], int] = usual_width
+    """How many bits the whole number of an item has, so that LINE.toml can give them names; 0 for a run of several."""
     takes_decimals: bool = False
     """Its handle has an argument `decimals`, digits by item, and scales or rounds by it: LINE.toml does not."""
     capture_id: int = 0

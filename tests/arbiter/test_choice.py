@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import pytest
 
+from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.health import SILENT, Health
 from busmaster.arbiter.transaction import Priority
 from busmaster.errors import WriteUnconfirmed
@@ -71,6 +72,36 @@ def test_r15_a_lower_class_never_goes_first() -> None:
     bench.ask(node, hcp2.Read(3), priority=POLL)
     bench.until_sent()
     assert [bench.answer() for _ in range(3)] == [request_of(2), request_of(1), request_of(3)]
+
+
+def test_r15_before_one_that_was_held_back_go_two_that_wait_anyway_and_a_check_of_who_owes() -> None:
+    """Nothing that goes before it proves anything: only the answer of the node that owes does."""
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, other)
+    bench.hear("FF")
+    for element in (1, 3, 4, 5):
+        bench.ask(node, hcp2.Read(element))
+    bench.until_sent()
+    assert [bench.answer(), bench.answer()] == [request_of(3), request_of(4)]
+    bench.until_sent()
+    assert bench.sent() == request_of(2, 2)
+    bench.hear("FF", after=0.004)
+    bench.until_sent()
+    assert bench.sent() == request_of(1), "in vain: it goes, and its answer will be doubted"
+
+
+def test_r15_nothing_is_picked_for_a_node_that_rests() -> None:
+    """Its on_return hook runs since it was asked."""
+    bench = Bench()
+    node, other, third = up(bench), up(bench, 2), up(bench, 3)
+    lost(bench, other)
+    bench.hear("FF")
+    bench.ask(node)
+    resting = bench.ask(third, hcp2.Read(3))
+    third.holds = 1
+    bench.until_sent()
+    assert (bench.sent(), resting.attempts) == (request_of(2, 2), 0)
 
 
 def test_r12_what_has_waited_too_long_is_not_picked_either() -> None:
@@ -364,3 +395,31 @@ def test_r15_a_node_that_is_likely_to_be_dead_is_not_asked_something_else_first(
     bench.ask(node)
     bench.until_sent()
     assert bench.sent() == request_of(1)
+
+
+def test_r15_three_answers_of_a_node_that_prove_nothing_are_enough_and_it_is_asked_what_it_was_to_be() -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, node)
+    node.unheard = SILENT
+    bench.served(bench.ask(other, hcp2.Read(3)))
+    node.unheard = 0
+    bench.until_ready()
+    bench.ask(node)
+    asked = []
+    while request_of(1) not in asked:
+        bench.until_sent()
+        asked.append(bench.sent())
+        bench.hear("FF", after=0.004)
+    assert len(asked) == 1 + MOST_BEFORE
+
+
+def test_r15_after_something_was_said_twice_answers_alike_are_not_asked_for_in_a_row_where_there_is_a_choice() -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    bench.hear(reply_of(1, 5))
+    bench.until_ready()
+    bench.ask(node, hcp2.Read(3))
+    bench.ask(other, hcp2.Read(3))
+    bench.ask(node, hcp2.Read(4))
+    assert [bench.answer(), bench.answer(), bench.answer()] == [request_of(3), request_of(4), request_of(3, 2)]

@@ -104,6 +104,15 @@ def test_reads_and_writes_and_packets_are_kept_apart() -> None:
     assert node.timings(hcp2.Read(2), TIMINGS, NEVER) == TIMINGS
 
 
+def test_the_silence_that_ends_a_reply_follows_the_baud_rate() -> None:
+    node = Learning()
+    node.timings(hcp2.Read(1), TIMINGS, AT_FIRST)
+    for byte_time in (TAU, 2 * TAU, TAU):
+        for _ in range(TRUSTED_AFTER):
+            node.note(hcp2.Read(1), False, 0.001, 0.001, 0.0, byte_time)
+        assert node.timings(hcp2.Read(1), TIMINGS, AT_FIRST).read.silence == pytest.approx(LEAST_SILENCE * byte_time)
+
+
 def test_what_an_earlier_run_has_learned_is_trusted_after_fewer_replies() -> None:
     node = Learning()
     node.begin_with([LearnedTimes("Read", False, 0.003, 0.004, 0.0, 0.008, True)])
@@ -152,10 +161,11 @@ def test_another_node_that_answers_with_another_echo_is_asked_at_once() -> None:
     assert unlike.value == 9.0
 
 
-def test_a_second_attempt_is_awaited_four_times_as_long_and_the_last_as_long_as_the_document_says() -> None:
+@pytest.mark.parametrize("retries", [0, 1, 2])
+def test_a_second_attempt_is_awaited_four_times_as_long_and_the_last_as_long_as_the_document_says(retries: int) -> None:
     bench = Bench()
     node = trained(bench)
-    asked = bench.ask(node, retries=2)
+    asked = bench.ask(node, retries=retries)
     sent_at = []
     while not bench.ended(asked):
         bench.until_sent()
@@ -167,7 +177,8 @@ def test_a_second_attempt_is_awaited_four_times_as_long_and_the_last_as_long_as_
         bench.to(bench.arbiter.poll_timeout())
         sent_at.append(bench.now)
     waited = [end - begin for begin, end in zip(sent_at[::2], sent_at[1::2], strict=True)]
-    assert waited == pytest.approx([REQUEST + WINDOW, REQUEST + 4 * WINDOW, REQUEST + TIMINGS.read.window])
+    windows = [*[WINDOW, 4 * WINDOW][:retries], TIMINGS.read.window]
+    assert waited == pytest.approx([REQUEST + window for window in windows])
     assert isinstance(asked.error, NoReply)
 
 

@@ -186,7 +186,7 @@ def test_a_bug_in_a_reader_is_no_dead_node_and_the_line_goes_on() -> None:
         bench.served(bench.ask(node, BuggyRead(1), retries=0))
         bench.until_ready()
         bench.wait(0.5)
-    assert node.health is Health.UP
+    assert (node.health, node.counters.garbled) == (Health.UP, 4)
     assert bench.served(bench.ask(node, hcp2.Read(3))).value == 5.0
 
 
@@ -259,3 +259,18 @@ def test_r7_what_a_read_ends_with_is_of_its_last_attempt() -> None:
     bench.hear("FF", after=0.004)
     assert isinstance(silent.error, NoReply)
     assert isinstance(garbled.error, GarbledReply)
+
+
+def test_r7_a_point_that_is_refused_in_two_cycles_is_polled_every_ten_seconds_from_then_on() -> None:
+    bench = Bench()
+    node = up(bench)
+    start = bench.now
+    bench.poll(node, 1.0, 3)
+    cycles: list[int] = []
+    while len(cycles) < 4:
+        bench.until_sent(limit=20.0)
+        assert bench.sent() == request_of(3)
+        bench.hear(NAK, after=0.004)
+        if (cycle := int(bench.now - start)) not in cycles:
+            cycles.append(cycle)
+    assert cycles == [0, 1, 12, 23]

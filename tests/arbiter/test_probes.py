@@ -6,6 +6,7 @@ from math import inf
 
 import pytest
 
+from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.health import (
     BUDGET_CAPACITY,
     FIRST_PROBE_DELAY,
@@ -16,6 +17,7 @@ from busmaster.arbiter.health import (
     note_failure,
     note_success,
 )
+from busmaster.arbiter.probes import Probes
 from busmaster.contract.profile import Profile
 from busmaster.errors import NodeDown, NoReply
 from busmaster.protocols._comms.codec import CHECKED
@@ -249,6 +251,17 @@ def test_r11_a_request_to_a_dead_node_is_tried_once_while_the_budget_allows_and_
         attempts.append(read.attempts)
         assert isinstance(read.error, NodeDown if fails_at_once else NoReply)
     assert attempts == [1, 1, 1, 0, 0, 0]
+
+
+def test_r11_a_request_to_a_dead_node_leaves_what_the_probe_that_is_due_costs() -> None:
+    due, now = node(), 7.0
+    due.health, due.probe_at = DOWN, now
+    probes = Probes(Deadlines(), [due, node()], now)
+    probes.budget.tokens = 1.9 * PROBE_COST
+    assert not probes.spare(PROBE_COST, now)
+    due.probe_at = now + 0.001
+    assert probes.spare(PROBE_COST, now)
+    assert probes.budget.tokens == pytest.approx(0.9 * PROBE_COST)
 
 
 def test_r11_an_owner_may_probe_at_any_time() -> None:

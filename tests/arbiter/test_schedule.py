@@ -23,7 +23,7 @@ from busmaster.errors import InvalidCommand
 from busmaster.planning.merging import at_once
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import Bench, up
+from tests.arbiter.bench import Bench, request_of, up
 
 TAU = LineSettings(57600).byte_time
 PERIODS = st.sampled_from([0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0])
@@ -145,6 +145,18 @@ def test_r9_a_slow_poll_waits_no_longer_for_later_fast_ones_than_its_patience() 
     set_members(poll, members(1))
     running(poll).release(0.0)
     assert next(begin_cycle(poll, 0.0)).deadline == LONGEST_PATIENCE
+
+
+def test_r9_a_request_among_polls_wants_to_be_answered_within_a_second() -> None:
+    """A cycle of half a second that begins with it goes before it, and one of two seconds behind."""
+    bench = Bench()
+    node = up(bench)
+    bench.ask(node, hcp2.Read(9))
+    bench.ask(node, hcp2.Read(3), priority=Priority.POLL)
+    for element, period in ((4, 0.5), (5, 2.0)):
+        bench.poll(node, period, element)
+    bench.wait(0.0)
+    assert [bench.answer() for _ in range(4)] == [request_of(element) for element in (9, 4, 3, 5)]
 
 
 def test_r11_a_node_that_was_never_heard_is_read_in_background() -> None:

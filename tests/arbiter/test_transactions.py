@@ -218,6 +218,7 @@ def test_r13_a_lost_port_fails_the_exchange_and_the_backlog_at_once() -> None:
     assert "unplugged" in str(waiting.error)
     assert (bench.ended(on_wire), bench.ended(waiting)) == (1, 1)
     assert isinstance(bench.ask(node).error, LineDown)
+    assert bench.arbiter.statistics(bench.now).losses == 1
 
 
 def test_r13_a_write_on_the_wire_of_a_lost_port_is_unconfirmed() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from busmaster.arbiter.state import LineState
@@ -200,6 +202,23 @@ def test_r1_a_holdoff_does_not_run_out_while_the_port_holds_a_closing_ack() -> N
     bench.unsent = 0
     bench.until_sent()
     assert bench.sent().startswith("02 01 00 08"), "the next read, and nothing lies before it in the port"
+
+
+def test_r1_a_turnaround_counts_from_when_a_held_closing_ack_has_left() -> None:
+    bench = Bench()
+    bench.arbiter.byte_time = 10 / 9600
+    slow = replace(msc.PROFILE.timings, packet=replace(msc.PROFILE.timings.packet, turnaround=0.300))
+    node = bench.node(1, msc.PROFILE, slow)
+    bench.wait(2.0)
+    bench.ask(node, msc.DataRead(2008))
+    bench.sent()
+    bench.hear(f"{ACK} 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D", after=0.1)
+    assert bench.sent() == ACK
+    bench.unsent = 1
+    bench.ask(node, msc.DataRead(2012))
+    bench.wait(1.0)
+    bench.unsent = 0
+    assert 0.300 <= bench.until_sent() <= 0.300 + LOOK
 
 
 def test_r4_bytes_that_come_while_the_whole_request_is_held_are_not_its_reply() -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 
-from busmaster.arbiter.events import Event, NodeChanged
+from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import line_time
 from busmaster.bus.bus import Bus
@@ -149,7 +149,7 @@ def test_r11_a_node_that_returns_again_while_its_hook_runs_gets_another_run_afte
     on_a_bus(story, device)
 
 
-async def until_back(events: AsyncIterator[Event]) -> AsyncIterator[Health]:
+async def until_back(events: AsyncIterator[object]) -> AsyncIterator[Health]:
     """The changes of health up to a return from DOWN."""
     async for event in events:
         if isinstance(event, NodeChanged):

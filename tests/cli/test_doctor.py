@@ -292,7 +292,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("hasty")
 def test_a_pty_is_examined_and_the_status_is_0_if_all_is_well(busmaster: Command) -> None:
     with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
-        done = busmaster("doctor", server.path, *HCP2, "--nodes", "1")
+        done = busmaster("doctor", server.path, *HCP2, "--nodes", "1", "--timeout", "1000")
     assert (done.status, done.err) == (0, "")
     assert [line.split()[1] for line in done.lines if line[:4].strip()] == [
         *("port", "permission", "holders", "open", "driver", "rs485", "silence", "echo", "node", "windows")
@@ -307,8 +307,8 @@ def test_an_adapter_is_examined_by_its_serial_number_and_by_its_path_that_name_i
     usb = UsbTree(tmp_path / "sys")
     with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
         usb.plug(server.path, "A500ABC")
-        by_serial = busmaster("doctor", "usb:A500ABC", *HCP2, "--nodes", "1")
-        by_path = busmaster("doctor", server.path, *HCP2, "--nodes", "1")
+        by_serial = busmaster("doctor", "usb:A500ABC", *HCP2, "--nodes", "1", "--timeout", "1000")
+        by_path = busmaster("doctor", server.path, *HCP2, "--nodes", "1", "--timeout", "1000")
         value = busmaster("read", "usb:A500ABC", *HCP2, "--node", "1", "1")
     absent = busmaster("doctor", "usb:A500XYZ")
     assert (by_serial.status, by_path.status) == (0, 0)

@@ -56,6 +56,18 @@ async def test_the_picture_fits_80_by_24_and_says_what_the_frame_says() -> None:
 
 
 @pytest.mark.asyncio
+async def test_a_number_is_shown_with_as_many_digits_as_its_point_has() -> None:
+    screen = Screen(None)
+    async with screen.run_test(size=(80, 24)) as pilot:
+        rows = (Row("node 1", "speed", 12.3456, precision=1), Row("node 1", "pull", 12.3456))
+        screen.take_frame(msgspec.structs.replace(frame(), rows=rows))
+        await pilot.pause()
+        lines = [line.split() for line in picture(screen)]
+    assert [line[2:4] for line in lines if line[:2] == ["node", "1"]] == [["speed", "12.3"]]
+    assert [line[:2] for line in lines if line[:1] == ["pull"]] == [["pull", "12.3456"]]
+
+
+@pytest.mark.asyncio
 async def test_two_groups_may_hold_the_same_point_and_the_rows_may_change() -> None:
     screen = Screen(None)
     async with screen.run_test(size=(80, 24)) as pilot:

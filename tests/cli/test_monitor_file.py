@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from socket import create_server
+from typing import Any
 
 import pytest
 
@@ -31,7 +32,7 @@ port = "socket://127.0.0.1:{port}?baudrate=57600"
 protocol = "hcp2"
 address = 2
 [nodes.winder.points]
-tension = {{ item = "1", unit = "N", factor = 0.1 }}
+tension = {{ item = "1", unit = "N", factor = 0.1, high = 0.4 }}
 [groups.fast]
 period = 0.1
 points = ["winder/tension"]
@@ -88,12 +89,12 @@ def written(folder: Path, port: int = 1) -> Path:
     return path
 
 
-def rows(path: Path) -> list[tuple[str, str, float, str]]:
+def rows(path: Path, query: str = "select node, item, value, unit from history") -> list[tuple[Any, ...]]:
     if not path.exists():
         return []
     database = sqlite3.connect(path, timeout=PATIENCE)
     try:
-        return database.execute("select node, item, value, unit from history").fetchall()
+        return database.execute(query).fetchall()
     except sqlite3.OperationalError:
         return []  # it is just being made
     finally:
@@ -115,6 +116,9 @@ def test_points_and_outputs_are_fed_and_not_a_byte_is_sent(tmp_path: Path) -> No
     assert set(rows(tmp_path / "line.sqlite")) == {("winder", "tension", 0.5, "N")}
     assert "sqlite: " in said
     assert "0 dropped" in said
+    alarm = "winder/tension = 0.5 N is above its high of 0.4 N"
+    assert said.count(f"busmaster: {alarm}\n") == 1
+    assert rows(tmp_path / "line.sqlite", "select node, text from events") == [("winder", alarm)]
     assert process.returncode == 130
 
 

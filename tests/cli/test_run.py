@@ -16,8 +16,10 @@ from pathlib import Path
 import pytest
 
 from busmaster.capture.pcapng import read_packets
+from busmaster.cli.run import output_text
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer, TcpServer, serve_pty
+from busmaster.outputs.base import OutputStatistics
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from tests.cli.conftest import ROOT, Command, ended_once, started
@@ -71,6 +73,11 @@ def test_run_prints_a_line_a_value_and_a_summary_of_groups_nodes_and_outputs(lin
     with closing(sqlite3.connect(tmp_path / "x.db")) as database:
         [found] = database.execute("select count(distinct node || '/' || item) from history").fetchone()
     assert found == 4
+
+
+def test_what_an_output_was_spared_is_told_apart_from_what_it_lost() -> None:
+    counts = OutputStatistics("csv", "written", 3, 1, 0, "", suppressed=5)
+    assert output_text(counts) == "csv: 3 written, 1 dropped, 5 suppressed as no news"
 
 
 def test_run_says_that_a_file_without_groups_polls_nothing(busmaster: Command, line: Path) -> None:

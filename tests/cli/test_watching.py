@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 
 import anyio
 import pytest
 
 from busmaster.arbiter.counters import DriverErrors
 from busmaster.bus.bus import Bus
+from busmaster.bus.meaning import Meaning
+from busmaster.cli import watching
 from busmaster.cli.arguments import View
 from busmaster.cli.messages import Action, Frame
-from busmaster.cli.watching import Watch, count_cycles
+from busmaster.cli.output import Level
+from busmaster.cli.watching import Watch, count_cycles, json_cycle, plain_cycle
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.emulator.serve import TcpServer
@@ -63,6 +68,48 @@ async def test_the_picture_has_every_point_its_age_and_its_nodes_health(controll
         assert frame.port == f"{controllers.host}:{controllers.port}  57600 8N1"
         assert frame.line in ("ready", "settling")
         assert 0 < frame.utilisation <= 1
+
+
+@pytest.mark.asyncio
+async def test_people_are_shown_digits_and_names_and_programs_all_digits_and_numbers(controllers: TcpServer) -> None:
+    async with watched(controllers, 1) as watch:
+        controller = Hcp2Controller(watch.bus, 1)
+        await controller.write(10, 1.25, 1)
+        pull = replace(controller.point("10"), meaning=Meaning(precision=3))
+        mode = replace(controller.point("11"), meaning=Meaning(labels={1: "on"}))
+        group = watch.bus.poll_group("meant", period=0.02, points=[pull, mode])
+        watch.add(group)
+        async for snapshot in group:
+            if all(sample.error is None for sample in snapshot.values()):
+                break
+        plain = [text.split(" ", 1)[1] for text in plain_cycle(watch, snapshot)]
+        assert plain == ["1/10 1.250", "1/11 1 on"]
+        samples = json.loads(json_cycle(watch, snapshot))["samples"]
+        assert (samples["1/10"]["value"], samples["1/11"]["value"], samples["1/11"]["label"]) == (1.25, 1, "on")
+        assert "label" not in samples["1/10"]
+        watch.saw(snapshot)
+        rows = {row.item: row for row in watch.picture().rows}
+        assert (rows["10"].value, rows["10"].precision, rows["11"].value) == (1.25, 3, "1 on")
+
+
+@pytest.mark.asyncio
+async def test_an_alarm_is_an_event_of_the_picture_and_a_warning_to_who_does_not_look(
+    controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[tuple[str, Level]] = []
+    monkeypatch.setattr(watching, "note", lambda line, level: said.append((line, level)))
+    async with watched(controllers, 1) as watch:
+        controller = Hcp2Controller(watch.bus, 1)
+        watch.groups[0].add(replace(controller.point("10"), meaning=Meaning(high=5, hysteresis=1)))
+        await controller.write(10, 6)
+        await seen(watch, lambda frame: any("1/10 = 6 is above its high" in event for event in frame.events))
+        await controller.write(10, 4)
+        await seen(watch, lambda frame: any("1/10 is back at 4" in event for event in frame.events))
+    alarms = [(text, level) for text, level in said if text.startswith("1/10")]
+    assert alarms[:2] == [
+        ("1/10 = 6 is above its high of 5", Level.WARNING),
+        ("1/10 is back at 4, was above its high of 5", Level.NOTICE),
+    ]
 
 
 @pytest.mark.asyncio

@@ -40,7 +40,7 @@ def path(tmp_path: Path, winder: TcpServer) -> Path:
 
 def audit(path: Path) -> list[tuple[Any, ...]]:
     """Door, by whom, point, value, outcome and error of each write that is on record."""
-    with sqlite3.connect(path.parent / "line.sqlite", timeout=10) as database:
+    with sqlite3.connect(path.parent / "line.sqlite", timeout=PATIENCE) as database:
         rows = database.execute("select door, by, point, value, outcome, error from audit order by time").fetchall()
     database.close()
     return rows

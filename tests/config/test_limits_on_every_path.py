@@ -158,7 +158,8 @@ def by_mqtt(name: str) -> Callable[[Plant, int], Awaitable[None]]:
                 topic=f"line/set/{key}", payload=str(value).encode(), retain=False, properties=None
             )
         )
-        serving = asyncio.ensure_future(commands.serve(plant.line.gate.write, plant.line.gate.refuse, answers.put))
+        gate = plant.line.gate
+        serving = asyncio.ensure_future(commands.serve(gate.write, gate.refuse, answers.put, lambda: 0))
         try:
             answer = await answers.get()
         finally:

@@ -78,7 +78,7 @@ RECORDS: tuple[Any, ...] = (
 """One of each kind that never changes."""
 CHANGING = (Expect(TIMING, Sizes(1, 2)), Done(5))
 """Made for each reply and read once: where freezing them would cost each exchange something."""
-BASES = {ReadElement, WriteElements, msc._AtAddress, msc._OfFlag}
+BASES = {ReadElement, WriteElements, modbus._Read, msc._AtAddress, msc._OfFlag}
 """What only their heirs are made of."""
 
 

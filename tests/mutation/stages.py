@@ -21,6 +21,7 @@ QUICK: dict[str, tuple[str, ...]] = {
             "outcomes",
             "exchanges",
             "in_step",
+            "owed",
             "health",
             "settling",
             "unsent",

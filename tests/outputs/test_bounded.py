@@ -156,7 +156,7 @@ def test_one_that_is_reopened_lets_go_of_what_it_had_open_and_goes_on() -> None:
     output.reopen()
     until(lambda: output.shuts == 1)
     offer(output, 4, 5)
-    output.close(5)
+    output.close(PATIENCE)
     assert output.cycles == [1, 2, 3, 4, 5]
     assert output.shuts == 2
 
@@ -166,6 +166,6 @@ def test_what_was_lost_before_it_could_be_offered_counts_as_dropped() -> None:
     output.start()
     output.miss(3)
     offer(output, 1, 1)
-    output.close(5)
+    output.close(PATIENCE)
     counts = output.statistics()
     assert (counts.written, counts.dropped, counts.waiting) == (2, 3, 0)

@@ -141,7 +141,7 @@ async def test_a_port_that_is_taken_is_told_and_tried_again() -> None:
 @asynccontextmanager
 async def served(**options: Any) -> AsyncIterator[MetricsOutput]:
     """A line with one node, polled three times, and its metrics."""
-    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)], paced=False)))
     controller = Hcp2Controller(bus, 5)
     output = MetricsOutput("metrics", MetricsSettings(port=0, **options), bus)
     async with bus:

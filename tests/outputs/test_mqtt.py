@@ -65,7 +65,7 @@ class Seen(MqttOutput):
 
 
 def emulated(handle: type[Hcp2Controller], address: int) -> Bus:
-    return Bus(MemoryPort(Line(handle.profile.line, [make_device("hcp2", address)])))
+    return Bus(MemoryPort(Line(handle.profile.line, [make_device("hcp2", address)], paced=False)))
 
 
 @asynccontextmanager

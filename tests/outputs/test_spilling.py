@@ -25,6 +25,7 @@ from tests.outputs.cycles import BUS, cycle, settled, until
 from tests.outputs.test_audit import WRITE
 from tests.outputs.test_distributor import TEXT, opened
 from tests.outputs.test_spool import spool_at, spooled
+from tests.patience import PATIENCE
 from tests.ports import free_port
 
 
@@ -81,7 +82,7 @@ def test_ten_times_what_memory_holds_waits_on_disk_and_is_written_in_order(tmp_p
     assert "Is a directory" in counts.error
     (tmp_path / "x").rmdir()
     until(lambda: settled(output))
-    output.close(5)
+    output.close(PATIENCE)
     assert output.statistics() == type(counts)(output.kind, "written", 1000, 0, 0, "", 0)
     assert numbers(tmp_path / "x") == list(range(1, 1001))
 
@@ -93,7 +94,7 @@ def test_what_could_not_be_written_at_the_end_is_written_by_the_next_process(tmp
     output.start()
     for number in range(1, 51):
         output.offer(cycle(number, number))
-    output.close(5)
+    output.close(PATIENCE)
     counts = output.statistics()
     assert (counts.written, counts.dropped, counts.spilled) == (0, 0, 50)
     (tmp_path / "x").rmdir()
@@ -101,7 +102,7 @@ def test_what_could_not_be_written_at_the_end_is_written_by_the_next_process(tmp
     again.offer(cycle(51, 51))
     again.start()
     until(lambda: again.written == 51)
-    again.close(5)
+    again.close(PATIENCE)
     counts = again.statistics()
     assert (counts.written, counts.dropped, counts.spilled, counts.waiting) == (51, 0, 0, 0)
     assert numbers(tmp_path / "x") == list(range(1, 52))
@@ -113,12 +114,12 @@ def test_events_and_writes_survive_on_disk_as_they_were(tmp_path: Path) -> None:
     output.offer(Happening(1.5, "", "the line is up"))
     output.offer(WRITE)
     output.start()
-    output.close(5)
+    output.close(PATIENCE)
     (tmp_path / "x").rmdir()
     again = sqlite(tmp_path, lambda _: None)
     again.start()
     until(lambda: again.written == 2)
-    again.close(5)
+    again.close(PATIENCE)
     database = sqlite3.connect(tmp_path / "x")
     assert database.execute("select * from events").fetchall() == [(1.5, None, "the line is up")]
     [row] = database.execute("select point, before, value, outcome, id from audit").fetchall()
@@ -149,7 +150,7 @@ def test_a_database_that_another_program_locks_loses_nothing(tmp_path: Path, mon
             if number % 50 == 0:
                 until(lambda: output.spilled == output.offered - 1)
     until(lambda: settled(output))
-    output.close(5)
+    output.close(PATIENCE)
     assert numbers(tmp_path / "x") == list(range(1, 501))
     assert said == ["sqlite is down: database is locked", "sqlite is up again"]
 
@@ -161,7 +162,7 @@ def test_a_spool_that_cannot_be_made_is_told_and_the_output_works_without(tmp_pa
     output.start()
     output.offer(cycle(1, 1))
     until(lambda: output.written == 1)
-    output.close(5)
+    output.close(PATIENCE)
     assert len(said) == 1
     assert "Is a directory" in said[0]
 
@@ -178,7 +179,7 @@ def test_a_spool_with_older_values_in_it_that_another_process_holds_keeps_the_ou
     assert output.written == 0
     other.close()
     until(lambda: output.written == 1)
-    output.close(5)
+    output.close(PATIENCE)
 
 
 def test_a_file_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
@@ -186,14 +187,14 @@ def test_a_file_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     said: list[str] = []
     output = csv(tmp_path, said.append)
     output.start()
-    output.close(5)
+    output.close(PATIENCE)
     assert "holds what waits for mqtt: name another file for csv" in said[0]
     database = sqlite3.connect(tmp_path / "other")
     database.execute("create table mine (number)")
     database.close()
     output = CsvOutput("csv", FileSettings(path=str(tmp_path / "y"), spill=str(tmp_path / "other")), said.append)
     output.start()
-    output.close(5)
+    output.close(PATIENCE)
     assert "is a database of something else" in said[-1]
 
 
@@ -278,7 +279,7 @@ def test_a_full_disk_costs_nothing_where_what_waits_is_on_another(tmp_path: Path
                 until(lambda: output.spilled == output.statistics().waiting)
         disk.clear()
         until(lambda: settled(output))
-        output.close(5)
+        output.close(PATIENCE)
         assert numbers(tmp_path / "disk" / "x") == list(range(1, last + 1))
     assert output.dropped == output.lost == 0
     assert "full" in said[0] or "No space left" in said[0]

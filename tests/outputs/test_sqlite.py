@@ -221,3 +221,34 @@ def test_a_new_file_is_for_its_owner_and_group(tmp_path: Path) -> None:
     with recording(path) as output:
         output.offer(cycle(1, 1.0))
     assert path.stat().st_mode & 0o007 == 0
+
+
+@pytest.mark.parametrize("endings", [("",), ("", "-wal", "-shm")])
+def test_a_database_that_was_moved_keeps_what_it_has_and_another_is_begun(
+    tmp_path: Path, endings: tuple[str, ...]
+) -> None:
+    path, aside = tmp_path / "x.db", tmp_path / "old.db"
+    said: list[str] = []
+    with recording(path) as output:
+        output._tell = said.append
+        output.offer(cycle(1, 1.0))
+        until(lambda: settled(output))
+        for ending in endings:
+            Path(f"{path}{ending}").rename(f"{aside}{ending}")
+        output.offer(cycle(2, 2.0))
+        until(lambda: settled(output))
+    assert query(aside, "select value from samples") == [(1.0,)]
+    assert query(path, "select value from samples") == [(2.0,)]
+    assert said == [f"{path} was moved or removed: another is begun"]
+
+
+def test_a_database_that_was_removed_is_begun_anew(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    with recording(path) as output:
+        output.offer(cycle(1, 1.0))
+        until(lambda: settled(output))
+        path.unlink()
+        output.offer(cycle(2, 2.0))
+        until(lambda: settled(output))
+    assert query(path, "select value from samples") == [(2.0,)]
+    assert query(path, "pragma integrity_check") == [("ok",)]

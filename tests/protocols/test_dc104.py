@@ -138,8 +138,15 @@ def test_parameter_0_takes_the_option_for_it() -> None:
     assert Write(0, 1, minimum=0).parameter == 0
 
 
+@pytest.mark.parametrize("maximum", [1, 255])
+def test_a_drive_may_have_one_parameter_or_all_that_can_be_named(maximum: int) -> None:
+    assert Read(maximum, maximum=maximum).parameter == maximum
+    with pytest.raises(InvalidCommand):
+        Read(maximum + 1, maximum=maximum)
+
+
 def test_commands_say_what_they_do() -> None:
-    assert str(Read(7)) == "read parameter 7"
+    assert (str(Read(7)), repr(Read(7))) == ("read parameter 7", "Read(parameter=7)")
     assert str(Write(7, 300)) == "write parameter 7 = 300"
     assert (Read(7).writes, Read(7).idempotent) == (False, True)
     assert (Write(7, 1).writes, Write(7, 1).idempotent) == (True, False)

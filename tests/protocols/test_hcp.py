@@ -140,7 +140,14 @@ def test_ten_values_of_five_characters_fill_one_telegram() -> None:
 
 @pytest.mark.parametrize(
     ("written", "read"),
-    [(123.456, 123.456), (0.12345, 0.1235), (16777217, 16777216), (0, -0.0), (1234567.8912, 1234567.875)],
+    [
+        (123.456, 123.456),
+        (0.12345, 0.1235),
+        (16777217, 16777216),
+        (0, -0.0),
+        (1234567.8912, 1234567.875),
+        (0.5, 0.50002),
+    ],
 )
 def test_a_value_kept_in_single_precision_counts_as_stored(written: float, read: float) -> None:
     assert is_read_back(written, read)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -200,6 +201,21 @@ def test_the_line_and_the_units_are_the_documents() -> None:
     assert PROFILE.exchange_limit == 2.0
 
 
+# what a write changes
+
+
+def test_a_value_that_is_written_changes_its_own_address_as_far_as_is_known() -> None:
+    assert DataWrite(10, 5).changes(PROFILE) == {("data", 10): 5}
+    stepping = replace(PROFILE, merge=Merging(address_step=2))
+    assert DataWrite(10, 5).changes(stepping) == {("data", 9): None, ("data", 10): 5, ("data", 11): None}
+
+
+def test_a_block_that_is_written_changes_whatever_lies_within_four_addresses_of_a_value() -> None:
+    """A value has four bytes: its address grows by no more, but by how much is not known."""
+    changes = BlockWrite(10, tuple(range(32))).changes(PROFILE)
+    assert changes == {("data", address): None for address in range(7, 10 + 32 * 4)} | {("data", 10): 0}
+
+
 # merged reads
 
 
@@ -228,6 +244,8 @@ def test_a_value_between_the_steps_or_beyond_the_block_stays_alone() -> None:
 
 def test_no_block_runs_beyond_the_last_address() -> None:
     assert merge([DataRead(65535), DataRead(65534)], address_step=1) == []
+    assert merge([DataRead(65505), DataRead(65506)], address_step=1) == []
+    assert len(merge([DataRead(65504), DataRead(65505)], address_step=1)) == 1
 
 
 def test_an_address_step_leaves_room_for_a_block() -> None:

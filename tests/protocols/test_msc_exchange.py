@@ -6,7 +6,7 @@ import pytest
 
 from busmaster.contract.exchange import MORE, Done, Expect, FrameError, Refused
 from busmaster.protocols.msc.codec import PROFILE, BlockRead, DataRead, DataWrite, ReadFlag, ReadStatus
-from busmaster.protocols.msc.exchange import PacketExchange, StalePacketListener, packet
+from busmaster.protocols.msc.exchange import PacketExchange, StalePacketListener, packet, packet_size
 
 ACK, NAK = b"\x06", b"\x15"
 TIMINGS = PROFILE.timings
@@ -243,6 +243,13 @@ def test_a_damaged_packet_before_the_ack_ends_the_attempt_when_the_line_pauses()
     assert error.value.send == ACK
 
 
+def test_bytes_that_are_no_packet_are_told_by_their_number_and_the_first_of_them() -> None:
+    exchange = reading()
+    exchange.feed(b"\x41\x42\x43")
+    with pytest.raises(FrameError, match="3 bytes that are no packet, the first of them 41"):
+        exchange.expired(True)
+
+
 def test_a_packet_before_the_ack_that_is_cut_short_ends_the_attempt() -> None:
     exchange = writing()
     assert exchange.feed(STALE[:5]) is MORE
@@ -286,6 +293,22 @@ def test_a_naked_request_that_must_not_be_repeated_now_is_refused_until_it_is_co
     failure = exchange.abandon()
     assert isinstance(failure, Refused)
     assert failure.confirm
+
+
+@pytest.mark.parametrize(
+    ("heard", "size"),
+    [
+        ("02 01 00 05", 13),
+        ("02 0F 00 F0", 248),
+        ("02 0F 00 F1", None),
+        ("02 00 00 05", None),
+        ("02 10 00 05", None),
+        ("06 01 00 05", None),
+        ("02 01 00", 0),
+    ],
+)
+def test_a_packet_begins_with_stx_a_unit_and_the_length_of_its_body(heard: str, size: int | None) -> None:
+    assert packet_size(bytes.fromhex(heard)) == size
 
 
 # while nothing is asked

@@ -70,6 +70,12 @@ def test_the_addresses_are_the_documents_and_no_other_is_taken(
                 profile.check_address(address)
 
 
+def test_an_address_is_known_by_its_number() -> None:
+    """Large numbers that are equal need not be the same object."""
+    profile = replace(hcp2.PROFILE, broadcast=1000)
+    profile.check_address(int("1000"))
+
+
 @pytest.mark.parametrize(
     ("profile", "timings"),
     [
@@ -86,10 +92,10 @@ def test_replies_are_awaited_as_long_as_the_documents_say(profile: Profile, timi
 
 def test_msc_and_dc104_await_each_leg_in_its_own_time() -> None:
     first, packet = msc.PROFILE.timings.read, msc.PROFILE.timings.packet
-    assert (first.window, packet) == (0.5, ReplyTiming(0.5, 1.0, 1.0, 0.1))
+    assert (first, packet) == (ReplyTiming(0.05, 0.5, 1.0, 0.1), ReplyTiming(0.5, 1.0, 1.0, 0.1))
     assert (msc.PROFILE.timings.write, msc.PROFILE.exchange_limit) == (first, 2.0)
     assert dc104.PROFILE.timings.read == dc104.PROFILE.timings.packet == ReplyTiming(0.05, 0.1, 0.2, 0.02)
-    assert dc104.PROFILE.timings.write.window == 0.5
+    assert dc104.PROFILE.timings.write == ReplyTiming(0.5, 0.5, 0.6, 0.02)
 
 
 @pytest.mark.parametrize(

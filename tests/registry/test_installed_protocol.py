@@ -131,7 +131,7 @@ def test_an_option_of_its_own_is_no_option_of_others(tally: None, busmaster: Com
 
 
 def test_the_doctor_asks_its_nodes(served: TcpServer, busmaster: Command) -> None:
-    found = busmaster("doctor", served.path, *TALLY, "--nodes", "3")
+    found = busmaster("doctor", served.path, *TALLY, "--nodes", "3", "--timeout", "1000")
     assert found.status == 0
     assert "read counter a: 0" in found.out
 

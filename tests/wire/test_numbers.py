@@ -27,6 +27,7 @@ from busmaster.wire.numbers import LONGEST_NUMBER, format_list, format_number, p
         (True, "1"),
         (16777217, "16777217"),
         (1e16, "10000000000000000"),
+        (10**20 - 1, "99999999999999999999"),
         (Decimal("1.5"), "1.5"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from busmaster.contract.arguments import is_decimal
 from busmaster.protocols.ct_ansi.capture import CtAnsiDialect
 from busmaster.protocols.ct_ansi.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.ct_ansi.handle import CtAnsiDrive
@@ -19,6 +20,7 @@ PROTOCOL = Protocol(
             items="1.21 (menu and parameter), 1.21:8 (8 parameters from there on)",
             documented=(ANY,),
             read_options=(CHAIN,),
+            width=lambda item: 0 if is_decimal(item.partition(":")[2]) else 32,
             takes_decimals=True,
             emulated=(*EMULATED, Option("plus", "flag"), Option("width", "whole")),
             capture_id=8,

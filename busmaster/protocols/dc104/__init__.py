@@ -29,6 +29,7 @@ PROTOCOL = Protocol(
                 Option("silent", "flag"),
             ),
             whole_numbers=everywhere,
+            width=lambda item: 16,
             capture_id=6,
         ),
     ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from busmaster.contract.arguments import is_decimal
 from busmaster.protocols.mentor.capture import MentorDialect
 from busmaster.protocols.mentor.codec import PROFILE, Read, ReadRun, Write
 from busmaster.protocols.mentor.handle import MentorDrive
@@ -42,6 +43,7 @@ PROTOCOL = Protocol(
             options=(Option("chained", "flag"),),
             read_options=(CHAIN,),
             whole_numbers=everywhere,
+            width=lambda item: 0 if is_decimal(item.partition(":")[2]) else 16,
             takes_decimals=True,
             emulated=EMULATED,
             capture_id=5,

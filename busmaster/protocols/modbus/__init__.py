@@ -5,7 +5,7 @@ from __future__ import annotations
 from busmaster.contract.items import Item
 from busmaster.protocols.modbus.capture import ModbusDialect
 from busmaster.protocols.modbus.codec import PROFILE, ReadBits, ReadRegisters, WriteCoils, WriteRegisters
-from busmaster.protocols.modbus.handle import ModbusUnit, is_whole
+from busmaster.protocols.modbus.handle import ModbusUnit, is_whole, width_of
 from busmaster.registry import NodeKind, Option, Protocol, device_of
 
 PROTOCOL = Protocol(
@@ -30,6 +30,7 @@ PROTOCOL = Protocol(
                 Item("input:0-65535", "0-65535", "an input register of 16 bits, read by function 4", access="read"),
             ),
             whole_numbers=is_whole,
+            width=width_of,
             emulated=(Option("size", "whole"), Option("functions", "numbers"), Option("read_only", "numbers")),
             capture_id=7,
         ),

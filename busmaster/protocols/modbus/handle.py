@@ -109,6 +109,14 @@ def is_whole(item: str) -> bool:
     return not Place.parse(item).number.kind.startswith("float")
 
 
+def width_of(item: str) -> int:
+    """Return how many bits what an item names has; 0 for a run."""
+    place = Place.parse(item)
+    if place.count is not None:
+        return 0
+    return 1 if place.is_bit else 16 * place.number.registers
+
+
 class ModbusUnit(Handle):
     """A Modbus unit, 1 to 247, or 0 to write to all. Addresses are those that are sent, 0 to 65535.
 

@@ -6,7 +6,8 @@ from busmaster.protocols.msc import codec
 from busmaster.protocols.msc.capture import MscDialect
 from busmaster.protocols.msc.codec import PROFILE
 from busmaster.protocols.msc.handle import MscController
-from busmaster.protocols.msc.items import ITEMS
+from busmaster.protocols.msc.items import ITEMS, width_of
+from busmaster.protocols.msc.listing import read_listing
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
 ADDRESS_STEP = Option("address_step", "whole", "addresses from one value to the next")
@@ -22,7 +23,7 @@ PROTOCOL = Protocol(
             items="2008 (a data address), 2008:32 (32 values from there on), flag:5, flags, status",
             documented=ITEMS,
             options=(
-                Option("symbols", "addresses", common=False),
+                Option("symbols", "addresses", common=False, reader=read_listing),
                 ADDRESS_STEP,
                 MODEL,
             ),
@@ -36,6 +37,7 @@ PROTOCOL = Protocol(
                 Option("packet_delay", "delay"),
             ),
             whole_numbers=everywhere,
+            width=width_of,
             capture_id=4,
         ),
     ),

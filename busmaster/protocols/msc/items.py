@@ -23,3 +23,11 @@ ITEMS = (
     Item("flags", "", "the flags that are on, of MSC-850/32 and MSC-250 in one go", access="read", keyword="RFLAGS"),
     Item("status", "", "the program's status word", access="read", keyword="RQSTAT", bits=STATUS_BITS),
 )
+
+
+def width_of(item: str) -> int:
+    """Return how many bits an item has, flags as many as there are; 0 for a run."""
+    name, colon, _ = item.partition(":")
+    if colon:
+        return 1 if name == "flag" else 0
+    return {"flags": 256, "status": 16}.get(item, 32)

@@ -1,0 +1,106 @@
+"""Alarms: values that left what they must not leave, each told when it begins and when it ends, and not in between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
+
+from busmaster.arbiter.events import Event
+from busmaster.bus.points import Point
+from busmaster.bus.samples import Sample
+
+Side: TypeAlias = Literal["low", "high"]
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmChanged:
+    """A polled value is above `high` or below `low` of its point (`active`), or no longer.
+
+    `limit` is the one that it crossed, `bound` that limit. `value` is None where it ended as the point is watched no
+    more.
+    """
+
+    point: Point[Any]
+    limit: Side
+    bound: float
+    value: float | None
+    active: bool
+
+    @property
+    def text(self) -> str:
+        """It in a sentence."""
+        crossed = f"{'above' if self.limit == 'high' else 'below'} its {self.limit} of {self._text(self.bound)}"
+        if self.active:
+            return f"{self.point.key} = {self._text(self.value)} is {crossed}"
+        how = "is watched no more" if self.value is None else f"is back at {self._text(self.value)}"
+        return f"{self.point.key} {how}, was {crossed}"
+
+    def _text(self, value: float | None) -> str:
+        return f"{value:.10g} {self.point.unit}".rstrip()
+
+
+BusEvent: TypeAlias = Event | AlarmChanged
+"""What a bus tells: of its line and nodes, and of what it polls."""
+
+
+class Alarms:
+    """Those of one line. `tell` is called with each that begins or ends.
+
+    A value that could not be read neither begins an alarm nor ends one.
+    """
+
+    def __init__(self, tell: Callable[[AlarmChanged], None]) -> None:
+        self.states: Mapping[Point[Any], AlarmChanged | None] = {}
+        """The alarm of each point that was looked at, None for none. Replaced whole, so that any thread may look."""
+        self._tell = tell
+
+    def look(self, points: Iterable[Point[Any]], samples: Mapping[Point[Any], Sample[Any]]) -> None:
+        """Tell what the samples of these points begin and end."""
+        changed: dict[Point[Any], AlarmChanged | None] = {}
+        told: list[AlarmChanged] = []
+        for point in points:
+            sample = samples.get(point)
+            if sample is None or sample.error is not None or not isinstance(sample.value, int | float):
+                continue
+            before = self.states.get(point)
+            if before is not None and _holds(before.limit, point, sample.value):
+                continue
+            now = _begun(point, sample.value)
+            if before is not None:
+                told.append(replace(before, value=sample.value, active=False))
+            if now is not None:
+                told.append(now)
+            if before is not None or now is not None or point not in self.states:
+                changed[point] = now
+        self._become({**self.states, **changed} if changed else self.states, told)
+
+    def forget(self, points: Iterable[Point[Any]]) -> None:
+        """End the alarms of points that are polled no more."""
+        gone = {point: self.states[point] for point in points if point in self.states}
+        if gone:
+            ended = [replace(alarm, value=None, active=False) for alarm in gone.values() if alarm is not None]
+            self._become({point: alarm for point, alarm in self.states.items() if point not in gone}, ended)
+
+    def _become(self, states: Mapping[Point[Any], AlarmChanged | None], told: Iterable[AlarmChanged]) -> None:
+        self.states = states
+        for alarm in told:
+            self._tell(alarm)
+
+
+def _begun(point: Point[Any], value: float) -> AlarmChanged | None:
+    """Return the alarm that a value begins, None if it begins none."""
+    low, high = point.meaning.low, point.meaning.high
+    if high is not None and value > high:
+        return AlarmChanged(point, "high", high, value, active=True)
+    if low is not None and value < low:
+        return AlarmChanged(point, "low", low, value, active=True)
+    return None
+
+
+def _holds(limit: Side, point: Point[Any], value: float) -> bool:
+    """Return whether a value is not yet back: one that is no number is not."""
+    meaning = point.meaning
+    if limit == "high":
+        return meaning.high is not None and not value <= meaning.high - meaning.margin
+    return meaning.low is not None and not value >= meaning.low + meaning.margin

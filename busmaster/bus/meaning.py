@@ -1,0 +1,174 @@
+"""What the value of a point means: its names, how it is shown, when it is passed on, and what it must not leave."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from math import isfinite
+from typing import Any
+
+from busmaster.errors import InvalidCommand
+
+
+class MeansNothing(InvalidCommand):
+    """What is said of a point means nothing. `field` is the one that says so, `fault` what is wrong with it."""
+
+    def __init__(self, field: str, fault: str) -> None:
+        self.field = field
+        self.fault = fault
+        super().__init__(f"{field}: {fault}")
+
+
+BIT_NAME = re.compile(r"[^\W\d][\w-]*")
+MOST_DIGITS = 15
+"""Behind them a float says nothing."""
+SHARE = 0.01
+"""Of what lies between low and high: the hysteresis where none is given."""
+OF_QUANTITIES = ("precision", "low", "high", "hysteresis")
+"""What numbers that have names cannot have."""
+
+
+class Named(int):
+    """A whole number and what it is called: it counts, compares and is stored as the number, and prints with both.
+
+    `label` is the label of the number, or the names of the bits that are set: "READY|FAULT".
+    """
+
+    label: str
+
+    def __new__(cls, number: int, label: str) -> Named:
+        self = super().__new__(cls, number)
+        self.label = label
+        return self
+
+    def __str__(self) -> str:
+        return f"{int(self)} {self.label}".rstrip()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Meaning:
+    """Say what the value of a point means. Raises MeansNothing, an InvalidCommand, for what means nothing.
+
+        status = replace(drive.point("11"), meaning=Meaning(bits={"READY": 0, "FAULT": 3}))
+        group.add(status, *status.bits)
+
+    `precision` is how many digits behind the point are shown to people, 0 to 15; what is computed with and stored is
+    not rounded. `bits` names bits of a word, 0 the lowest, each of which is a point of its own; `labels` names whole
+    numbers. With `deadband` outputs are told a value only where it is further than that from what they were told
+    last, 0 for every change; with `heartbeat` at the latest after so many seconds. A value above `high` or below
+    `low` begins an alarm, which ends when it is back by `hysteresis`; that is a hundredth of what is between the
+    two, or of the one that is given, where it is left out. All but seconds is in the unit of the value.
+    """
+
+    precision: int | None = None
+    bits: Mapping[str, int] = field(default_factory=dict)
+    labels: Mapping[int, str] = field(default_factory=dict)
+    deadband: float | None = None
+    heartbeat: float | None = None
+    low: float | None = None
+    high: float | None = None
+    hysteresis: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, fault in self.faults():
+            raise MeansNothing(name, fault)
+
+    def faults(self) -> Iterator[tuple[str, str]]:
+        """Yield what is wrong, each with the name of the field that says so."""
+        yield from self._faults_of_names()
+        for name in ("precision", "deadband", "heartbeat", "low", "high", "hysteresis"):
+            value = getattr(self, name)
+            if value is not None and (isinstance(value, bool) or not isfinite(value)):
+                yield name, f"must be a finite number, not {value}"
+        if self.precision is not None and not 0 <= self.precision <= MOST_DIGITS:
+            yield "precision", f"is 0 to {MOST_DIGITS} digits behind the point, not {self.precision}"
+        if self.deadband is not None and not self.deadband >= 0:
+            yield "deadband", f"is 0 or more, not {self.deadband}"
+        if self.heartbeat is not None and not self.heartbeat > 0:
+            yield "heartbeat", f"is more than 0 seconds, not {self.heartbeat}; leave it out for none"
+        yield from self._faults_of_limits()
+
+    def _faults_of_names(self) -> Iterator[tuple[str, str]]:
+        if self.bits and self.labels:
+            yield "labels", "a number has bits or labels, not both: bits are of words"
+        for name in OF_QUANTITIES if self.bits or self.labels else ():
+            if getattr(self, name) is not None:
+                yield name, f"is for quantities, and this number has {'bits' if self.bits else 'labels'}"
+        if (self.bits or self.labels) and self.deadband:
+            yield "deadband", "of a number with names is 0: every change is told"
+        holders: dict[int, str] = {}
+        for name, bit in self.bits.items():
+            if not BIT_NAME.fullmatch(name):
+                yield "bits", f"the name of a bit begins with a letter and is of letters, digits, _ and -, not {name!r}"
+            if type(bit) is not int or bit < 0:
+                yield "bits", f"{name} must be the number of a bit, 0 for the lowest, not {bit!r}"
+            elif holders.setdefault(bit, name) != name:
+                yield "bits", f"{name} and {holders[bit]} are the same bit, {bit}"
+        for number, label in self.labels.items():
+            if type(number) is not int:
+                yield "labels", f"are of whole numbers, not of {number!r}"
+            if not label or not label.isprintable():
+                yield "labels", f"the label of {number} is a text on one line, not {label!r}"
+
+    def _faults_of_limits(self) -> Iterator[tuple[str, str]]:
+        low, high, hysteresis = self.low, self.high, self.hysteresis
+        if low is not None and high is not None and low >= high:
+            yield "low", f"{low} must be below high, which is {high}"
+        if hysteresis is None:
+            return
+        if not hysteresis >= 0:
+            yield "hysteresis", f"is 0 or more, not {hysteresis}"
+        elif not self.watched:
+            yield "hysteresis", "is of low and high: write one of them, or leave it out"
+        elif low is not None and high is not None and hysteresis >= high - low:
+            yield "hysteresis", f"must be less than the {high - low:.10g} between low and high, not {hysteresis}"
+
+    @property
+    def watched(self) -> bool:
+        """Whether it has a limit whose crossing is told."""
+        return self.low is not None or self.high is not None
+
+    @property
+    def margin(self) -> float:
+        """Return by how much a value must be back for its alarm to end."""
+        if self.hysteresis is not None:
+            return self.hysteresis
+        if self.low is not None and self.high is not None:
+            return SHARE * (self.high - self.low)
+        return SHARE * abs(self.low or self.high or 0.0)
+
+    @property
+    def by_exception(self) -> bool:
+        """Whether outputs are told only what is new."""
+        return self.deadband is not None or self.heartbeat is not None
+
+    @property
+    def names(self) -> bool:
+        return bool(self.bits or self.labels)
+
+    def named(self, value: Any) -> Any:
+        """Return the value with its names; as it is where it has none, or other ones from its protocol."""
+        if not isinstance(value, int | float) or value != value // 1:
+            return value
+        number = int(value)
+        if self.labels:
+            return Named(number, self.labels[number]) if number in self.labels else value
+        if isinstance(value, Enum):
+            return value
+        return Named(number, "|".join(name for name, bit in self.bits.items() if number >> bit & 1))
+
+
+PLAIN = Meaning()
+"""Of a point of which nothing is said."""
+
+
+def bit_of(value: Any, bit: int) -> bool:
+    """Return whether a bit of a word is set, or a number is among flags. Raises ValueError for what is no word."""
+    number = value.value if isinstance(value, Enum) else value
+    if isinstance(number, frozenset | set):
+        return bit in number
+    if not isinstance(number, int | float) or not isfinite(number) or number != int(number):
+        raise ValueError("it is no word")
+    return bool(int(number) >> bit & 1)

@@ -1,0 +1,89 @@
+"""`busmaster points`: the points of a file as a table, out and in."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+from busmaster.cli.app import OK, WRONG_USAGE
+from busmaster.cli.lines import file_argument, load
+from busmaster.cli.output import Level, columns, emit, note
+from busmaster.config import LineFile
+from busmaster.config.points_table import COLUMNS, ITEM, NODE, ORIGIN, POINT, points_csv, rows, said_text
+from busmaster.config.points_taking import BadRows, taken, write_beside
+
+
+@click.command(short_help="The points of a file as a table, out and in.")
+@file_argument()
+@click.option("--csv", "as_csv", is_flag=True, help="Print them as CSV.")
+@click.option(
+    "--from",
+    "table",
+    type=click.Path(exists=True, dir_okay=False, allow_dash=True),
+    metavar="CSV",
+    help="Take them from this CSV into LINE.toml; - is standard input.",
+)
+def command(path: str, as_csv: bool, table: str | None) -> int:
+    """Show the points of LINE.toml, one a line: what the file says of each, and the template or table it comes from.
+
+    With --csv as CSV, for a spreadsheet. With --from what such a CSV says is written into LINE.toml, and each change is
+    printed; comments and order stay. Rows add and change points, and none is taken away. Nothing is written unless all
+    rows are good; what is wrong is told by row and column.
+    """
+    if as_csv and table is not None:
+        raise click.UsageError("--csv and --from exclude each other: one is out, the other in")
+    if table is not None:
+        # read to its end first: whoever edits it in a pipe may edit the file too
+        data = sys.stdin.buffer.read() if table == "-" else Path(table).read_bytes()
+        return take(load(path), path, "standard input" if table == "-" else table, data)
+    file = load(path)
+    if as_csv:
+        print_csv(points_csv(file))
+    else:
+        emit(*page(file))
+    return OK
+
+
+def page(file: LineFile) -> Iterator[str]:
+    """Yield the lines of a table, with the columns of which something is said anywhere."""
+    texts = [
+        {NODE: row.node, POINT: row.point, ITEM: row.point, ORIGIN: row.origin}
+        | {key: said_text(row.said, key) for key in row.said}
+        for row in rows(file)
+    ]
+    if not texts:
+        yield "no points: describe them in [nodes.NAME.points]"
+        return
+    used = [column for column in COLUMNS if any(text.get(column) for text in texts)]
+    yield from columns([[column.upper() for column in used], *([text.get(key, "") for key in used] for text in texts)])
+
+
+def print_csv(data: bytes) -> None:
+    """Print CSV to the letter; on a terminal nothing in it makes it do anything."""
+    if sys.stdout.isatty():
+        emit(*data.decode().splitlines())
+        return
+    sys.stdout.flush()
+    sys.stdout.buffer.write(data)
+    sys.stdout.flush()
+
+
+def take(file: LineFile, path: str, name: str, data: bytes) -> int:
+    """Write what a CSV of that name says into the file, tell what changes, and return the exit status."""
+    try:
+        taking = taken(file, name, data)
+    except BadRows as bad:
+        for fault in bad.faults:
+            note(fault, Level.ERROR)
+        return WRONG_USAGE
+    if taking.changes:
+        write_beside(path, taking.text)
+    emit(*map(str, taking.changes))
+    count = len(taking.changes)
+    note(f"{path}: {count or 'no'} point{'' if count == 1 else 's'} changed{'' if count else ': it is as it was'}")
+    if taking.stay:
+        note(f"not in the CSV, and so as before: {', '.join(taking.stay)}")
+    return OK

@@ -1,0 +1,26 @@
+"""A few of the faults, those that are quick and sure; `python -m tests.plant` makes them all."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.outputs.brokers import needs_mosquitto
+from tests.plant.faults import FAULTS
+from tests.plant.trial import trial
+
+QUICK = ("port-gone", "broker-killed-spill", "csv-moved", "sqlite-moved", "disk-full", "1e308", "kill")
+
+pytestmark = [needs_mosquitto, pytest.mark.slow]
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_nothing_is_lost_by_a_fault_that_is_not_counted_and_no_value_is_wrong(name: str) -> None:
+    found = trial(FAULTS[name])
+    assert not found.problems
+    assert found.back
+
+
+def test_a_dead_node_in_the_safe_state_is_named_and_ends_with_1() -> None:
+    found = trial(FAULTS["term-dead"])
+    assert not found.problems
+    assert any("the safe state of winder/setpoint is not confirmed" in line for line in found.told)
