@@ -29,12 +29,15 @@ LONGEST_PATH = 107
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """Who serves a line: its name, its port, the socket, and the process."""
+    """Who serves a line: its name, its port, the socket, and the process; of the port, what it was opened with."""
 
     name: str
     port: str
     socket: str
     pid: int
+    baudrate: int | None = None
+    framing: str | None = None
+    echo: bool = False
 
     @property
     def address(self) -> str:
@@ -49,30 +52,41 @@ def line_name(text: str) -> str:
 
 
 def runtime_folder() -> Path:
-    """Return this user's folder for sockets, which nobody else may enter. Raises InvalidCommand where it is not so."""
-    if given := os.environ.get("RUNTIME_DIRECTORY"):
-        return Path(given.split(":")[0])
-    if given := os.environ.get("XDG_RUNTIME_DIR"):
-        folder = Path(given, "busmaster")
-    else:
-        folder = Path("/tmp", f"busmaster-{os.getuid()}")
+    """Return this user's folder for sockets, made if it is not there.
+
+    Raises InvalidCommand where others may write there: they could pose as its lines.
+    """
+    folder = _folder()
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
     except OSError as error:
         raise InvalidCommand(f"{folder} cannot be made: {error.strerror}; set XDG_RUNTIME_DIR") from None
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise InvalidCommand(f"{folder} is not this user's alone: others could pose as its lines; remove it")
+    if not _is_ours(folder):
+        raise InvalidCommand(f"others may write in {folder}, and could pose as its lines: remove it")
     return folder
+
+
+def _folder() -> Path:
+    if given := os.environ.get("RUNTIME_DIRECTORY"):  # from systemd
+        return Path(given.split(":")[0])
+    if given := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(given, "busmaster")
+    return Path("/tmp", f"busmaster-{os.getuid()}")
+
+
+def _is_ours(folder: Path) -> bool:
+    """Return whether a folder is this user's, or root's, and nobody else may write there."""
+    try:
+        found = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid in (os.getuid(), 0) and not found.st_mode & 0o022
 
 
 def owners() -> Iterator[Owner]:
     """Yield the lines that are served in this user's folder, and by systemd, as far as this user may see them."""
-    folders = [SYSTEM, *_inside(SYSTEM)]
-    with contextlib.suppress(InvalidCommand):
-        folders.insert(0, runtime_folder())
     seen: set[str] = set()
-    for folder in folders:
+    for folder in (*filter(_is_ours, [_folder()]), SYSTEM, *_inside(SYSTEM)):
         for path in sorted(folder.glob("*.line")):
             owner = _read(path)
             if owner is not None and owner.socket not in seen and _listens(owner):
@@ -82,13 +96,21 @@ def owners() -> Iterator[Owner]:
 
 def find_owner(port: str) -> Owner | None:
     """Return who serves the line that has this name, or whose port this is, however the port is written."""
-    wanted = port.partition("?")[0]
-    device = os.path.realpath(wanted) if wanted.startswith("/") else wanted
-    for owner in owners():
-        theirs = os.path.realpath(owner.port) if owner.port.startswith("/") else owner.port
-        if owner.name == port or theirs == device:
-            return owner
-    return None
+    device = _device(port)
+    return next((owner for owner in owners() if owner.name == port or _device(owner.port) == device), None)
+
+
+def _device(port: str) -> str:
+    """Return what a port is, whatever leads to it and is said of it: a device, or HOST:PORT."""
+    name = port.partition("?")[0].removeprefix("socket://")
+    return os.path.realpath(name) if name.startswith("/") else name
+
+
+def owner_of(port: str) -> Owner | None:
+    """Return who serves `unix:PATH`, or the line that has this name or port; None if nobody says so."""
+    if port.startswith("unix:"):
+        return _read(Path(socket_path(port)).with_suffix(".line"))
+    return find_owner(port)
 
 
 def socket_path(address: str) -> str:
@@ -103,15 +125,16 @@ def socket_path(address: str) -> str:
 
 
 class ServedSocket:
-    """The socket of one line, listening, in `with`. Raises InvalidCommand, naming the process, where one serves it.
+    """The socket of its owner's line, listening, in `with`. Raises InvalidCommand, naming the process, where one does
+    so already.
 
     What a process that has died left there is replaced. `mode` is the socket's; `group` is a group's number.
     """
 
-    def __init__(self, path: Path, name: str, port: str, *, mode: int = 0o600, group: int | None = None) -> None:
-        self.owner = Owner(name, port, str(path), os.getpid())
+    def __init__(self, owner: Owner, *, mode: int = 0o600, group: int | None = None) -> None:
+        self.owner = owner
         self.socket: socket.socket
-        self._path = path
+        self._path = Path(owner.socket)
         self._mode = mode
         self._group = group
         self._lock = -1
@@ -181,8 +204,8 @@ class ServedSocket:
 def _read(path: Path) -> Owner | None:
     try:
         said = json.loads(path.read_text())
-        return Owner(str(said["name"]), str(said["port"]), str(said["socket"]), int(said["pid"]))
-    except (OSError, ValueError, KeyError, TypeError):
+        return Owner(**said)
+    except (OSError, ValueError, TypeError):
         return None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pwd
 import socket
 import struct
@@ -45,8 +44,3 @@ def program_name(pid: int) -> str:
             return file.read().strip()
     except OSError:
         return "a program"
-
-
-def this_process() -> Peer:
-    """Return this process."""
-    return Peer(os.getpid(), user_name(os.getuid()), program_name(os.getpid()))

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, TypeVar, Unpack
 
 from busmaster.arbiter.counters import LineStatistics
-from busmaster.arbiter.events import Event
+from busmaster.bus.alarms import BusEvent
 from busmaster.bus.limits import Limit
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, RequestOptions
@@ -238,7 +238,7 @@ class RemoteBus:
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._groups: dict[int, RemoteGroup] = {}
         self._count = 0
-        self._events: list[Stream[Event]] = []
+        self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
 
     async def __aenter__(self) -> RemoteBus:
@@ -352,9 +352,9 @@ class RemoteBus:
         """Return the names of the line's poll groups."""
         return tuple(group["name"] for group in await self._ask("groups", {}))
 
-    def events(self) -> Stream[Event]:
+    def events(self) -> Stream[BusEvent]:
         """Return a stream of what happens to line and nodes from now on; a node in it is this program's."""
-        stream: Stream[Event] = Stream(self._events, EVENT_BUFFER)
+        stream: Stream[BusEvent] = Stream(self._events, EVENT_BUFFER)
         if not self._hears_events:
             self._hears_events = True
             self.link.ask("events", {"stream": 0})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
@@ -19,7 +20,7 @@ from busmaster.contract.exchange import Command
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
 from busmaster.service.client import Client
-from busmaster.service.folder import ServedSocket, line_name, runtime_folder
+from busmaster.service.folder import Owner, ServedSocket, line_name, runtime_folder
 from busmaster.service.messages import (
     HELLO_WITHIN,
     INVALID_PARAMS,
@@ -31,7 +32,7 @@ from busmaster.service.messages import (
     written,
 )
 from busmaster.service.outbox import Outbox
-from busmaster.service.peers import peer_of, this_process
+from busmaster.service.peers import peer_of
 from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
 
 if TYPE_CHECKING:
@@ -95,7 +96,18 @@ class Service:
     async def __aenter__(self) -> Service:
         serve = _websockets()
         path = self._path or runtime_folder() / f"{self.name}.sock"
-        served = ServedSocket(path, self.name, self.bus.endpoint.name, mode=self._mode, group=self._group)
+        endpoint = self.bus.endpoint
+        settings = endpoint.settings
+        owner = Owner(
+            self.name,
+            endpoint.name,
+            str(path),
+            os.getpid(),
+            None if settings is None else settings.baudrate,
+            None if settings is None else settings.framing,
+            endpoint.echo,
+        )
+        served = ServedSocket(owner, mode=self._mode, group=self._group)
         self._served = served.__enter__()
         try:
             self._server = await serve(
@@ -221,21 +233,25 @@ class Service:
         common = [version for version in VERSIONS if version in wanted]
         if not common:
             raise Malformed(f"versions {wanted} are not spoken here, but {list(VERSIONS)}", INVALID_PARAMS)
-        owner = this_process()
+        owner = self._served.owner
         nodes = [
-            {"protocol": node.profile.name, "address": node.address, "label": node.label, "stops": node.stops}
+            {
+                "protocol": node.profile.name,
+                "address": node.address,
+                "label": node.label,
+                "stops": node.stops,
+                "health": node.health.value,
+            }
             for node in self.bus.nodes
         ]
-        settings = self.bus.endpoint.settings
         result = {
             "version": max(common),
-            "name": self.name,
-            "line": self.bus.endpoint.name,
-            "baudrate": None if settings is None else settings.baudrate,
-            "framing": None if settings is None else settings.framing,
-            "echo": self.bus.endpoint.echo,
+            "name": owner.name,
+            "line": owner.port,
+            "baudrate": owner.baudrate,
+            "framing": owner.framing,
+            "echo": owner.echo,
             "process": owner.pid,
-            "user": owner.user,
             "read_only": self.gate.read_only,
             "clients": len(self._clients),
             "nodes": nodes,

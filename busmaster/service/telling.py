@@ -8,7 +8,6 @@ from typing import Any, Protocol, cast
 
 from busmaster.arbiter.counters import DriverErrors, LineStatistics, Quantiles
 from busmaster.arbiter.events import (
-    Event,
     LatenessLowered,
     LatenessRaised,
     LineChange,
@@ -18,6 +17,7 @@ from busmaster.arbiter.events import (
 )
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import Timeline
+from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.points import Point
 from busmaster.bus.requester import Requester
 from busmaster.bus.samples import Quality, Sample
@@ -106,7 +106,7 @@ def _sample_of(said: Sequence[Any], point: Point[Any]) -> Sample[Any]:
 # events
 
 
-def said_event(event: Event) -> dict[str, Any] | None:
+def said_event(event: BusEvent) -> dict[str, Any] | None:
     """Return an event as it is said; None for one that no client hears."""
     said: dict[str, Any] = {"event": type(event).__name__}
     match event:
@@ -121,19 +121,26 @@ def said_event(event: Event) -> dict[str, Any] | None:
         case PortFailed():
             bug = None if event.bug is None else f"{type(event.bug).__name__}: {event.bug}"
             return said | {"cause": event.cause, "hint": event.hint, "bug": bug}
+        case AlarmChanged():
+            [point] = said_points([event.point])
+            told = {name: getattr(event, name) for name in ("limit", "bound", "value", "active")}
+            return said | {"point": point, **told}
         case _:
             return None
     node = event.node
     return said | {"protocol": node.profile.name, "address": node.address, "label": node.label}
 
 
-def event_of(said: Mapping[str, Any], find: FindNode) -> Event | None:
+def event_of(said: Mapping[str, Any], find: FindNode) -> BusEvent | None:
     """Return the event that was said; its `node` is the client's own. None for one of a later version."""
     name = said["event"]
     if name == "LineChanged":
         return LineChanged(LineChange(said["change"]), said["cause"])
     if name == "PortFailed":
         return PortFailed(said["cause"], said["hint"], None if said["bug"] is None else Exception(said["bug"]))
+    if name == "AlarmChanged":
+        point = point_of(said["point"], find)
+        return AlarmChanged(point, said["limit"], said["bound"], said["value"], said["active"])
     if name not in ("NodeChanged", "LatenessRaised", "LatenessLowered"):
         return None
     # It has all that an event's reader asks of a node: label, address, profile, line.
