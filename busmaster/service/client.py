@@ -46,6 +46,8 @@ class Client:
         self._line = line
         self._number = number
         self._nodes: dict[NodeKey, Node] = {}
+        self._stops: dict[NodeKey, int] = {}
+        """How often each had been told to stop when this client named it: the client counts from there."""
         self._refused: dict[NodeKey, str] = {}
         """Why a node that it named may not be asked as it said; its requests are refused until it names it rightly."""
         self._running: dict[int, asyncio.Task[None]] = {}
@@ -76,7 +78,7 @@ class Client:
         """Say how often a node was told to stop, if this client knows it."""
         key = (node.profile.name, node.address)
         if key in self._nodes:
-            params = {"protocol": key[0], "address": key[1], "stops": node.stops}
+            params = {"protocol": key[0], "address": key[1], "stops": node.stops - self._stops[key]}
             self.outbox.put_latest(("stops", key), written({"method": "stops", "params": params}))
 
     # what it says
@@ -87,7 +89,10 @@ class Client:
         if not isinstance(method, str) or not isinstance(params, dict):
             raise Malformed("a message has a method, and its parameters by name")
         if number is None:
-            self._notified(method, params)
+            try:
+                self._notified(method, params)
+            except TypeError as error:  # a list for a number
+                raise Malformed(f"{method[:40]}: {error}") from None
             return
         if isinstance(number, bool) or not isinstance(number, int):
             raise Malformed("the id of a request is a whole number")
@@ -150,7 +155,7 @@ class Client:
             if len(self._refused) < MOST_NODES:
                 self._refused[key] = str(error)
             raise
-        return {"label": node.label, "stops": node.stops, "health": node.health.value}
+        return {"label": node.label, "health": node.health.value}
 
     def node(self, name: str, address: int, timings: Any = None, retries: int | None = None) -> Node:
         """Return a node, which this client has until it leaves. Raises InvalidCommand as `Bus.node` does."""
@@ -167,7 +172,12 @@ class Client:
         if known is not None:
             bus.give_back(node)  # it was asked for its complaint alone
         self._nodes[name, address] = node
+        self._stops.setdefault((name, address), node.stops)
         return node
+
+    def stops_before(self, node: Node) -> int:
+        """Return how often a node had been told to stop when this client named it."""
+        return self._stops[node.profile.name, node.address]
 
     # requests
 
@@ -176,7 +186,7 @@ class Client:
             priority = checked_priority(params.get("options", {}).get("priority", Priority.COMMAND))
             if len(self._running) >= MOST_REQUESTS + (MOST_URGENT if priority is Priority.URGENT else 0):
                 raise BacklogFull(f"{len(self._running)} requests of this program are not answered yet")
-            errand = Errand.of(params, self.node, self._line, self.peer)
+            errand = Errand.of(params, self, self._line)
         except (BusError, InvalidCommand) as error:
             self._refuse(number, error)
         except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Protocol, cast
 
 from busmaster.bus.bus import Bus
@@ -46,6 +46,21 @@ class Line(Protocol):
         ...
 
 
+class Asker(Protocol):
+    """Who asks for it."""
+
+    @property
+    def peer(self) -> Peer: ...
+
+    def node(self, name: str, address: int, /) -> Node:
+        """Return a node of the line. Raises InvalidCommand."""
+        ...
+
+    def stops_before(self, node: Node, /) -> int:
+        """Return the stops of a node from which this client counts."""
+        ...
+
+
 class Errand:
     """One command with its options, for one client."""
 
@@ -74,9 +89,9 @@ class Errand:
         self._asked = asked
 
     @classmethod
-    def of(cls, params: Mapping[str, Any], find: Callable[[str, int], Node], line: Line, peer: Peer) -> Errand:
+    def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
-        node = find(params["protocol"], params["address"])
+        node = asker.node(params["protocol"], params["address"])
         protocol = protocol_of(params["protocol"])
         command = protocol.read_back(params["command"])
         touches = params.get("touches")
@@ -84,15 +99,15 @@ class Errand:
         if not set(given) <= OPTIONS:
             raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
         RequestOptions.of(given, node.label)  # checked here, before it may wait
-        now = line.bus.now()
+        now, stops_seen = line.bus.now(), params.get("stops_seen")
         return cls(
             node,
             command,
             None if touches is None else protocol.read_back(touches),
             given,
             line=line,
-            peer=peer,
-            stops_seen=params.get("stops_seen"),
+            peer=asker.peer,
+            stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
             stop=params.get("stop") is True,
             asked=min(now, seconds(params.get("asked", now), "asked")),
         )

@@ -6,7 +6,7 @@ import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable, Hashable
 
-from busmaster.service.messages import MOST_UNREAD
+from busmaster.service.messages import MOST_UNREAD, MOST_WAITING
 
 
 class _Letter:
@@ -21,8 +21,8 @@ class _Letter:
 class Outbox:
     """Messages that wait until the one before them is sent.
 
-    Answers are bounded by the requests that a client may make; of news, which come unasked, the oldest are dropped
-    beyond MOST_UNREAD. `on_drop` is told whose that was.
+    Answers are never dropped, but `room` says when a client may ask more; of news, which come unasked, the oldest are
+    dropped beyond MOST_UNREAD. `on_drop` is told whose that was.
     """
 
     def __init__(self, send: Callable[[str], Awaitable[None]], on_drop: Callable[[Hashable], None]) -> None:
@@ -33,12 +33,18 @@ class Outbox:
         self._latest: dict[Hashable, _Letter] = {}
         self._something = asyncio.Event()
         self._flushed = asyncio.Event()
+        self._sent = asyncio.Event()
         self._sending = False
 
     @property
     def empty(self) -> bool:
         """Whether all that was put in has been handed over."""
         return not (self._letters or self._sending)
+
+    @property
+    def waiting(self) -> int:
+        """Return how many messages are not handed over yet."""
+        return len(self._letters)
 
     def put(self, text: str) -> None:
         """Say this: it is never dropped."""
@@ -67,6 +73,12 @@ class Outbox:
         self._letters.append(letter)
         self._something.set()
 
+    async def room(self) -> None:
+        """Return when not too much waits: what a client asks that does not read the answers is not read either."""
+        while len(self._letters) >= MOST_WAITING:
+            self._sent.clear()
+            await self._sent.wait()
+
     async def flushed(self) -> None:
         """Return when all that was put in has been handed over."""
         while not self.empty:
@@ -87,6 +99,7 @@ class Outbox:
                 self._sending = True
                 await self._send(letter.text)
                 self._sending = False
+                self._sent.set()
             self._flushed.set()
             self._something.clear()
             await self._something.wait()

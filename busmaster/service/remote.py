@@ -51,7 +51,7 @@ class RemoteNode:
 
     def __init__(self, bus: RemoteBus, profile: Profile, address: int) -> None:
         self.stops = 0
-        """How often it was told to stop, by whatever program."""
+        """How often it was told to stop, by whatever program, since this one named it."""
         self.label = profile.label(address)
         self._bus = bus
         self._profile = profile
@@ -236,6 +236,8 @@ class RemoteBus:
         self._link: Link | None = None
         self._nodes: dict[tuple[str, int], RemoteNode] = {}
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
+        self._told: set[RemoteNode] = set()
+        """Those of them of which the owner knows."""
         self._groups: dict[int, RemoteGroup] = {}
         self._count = 0
         self._events: list[Stream[BusEvent]] = []
@@ -251,9 +253,9 @@ class RemoteBus:
         for known in said["nodes"]:
             node = self._nodes.get((known["protocol"], known["address"]))
             if node is not None:
-                node.label, node.stops = known["label"], known["stops"]
-        for node, (timings, retries) in self._named.items():
-            self._name(node, timings, retries)
+                node.label = known["label"]
+        for node in self._named:
+            self._name(node)
         return self
 
     async def __aexit__(
@@ -286,27 +288,37 @@ class RemoteBus:
     ) -> RemoteNode:
         """Return the node at this address, as `Bus.node` does.
 
-        Raises InvalidCommand for an address that the protocol does not have. What the line's owner has against it, such
-        as other timings, its first request raises.
+        Raises InvalidCommand for an address that the protocol does not have, and for other timings or retries than this
+        program named first. What the line's owner has against them, the node's requests raise.
         """
         profile.check_address(address)
-        if profile != protocol_of(profile.name).profile:
-            raise InvalidCommand(f"{profile.label(address)}: only the usual {profile.name} is spoken on another's line")
-        node = self._nodes.get((profile.name, address))
-        if node is None:
-            node = self._nodes[profile.name, address] = RemoteNode(self, profile, address)
-        elif timings is None and retries is None:
-            return node
-        self._named[node] = timings, retries
+        node = self._find(profile, address)
+        said = self._named.setdefault(node, (timings, retries))
+        if timings not in (None, said[0]) or retries not in (None, said[1]):
+            raise InvalidCommand(
+                f"{node.label} is in use already, and now asked for with other timings or retries: "
+                "give all handles of an address the same options, or leave them out in all but the first"
+            )
         if self._link is not None:
-            self._name(node, timings, retries)
+            self._name(node)
         return node
 
     def find(self, protocol: str, address: int) -> RemoteNode:
-        """Return a node by the name of its protocol."""
-        return self.node(protocol_of(protocol).profile, address)
+        """Return a node that the owner speaks of, by the name of its protocol. It is not named for that."""
+        return self._find(protocol_of(protocol).profile, address)
 
-    def _name(self, node: RemoteNode, timings: Timings | Learned | None, retries: int | None) -> None:
+    def _find(self, profile: Profile, address: int) -> RemoteNode:
+        if profile != protocol_of(profile.name).profile:
+            raise InvalidCommand(f"{profile.label(address)}: only the usual {profile.name} is spoken on another's line")
+        key = profile.name, address
+        return self._nodes.get(key) or self._nodes.setdefault(key, RemoteNode(self, profile, address))
+
+    def _name(self, node: RemoteNode) -> None:
+        """Tell the owner that this program uses a node, and how: once."""
+        if node in self._told:
+            return
+        self._told.add(node)
+        timings, retries = self._named[node]
         params: dict[str, Any] = {"protocol": node.profile.name, "address": node.address}
         if timings is not None:
             params["timings"] = said_timings(timings)
@@ -316,7 +328,7 @@ class RemoteBus:
 
         def named(future: asyncio.Future[Any]) -> None:
             if not future.cancelled() and future.exception() is None:
-                node.label, node.stops = future.result()["label"], max(node.stops, future.result()["stops"])
+                node.label = future.result()["label"]
 
         asked.future.add_done_callback(named)
 

@@ -208,6 +208,7 @@ class Service:
                 self._welcome(client, read(await connection.recv()))
             async for text in connection:
                 client.take(read(text))
+                await client.outbox.room()
         except (Malformed, TimeoutError) as error:
             self.refused += 1
             code = error.code if isinstance(error, Malformed) else INVALID_PARAMS
@@ -239,7 +240,6 @@ class Service:
                 "protocol": node.profile.name,
                 "address": node.address,
                 "label": node.label,
-                "stops": node.stops,
                 "health": node.health.value,
             }
             for node in self.bus.nodes

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator, Callable
 from typing import Any, Protocol
 
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
+from busmaster.errors import BusError, InvalidCommand
 from busmaster.service.messages import encoded
 from busmaster.service.telling import said_event, said_points, said_snapshot
 
@@ -52,9 +54,12 @@ class Broadcast:
             self._on_end()
 
     async def _run(self) -> None:
-        async for method, body in self._bodies():
-            for reader, stream in self.readers:
-                reader.tell(stream, method, body)
+        try:
+            async for method, body in self._bodies():
+                for reader, stream in self.readers:
+                    reader.tell(stream, method, body)
+        except (TypeError, BusError, InvalidCommand):  # what has a value that cannot be said, or is closed already
+            logging.getLogger("busmaster.service").exception("a stream ended")
         self._on_end()
         for reader, stream in self.readers:
             reader.tell_surely(stream, "ended", {})

@@ -111,10 +111,11 @@ def test_the_audit_is_true_of_a_program_that_is_killed_mid_write(tmp_path: Path)
         ("[" * 100_000, "this is no JSON"),
         ("[]", "this is no message of JSON-RPC 2.0"),
         ('{"jsonrpc": "2.0", "id": 2, "method": 3}', "a message has a method"),
+        ('{"jsonrpc": "2.0", "method": "cancel", "params": {"id": [1]}}', "cancel: "),
         ('{"jsonrpc": "2.0", "id": true, "method": "groups"}', "the id of a request is a whole number"),
         (b"\x00\xff", "a message is text"),
     ],
-    ids=range(6),
+    ids=range(7),
 )
 def test_garbage_ends_the_conversation_with_its_reason(said: str | bytes, complaint: str, tmp_path: Path) -> None:
     async def story(line: Served) -> None:
@@ -271,6 +272,30 @@ def test_a_program_that_does_not_read_loses_its_own_news_and_nothing_else() -> N
     asyncio.run(run())
 
 
+def test_a_program_that_does_not_read_its_answers_is_not_read_either(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.service.outbox.MOST_WAITING", 3)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with raw(line, max_queue=1) as client:
+            client.connection.transport.pause_reading()
+
+            async def flood() -> None:
+                for number in range(2, 10_000_000):
+                    await client.say(id=number, method="statistics", params={})
+
+            flooding = asyncio.ensure_future(flood())
+            await until(lambda: line.service.clients[-1].outbox.waiting >= 3)
+            for _ in range(20):
+                assert await Hcp2Controller(remote, 5).read(1) == 0
+                assert line.service.clients[-1].outbox.waiting <= 4
+            flooding.cancel()
+            client.connection.transport.abort()
+
+    on_a_served_line(tmp_path, story)
+
+
 def test_a_thousand_programs_come_and_go_as_they_like_and_leave_nothing(tmp_path: Path) -> None:
     chance = random.Random(1)
     half_open: list[asyncio.StreamWriter] = []
@@ -359,6 +384,11 @@ def test_a_line_is_found_by_its_name_and_by_its_port_however_that_is_written(
         assert find_owner("/dev/null") is None
     path.with_suffix(".line").write_text(json.dumps({"name": "slitter", "port": "x", "socket": str(path), "pid": 1}))
     assert list(owners()) == []
+
+
+def test_systemd_says_where_its_lines_have_their_sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", f"{tmp_path}/slitter")
+    assert runtime_folder() == tmp_path / "slitter"
 
 
 def test_a_folder_that_others_could_enter_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

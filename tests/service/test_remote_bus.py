@@ -159,6 +159,39 @@ def test_a_stop_of_one_program_counts_for_all(tmp_path: Path) -> None:
     on_a_served_line(tmp_path, story)
 
 
+def test_a_stop_of_long_ago_does_not_keep_cancel_errors_from_leaving_the_drive_enabled(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        own = MicroFlexDrive(line.bus, 7)
+        await own.disable()
+        await own.enable()
+        status = await MicroFlexDrive(remote, 7).cancel_errors()  # it names the drive, and asks at once
+        assert StatusWord.ENABLED in status
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_hearing_of_a_node_is_not_naming_it(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        events = remote.events()
+        async with connect(line.address) as other:
+            await Hcp2Controller(other, 5).read(1)
+            await anext(events)
+        await until(lambda: not line.bus.nodes)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_handles_of_one_node_agree_on_its_timings(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        first = Hcp2Controller(remote, 5, timings=PATIENT)
+        with pytest.raises(InvalidCommand, match="other timings or retries"):
+            Hcp2Controller(remote, 5, retries=7)
+        Hcp2Controller(remote, 5, timings=PATIENT)
+        assert await first.read(1) == await Hcp2Controller(remote, 5).read(1) == 0
+
+    on_a_served_line(tmp_path, story)
+
+
 def test_a_disable_overtakes_what_another_program_waits_to_write(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         async with connect(line.address) as other:
