@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Hashable, Mapping
 from typing import Any, Protocol, cast
 
 from busmaster.bus.bus import Bus
@@ -41,8 +41,8 @@ class Line(Protocol):
         """Return what tells of line and nodes."""
         ...
 
-    def named(self, node: Node, command: Command[Any], /) -> Point[Any]:
-        """Return the point of a poll group that reads this, or one without a name."""
+    def named(self, node: Node, places: Collection[Hashable], /) -> Point[Any] | None:
+        """Return the point of a poll group that reads these places of a node."""
         ...
 
 
@@ -169,16 +169,22 @@ class Errand:
         return cast("CommandOptions", options)
 
     def _wish(self) -> Wish:
-        point = self._line.named(self.node, self._touches or self.command)
-        value = _value(self.command, self._touches, point)
-        return Wish(door=DOOR, by=str(self._peer), name=f"{point.key}", point=point, value=value)
+        """Return what is on record of it: by the name of a point and in its unit, where the owner polls that."""
+        command, point = self.command, None
+        value: Any = self.text
+        if isinstance(command, Changing):
+            changes = command.changes(self.node.profile)
+            point = self._line.named(self.node, changes.keys())
+            if point is not None:
+                value = _value(point, changes, value)
+        point = point or Point(self.node, self.text, command)
+        return Wish(door=DOOR, by=str(self._peer), name=point.key, point=point, value=value)
 
 
-def _value(command: object, touches: object, point: Point[Any]) -> Any:
-    """Return what is written, in the point's unit where that is known; else the command in words."""
-    if isinstance(command, Changing) and isinstance(touches, Placed):
-        try:
-            return point.value_of(touches.shown(command.changes(point.node.profile)))
-        except Exception:  # whatever it is, the record says what was sent
-            pass
-    return str(command)
+def _value(point: Point[Any], changes: Mapping[Hashable, Any], otherwise: Any) -> Any:
+    """Return what the point will read after these changes, in its unit."""
+    assert isinstance(point.command, Placed)
+    try:
+        return point.value_of(point.command.shown(changes))
+    except Exception:  # of a decoder; the record then says what was sent
+        return otherwise

@@ -44,7 +44,7 @@ class Outbox:
     @property
     def waiting(self) -> int:
         """Return how many messages are not handed over yet."""
-        return len(self._letters)
+        return len(self._letters) + self._sending
 
     def put(self, text: str) -> None:
         """Say this: it is never dropped."""
@@ -75,7 +75,7 @@ class Outbox:
 
     async def room(self) -> None:
         """Return when not too much waits: what a client asks that does not read the answers is not read either."""
-        while len(self._letters) >= MOST_WAITING:
+        while self.waiting >= MOST_WAITING:
             self._sent.clear()
             await self._sent.wait()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+from collections.abc import Collection, Hashable
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
@@ -16,7 +17,7 @@ from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
-from busmaster.contract.exchange import Command
+from busmaster.contract.places import Placed
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
 from busmaster.service.client import Client
@@ -80,7 +81,7 @@ class Service:
         self._groups: dict[PollGroup, GroupBroadcast] = {}
         self._events: EventBroadcast | None = None
         self._points: dict[object, Point[Any]] = {}
-        self._points_of: list[tuple[str, int]] = []
+        self._points_of: list[tuple[str, tuple[Point[Any], ...]]] = []
         self._log = logging.getLogger("busmaster.service")
 
     @property
@@ -162,13 +163,18 @@ class Service:
             self._events = EventBroadcast(self.bus, self._end_events)
         return self._events
 
-    def named(self, node: Node, command: Command[Any]) -> Point[Any]:
-        """Return the point of a poll group that reads this, or one without a name."""
-        groups = [(group.name, len(group.points)) for group in self.bus.groups]
+    def named(self, node: Node, places: Collection[Hashable]) -> Point[Any] | None:
+        """Return the point of a poll group that reads these places of a node."""
+        groups = [(group.name, group.points) for group in self.bus.groups]
         if groups != self._points_of:
             self._points_of = groups
-            self._points = {point.quantity: point for group in self.bus.groups for point in group.points}
-        return self._points.get((node, command)) or Point(node, str(command), command)
+            self._points = {
+                (point.node, frozenset(point.command.places)): point
+                for _, points in groups
+                for point in points
+                if isinstance(point.command, Placed)
+            }
+        return self._points.get((node, frozenset(places)))
 
     def _forget_group(self, group: PollGroup) -> None:
         self._groups.pop(group, None)
