@@ -164,7 +164,9 @@ async def _rate(counts: Counter[str], seconds: float) -> float:
 
 async def _call(master: ModbusMaster, number: int, counts: Counter[str]) -> None:
     unit, register = number % UNITS + 1, 10 * number
-    while True:
+    caller = asyncio.current_task()
+    assert caller is not None
+    while not caller.cancelling():  # pymodbus makes an error of its own of a cancellation
         try:
             value = await master.read(unit, register)
         except Failed:

@@ -21,6 +21,7 @@ from benchmarks.lines import SocketPort
 from busmaster.bus.bus import Bus
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
+from busmaster.transport.alarm import KernelTimer, kernel_timer
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -89,11 +90,14 @@ class Ours:
 
 
 class Bare(asyncio.Protocol):
-    """The least that a master can be."""
+    """The least that a master can be. It keeps `silence` seconds between a reply and the next request, by a timer of
+    the kernel's of its own."""
 
     name = "bare asyncio.Protocol"
 
-    def __init__(self, questions: Sequence[Question]) -> None:
+    def __init__(self, questions: Sequence[Question], silence: float = 0.0) -> None:
+        self._silence = silence
+        self._timer: KernelTimer | None = None
         self._sends = [ask.request for ask in questions]
         self._replies = [b"".join(ask.reply) for ask in questions]
         self._closings = [ask.closing for ask in questions]
@@ -106,6 +110,14 @@ class Bare(asyncio.Protocol):
 
     async def open(self, endpoint: Endpoint) -> None:
         self._transport = await endpoint.open(lambda: self)
+        if self._silence:
+            self._timer = kernel_timer(asyncio.get_running_loop(), self._on_silence)
+
+    def _on_silence(self) -> None:
+        assert self._timer is not None
+        assert self._transport is not None
+        if self._timer.has_expired():
+            self._transport.write(self._sends[self._next])
 
     def data_received(self, data: bytes) -> None:
         buffer = self._buffer = self._buffer + data
@@ -118,7 +130,9 @@ class Bare(asyncio.Protocol):
         send = self._closings[self._next]
         self._next = (self._next + 1) % len(self._sends)
         self._left -= 1
-        if self._left:
+        if self._left and self._timer is not None:
+            self._timer.set(self._silence)
+        elif self._left:
             send += self._sends[self._next]
         if send:
             self._transport.write(send)  # type: ignore[union-attr]  # it is open: bytes came
@@ -135,6 +149,9 @@ class Bare(asyncio.Protocol):
 
     async def close(self) -> None:
         assert self._transport is not None
+        if self._timer is not None:
+            asyncio.get_running_loop().remove_reader(self._timer.descriptor)
+            self._timer.close()
         self._transport.close()
         await asyncio.sleep(0)
 

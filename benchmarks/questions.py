@@ -1,10 +1,12 @@
-"""Questions to ask, with their bytes and the right answers: HCP2 reads of numbers, MSC reads of data."""
+"""Questions to ask, with their bytes and the right answers: HCP2 reads of numbers, MSC reads of data, Modbus reads of
+registers."""
 
 from __future__ import annotations
 
 from benchmarks.masters import Question
 from busmaster.contract.profile import LineSettings
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.exchange import packet
 from busmaster.wire.checks import xor
@@ -39,7 +41,20 @@ def msc_questions() -> list[Question]:
     return questions
 
 
+def modbus_questions() -> list[Question]:
+    """One holding register of four units."""
+    questions = []
+    for unit in NODES:
+        value = 1000 * unit
+        command = modbus.ReadRegisters(unit)
+        request = command.open(unit, modbus.PROFILE.timings).request
+        reply = modbus.with_crc(bytes((unit, 3, 2)) + value.to_bytes(2, "big"))
+        questions.append(Question(command, unit, request, (reply,), (value,)))
+    return questions
+
+
 def wire_time(ask: Question, settings: LineSettings, delay: float) -> float:
-    """Seconds that the bits of this transaction and the device's reply time take, and nothing else."""
+    """Seconds that the bits of this transaction, the device's reply time and the protocol's silence behind it take."""
     bits = len(ask.request) + sum(map(len, ask.reply)) + len(ask.closing)
-    return bits * settings.byte_time + delay
+    silence = modbus.SILENCE if isinstance(ask.command, modbus.ReadRegisters) else 0.0
+    return bits * settings.byte_time + delay + silence

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import os
 import shutil
+import signal
 import tempfile
 
 from hypothesis import settings
@@ -19,3 +20,9 @@ os.environ.pop("RUNTIME_DIRECTORY", None)
 atexit.register(shutil.rmtree, os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
 
 settings.load_profile("ci" if os.environ.get("CI") else "busmaster")
+
+# A shell that starts a job in the background has it ignore these, and so would every command that the tests start and
+# end by Ctrl-C. What a process handles is back at its default in those that it starts.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)

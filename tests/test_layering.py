@@ -52,6 +52,7 @@ OPEN: dict[str, set[str]] = {
             "events",
             "health",
             "histogram",
+            "learned",
             "mark",
             "schedule",
             "state",

@@ -14,12 +14,13 @@ The rule, for each kind of command (its type) and each of the node's two legs (t
 ACK) on its own: the window is twice the largest reply time of the last 500 to 1000 replies, or the largest until the
 first bytes were handed over if that is more (an adapter may hand over a whole reply at once), plus 2 ms; at least 5 ms,
 at most the document's. It is trusted after 200 replies.
-The second attempt of a read has four times that. The silence after which a reply is over is twice the longest pause
+The second attempt of a read has twice that. The silence after which a reply is over is twice the longest pause
 within one of those replies, but 17 bytes at least. (A smoothed mean and deviation, as TCP has it, follows the usual
 reply too closely: of 76,000 replies it missed 1236, the largest none.)
 
-A node that was later than three quarters of a learned window, or whose reply came after it, has the document's times
-again for 200 replies.
+A node that was later than three quarters of a learned window (one shorter than the document's), or whose reply came
+after it, has the document's times again for 20 replies: enough to tell one that has become slower from one that was
+late once. One that was away has them for 200, for it may be another device.
 
 Of times nothing is done here but to add, subtract, compare and multiply by a constant.
 """
@@ -33,9 +34,9 @@ from math import inf
 from busmaster.contract.timing import ReplyTiming, Timings
 
 TRUSTED_AFTER = 200
-"""Replies of a kind after which its times are trusted, and once more after each that was late."""
+"""Replies of a kind after which its times are trusted."""
 TRUSTED_AGAIN_AFTER = 20
-"""As many where times of an earlier run are known."""
+"""As many where times of an earlier run are known, or after one that was late."""
 EPOCH = 500
 """Replies after which an epoch ends: the largest of this one and the last count."""
 MARGIN = 0.002
@@ -44,7 +45,7 @@ SLOWER = 2
 """How many times its slowest reply is awaited of a node."""
 LEAST = 0.005
 """The shortest window, in seconds: less than a process is held up for."""
-AT_FIRST, AGAIN, AT_LAST, NEVER = 1, 4, 10**9, 0
+AT_FIRST, AGAIN, AT_LAST, NEVER = 1, 2, 10**9, 0
 """How many times the learned window an attempt is awaited, but no longer than the document says. AT_LAST is the attempt
 on which an outcome rests: the document's window. NEVER: neither its window nor its silence is learned."""
 LATE_SHARE = 0.75
@@ -68,6 +69,11 @@ class LearnedTimes:
     pause: float
     window: float
     trusted: bool
+
+
+def window_of(slowest: float, heard: float) -> float:
+    """Return the seconds in which a reply of such a node begins: see `LearnedTimes` for what is given, in seconds."""
+    return max(LEAST, max(SLOWER * slowest, heard) + MARGIN)
 
 
 class _Largest:
@@ -128,7 +134,7 @@ class LegTimes:
     @property
     def window(self) -> float:
         """Seconds in which a reply begins, by all that is known."""
-        return max(LEAST, max(SLOWER * self.slowest.value, self.heard.value) + MARGIN)
+        return window_of(self.slowest.value, self.heard.value)
 
     def timing(self, document: ReplyTiming, byte_time: float, patience: int) -> ReplyTiming:
         """Return what is awaited: the document's while too little is known."""
@@ -167,9 +173,10 @@ class Kind:
             self._byte_time = byte_time
             self._given = None
 
-    def doubt(self) -> None:
-        """Go back to the document's times for a while."""
-        self.first.doubts = self.packet.doubts = TRUSTED_AFTER
+    def doubt(self, replies: int) -> None:
+        """Go back to the document's times for at least so many replies."""
+        for leg in (self.first, self.packet):
+            leg.doubts = max(leg.doubts, replies)
         self._given = None
 
     def _learned(self, own: Timings, patience: int) -> Timings:
@@ -202,11 +209,14 @@ class Learning:
         if kind is not None:
             kind.note(packet, begun, heard, pause, byte_time)
 
-    def doubt(self) -> None:
-        """Go back to the document's times until enough replies have come: the node was late, or has been away."""
-        self.returns += 1
-        for kind in self.kinds.values():
-            kind.doubt()
+    def was_late(self) -> None:
+        """Go back to the document's times until it has shown whether it has become slower."""
+        self._doubt(TRUSTED_AGAIN_AFTER)
+
+    def was_away(self) -> None:
+        """Go back to the document's times until enough is known of what may be another device."""
+        self._known = {}
+        self._doubt(TRUSTED_AFTER)
 
     def times(self, document: Timings) -> tuple[LearnedTimes, ...]:
         """Return what is known, a leg at a time."""
@@ -223,6 +233,16 @@ class Learning:
     def begin_with(self, known: Iterable[LearnedTimes]) -> None:
         """Start from what an earlier run has learned: it is trusted after fewer replies."""
         self._known = {(times.kind, times.packet): times for times in known}
+
+    def to_keep(self, document: Timings) -> tuple[LearnedTimes, ...]:
+        """Return what the next run may begin with: what is trusted, and what this one began with and never doubted."""
+        trusted = {(times.kind, times.packet): times for times in self.times(document) if times.trusted}
+        return tuple({**self._known, **trusted}.values())
+
+    def _doubt(self, replies: int) -> None:
+        self.returns += 1
+        for kind in self.kinds.values():
+            kind.doubt(replies)
 
     def _begin(self, name: str) -> Kind:
         kind = Kind()

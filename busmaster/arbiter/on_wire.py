@@ -75,9 +75,12 @@ class OnWire:
         pause = leg.pause if leg.went_on_at < leg.begun_at else max(leg.pause, now - leg.went_on_at)
         packet = leg.timing is not exchange.timing
         learning.note(transaction.command, packet, begun, heard, max(0.0, pause - leg.latency), leg.byte_time)
-        # Only a learned window that is nearly missed says that the node has become slower; the document's says nothing.
-        if leg.timing.silence is not None and heard > LATE_SHARE * leg.timing.window:
-            learning.doubt()
+        # Only a learned window that is nearly missed says that the node has become slower; the document's says nothing,
+        # not even where what was learned comes to as much: the node is as slow as it has always been.
+        document = transaction.node.timings
+        longest = (document.packet if packet else document.write if transaction.writes else document.read).window
+        if leg.timing.silence is not None and LATE_SHARE * leg.timing.window < heard and leg.timing.window < longest:
+            learning.was_late()
 
     def without_noise(self, data: bytes) -> bytes:
         """Return what is left of the first bytes of a reply where the profile tolerates noise before it."""

@@ -94,6 +94,6 @@ class Trust:
         if paid is not None and node is not None and node.learning is not None and paid.awaited is not None:
             first_byte = unasked.last_byte - (len(run) - 1) * wire.leg.byte_time - wire.leg.latency
             if first_byte - paid.asked > LATE_SHARE * paid.awaited.window:
-                node.learning.doubt()
+                node.learning.was_late()
                 unasked.blame_for(node, paid.asked, first_byte)
         return node

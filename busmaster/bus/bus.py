@@ -364,7 +364,8 @@ class Bus:
         """Return how long, in seconds, a request of this class, made now, waits at most until it is sent (R9).
 
         It reckons with what is polled, what waits already, every node's probe, and each kind of command that was
-        asked or polled so far; with nodes that are dead, late or trickling; not with a line that is never silent.
+        asked or polled so far; with nodes that are dead, late or trickling; not with a line that is never silent. Reply
+        times that are learned do not shorten it: those of the document may come back at any moment.
         """
         self.check_loop()
         priority = checked_priority(priority)

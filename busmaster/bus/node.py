@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Hashable
+from collections.abc import Awaitable, Callable, Hashable, Iterable
 from dataclasses import replace
 from math import inf
 from threading import get_ident
@@ -11,6 +11,7 @@ from typing import Any, Protocol, TypeVar, Unpack
 
 from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health, NodeRecord
+from busmaster.arbiter.learned import LearnedTimes
 from busmaster.arbiter.transaction import LEFT, Priority, Timeline, Transaction
 from busmaster.bus.limiter import Limiter
 from busmaster.bus.limits import Limit
@@ -351,6 +352,19 @@ class Node:
     @property
     def suspended(self) -> bool:
         return self.shared.now() < self.record.suspended_until
+
+    def times_to_keep(self) -> tuple[LearnedTimes, ...]:
+        """Return what `begin_with` may be given in the next run: the reply times that were learned and are trusted."""
+        record = self.record
+        return () if record.learning is None else record.learning.to_keep(record.timings)
+
+    def begin_with(self, known: Iterable[LearnedTimes]) -> None:
+        """Begin with what an earlier run has learned of its reply times, before it is asked anything.
+
+        That is trusted after twenty replies; where nothing is to be learned it is left out.
+        """
+        if self.record.learning is not None:
+            self.record.learning.begin_with(known)
 
     def statistics(self) -> NodeStatistics:
         """Return counts and latencies since the bus was opened or its statistics were reset."""

@@ -14,7 +14,7 @@ from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import columns, emit, emit_all, json_line
 from busmaster.config import ConfiguredLine
 from busmaster.contract.profile import LineSettings
-from busmaster.planning import GroupPlan, Plan
+from busmaster.planning import GroupPlan, Losses, Plan
 from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.serial_port import SerialPort
 
@@ -51,7 +51,18 @@ def page(head: str, plan: Plan) -> list[str]:
         *(table if plan.groups else ["no poll groups"]),
         *((f"{verdict}:", *plan.advice) if plan.advice else (f"{verdict}: {share}",)),
         f"a command waits {time_text(plan.typical_wait)} on a healthy line; at the very worst: {', '.join(waits)}",
+        *([losses_text(plan.losses)] if plan.groups else []),
     ]
+
+
+def losses_text(losses: Losses) -> str:
+    """Return what lost frames would cost, and what learned reply times would spare."""
+    shortest, longest = map(time_text, losses.windows)
+    windows = f"a window of {shortest}" if shortest == longest else f"windows of {shortest} to {longest}"
+    return (
+        f"with {losses.share:.0%} of all frames lost it asks for {losses.documented:.0%} of the line; "
+        f'with timing = "learned" ({windows}) for {losses.learned:.0%}'
+    )
 
 
 def port_text(endpoint: Endpoint, line: LineSettings) -> str:
@@ -114,6 +125,12 @@ def fields(plan: Plan) -> dict[str, Any]:
         "typical_wait": plan.typical_wait,
         "worst_waits": {priority.name.lower(): finite(wait) for priority, wait in plan.worst_waits.items()},
         "fitting_baudrate": plan.fitting_baudrate,
+        "losses": {
+            "share": plan.losses.share,
+            "utilisation": plan.losses.documented,
+            "learned_utilisation": plan.losses.learned,
+            "learned_windows": plan.losses.windows,
+        },
         "advice": list(plan.advice),
     }
 

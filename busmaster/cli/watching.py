@@ -16,6 +16,7 @@ from anyio.abc import TaskGroup
 
 from busmaster.arbiter.events import LineChange, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health
+from busmaster.arbiter.learned import LearnedTimes
 from busmaster.arbiter.state import LineState
 from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.bus import Bus
@@ -286,8 +287,19 @@ class Watch:
                 f"{node.label}: {node.requests} requests, {node.failed} failed, "
                 f"p50 {node.p50 * 1000:.2f} ms, p99 {node.p99 * 1000:.2f} ms"
             )
+        for bus_node in self.bus.nodes:
+            if text := learned_text(bus_node.statistics().learned):
+                note(f"{bus_node.label}: {text}")
         if text := uart.damage_text(uart.damage(counts.damaged, counts.breaks, counts.driver)):
             note(f"uart: {text}; `busmaster doctor` says what to look for")
+
+
+def learned_text(learned: Iterable[LearnedTimes]) -> str:
+    """Return what was learned of a node's reply times: the window of each kind of command that is trusted."""
+    windows = ", ".join(
+        f"{times.kind}{' (packet)' * times.packet} {times.window * 1000:.2f} ms" for times in learned if times.trusted
+    )
+    return windows and f"learned windows: {windows}"
 
 
 def p99_of(periods: Iterable[float]) -> float | None:

@@ -16,6 +16,7 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import WriteOptions
+from busmaster.config.kept_times import KeptTimes
 from busmaster.config.names import expanded, listed
 from busmaster.config.point_section import PointSection, check_suits, sort_of
 from busmaster.config.points import NamedPoint, Scale
@@ -65,6 +66,7 @@ class ConfiguredLine:
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         self.gate = Gate(self.bus, read_only=read_only)
         self.outputs = Distributor(self.bus, tell, gate=self.gate)
+        self._kept_times = KeptTimes(self.bus, self._tell)
         self.gate.record = self.outputs.record
         if outputs:
             self._add_outputs()
@@ -73,6 +75,7 @@ class ConfiguredLine:
         """Open the port, and start the groups and the outputs. Raises LineDown if the port cannot be opened."""
         await self.bus.__aenter__()
         try:
+            await self._kept_times.start(self.file.learned, self._own_nodes())
             self._start_groups()
             self.outputs.start(self.groups.values())
         except BaseException:
@@ -87,6 +90,7 @@ class ConfiguredLine:
         try:
             await self.bus.__aexit__(kind, error, traceback)
         finally:
+            await self._kept_times.close()
             await self.outputs.close()
 
     async def take(self, file: LineFile) -> None:
@@ -101,6 +105,7 @@ class ConfiguredLine:
         before, points, wanted = self.file, self._points, self._wanted
         self.nodes = {name: self.nodes.get(name) or fresh[name] for name in file.nodes}
         self.file = file
+        self._kept_times.take(file.learned, self._own_nodes())
         self._points = {name: point for name, point in points.items() if _section(before, name) == _section(file, name)}
         held, self._limits = self._limits, list(self._held_limits())
         for node, limit in held:
@@ -177,6 +182,12 @@ class ConfiguredLine:
         return self.bus.plan(*planned)
 
     # inside
+
+    def _tell(self, text: str) -> None:
+        self.outputs.tell(text)
+
+    def _own_nodes(self) -> dict[str, Node]:
+        return {name: Node.of(handle) for name, handle in self.nodes.items()}
 
     def _start_groups(self) -> None:
         """Start the groups that do not run."""

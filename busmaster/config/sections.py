@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,6 +26,7 @@ from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import InvalidCommand
+from busmaster.outputs.base import check_folder
 from busmaster.registry import NodeKind, find, kinds
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -73,12 +74,16 @@ class GroupSection:
 
 @dataclass(frozen=True, slots=True)
 class LineFile:
-    """All that one file says. `table` is the whole of it, for messages."""
+    """All that one file says. `learned` is where learned reply times are kept, if they are.
+
+    `table` is the whole of it, for messages.
+    """
 
     path: str
     title: str
     port: SerialPort | TcpPort
     strict: bool
+    learned: str | None
     nodes: Mapping[str, NodeSection]
     groups: Mapping[str, GroupSection]
     outputs: Outputs
@@ -97,7 +102,8 @@ def read(source: Source) -> LineFile:
     """Read what a source says of a line. Raises FileError, naming line and key, for what is wrong in it."""
     top = Table(source)
     top.only(
-        "title", "port", "strict", "timing", "protocols", "nodes", "groups", "outputs", "safe", "service", "emulator"
+        *("title", "port", "strict", "timing", "learned", "protocols", "nodes", "groups", "outputs", "safe", "service"),
+        "emulator",
     )
     nodes = {node.name: node for node in _nodes(top, _defaults(top))}
     groups = {table.name: _group(table) for table in top.tables("groups")}
@@ -105,6 +111,7 @@ def read(source: Source) -> LineFile:
         path=source.name,
         title=top.text("title", os.path.basename(source.name)),
         strict=top.flag("strict", False),
+        learned=_learned(top, nodes.values()),
         port=read_port(top, [node.profile for node in nodes.values()]),
         nodes=nodes,
         groups=groups,
@@ -117,6 +124,17 @@ def read(source: Source) -> LineFile:
     if not nodes:
         raise top.error("there are no nodes: describe each in a table of its own, [nodes.NAME]")
     return file
+
+
+def _learned(top: Table, nodes: Iterable[NodeSection]) -> str | None:
+    """Read where learned reply times are kept from one run to the next."""
+    path = top.text("learned", None)
+    if path is not None:
+        if not any(isinstance(node.timings, Learned) for node in nodes):
+            raise top.error(f'no reply times are learned: say timing = "{LEARNED_WORD}" too', "learned")
+        with top.at("learned"):
+            check_folder(path)
+    return path
 
 
 # nodes

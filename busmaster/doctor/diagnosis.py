@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import median
 
+from busmaster.arbiter.learned import window_of
 from busmaster.capture.decode import Decoder
 from busmaster.capture.frames import Kind
 from busmaster.contract.profile import LineSettings, Profile
@@ -141,6 +142,21 @@ def nodes(records: Sequence[Record], timing: ReplyTiming) -> Iterator[Finding]:
     starts = [start for record in records for start in record.starts]
     if starts:
         yield windows(starts, timing)
+        yield learning(starts, timing)
+
+
+def learning(starts: Sequence[float], timing: ReplyTiming) -> Finding:
+    """Say what learned reply times would come to with these latencies, in seconds."""
+    slowest = max(starts)
+    window = min(window_of(slowest, slowest), timing.window)
+    if window >= timing.window:
+        return Finding("learning", True, "learned windows would be no shorter than the one that is set")
+    return Finding(
+        "learning",
+        True,
+        f"learned windows would be {milliseconds(window)} ms at most: a lost reply would hold up the line for about as "
+        f'long, in place of {milliseconds(timing.lateness)} ms (--timeout learned, timing = "learned")',
+    )
 
 
 def node(record: Record, others_are_clean: bool) -> Finding:

@@ -1,6 +1,7 @@
 """Does a schedule fit a line, and how long can anybody wait on it? Pure arithmetic; see `plan` and `bounds`."""
 
 from busmaster.planning.fit import BAUDRATES, GroupPlan, MergedReads, Plan, PlannedGroup, plan, plan_steps
+from busmaster.planning.losses import Losses
 from busmaster.planning.worst_case import (
     Bounds,
     PlannedNode,
@@ -14,6 +15,7 @@ __all__ = [
     "BAUDRATES",
     "Bounds",
     "GroupPlan",
+    "Losses",
     "MergedReads",
     "Plan",
     "PlannedGroup",

@@ -20,6 +20,7 @@ from busmaster.arbiter.schedule import SLICE, Priority, Schedule, line_time
 from busmaster.arbiter.transaction import Poll
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import LineSettings
+from busmaster.planning.losses import Losses, LostAttempts, losses
 from busmaster.planning.merging import WEIGHING, Merge, Served, at_once, cheapest
 from busmaster.planning.worst_case import Bounds, PlannedNode, Read, bound_steps, unanswered
 
@@ -107,6 +108,7 @@ class Plan:
     dead_wait: float
     worst_waits: Mapping[Priority, float]
     fitting_baudrate: int | None
+    losses: Losses
 
     @property
     def fits(self) -> bool:
@@ -168,6 +170,7 @@ def plan_steps(
         dead_wait=max((draft.unanswered + receive_latency for draft in drafts if draft.costs), default=0.0),
         worst_waits={priority: bound.wait(priority) for priority in Priority},
         fitting_baudrate=(yield from _fitting_baudrate(drafts, line)) if utilisation > COMFORT else None,
+        losses=losses(utilisation, [(draft.group.period, draft.lost) for draft in drafts]),
     )
 
 
@@ -180,6 +183,7 @@ class _Draft:
         self.exchanges: list[tuple[PlannedNode, Served]] = []
         self.costs: list[float] = []
         self.unanswered = 0.0
+        self.lost = LostAttempts()
         self.could_save = 0.0
         self.poll = Poll(group.name, group.period, phase=group.phase)
         self.poll.group = self
@@ -202,6 +206,7 @@ class _Draft:
             exchange = node.open(served.command)
             self.costs.append(line_time(exchange, self.byte_time, node.reply_time))
             self.unanswered = max(self.unanswered, unanswered(exchange, self.byte_time))
+            self.lost.add(node, exchange, self.byte_time)
             yield WEIGHING
         self.poll.cost = sum(self.costs)
 

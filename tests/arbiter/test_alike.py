@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import count
+from itertools import count, pairwise
 from random import Random
 
 import pytest
@@ -53,6 +53,8 @@ class Saturated:
         self.right = 0
         self.wrong: list[int] = []
         """The numbers of the requests whose values are another's."""
+        self.unlike: list[int] = []
+        """The numbers of the requests that were checks."""
 
     def run(self, requests: int) -> Saturated:
         bench = self.bench
@@ -63,6 +65,8 @@ class Saturated:
                 asked += 1
             if request := bench.sent():
                 number += 1
+                if bytes.fromhex(request)[4:6] != b"01":
+                    self.unlike.append(number)
                 self._answer(bytes.fromhex(request), number)
             due, data = min(self.coming, default=(float("inf"), ""))
             if due <= bench.arbiter.poll_timeout():
@@ -116,6 +120,11 @@ def test_a_steady_line_is_checked_after_128_answers_alike(kind: str) -> None:
     line = Saturated(KINDS[kind]).run(3 * LONGEST_STEADY)
     assert line.wrong == []
     assert line.checks <= 4, "the first one is sooner: no node's usual time is known yet"
+
+
+def test_a_steady_line_is_checked_at_every_128th_answer() -> None:
+    unlike = Saturated(KINDS["one"]).run(5 * LONGEST_STEADY).unlike
+    assert [later - earlier for earlier, later in pairwise(unlike[1:])] == [128, 128]
 
 
 def test_a_line_whose_answers_vary_by_more_than_half_a_request_is_checked_after_32() -> None:

@@ -59,6 +59,14 @@ def test_r9_after_seven_polls_background_gets_a_slot() -> None:
     assert order(filled(*[POLL] * 9, BACKGROUND)) == [*[POLL] * 7, BACKGROUND, *[POLL] * 2]
 
 
+def test_r9_a_turn_of_background_on_a_free_line_does_not_count_towards_its_slot() -> None:
+    backlog = filled(BACKGROUND)
+    assert order(backlog) == [BACKGROUND]
+    for priority in (*[POLL] * 9, BACKGROUND):
+        backlog.push(waiting(priority))
+    assert order(backlog) == [*[POLL] * 7, BACKGROUND, *[POLL] * 2]
+
+
 def test_r9_the_slot_is_never_before_urgent() -> None:
     assert order(filled(*[URGENT] * 20, COMMAND, POLL))[:20] == [URGENT] * 20
 

@@ -7,7 +7,7 @@ from math import inf
 import pytest
 
 from busmaster.arbiter.health import SILENT, NodeRecord
-from busmaster.arbiter.in_step import ANY_BYTE, Awaited, InStep
+from busmaster.arbiter.in_step import ANY_BYTE, LAPSE, Awaited, InStep
 from busmaster.contract.profile import Profile
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -79,3 +79,12 @@ def test_r15_another_nodes_answer_pays_only_for_a_node_that_is_silent_and_late()
         in_step.owe((ONE,), owing, asked=0.0, over=0.150)
         in_step.answered(living(2), asked, 1.0, 0.1)
         assert (in_step.ends((ONE,), 1.0) < inf) is paid
+
+
+def test_r15_only_what_is_like_a_forgiven_reply_is_doubted_and_only_until_it_would_have_lapsed() -> None:
+    in_step = InStep()
+    in_step.owe((ONE,), living(), asked=1.0, over=1.150)
+    in_step.forgive((ONE,))
+    assert in_step.is_doubtful((ONE,), 10.9)
+    assert not in_step.is_doubtful((TWO,), 10.9)
+    assert not in_step.is_doubtful((ONE,), 1.0 + LAPSE)

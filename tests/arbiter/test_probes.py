@@ -197,6 +197,19 @@ def test_r11_a_quarter_of_a_pause_is_earned_as_far_as_it_is_longer_than_a_probe(
     assert budget.tokens == pytest.approx(0.1)
 
 
+def test_r11_pauses_of_a_line_that_are_shorter_than_a_probe_earn_nothing_however_many_they_are() -> None:
+    bench = Bench()
+    live, budget = up(bench), bench.arbiter.dispatcher.probes.budget
+    budget.tokens, budget.probe = 0.0, PROBE_COST
+    for element in range(1, 11):
+        bench.wait(0.9 * PROBE_COST)
+        bench.served(bench.ask(live, hcp2.Read(element)))
+    assert budget.tokens == 0.0
+    bench.wait(2 * PROBE_COST)
+    bench.served(bench.ask(live))
+    assert budget.tokens > 0.0
+
+
 @pytest.mark.parametrize("looks", [1, 2, 11])
 def test_r11_a_pause_earns_as_much_however_often_it_is_looked_at(looks: int) -> None:
     budget = ProbeBudget(0.0)

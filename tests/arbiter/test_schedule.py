@@ -269,6 +269,7 @@ def test_no_offset_is_quieter_than_the_one_chosen(others: list[tuple[float, floa
         polls[-1].base = phase * other_period
     poll = Poll("new", period, cost=0.01)
     offset = at_once(quietest_offset(poll, polls, 0.0))
+    assert 0 <= offset < period
     chosen = overlap(poll, offset, polls, 2.0)
     tried = [overlap(poll, n / 40 * period, polls, 2.0) for n in range(40)]
     assert chosen <= min(tried) + 1e-6
@@ -468,6 +469,16 @@ def test_a_demand_waits_until_the_poll_is_prepared() -> None:
     schedule.demand(poll)
     assert schedule.begin(0.0) == [member]
     assert poll.due == 0.0
+    assert schedule.next_due() == pytest.approx(5.0)
+
+
+def test_a_demand_runs_one_cycle_at_once_and_leaves_the_grid_alone() -> None:
+    poll = Poll("a", 10.0, phase=5.0)
+    [member] = members(1)
+    set_members(poll, [member])
+    schedule = running(poll)
+    schedule.demand(poll)
+    assert schedule.begin(1.0) == [member]
     assert schedule.next_due() == pytest.approx(5.0)
 
 

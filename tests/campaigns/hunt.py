@@ -47,7 +47,7 @@ SHORT = 10**8
 
 def be_hasty() -> None:
     """Learn from a few replies, and forget soon: what is learned is often wrong, and must not matter."""
-    learning.TRUSTED_AFTER, learning.EPOCH = 3, 10
+    learning.TRUSTED_AFTER, learning.TRUSTED_AGAIN_AFTER, learning.EPOCH = 3, 3, 10
 
 
 class Hunt:

@@ -12,6 +12,7 @@ from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.schedule import line_time, set_members
 from busmaster.arbiter.transaction import Poll, Priority, Transaction
 from busmaster.contract.exchange import Command
+from busmaster.contract.learning import Learned
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings
 from busmaster.emulator.device import Delay, Device
@@ -45,7 +46,7 @@ class Load:
         devices: Sequence[Device] | None = None,
         profile: Profile = hcp2.PROFILE,
         settings: LineSettings = LINE,
-        timings: Timings | None = None,
+        timings: Timings | Learned | None = None,
         faults: Faults | None = None,
     ) -> None:
         self.random = random.Random(seed)

@@ -121,6 +121,9 @@ WITHIN = (
     Mix("bytewise", "replies reach the host in pieces", {"split": 0.5}, chunks=True, runs=True),
     Mix("lost", "requests and replies are lost", {"lost": 0.1, "deaf": 0.1}, runs=True),
     Mix("late", "replies begin up to the lateness", {"lost": 0.02}, slow=0.3, runs=True),
+    Mix(
+        "tails", "few replies are later than usual", {"lost": 0.01}, slow=0.002, span=(0.1, 0.97), writes=0.1, runs=True
+    ),
     Mix("cancelled", "callers go away, replies are late", slow=0.3, cancel=0.6, runs=True),
     Mix(
         "garbled",

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
+from busmaster.arbiter import learned
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.transaction import Poll, Priority, Transaction
-from busmaster.contract.profile import LineSettings
+from busmaster.contract.exchange import Command
+from busmaster.contract.learning import LEARNED
+from busmaster.contract.profile import LineSettings, Profile
 from busmaster.emulator.device import Delay, Device
+from busmaster.emulator.faults import Faults
 from busmaster.errors import BacklogFull
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import EmulatedMsc
+from busmaster.registry import make_device
 from busmaster.wire.checks import xor
 from tests.campaigns.loads import EXCHANGE, LINE, REPLY_TIME, Load, quantile
 
@@ -96,6 +103,62 @@ def test_r9_at_120_percent_command_load_the_polls_keep_their_eighth() -> None:
     assert sum(line.good.values()) - before >= 0.95 * 60.0 / EXCHANGE / 8
     assert all(isinstance(command.error, BacklogFull) for command in full)
     assert full
+
+
+# learned reply times
+
+
+@pytest.mark.parametrize("profile", [hcp2.PROFILE, mentor.PROFILE])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_r9_no_wait_exceeds_its_bound_whatever_was_learned_and_whenever_it_proves_wrong(
+    seed: int, profile: Profile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows are learned from a few replies, of nodes that turn slow and quick again, with one frame in ten lost."""
+    monkeypatch.setattr(learned, "TRUSTED_AFTER", 3)
+    monkeypatch.setattr(learned, "TRUSTED_AGAIN_AFTER", 3)
+    monkeypatch.setattr(learned, "EPOCH", 10)
+    devices = [make_device(profile.name, address) for address in profile.addresses[1:5]]
+    line = Load(seed=seed, devices=devices, profile=profile, timings=LEARNED, faults=Faults(lost=0.1))
+    reads = list(profile.checks)[:2]
+    for number, node in enumerate(line.nodes):
+        line.poll_of(str(number), 0.2, [Transaction(node, command) for command in reads])
+    line.run(2.0)
+    times = [0.002, 0.002, 0.03, 0.09]
+
+    def change() -> None:
+        device = line.random.choice(devices)
+        device.delay = Delay(line.random.choice(times))
+
+    line.every(lambda: line.random.expovariate(2.0), change)
+    written: Command[Any] = hcp2.Write(1, (1.0,)) if profile is hcp2.PROFILE else mentor.Write(1, 17, 1)
+    ahead: dict[Transaction, int] = {}
+    shares: list[float] = []
+
+    def ask() -> None:
+        backlog = line.world.arbiter.dispatcher.backlog
+        priority = line.random.choice((Priority.URGENT, Priority.COMMAND, Priority.COMMAND))
+        command: Command[Any] = line.random.choice([*reads, written, written])
+        parked = sum(map(len, line.world.arbiter.dispatcher.writes.queues.values()))
+        waiting = backlog.waiting(priority) + parked
+        ahead[line.ask(line.random.choice(line.nodes), command, priority)] = waiting
+
+    def note(transaction: Transaction) -> None:
+        if transaction in ahead and transaction.attempts == 1:
+            before = ahead.pop(transaction)
+            bounds = line.bounds()  # a lateness that was raised meanwhile counts
+            if transaction.priority is Priority.URGENT:
+                bound = bounds.wait(Priority.URGENT, ahead=before) * (1 if transaction.writes else 1 + MOST_BEFORE)
+            else:
+                bound = bounds.wait(Priority.COMMAND, ahead=before)
+            shares.append((transaction.started - transaction.queued) / bound)
+
+    line.on_completed = note
+    line.every(lambda: line.random.expovariate(1.0), ask)
+    line.run(120.0)
+    assert len(shares) > 60
+    assert max(shares) > 0.05
+    assert any(node.learning is not None and node.learning.returns > 5 for node in line.nodes), "it does prove wrong"
+    assert max(shares) <= 1.0
 
 
 # urgent

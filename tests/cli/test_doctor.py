@@ -106,7 +106,15 @@ class Chatterbox(Device):
 def test_on_a_line_in_order_every_node_is_measured_and_nothing_is_to_be_mended() -> None:
     findings = examined(line_of("hcp2", [hcp2(1), hcp2(2, Delay(0.010, 0.020))]), (1, 2))
     assert findings.wrong == set()
-    assert [finding.topic for finding in findings] == ["open", "silence", "echo", "node 1", "node 2", "windows"]
+    assert [finding.topic for finding in findings] == [
+        "open",
+        "silence",
+        "echo",
+        "node 1",
+        "node 2",
+        "windows",
+        "learning",
+    ]
     assert (
         findings.on("node 1").what == "answers after 2.2 / 2.2 / 2.2 ms (least / median / p99 of 25): read element 1: 0"
     )
@@ -250,6 +258,14 @@ def test_where_nobody_answers_that_is_one_finding() -> None:
     assert findings.on("nodes").what == "no answer from nodes 6, 7 at 57600 8N1"
 
 
+def test_what_learned_windows_would_come_to_is_said() -> None:
+    findings = examined(line_of("hcp2", [hcp2(5, Delay(0.020))]), (5,))
+    assert findings.on("learning").what.startswith("learned windows would be 42 ms at most: a lost reply would hold up")
+    assert "in place of 150 ms" in findings.on("learning").what
+    findings = examined(line_of("hcp2", [hcp2(5, Delay(0.080))]), (5,))
+    assert "no shorter than the one that is set" in findings.on("learning").what
+
+
 @pytest.mark.parametrize(
     ("milliseconds", "wrong", "advice"),
     [(30, False, ""), (70, False, "counted late: a nominal time of 110 ms would fit"), (120, True, "--timeout 365")],
@@ -295,7 +311,7 @@ def test_a_pty_is_examined_and_the_status_is_0_if_all_is_well(busmaster: Command
         done = busmaster("doctor", server.path, *HCP2, "--nodes", "1", "--timeout", "1000")
     assert (done.status, done.err) == (0, "")
     assert [line.split()[1] for line in done.lines if line[:4].strip()] == [
-        *("port", "permission", "holders", "open", "driver", "rs485", "silence", "echo", "node", "windows")
+        *("port", "permission", "holders", "open", "driver", "rs485", "silence", "echo", "node", "windows", "learning")
     ]
 
 

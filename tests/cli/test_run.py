@@ -155,6 +155,8 @@ def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     assert outcome.lines[0].startswith("Slitter: 127.0.0.1:")
     assert [row.split()[0] for row in outcome.lines[1:4]] == ["GROUP", "fast", "slow"]
     assert outcome.lines[4].startswith("it fits: the schedule asks for ")
+    assert outcome.lines[-1].startswith("with 1% of all frames lost it asks for ")
+    assert 'with timing = "learned" (a window of 52 ms) for ' in outcome.lines[-1]
 
 
 def test_plan_says_what_would_fit_where_it_does_not_and_ends_with_1(busmaster: Command, line: Path) -> None:
@@ -167,6 +169,7 @@ def test_plan_says_what_would_fit_where_it_does_not_and_ends_with_1(busmaster: C
     assert [group["group"] for group in plan["groups"]] == ["fast", "slow"]
     assert plan["groups"][0]["values"] == 3
     assert plan["worst_waits"].keys() == {"urgent", "command", "poll", "background"}
+    assert plan["utilisation"] < plan["losses"]["learned_utilisation"] < plan["losses"]["utilisation"]
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from dataclasses import replace
 import anyio
 import pytest
 
+from busmaster.arbiter import learned
 from busmaster.arbiter.counters import DriverErrors
 from busmaster.bus.bus import Bus
 from busmaster.bus.meaning import Meaning
@@ -18,6 +19,7 @@ from busmaster.cli.arguments import View
 from busmaster.cli.messages import Action, Frame
 from busmaster.cli.output import Level
 from busmaster.cli.watching import Watch, count_cycles, json_cycle, plain_cycle
+from busmaster.contract.learning import LEARNED
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.emulator.serve import TcpServer
@@ -218,3 +220,20 @@ async def test_what_the_uart_found_wrong_ends_the_summary_if_there_was_anything(
             "busmaster: uart: 12 framing errors, 1 break, 2 bytes lost in the driver; "
             "`busmaster doctor` says what to look for"
         )
+
+
+@in_virtual_time
+async def test_what_was_learned_of_reply_times_is_in_the_summary_once_it_is_trusted(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learned, "TRUSTED_AFTER", 3)
+    async with Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)]))) as bus:
+        controller = Hcp2Controller(bus, 1, timings=LEARNED)
+        watch = Watch(bus, "test", View())
+        await controller.read(1)
+        watch.summarise()
+        assert "learned" not in capfd.readouterr().err
+        for _ in range(2):
+            await controller.read(1)
+        watch.summarise()
+        assert "busmaster: node 1: learned windows: Read 6.35 ms" in capfd.readouterr().err.splitlines()

@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from busmaster.config import FileError, LineFile, load
@@ -92,6 +92,7 @@ def test_what_goes_out_gives_the_same_points_to_a_file_without_any() -> None:
     label=st.text(min_size=1).filter(str.isprintable),
     factor=st.floats(1e-12, 1e12) | st.integers(1, 10**9),
 )
+@example(unit="a\rb\x7f\x00", name="\x7f", label="=", factor=1e-05)
 def test_any_text_and_any_number_goes_out_and_comes_in_to_the_letter(
     unit: str, name: str, label: str, factor: float
 ) -> None:
@@ -170,6 +171,12 @@ def test_an_empty_cell_says_that_nothing_is_said(form: str) -> None:
     back = take(file(FORMS[form], ""), "node,point,maximum", "w,a,", "w,b,")
     assert [str(change) for change in back.changes] == ["w/a: maximum 1000 -> none"]
     assert tomllib.loads(back.text)["nodes"]["w"]["points"] == {"a": {"item": "10"}, "b": {"item": "11"}}
+
+
+def test_lines_that_go_and_come_at_one_place_do_not_mix() -> None:
+    held = file('points.a.item = "10"\npoints.b.maximum = 5\npoints.b.item = "11"\n', "")
+    back = take(held, "node,point,maximum,unit", "w,b,,", "w,a,,mm")
+    assert tomllib.loads(back.text)["nodes"]["w"]["points"] == {"a": {"item": "10", "unit": "mm"}, "b": {"item": "11"}}
 
 
 def test_a_value_that_does_not_change_keeps_its_spelling() -> None:

@@ -17,6 +17,7 @@ from busmaster.contract.driver import Ending
 from busmaster.contract.exchange import Done, Expect, LaterLeg, Sizes
 from busmaster.contract.items import Bit, Item
 from busmaster.contract.learning import Learned
+from busmaster.contract.places import Changing, Placed, Telling
 from busmaster.contract.profile import Batch, LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
@@ -127,6 +128,12 @@ def test_a_record_never_changes_has_slots_and_is_equal_to_its_twin(record: Any) 
 def test_a_step_has_slots_and_compares_by_value(record: Any) -> None:
     assert replace(record) == record
     assert not hasattr(record, "__dict__")
+
+
+def test_a_read_can_be_asked_for_its_places_and_what_it_tells_and_a_write_for_what_it_changes() -> None:
+    for command in (hcp.Read(1), hcp.Write(1, (5,)), mentor.Read(1, 17), mentor.Write(1, 17, 5)):
+        asked = [isinstance(command, kind) for kind in (Placed, Telling, Changing)]
+        assert asked == [not command.writes, not command.writes, command.writes]
 
 
 def test_a_profile_never_changes() -> None:

@@ -16,7 +16,7 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.profile import LineSettings
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
-from busmaster.planning import Bounds, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan
+from busmaster.planning import Bounds, Losses, Plan, PlannedGroup, PlannedNode, bounds, longest_hold, plan
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -253,6 +253,26 @@ def test_the_plan_tells_the_waits_of_every_class_and_of_every_group() -> None:
     assert prediction.worst_waits[COMMAND] == pytest.approx((1 + 4 + 3) * hold)
     assert [g.worst_wait for g in prediction.groups] == pytest.approx([0.5 + 4 * 8 * 6 * hold, 10.0 + 4 * 8 * 6 * hold])
     assert prediction.groups[0].worst_cycle == pytest.approx(prediction.groups[0].worst_wait + hold)
+
+
+# what lost frames cost
+
+
+def test_what_lost_frames_cost_and_learning_would_spare_is_reckoned() -> None:
+    """A line that is full: what it keeps of its rate is what the benchmark `lossy_line` measures, 58 and 94 to 95 %."""
+    full = planned(group("g", 32 * EXCHANGE, 32))
+    assert full.utilisation == pytest.approx(1.0)
+    assert 1 / full.losses.documented == pytest.approx(0.58, abs=0.1)
+    assert 1 / full.losses.learned == pytest.approx(0.95, abs=0.015)
+    assert full.losses.windows == pytest.approx((0.006, 0.006))
+
+
+def test_learning_spares_nothing_where_replies_take_as_long_as_the_window() -> None:
+    slow = PlannedNode(hcp2.PROFILE, 2, reply_time=0.09)
+    losses = planned(group("g", 10.0, 2, node=slow)).losses
+    assert losses.learned == pytest.approx(losses.documented, rel=0.01)
+    assert losses.windows == (hcp2.PROFILE.timings.read.window,) * 2
+    assert planned().losses == Losses(0.01, 0.0, 0.0, (0.0, 0.0))
 
 
 def test_what_else_may_be_asked_counts_in_the_worst_case() -> None:

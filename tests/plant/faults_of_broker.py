@@ -30,7 +30,7 @@ def killed(plant: Plant) -> None:
     away(plant)
     plant.wait_for_cycles(ENOUGH)
     back(plant)
-    plant.run.heard("mqtt is up again", plant.over_at)
+    plant.run.heard("mqtt is up again", plant.fault_at)
 
 
 def stopped(plant: Plant) -> None:
@@ -38,7 +38,7 @@ def stopped(plant: Plant) -> None:
     plant.run.heard("mqtt is down", plant.fault_at)
     plant.broker.send(signal.SIGCONT)
     plant.over()
-    plant.run.heard("mqtt is up again", plant.over_at)
+    plant.run.heard("mqtt is up again", plant.fault_at)
 
 
 def refuses(plant: Plant) -> None:
@@ -48,7 +48,7 @@ def refuses(plant: Plant) -> None:
     plant.gateway.close()
     plant.broker.kill()
     back(plant)
-    plant.run.heard("mqtt is up again", plant.over_at)
+    plant.run.heard("mqtt is up again", plant.fault_at)
 
 
 def half_open(plant: Plant) -> None:
@@ -57,14 +57,14 @@ def half_open(plant: Plant) -> None:
     plant.gateway.reset()
     plant.gateway.pass_on()
     plant.over()
-    plant.run.heard("mqtt is up again", plant.over_at)
+    plant.run.heard("mqtt is up again", plant.fault_at)
 
 
 def broken_off(plant: Plant) -> None:
     plant.gateway.reset()
     plant.run.heard("mqtt is down", plant.fault_at)
     plant.over()
-    plant.run.heard("mqtt is up again", plant.over_at)
+    plant.run.heard("mqtt is up again", plant.fault_at)
 
 
 def away_at_the_end(plant: Plant) -> str:
@@ -90,7 +90,7 @@ def damaged_spill(plant: Plant) -> str:
         file.write(bytes(range(256)) * 16)
     back(plant)
     plant.start_run()
-    plant.run.heard("is kept as", plant.over_at)
+    plant.run.heard("is kept as", plant.fault_at)
     return note
 
 

@@ -114,7 +114,7 @@ def while_the_line_is_gone(plant: Plant) -> str:
     assert not answer["ok"]
     plant.order("back")
     plant.over()
-    plant.run.heard("the line is up", plant.over_at)
+    plant.run.heard("the line is up", plant.fault_at)
     plant.obeys_commands()
     return f"answered: {answer['error']}"
 
@@ -126,7 +126,7 @@ def to_a_dead_node(plant: Plant) -> str:
     assert not answer["ok"]
     plant.order("on")
     plant.over()
-    plant.run.heard("winder is up", plant.over_at)
+    plant.run.heard("winder is up", plant.fault_at)
     plant.obeys_commands()
     return f"answered: {answer['error']}"
 

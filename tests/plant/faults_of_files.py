@@ -61,7 +61,7 @@ def folder_removed(plant: Plant) -> None:
     plant.run.heard("csv is down", plant.fault_at)
     folder.mkdir()
     plant.over()
-    plant.run.heard("csv is up again", plant.over_at)
+    plant.run.heard("csv is up again", plant.fault_at)
 
 
 def full(*kinds: str) -> Callable[[Plant], None]:
@@ -73,7 +73,7 @@ def full(*kinds: str) -> Callable[[Plant], None]:
         plant.disk.clear()
         plant.over()
         for kind in kinds:
-            plant.run.heard(f"{kind} is up again", plant.over_at)
+            plant.run.heard(f"{kind} is up again", plant.fault_at)
 
     return make
 
@@ -88,8 +88,8 @@ def read_only(plant: Plant) -> None:
     finally:
         subprocess.run(["umount", "-l", str(folder)], check=True)
     plant.over()
-    plant.run.heard("csv is up again", plant.over_at)
-    plant.run.heard("jsonl is up again", plant.over_at)
+    plant.run.heard("csv is up again", plant.fault_at)
+    plant.run.heard("jsonl is up again", plant.fault_at)
 
 
 def mount(*arguments: str) -> None:
@@ -110,7 +110,7 @@ def locked(plant: Plant) -> None:
     other.stdin.close()
     other.wait()
     plant.over()
-    plant.run.heard("sqlite is up again", plant.over_at)
+    plant.run.heard("sqlite is up again", plant.fault_at)
 
 
 def read_for_long(plant: Plant) -> None:
@@ -140,7 +140,7 @@ def no_database(plant: Plant) -> None:
     plant.run.heard("sqlite is down", plant.fault_at)
     path.unlink()
     plant.over()
-    plant.run.heard("sqlite is up again", plant.over_at)
+    plant.run.heard("sqlite is up again", plant.fault_at)
 
 
 def half_a_line(plant: Plant) -> None:
@@ -152,7 +152,7 @@ def half_a_line(plant: Plant) -> None:
         file.write("2026-01-01T00:00:00.000Z,fast,1,win")
     plant.start_run()
     plant.over()
-    plant.run.heard("middle of a line", plant.over_at)
+    plant.run.heard("middle of a line", plant.fault_at)
 
 
 ON_DISK = Site(disk=256, on_disk=("csv", "jsonl"))

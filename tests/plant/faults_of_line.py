@@ -14,7 +14,7 @@ def port_gone(plant: Plant) -> None:
     plant.run.heard("the line is down", plant.fault_at)
     plant.order("back")
     plant.over()
-    plant.run.heard("the line is up", plant.over_at)
+    plant.run.heard("the line is up", plant.fault_at)
 
 
 def drives_killed(plant: Plant) -> None:
@@ -22,7 +22,7 @@ def drives_killed(plant: Plant) -> None:
     plant.run.heard("the line is down", plant.fault_at)
     plant.start_drives()
     plant.over()
-    plant.run.heard("the line is up", plant.over_at)
+    plant.run.heard("the line is up", plant.fault_at)
 
 
 def still_for(seconds: float) -> Fault:
@@ -40,7 +40,7 @@ def node_off(plant: Plant) -> None:
     plant.run.heard(f"{plant.nodes[-1]} is down", plant.fault_at)
     plant.order("on")
     plant.over()
-    plant.run.heard(f"{plant.nodes[-1]} is up", plant.over_at)
+    plant.run.heard(f"{plant.nodes[-1]} is up", plant.fault_at)
 
 
 def node_garbles(plant: Plant) -> None:
@@ -48,7 +48,7 @@ def node_garbles(plant: Plant) -> None:
     plant.run.heard(f"{plant.nodes[-1]} is down", plant.fault_at)
     plant.order("calm")
     plant.over()
-    plant.run.heard(f"{plant.nodes[-1]} is up", plant.over_at)
+    plant.run.heard(f"{plant.nodes[-1]} is up", plant.fault_at)
 
 
 def noise(plant: Plant) -> None:
@@ -64,7 +64,7 @@ def missing_at_start(plant: Plant) -> None:
     plant.run.heard("cannot connect")
     plant.start_drives()
     plant.over()
-    plant.run.heard("the line is up", plant.over_at)
+    plant.run.heard("the line is up", plant.fault_at)
 
 
 def another_master(plant: Plant) -> str:
@@ -92,7 +92,7 @@ def all_nodes_off(plant: Plant) -> None:
     plant.order("on")
     plant.over()
     for node in plant.nodes:
-        plant.run.heard(f"{node} is up", plant.over_at)
+        plant.run.heard(f"{node} is up", plant.fault_at)
 
 
 FAULTS = {

@@ -112,7 +112,7 @@ def stdout_full(plant: Plant) -> None:
     plant.run.heard("standard output is down", plant.fault_at)
     plant.disk.clear()
     plant.over()
-    plant.run.heard("standard output is up again", plant.over_at)
+    plant.run.heard("standard output is up again", plant.fault_at)
 
 
 def stdin_closed(plant: Plant) -> None:
@@ -184,7 +184,7 @@ def capture_full(plant: Plant) -> None:
     plant.run.heard("the capture rests", plant.fault_at)
     plant.disk.clear()
     plant.over()
-    plant.run.heard("the capture goes on", plant.over_at)
+    plant.run.heard("the capture goes on", plant.fault_at)
 
 
 def capture_cut_off(plant: Plant) -> str:

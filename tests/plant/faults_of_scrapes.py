@@ -70,7 +70,7 @@ def port_taken(plant: Plant) -> None:
         plant.start_run()
         plant.run.heard("metrics is down")
     plant.over()
-    plant.run.heard("metrics is up again", plant.over_at)
+    plant.run.heard("metrics is up again", plant.fault_at)
     plant.scrape()
 
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from tests.plant import faults_of_broker, faults_of_commands, faults_of_files, faults_of_line, faults_of_run
 from tests.plant import faults_of_scrapes as scrapes
-from tests.plant.account import counts_of
+from tests.plant.account import Counts, counts_of
 from tests.plant.brokers import PREFIX
 from tests.plant.holdings import Holding, json_lines, of_stdout
 from tests.plant.plant import HOLDERS, SETPOINT, Plant, Site, tail_of
@@ -111,7 +111,7 @@ class LongRun:
     minutes: list[Minute] = field(default_factory=list)
     samples: int = 0
     held: dict[str, Holding] = field(default_factory=dict)
-    counted: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+    counted: dict[str, Counts] = field(default_factory=dict)
     commands: Counter[str] = field(default_factory=Counter)
     scrapes: Counter[str] = field(default_factory=Counter)
     reads: Counter[str] = field(default_factory=Counter)
@@ -216,10 +216,9 @@ def settle(plant: Plant, found: LongRun, starts: list[float], notes: list[tuple[
     if polled.vanished:
         found.problems.append(f"{polled.vanished} cycles were neither polled nor counted as missed")
     for holder in HOLDERS:
-        _, dropped, kept = found.counted[holder]
         lost = found.samples - len(found.held[holder].samples)
-        if lost > dropped + kept:
-            found.problems.append(f"{holder}: {lost} lost, {dropped} counted, {kept} kept on disk")
+        if lost > sum(found.counted[holder]):
+            found.problems.append(f"{holder}: {lost} lost, {found.counted[holder]}")
     found.problems += list(disagreements(found.held))
     found.problems += list(audit_gaps(plant, found))
     found.problems += [line for line in found.told if "Traceback" in line]

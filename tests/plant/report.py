@@ -49,13 +49,14 @@ def long_report(run: LongRun) -> str:
             for number, minute in enumerate(run.minutes, 1)
         ),
         "",
-        "| output | polled | held | lost | counted | kept on disk | twice |",
-        "|---|---:|---:|---:|---:|---:|---:|",
+        "| output | polled | held | no news | dropped | kept on disk | lost, and not counted | twice |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for holder in HOLDERS:
-        held, (_, dropped, kept) = run.held[holder], run.counted[holder]
-        lost = run.samples - len(held.samples)
-        lines.append(f"| {holder} | {run.samples} | {len(held.samples)} | {lost} | {dropped} | {kept} | {held.twice} |")
+        held, (dropped, kept, suppressed) = run.held[holder], run.counted[holder]
+        lost = max(0, run.samples - len(held.samples) - dropped - kept - suppressed)
+        counts = (run.samples, len(held.samples), suppressed, dropped, kept, lost, held.twice)
+        lines.append(f"| {holder} | {' | '.join(map(str, counts))} |")
     for name, counter in (("commands", run.commands), ("scrapes", run.scrapes), ("readings by sqlite3", run.reads)):
         lines.append(f"\n{name}: {', '.join(f'{what} {count}' for what, count in counter.items())}")
     lines += ["", "told:", *(f"    {text}" for text in run.told), *(f"PROBLEM: {text}" for text in run.problems)]

@@ -102,6 +102,12 @@ def test_a_value_is_written_shortest_exact(value: float, text: str) -> None:
     assert Write(1, 21, value).text == text
 
 
+@pytest.mark.parametrize(("menu", "number"), [(0, 0), (99, 99)])
+def test_menus_and_their_parameters_go_from_0_to_99(menu: int, number: int) -> None:
+    for command in (Read(menu, number), Write(menu, number, 5)):
+        assert b"%02d%02d" % (menu, number) in command.open(12, PROFILE.timings).request
+
+
 def told(story: Callable[[CtAnsiDrive], Coroutine[Any, Any, None]], **options: Any) -> None:
     async def main() -> None:
         async with Bus(MemoryPort(Line(PROFILE.line, [EmulatedCtAnsi(12), EmulatedCtAnsi(13)]))) as bus:

@@ -119,7 +119,17 @@ def test_a_reply_cut_short_says_how_short() -> None:
 
 @pytest.mark.parametrize(
     ("parameter", "limits"),
-    [(0, {}), (256, {}), (-1, {}), (121, {"maximum": 120}), (1.5, {}), (True, {}), ("1", {}), (5, {"maximum": 256})],
+    [
+        (0, {}),
+        (256, {}),
+        (-1, {}),
+        (121, {"maximum": 120}),
+        (1.5, {}),
+        (True, {}),
+        ("1", {}),
+        (5, {"maximum": 256}),
+        (5, {"minimum": 2}),
+    ],
 )
 def test_a_parameter_that_the_drive_does_not_have_is_never_sent(parameter: int, limits: dict[str, int]) -> None:
     for build in (lambda: Read(parameter, **limits), lambda: Write(parameter, 0, **limits)):

@@ -53,7 +53,9 @@ def test_a_data_table_is_read_and_what_is_around_it_is_not() -> None:
 
 
 def test_a_table_that_goes_on_under_another_title_is_read_on() -> None:
-    assert table("a 2008", "", "\f PRESS.MAC listing", " 0001 stop", "Data Table (continued)", "b 2012") == {
+    assert table(
+        "a 2008", "", "\f PRESS.MAC listing", " 0001 stop", "Data Table (continued)", "SYMBOL ADDRESS", "b 2012"
+    ) == {
         "a": 2008,
         "b": 2012,
     }

@@ -272,28 +272,32 @@ def test_a_program_that_does_not_read_loses_its_own_news_and_nothing_else() -> N
     asyncio.run(run())
 
 
-def test_a_program_that_does_not_read_its_answers_is_not_read_either(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("busmaster.service.outbox.MOST_WAITING", 3)
+def test_a_program_that_does_not_read_its_answers_is_not_read_either() -> None:
+    async def run() -> None:
+        free = asyncio.Event()
 
-    async def story(line: Served, remote: RemoteBus) -> None:
-        async with raw(line, max_queue=1) as client:
-            client.connection.transport.pause_reading()
+        async def send(text: str) -> None:
+            await free.wait()
 
-            async def flood() -> None:
-                for number in range(2, 10_000_000):
-                    await client.say(id=number, method="statistics", params={})
+        outbox = Outbox(send, print)
+        running = asyncio.ensure_future(outbox.run())
+        taken = 0
 
-            flooding = asyncio.ensure_future(flood())
-            await until(lambda: line.service.clients[-1].outbox.waiting >= 3)
-            for _ in range(20):
-                assert await Hcp2Controller(remote, 5).read(1) == 0
-                assert line.service.clients[-1].outbox.waiting <= 4
-            flooding.cancel()
-            client.connection.transport.abort()
+        async def take() -> None:
+            nonlocal taken
+            for taken in range(1, 2 * messages.MOST_WAITING):
+                outbox.put("an answer")
+                await outbox.room()
 
-    on_a_served_line(tmp_path, story)
+        taking = asyncio.ensure_future(take())
+        await until(lambda: outbox.waiting >= messages.MOST_WAITING)
+        assert taken == messages.MOST_WAITING
+        free.set()
+        await taking
+        assert taken > messages.MOST_WAITING
+        running.cancel()
+
+    asyncio.run(run())
 
 
 def test_a_thousand_programs_come_and_go_as_they_like_and_leave_nothing(tmp_path: Path) -> None:
