@@ -33,6 +33,7 @@ from busmaster.transport.tcp import TcpPort
 
 NODE_KEYS = ("protocol", "address", "timing", "retries", "reply_time", "template", "points")
 """What every node's table may say; its kind's options come to it."""
+TABLES = ("protocols", "nodes", "groups", "outputs", "safe", "service", "emulator")
 PRIORITIES = {"poll": Priority.POLL, "background": Priority.BACKGROUND}
 
 
@@ -101,10 +102,7 @@ def load(path: str | os.PathLike[str]) -> LineFile:
 def read(source: Source) -> LineFile:
     """Read what a source says of a line. Raises FileError, naming line and key, for what is wrong in it."""
     top = Table(source)
-    top.only(
-        *("title", "port", "strict", "timing", "learned", "protocols", "nodes", "groups", "outputs", "safe", "service"),
-        "emulator",
-    )
+    top.only("title", "port", "strict", "timing", "learned", *TABLES)
     nodes = {node.name: node for node in _nodes(top, _defaults(top))}
     groups = {table.name: _group(table) for table in top.tables("groups")}
     file = LineFile(

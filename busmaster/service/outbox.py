@@ -35,6 +35,8 @@ class Outbox:
         self._flushed = asyncio.Event()
         self._sent = asyncio.Event()
         self._sending = False
+        self._over = False
+        """Whether nothing can be sent any more: nobody is to wait for that."""
 
     @property
     def empty(self) -> bool:
@@ -75,18 +77,26 @@ class Outbox:
 
     async def room(self) -> None:
         """Return when not too much waits: what a client asks that does not read the answers is not read either."""
-        while self.waiting >= MOST_WAITING:
+        while self.waiting >= MOST_WAITING and not self._over:
             self._sent.clear()
             await self._sent.wait()
 
     async def flushed(self) -> None:
         """Return when all that was put in has been handed over."""
-        while not self.empty:
+        while not (self.empty or self._over):
             self._flushed.clear()
             await self._flushed.wait()
 
     async def run(self) -> None:
         """Send what is put in, one after the other, until the connection is lost."""
+        try:
+            await self._send_all()
+        finally:
+            self._over = True
+            self._sent.set()
+            self._flushed.set()
+
+    async def _send_all(self) -> None:
         while True:
             while self._letters:
                 letter = self._letters.popleft()

@@ -285,7 +285,8 @@ def test_a_program_that_does_not_read_its_answers_is_not_read_either() -> None:
 
         async def take() -> None:
             nonlocal taken
-            for taken in range(1, 2 * messages.MOST_WAITING):
+            while taken < 2 * messages.MOST_WAITING:
+                taken += 1
                 outbox.put("an answer")
                 await outbox.room()
 
@@ -298,6 +299,27 @@ def test_a_program_that_does_not_read_its_answers_is_not_read_either() -> None:
         running.cancel()
 
     asyncio.run(run())
+
+
+def test_a_program_that_is_lost_while_it_does_not_read_leaves_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.service.outbox.MOST_WAITING", 3)
+
+    async def story(line: Served) -> None:
+        async with raw(line, max_queue=1) as client:
+
+            async def flood() -> None:
+                for number in range(2, 10_000_000):
+                    await client.say(id=number, method="statistics", params={})
+
+            flooding = asyncio.ensure_future(flood())
+            await until(lambda: line.service.clients[0].outbox.waiting >= 3)
+            client.connection.transport.abort()
+            await asyncio.gather(flooding, return_exceptions=True)
+            await line.alone()
+
+    on_a_line(tmp_path, story)
 
 
 def test_a_thousand_programs_come_and_go_as_they_like_and_leave_nothing(tmp_path: Path) -> None:
