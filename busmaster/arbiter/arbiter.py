@@ -81,8 +81,7 @@ class Arbiter(LineMachine):
         What it may still have on the wire runs out, and what it owes stays owed.
         """
         self.dispatcher.nodes.remove(node)
-        if not self.dispatcher.writes.queues.get(node):
-            self.dispatcher.writes.queues.pop(node, None)
+        self.dispatcher.writes.forget_empty()
         self.dispatcher.probes.plan()
 
     def name_node(self, node: NodeRecord, label: str) -> None:

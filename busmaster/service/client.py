@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Hashable, Mapping
+from functools import partial
 from typing import Any
 
 from busmaster.arbiter.health import NodeRecord
@@ -193,7 +194,8 @@ class Client:
             self._refuse(number, InvalidCommand(f"request: {type(error).__name__}: {error}"))
         else:
             self._errands[number] = errand
-            self._running[number] = asyncio.ensure_future(self._run(number, errand))
+            self._running[number] = task = asyncio.ensure_future(self._run(number, errand))
+            task.add_done_callback(partial(self._ended, number, errand))
 
     async def _run(self, number: int, errand: Errand) -> None:
         try:
@@ -204,8 +206,10 @@ class Client:
         except Exception as bug:  # of a protocol: the client is told, and the line goes on
             self._log.exception("a request of %s failed", self.peer)
             self._refuse(number, errand.unforeseen(bug))
-        finally:
-            del self._running[number], self._errands[number]
+
+    def _ended(self, number: int, errand: Errand, _: object) -> None:
+        del self._running[number], self._errands[number]
+        errand.give_up()  # a task that is cancelled before its first step runs nothing of it
 
     def _say(self, message: Mapping[str, Any]) -> None:
         self.outbox.put(written(message))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Collection, Hashable, Mapping
 from typing import Any, Protocol, cast
 
@@ -87,6 +88,7 @@ class Errand:
         self._stops_seen = stops_seen
         self._stop = stop
         self._asked = asked
+        self._begun = False
 
     @classmethod
     def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
@@ -108,7 +110,7 @@ class Errand:
             line=line,
             peer=asker.peer,
             stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
-            stop=params.get("stop") is True,
+            stop=params.get("stop") is True and _check_stop(node, command),
             asked=min(now, seconds(params.get("asked", now), "asked")),
         )
 
@@ -118,6 +120,7 @@ class Errand:
 
     async def run(self) -> Any:
         """Run it and return its value. Raises BusError or InvalidCommand; every write passes the gate."""
+        self._begun = True
         if not self.command.writes:
             return await self._request()
         wish = self._wish()
@@ -133,6 +136,11 @@ class Errand:
             raise
         passage.end(None)
         return value
+
+    def give_up(self) -> None:
+        """Keep the record of a write that was given up before it was run."""
+        if self.command.writes and not self._begun:
+            self._line.gate.begin(self._wish()).end(self._truth(asyncio.CancelledError()))
 
     def unforeseen(self, bug: Exception) -> BusError:
         """Return the error for a request that failed by a mistake in the program."""
@@ -179,6 +187,14 @@ class Errand:
                 value = _value(point, changes, value)
         point = point or Point(self.node, self.text, command)
         return Wish(door=DOOR, by=str(self._peer), name=point.key, point=point, value=value)
+
+
+def _check_stop(node: Node, command: Command[Any]) -> bool:
+    """Return True for what stops. Raises InvalidCommand for what does more: a stop passes whatever the limits."""
+    changes = command.changes(node.profile) if isinstance(command, Changing) else {"": None}
+    if any(value != 0 for value in changes.values()):
+        raise InvalidCommand(f"{node.label}: {command} is no stop, which writes 0 and nothing else: leave out `stop`")
+    return True
 
 
 def _value(point: Point[Any], changes: Mapping[Hashable, Any], otherwise: Any) -> Any:

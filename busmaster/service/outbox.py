@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Awaitable, Callable, Hashable
 
 from busmaster.service.messages import MOST_UNREAD, MOST_WAITING
@@ -12,9 +12,8 @@ from busmaster.service.messages import MOST_UNREAD, MOST_WAITING
 class _Letter:
     __slots__ = ("key", "text")
 
-    def __init__(self, text: str | None, key: Hashable = None) -> None:
+    def __init__(self, text: str, key: Hashable = None) -> None:
         self.text = text
-        """None of one that was dropped."""
         self.key = key
 
 
@@ -28,7 +27,7 @@ class Outbox:
     def __init__(self, send: Callable[[str], Awaitable[None]], on_drop: Callable[[Hashable], None]) -> None:
         self._send = send
         self._on_drop = on_drop
-        self._letters: deque[_Letter] = deque()
+        self._letters: OrderedDict[_Letter, None] = OrderedDict()  # one that is dropped is taken out from between
         self._news: deque[_Letter] = deque()
         self._latest: dict[Hashable, _Letter] = {}
         self._something = asyncio.Event()
@@ -65,14 +64,14 @@ class Outbox:
         """Say this of one of its streams, unless it does not keep up."""
         while len(self._news) >= MOST_UNREAD:
             oldest = self._news.popleft()
-            oldest.text = None
+            del self._letters[oldest]
             self._on_drop(oldest.key)
         letter = _Letter(text, key)
         self._news.append(letter)
         self._add(letter)
 
     def _add(self, letter: _Letter) -> None:
-        self._letters.append(letter)
+        self._letters[letter] = None
         self._something.set()
 
     async def room(self) -> None:
@@ -99,9 +98,7 @@ class Outbox:
     async def _send_all(self) -> None:
         while True:
             while self._letters:
-                letter = self._letters.popleft()
-                if letter.text is None:
-                    continue
+                letter, _ = self._letters.popitem(last=False)
                 if self._news and self._news[0] is letter:
                     self._news.popleft()
                 elif self._latest.get(letter.key) is letter:

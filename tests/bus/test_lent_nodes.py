@@ -9,6 +9,7 @@ import pytest
 from busmaster import Bus, Hcp2Controller, MemoryPort, Node
 from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand, NoReply
+from busmaster.protocols.hcp2.codec import Write
 from busmaster.registry import find, make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 
@@ -85,5 +86,22 @@ def test_another_protocol_may_be_lent_once_the_line_has_no_node_of_the_first() -
                 Hcp2Controller(bus, 5)
             bus.give_back(lent)
             assert await Hcp2Controller(bus, 5).read(1) == 0
+
+    run_in_virtual_time(run())
+
+
+def test_no_queue_is_kept_of_nodes_that_were_given_back() -> None:
+    async def run() -> None:
+        async with bus_with(5) as bus:
+            own = Hcp2Controller(bus, 5)
+            for address in (8, 9, 10):
+                lent = bus.lend_node(PROFILE, address)
+                writing = asyncio.ensure_future(lent.request(Write(1, (1,)), retries=0))
+                await asyncio.sleep(0.01)
+                writing.cancel()  # it is on the wire, and ends after its node has left
+                bus.give_back(lent)
+                await own.read(1)
+            bus.give_back(bus.lend_node(PROFILE, 11))
+            assert not own.node.shared.arbiter.dispatcher.writes.queues
 
     run_in_virtual_time(run())
