@@ -89,7 +89,7 @@ def owners() -> Iterator[Owner]:
     for folder in (*filter(_is_ours, [_folder()]), SYSTEM, *_inside(SYSTEM)):
         for path in sorted(folder.glob("*.line")):
             owner = _read(path)
-            if owner is not None and owner.socket not in seen and _listens(owner):
+            if owner is not None and owner.socket not in seen and _listens(owner.socket):
                 seen.add(owner.socket)
                 yield owner
 
@@ -147,6 +147,8 @@ class ServedSocket:
             try:
                 self._listen()
             except BaseException:
+                with contextlib.suppress(OSError):
+                    self._line.unlink()
                 os.close(self._lock)
                 raise
         except OSError as error:
@@ -188,17 +190,30 @@ class ServedSocket:
         with contextlib.suppress(FileNotFoundError):
             if not stat.S_ISSOCK(self._path.lstat().st_mode):
                 raise InvalidCommand(f"{self._path} is no socket: it is left alone")
+            if _listens(self._path):
+                raise InvalidCommand(f"{self._path} is the socket of another program: it is left alone")
             self._path.unlink()
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        try:
+            self._bind()
+        except BaseException:
+            self.socket.close()
+            raise
+
+    def _bind(self) -> None:
         before = os.umask(0o177)
         try:
             self.socket.bind(str(self._path))
         finally:
             os.umask(before)
-        if self._group is not None:
-            os.chown(self._path, -1, self._group)
-        os.chmod(self._path, self._mode)
-        self.socket.listen()
+        try:
+            if self._group is not None:
+                os.chown(self._path, -1, self._group)
+            os.chmod(self._path, self._mode)
+            self.socket.listen()
+        except BaseException:
+            self._path.unlink()
+            raise
 
 
 def _read(path: Path) -> Owner | None:
@@ -209,12 +224,12 @@ def _read(path: Path) -> Owner | None:
         return None
 
 
-def _listens(owner: Owner) -> bool:
+def _listens(path: Path | str) -> bool:
     """Return whether somebody listens there; True too where this user may not ask."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.setblocking(False)
         try:
-            probe.connect(owner.socket)
+            probe.connect(str(path))
         except (ConnectionRefusedError, FileNotFoundError):
             return False
         except OSError:

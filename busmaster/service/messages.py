@@ -30,6 +30,9 @@ MOST_POINTS = 1000
 HELLO_WITHIN = 10.0
 """Seconds in which a client's first message has to come."""
 
+LONGEST_REPLY = 5.0
+"""Seconds for which a program may have the line wait for a reply: nothing else is sent meanwhile."""
+
 PARSE_ERROR, INVALID_REQUEST, NO_METHOD, INVALID_PARAMS, INTERNAL, BUS_ERROR = (
     -32700,
     -32600,
@@ -104,9 +107,14 @@ def timings_of(said: Any) -> Timings | Learned | None:
             if isinstance(document, Learned):
                 raise TypeError("learned twice")
             return Learned(document)
-        return Timings(**{leg: ReplyTiming(**timing) for leg, timing in said.items()})
+        legs = {leg: ReplyTiming(**timing) for leg, timing in said.items()}
+        times = Timings(**legs)
     except (TypeError, KeyError) as error:
         raise InvalidCommand(f"these are no reply times: {error}") from None
+    for leg in legs.values():
+        if max(leg.lateness, leg.byte_gap, leg.turnaround, leg.silence or 0.0) > LONGEST_REPLY:
+            raise InvalidCommand(f"a program may have the line wait {LONGEST_REPLY:g} s for a reply, and no longer")
+    return times
 
 
 def _said_timing(timing: ReplyTiming) -> dict[str, float]:

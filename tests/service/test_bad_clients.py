@@ -16,6 +16,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, Service, connect
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.line import Line
 from busmaster.errors import BacklogFull, InvalidCommand
 from busmaster.service import messages
@@ -404,7 +405,40 @@ def test_only_what_stops_passes_the_limits_as_a_stop(tmp_path: Path) -> None:
     on_a_line(tmp_path, story)
 
 
+def test_a_program_cannot_have_the_line_wait_as_long_as_it_likes(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        long = Timings.uniform(ReplyTiming(0.01, 0.01, messages.LONGEST_REPLY + 1, 0.01))
+        with pytest.raises(InvalidCommand, match="may have the line wait 5 s"):
+            await Hcp2Controller(remote, ABSENT, timings=long).read(1)
+        assert line.bus.nodes == ()
+
+    on_a_served_line(tmp_path, story)
+
+
 # the socket
+
+
+def test_the_socket_of_another_program_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "other.sock"
+    with socket.socket(socket.AF_UNIX) as other, socket.socket(socket.AF_UNIX) as friend:
+        other.bind(str(path))
+        other.listen()
+        with pytest.raises(InvalidCommand, match="another program: it is left alone"):
+            ServedSocket(Owner("other", "x", str(path), 1)).__enter__()
+        friend.connect(str(path))
+    assert os.listdir(tmp_path) == ["other.sock"]
+
+
+def test_a_socket_that_cannot_be_given_to_its_group_is_not_left_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def chown(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "chown", chown)
+    with pytest.raises(InvalidCommand, match="cannot be served: Operation not permitted"):
+        ServedSocket(Owner("line", "x", str(tmp_path / "line.sock"), 1), group=1).__enter__()
+    assert os.listdir(tmp_path) == []
 
 
 def test_a_socket_is_this_users_alone_unless_it_is_given_to_a_group(tmp_path: Path) -> None:
