@@ -17,13 +17,15 @@ from busmaster.protocols.modbus.codec import PROFILE
 MOST = 0.4
 """Milliseconds that a remote read may take more than a local one."""
 WARM_UP = 20
+DELAY = 0.002
+"""Seconds, always the same, that the unit takes to reply."""
 
 
 def run(options: Options) -> Outcome:
     outcome = Outcome()
     local: list[float] = []
     remote: list[float] = []
-    with ServedLine(UNIT) as line:
+    with ServedLine(UNIT, delay={"low": DELAY}) as line:
         owner = Apart("benchmarks.owned_line", paced=False)
         try:
             address = owner.ask({"port": line.path})
