@@ -169,7 +169,7 @@ class Link:
 
     def _drop(self, asked: Asked) -> None:
         """Wait for it no longer, and have it cancelled there."""
-        if self._asked.pop(asked.number, None) is not None:
+        if self._asked.pop(asked.number, None) is not None and asked.handed:
             self.tell("cancel", {"id": asked.number})
 
     def _overdue(self, asked: Asked) -> None:
@@ -194,6 +194,8 @@ class Link:
                 while self._waiting:
                     text, asked = self._waiting.popleft()
                     if asked is not None:
+                        if asked.future.done():
+                            continue  # nobody waits for it any more: it is not even said
                         asked.handed = True
                     await self._connection.send(text)
                 self._something.clear()

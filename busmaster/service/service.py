@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 HOSTS = ("localhost", "busmaster")
 """What a client calls us: a page that was tricked into asking here would say another name."""
+READ_AT_ONCE = 4096
+"""Bytes of a connection that are taken in one turn of the line's loop: of small messages it holds hundreds."""
 CLOSE_WITHIN = 1.0
 """Seconds that a client has to hear the last of it."""
 POLICY, GOING_AWAY = 1008, 1001
@@ -201,6 +203,7 @@ class Service:
 
     async def _serve(self, connection: ServerConnection) -> None:
         peer = peer_of(connection.transport.get_extra_info("socket"))
+        connection.transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]
         self._count += 1
 
         def drop(stream: object) -> None:
@@ -215,6 +218,7 @@ class Service:
             async for text in connection:
                 client.take(read(text))
                 await client.outbox.room()
+                await asyncio.sleep(0)  # what came together is taken one by one: the line goes between
         except (Malformed, TimeoutError) as error:
             self.refused += 1
             code = error.code if isinstance(error, Malformed) else INVALID_PARAMS

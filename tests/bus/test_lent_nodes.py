@@ -102,6 +102,6 @@ def test_no_queue_is_kept_of_nodes_that_were_given_back() -> None:
                 bus.give_back(lent)
                 await own.read(1)
             bus.give_back(bus.lend_node(PROFILE, 11))
-            assert not own.node.shared.arbiter.dispatcher.writes.queues
+            assert not Node.of(own).shared.arbiter.dispatcher.writes.queues
 
     run_in_virtual_time(run())

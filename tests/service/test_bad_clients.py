@@ -16,7 +16,6 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, Service, connect
-from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.line import Line
 from busmaster.errors import BacklogFull, InvalidCommand
 from busmaster.service import messages
@@ -273,23 +272,6 @@ def test_a_program_that_does_not_read_loses_its_own_news_and_nothing_else() -> N
     asyncio.run(run())
 
 
-def test_news_that_were_dropped_take_no_memory() -> None:
-    async def run() -> None:
-        async def send(_: str) -> None:
-            await asyncio.Event().wait()
-
-        outbox = Outbox(send, lambda _: None)
-        running = asyncio.ensure_future(outbox.run())
-        outbox.put("an answer that is not read")
-        await asyncio.sleep(0)
-        for number in range(10 * messages.MOST_UNREAD):
-            outbox.put_news(7, f"news {number}")
-        assert outbox.waiting == messages.MOST_UNREAD + 1
-        running.cancel()
-
-    asyncio.run(run())
-
-
 def test_a_program_that_does_not_read_its_answers_is_not_read_either() -> None:
     async def run() -> None:
         free = asyncio.Event()
@@ -374,71 +356,7 @@ def test_a_thousand_programs_come_and_go_as_they_like_and_leave_nothing(tmp_path
     on_a_served_line(tmp_path, story)
 
 
-def test_a_write_that_is_cancelled_as_it_comes_is_on_record_and_leaves_nothing(tmp_path: Path) -> None:
-    async def story(line: Served, remote: RemoteBus) -> None:
-        controller = Hcp2Controller(remote, 5)
-        await controller.read(1)
-        for _ in range(3):
-            writing = asyncio.ensure_future(controller.write(1, 7))
-            await asyncio.sleep(0)
-            writing.cancel()  # both are sent at once, and so taken before the request's first step
-            await asyncio.gather(writing, return_exceptions=True)
-        assert await remote.groups() == ()
-        await until(lambda: len(line.records) == 3)
-        assert line.audit() == [("5/write element 1 = 7", "not started")] * 3
-        assert line.service.clients[0].errands == ()
-        assert await Hcp2Controller(line.bus, 5).read(1) == 0
-
-    on_a_served_line(tmp_path, story)
-
-
-def test_only_what_stops_passes_the_limits_as_a_stop(tmp_path: Path) -> None:
-    async def story(line: Served) -> None:
-        own = Hcp2Controller(line.bus, 5)
-        own.point("1").limit(maximum=10)
-        async with raw(line) as client:
-            write = {"command": "write", "element": 1, "values": [11.0]}
-            said = await client.ask("request", protocol="hcp2", address=5, command=write, stop=True)
-            assert "is no stop" in said["error"]["message"]
-        assert await own.read(1) == 0
-
-    on_a_line(tmp_path, story)
-
-
-def test_a_program_cannot_have_the_line_wait_as_long_as_it_likes(tmp_path: Path) -> None:
-    async def story(line: Served, remote: RemoteBus) -> None:
-        long = Timings.uniform(ReplyTiming(0.01, 0.01, messages.LONGEST_REPLY + 1, 0.01))
-        with pytest.raises(InvalidCommand, match="may have the line wait 5 s"):
-            await Hcp2Controller(remote, ABSENT, timings=long).read(1)
-        assert line.bus.nodes == ()
-
-    on_a_served_line(tmp_path, story)
-
-
 # the socket
-
-
-def test_the_socket_of_another_program_is_left_alone(tmp_path: Path) -> None:
-    path = tmp_path / "other.sock"
-    with socket.socket(socket.AF_UNIX) as other, socket.socket(socket.AF_UNIX) as friend:
-        other.bind(str(path))
-        other.listen()
-        with pytest.raises(InvalidCommand, match="another program: it is left alone"):
-            ServedSocket(Owner("other", "x", str(path), 1)).__enter__()
-        friend.connect(str(path))
-    assert os.listdir(tmp_path) == ["other.sock"]
-
-
-def test_a_socket_that_cannot_be_given_to_its_group_is_not_left_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def chown(*_: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(os, "chown", chown)
-    with pytest.raises(InvalidCommand, match="cannot be served: Operation not permitted"):
-        ServedSocket(Owner("line", "x", str(tmp_path / "line.sock"), 1), group=1).__enter__()
-    assert os.listdir(tmp_path) == []
 
 
 def test_a_socket_is_this_users_alone_unless_it_is_given_to_a_group(tmp_path: Path) -> None:
