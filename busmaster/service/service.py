@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 HOSTS = ("localhost", "busmaster")
 """What a client calls us: a page that was tricked into asking here would say another name."""
+SEND_WITHIN = 20.0
+"""Seconds in which a client has to take a message: one that stands still is let go, with all that it asked for."""
 READ_AT_ONCE = 4096
 """Bytes of a connection that are taken in one turn of the line's loop: of small messages it holds hundreds."""
 CLOSE_WITHIN = 1.0
@@ -209,7 +211,7 @@ class Service:
         def drop(stream: object) -> None:
             client.dropped[stream] = client.dropped.get(stream, 0) + 1
 
-        client = Client(self, peer, self._count, Outbox(connection.send, drop))
+        client = Client(self, peer, self._count, Outbox(partial(_send, connection), drop))
         self._clients[client] = connection
         sending = asyncio.ensure_future(client.outbox.run())
         try:
@@ -278,6 +280,15 @@ class Service:
                 await client.outbox.flushed()
         except TimeoutError:
             pass
+
+
+async def _send(connection: ServerConnection, text: str) -> None:
+    try:
+        async with asyncio.timeout(SEND_WITHIN):
+            await connection.send(text)
+    except TimeoutError:
+        connection.transport.abort()  # the library's pings wait behind what is not taken, and find nothing out
+        raise
 
 
 def _websockets() -> Any:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import socket
 from pathlib import Path
 
 import pytest
+from websockets.exceptions import ConnectionClosed
 
 from busmaster import Hcp2Controller, RemoteBus
 from busmaster.contract.timing import ReplyTiming, Timings
@@ -144,5 +146,22 @@ def test_messages_that_come_together_are_taken_one_in_a_turn(tmp_path: Path, mon
         await until(lambda: len(taken) >= 1000)
         assert len(set(taken)) == len(taken)
         assert max(sizes) <= READ_AT_ONCE
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_program_that_stands_still_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.service.service.SEND_WITHIN", 0.05)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with raw(line, max_queue=1) as client:
+            client.connection.transport.pause_reading()
+            with contextlib.suppress(ConnectionClosed):
+                while True:
+                    await client.say(id=2, method="statistics", params={})
+                    await asyncio.sleep(0)
+            await until(lambda: len(line.service.clients) == 1)
+            client.connection.transport.abort()
+        assert await Hcp2Controller(remote, 5).read(1) == 0
 
     on_a_served_line(tmp_path, story)
