@@ -56,6 +56,8 @@ if TYPE_CHECKING:
     from busmaster.protocols.modbus.handle import ModbusUnit
     from busmaster.protocols.msc.handle import MscController
     from busmaster.protocols.msc.status import ProgramStatus
+    from busmaster.service.remote import RemoteBus, connect
+    from busmaster.service.service import Service
 
 __all__ = [
     "LEARNED",
@@ -112,11 +114,13 @@ __all__ = [
     "Quality",
     "Quantiles",
     "Refused",
+    "RemoteBus",
     "ReplyTiming",
     "RequestOptions",
     "Requester",
     "Sample",
     "SerialPort",
+    "Service",
     "Snapshot",
     "StatusWord",
     "Stream",
@@ -126,6 +130,7 @@ __all__ = [
     "Timings",
     "VerifyFailed",
     "WriteUnconfirmed",
+    "connect",
     "endpoint",
     "open_line",
 ]
@@ -143,7 +148,10 @@ ON_DEMAND = {
     "ModbusUnit": "busmaster.protocols.modbus.handle",
     "MscController": "busmaster.protocols.msc.handle",
     "ProgramStatus": "busmaster.protocols.msc.status",
+    "RemoteBus": "busmaster.service.remote",
+    "Service": "busmaster.service.service",
     "StatusWord": "busmaster.protocols.hcp2.microflex",
+    "connect": "busmaster.service.remote",
     "open_line": "busmaster.config.line",
 }
 """Public names that a bus alone does not need, and the modules which are imported when these are asked for."""

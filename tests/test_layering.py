@@ -29,6 +29,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "emulator.memory": {"emulator", "transport"} | BASE,
     "registry": {"registry", "bus.handle", "emulator.device", "emulator.traceable", "capture.decode"} | BASE,
     "gate": {"gate", "bus", "arbiter"} | BASE,
+    "service": {"service", "gate", "registry", "bus", "arbiter", "planning"} | BASE,
     "outputs": {"outputs", "gate", "bus", "arbiter"} | BASE,
     "capture": {"capture", "wire", "registry", "arbiter.tap"} | BASE,
     "doctor": {"doctor", "registry", "capture", "transport", "arbiter", "outputs.values"} | BASE,
@@ -73,6 +74,7 @@ OPEN: dict[str, set[str]] = {
     "outputs": {"base", "cells", "distributor", "settings", "values"},
     "planning": {"", "merging"},
     "registry": {""},
+    "service": {"folder", "remote", "service"},
     "transport": {
         *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "serial_port", "tcp"),
     },
@@ -273,7 +275,8 @@ def test_the_checks_see_an_import_inside_a_function_and_skip_one_for_types() -> 
 def test_what_the_core_may_import_outside_the_package_is_its_three_dependencies() -> None:
     """The extras stay optional: nothing below the command line and the outputs needs them."""
     optional = {"click", "rich", "textual", "msgspec", "aiomqtt", "prometheus_client", "matplotlib"}
-    holders = {"cli", "config", "capture", "doctor", "outputs", "testing", "__main__"}
+    optional |= {"websockets"}
+    holders = {"cli", "config", "capture", "doctor", "outputs", "service", "testing", "__main__"}
     for module in modules():
         if module.split(".")[0] in holders:
             continue

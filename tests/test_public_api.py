@@ -19,7 +19,7 @@ import busmaster
 from busmaster import errors
 from tests.patience import PATIENCE
 
-OPTIONAL = ("click", "rich", "msgspec", "textual", "aiomqtt", "prometheus_client", "matplotlib")
+OPTIONAL = ("click", "rich", "msgspec", "textual", "aiomqtt", "prometheus_client", "matplotlib", "websockets")
 
 
 def order(name: str) -> tuple[object, ...]:

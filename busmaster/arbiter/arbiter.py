@@ -75,6 +75,15 @@ class Arbiter(LineMachine):
         self._quarantine = max(self._quarantine, self._up_at + node.lateness + self._leg.latency + self.byte_time)
         return node
 
+    def remove_node(self, node: NodeRecord) -> None:
+        """Probe a node no more, nor ask it anything else by the line's own wish: nobody names it any longer.
+
+        What it may still have on the wire runs out, and what it owes stays owed.
+        """
+        self.dispatcher.nodes.remove(node)
+        self.dispatcher.writes.forget_empty()
+        self.dispatcher.probes.plan()
+
     def name_node(self, node: NodeRecord, label: str) -> None:
         """Have messages call the node by this label."""
         node.label = label

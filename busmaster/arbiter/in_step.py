@@ -73,7 +73,14 @@ class Debt:
 
     def of(self, node: NodeRecord | None, now: float) -> bool:
         """Return whether it could be the answer of this node (None: of any) to a request that is made now."""
-        return now < self.until or (node is not None and self.node is node)
+        return now < self.until or (node is not None and self.is_of(node))
+
+    def is_of(self, node: NodeRecord) -> bool:
+        """Return whether this node owes it: also one that was removed meanwhile, and added again."""
+        own = self.node
+        return own is node or (
+            own is not None and own.address == node.address and own.profile.name == node.profile.name
+        )
 
 
 class InStep:
@@ -158,7 +165,7 @@ class InStep:
 
         `patience` is how long a reply is taken to need, in seconds, of a node whose replies were never timed.
         """
-        self.debts = [debt for debt in self.debts if debt.node is not node]
+        self.debts = [debt for debt in self.debts if not debt.is_of(node)]
         for debt in self.debts:
             if debt.over <= asked and debt.until == inf and _is_silent(debt):
                 debt.until = now + (0.0 if debt.node is None else debt.node.latest(patience))

@@ -28,6 +28,11 @@ class Writes:
         if first.priority > write.priority and first.phase is QUEUED:
             self._backlog.promote(first, write.priority)
 
+    def forget_empty(self) -> None:
+        """Keep no queue of a node to which nothing is written: it may be gone. One that is asked gets a new one."""
+        for node in [node for node, waiting in self.queues.items() if not waiting]:
+            del self.queues[node]
+
     def over(self, write: Transaction) -> None:
         """Note that the write has ended: the next one of its node may go."""
         writes = self.queues[write.node]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Coroutine, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Generator, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, TypeVar
@@ -15,7 +15,7 @@ import anyio._backends._asyncio  # now, not when a line runs: it takes 30 ms
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import CameUnasked, NodeChanged, PortFailed
-from busmaster.arbiter.health import Health
+from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import SLICE
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Tap
@@ -196,6 +196,33 @@ class Bus:
         with those that are on it; and for another profile, timings or retries than the node was first asked with. What
         is None was left open.
         """
+        node = self._find_or_add(profile, address, timings, retries)
+        node.kept = True
+        return node
+
+    def lend_node(
+        self, profile: Profile, address: int, *, timings: Timings | Learned | None = None, retries: int | None = None
+    ) -> Node:
+        """Return the node as `node` does, for somebody who will give it back.
+
+        One that was only ever lent leaves the bus when all who borrowed it have given it back.
+        """
+        node = self._find_or_add(profile, address, timings, retries)
+        node.borrowers += 1
+        return node
+
+    def give_back(self, node: Node) -> None:
+        """Take back a node that was lent: nothing of it is polled or asked any more by whoever gives it back."""
+        node.borrowers -= 1
+        if not (node.kept or node.borrowers):
+            del self._nodes[node.profile.name, node.address]
+            self._line.forget_node(node, node.record)
+            if not any(other.profile.name == node.profile.name for other in self._nodes.values()):
+                del self._profiles[node.profile.name]  # another protocol may be spoken on an empty line
+
+    def _find_or_add(
+        self, profile: Profile, address: int, timings: Timings | Learned | None, retries: int | None
+    ) -> Node:
         self.check_loop()
         profile.check_address(address)
         if timings is not None and not isinstance(timings, Timings | Learned):
@@ -223,6 +250,11 @@ class Bus:
     @property
     def nodes(self) -> tuple[Node, ...]:
         return tuple(self._nodes.values())
+
+    @property
+    def on_stop(self) -> list[Callable[[NodeRecord], None]]:
+        """Return what is told, at once, when a node is told to stop."""
+        return self._line.on_stop
 
     @property
     def groups(self) -> tuple[PollGroup, ...]:
@@ -387,10 +419,14 @@ class Bus:
             del self._groups[group.name]
 
     def _on_event(self, event: BusEvent) -> None:
-        if isinstance(event, NodeChanged) and event.after is Health.DOWN and self._line.limiter is not None:
-            self._line.limiter.forget(self._nodes[event.node.profile.name, event.node.address])
-        if isinstance(event, NodeChanged) and event.returning:
-            self._start(self._run_hook(self._nodes[event.node.profile.name, event.node.address]))
+        if isinstance(event, NodeChanged):
+            node = self._nodes.get((event.node.profile.name, event.node.address))
+            if node is None or node.record is not event.node:
+                return  # it was given back while it was asked something
+            if event.after is Health.DOWN and self._line.limiter is not None:
+                self._line.limiter.forget(node)
+            if event.returning:
+                self._start(self._run_hook(node))
         self._line.logbook.note(event, self.now())
         if not isinstance(event, CameUnasked):
             for stream in self._streams:

@@ -59,6 +59,10 @@ class Limiter:
         if node in self._of:
             self._of[node].known.clear()
 
+    def forget_node(self, node: Requester) -> None:
+        """Hold no limit of this node any more: it is gone."""
+        self._of.pop(node, None)
+
     def check(self, node: Requester, command: Command[Any]) -> None:
         """Raise InvalidCommand, naming node and limit, for what may not be written. Of steps nothing is said."""
         for one in self._reached(node):

@@ -31,7 +31,7 @@ T = TypeVar("T")
 PROBE = RequestOptions(retries=0)
 REPLIES_REMEMBERED = 256
 
-__all__ = ["Health", "Node", "NodeStatistics", "Priority", "Timeline"]
+__all__ = ["Health", "Journey", "Node", "NodeStatistics", "Priority", "Timeline"]
 
 
 class HasNode(Protocol):
@@ -39,6 +39,17 @@ class HasNode(Protocol):
 
     @property
     def node(self) -> Requester: ...
+
+
+class Journey:
+    """How far one request has come."""
+
+    transaction: Transaction | None = None
+
+    @property
+    def sent(self) -> bool:
+        """Whether an attempt of it was handed to the line."""
+        return self.transaction is not None and self.transaction.attempts > 0
 
 
 class Node:
@@ -57,6 +68,10 @@ class Node:
         self._measured = 0
         self._to_all = record.address == record.profile.broadcast
         """Nobody answers at its address."""
+        self.kept = False
+        """Whether the program that owns the line has named it itself."""
+        self.borrowers = 0
+        """How many have it who will give it back."""
         self.returning = asyncio.Lock()
         """Held while its hook runs."""
         self._on_return: Callable[[Node], Awaitable[None]] | None = None
@@ -100,7 +115,7 @@ class Node:
 
     def note_stop(self) -> None:
         """Tell the line that this node is being told to stop: what was decided before must not undo it."""
-        self.shared.arbiter.note_stop(self.record)
+        self.shared.note_stop(self.record)
 
     def now(self) -> float:
         """Return the time of the bus's clock, in seconds."""
@@ -229,14 +244,34 @@ class Node:
         async with limiter.passing(self, command, chosen, chosen.safe) as left:
             return await self._timed(command, left)
 
+    async def followed_request(
+        self,
+        command: Command[T],
+        journey: Journey,
+        *,
+        touches: Command[Any] | None = None,
+        stops_seen: int | None = None,
+        stop: bool = False,
+        **options: Unpack[CommandOptions],
+    ) -> T:
+        """Do what `request` does, and say by `journey`, also once this was cancelled, whether it was ever sent."""
+        chosen, limiter = self._options(options), self.shared.limiter
+        if limiter is None or not command.writes:
+            return (await self._timed(command, chosen, touches, stops_seen, journey))[0]
+        async with limiter.passing(self, command, chosen, stop) as left:
+            return (await self._timed(command, left, touches, stops_seen, journey))[0]
+
     async def _timed(
         self,
         command: Command[T],
         options: RequestOptions,
         touches: Command[Any] | None = None,
         stops_seen: int | None = None,
+        journey: Journey | None = None,
     ) -> tuple[T, Timeline]:
         transaction, future = self._start(command, options, False, touches, stops_seen)
+        if journey is not None:
+            journey.transaction = transaction
         try:
             return await future, transaction.timeline()
         except asyncio.CancelledError:

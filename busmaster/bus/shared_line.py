@@ -16,6 +16,7 @@ from busmaster.bus.alarms import Alarms
 from busmaster.bus.limiter import Limiter
 from busmaster.bus.logbook import Logbook
 from busmaster.bus.points import Point
+from busmaster.bus.requester import Requester
 from busmaster.bus.samples import Sample
 from busmaster.bus.snapshots import Snapshot
 from busmaster.errors import BusClosed, InvalidCommand
@@ -42,6 +43,8 @@ class SharedLine:
         self.thread = 0
         """In which its loop runs; 0 while the bus is not open."""
         self.loop_runs: Callable[[], bool] = lambda: False
+        self.on_stop: list[Callable[[NodeRecord], None]] = []
+        """Told, at once, when a node is told to stop."""
         self.latest_of: dict[str, Snapshot] = {}
         """The latest snapshot of each poll group, by the group's name."""
         self.last_touched = -inf
@@ -112,6 +115,21 @@ class SharedLine:
         return youngest
 
     # nodes
+
+    def note_stop(self, record: NodeRecord) -> None:
+        """Do what `Node.note_stop` does."""
+        self.arbiter.note_stop(record)
+        for told in self.on_stop:
+            told(record)
+
+    def forget_node(self, node: Requester, record: NodeRecord) -> None:
+        """Ask a node nothing more by itself, and forget what is known of it: nobody uses it any more."""
+        self.arbiter.remove_node(record)
+        if self.limiter is not None:
+            self.limiter.forget_node(node)
+        self._written.pop(record, None)
+        for touched in [what for what in self._touched if node in (what if isinstance(what, tuple) else (what,))]:
+            del self._touched[touched]
 
     def suspend(self, record: NodeRecord, seconds: float) -> None:
         """Do what `Node.suspend` does."""

@@ -29,6 +29,8 @@ COMMANDS = (
     "scan",
     "emulate",
     "run",
+    "serve",
+    "status",
     "safe",
     "plan",
     "points",
@@ -90,7 +92,8 @@ def cli() -> None:
 
     PORT is a device path, with options as in a URL (/dev/ttyUSB0?baudrate=9600&parity=E); usb:SERIAL for the USB
     adapter with that serial number, whatever its path; or socket://HOST:PORT for a serial device server that passes
-    raw TCP.
+    raw TCP. `read` and `write` take unix:PATH too, a line that another busmaster serves, and use that service for a
+    PORT that it owns.
     """
 
 

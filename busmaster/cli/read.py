@@ -36,7 +36,7 @@ async def read(
     connection: Connection, address: int, items: tuple[str, ...], how: dict[str, Any], as_json: bool
 ) -> None:
     """Read the items of one node and print each; all are checked before the first is asked for."""
-    bus = connection.open_bus()
+    bus = connection.reach()
     handle = connection.open_handle(bus, address)
     points = [handle.point(item) for item in items]
     async with bus:

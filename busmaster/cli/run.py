@@ -16,6 +16,7 @@ from busmaster.cli.hangups import Hangups
 from busmaster.cli.lines import file_argument, load, other_port, port_option
 from busmaster.cli.output import Level, note, number_text
 from busmaster.cli.safe import tell_unsafe
+from busmaster.cli.serving import served
 from busmaster.cli.systemd import ServiceManager
 from busmaster.cli.watching import Watch, follow
 from busmaster.config import ConfiguredLine, LineFile
@@ -89,6 +90,7 @@ class Running:
         self.left_safely = True
         self._leaving = False
         self._path = path
+        self._view = view
         self._hangups = hangups
         self._ending = ending
         self._watch = Watch(line.bus, line.file.title, view, gate=line.gate, steady=True)
@@ -101,10 +103,11 @@ class Running:
         try:
             async with self.line:
                 entered = True
-                try:
-                    return await self._poll()
-                finally:
-                    await self._leave()
+                async with served(self.line, tell=self._view.silent):
+                    try:
+                        return await self._poll()
+                    finally:
+                        await self._leave()
         finally:
             for counts in self.line.outputs.statistics() if entered else ():
                 note(output_text(counts))

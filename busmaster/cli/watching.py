@@ -102,7 +102,7 @@ class Watch:
             self._begin(tasks, group)
 
     def _begin(self, tasks: TaskGroup, group: PollGroup) -> None:
-        tasks.start_soon(count_cycles if shown_on_screen(self.view) else print_cycles, self, group)
+        tasks.start_soon(count_cycles if shown_on_screen(self.view) or self.view.silent else print_cycles, self, group)
 
     def saw(self, snapshot: Snapshot) -> None:
         """Count one cycle, and keep the good values: a point that fails shows its last one, growing old."""
@@ -388,7 +388,7 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
 
 def wants_screen(view: View) -> bool:
     """Tell whether there is a terminal on both sides, and nobody who would rather have it otherwise."""
-    return not view.plain and not view.as_json and sys.stdout.isatty() and sys.stdin.isatty()
+    return not (view.plain or view.as_json or view.silent) and sys.stdout.isatty() and sys.stdin.isatty()
 
 
 def shown_on_screen(view: View) -> bool:

@@ -52,7 +52,7 @@ def command(
 
 async def write(connection: Connection, address: int, pairs: Pairs, verify: bool, as_json: bool) -> None:
     """Write the pairs to one node, one after another, and print each; all are checked before the first is sent."""
-    bus = connection.open_bus()
+    bus = connection.reach()
     handle = connection.open_handle(bus, address)
     prepared = [(item, handle.prepare_write(item, values, verify=verify)) for item, values in pairs]
     async with bus:

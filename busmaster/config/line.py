@@ -343,6 +343,8 @@ def check_same_line(before: LineFile, after: LineFile) -> None:
     """Raise InvalidCommand where a file says of the port, or of a node, what a line that runs cannot change."""
     if (before.port, before.strict) != (after.port, after.strict):
         raise InvalidCommand("other settings of the port need a restart")
+    if before.service != after.service:
+        raise InvalidCommand("another [service] needs a restart")
     own = {_address(node): node for node in before.nodes.values()}
     for node in after.nodes.values():
         known = before.nodes.get(node.name) or own.get(_address(node))  # renamed, it has other settings

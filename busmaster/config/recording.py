@@ -78,7 +78,7 @@ def _groups(table: Table, key: str, known: Collection[str]) -> tuple[str, ...]:
     return chosen
 
 
-def _mode(table: Table, key: str) -> int:
+def read_mode(table: Table, key: str) -> int:
     """Read who may read and write a new file, as chmod takes it in octal."""
     text = table.text(key)
     if len(text) not in (3, 4) or not set(text) <= set("01234567") or int(text, 8) > 0o777:
@@ -109,7 +109,7 @@ KINDS: Mapping[str, type[Settings]] = {
     "metrics": MetricsSettings,
 }
 READERS: Readers = {
-    "mode": _mode,
+    "mode": read_mode,
     "keep_days": _limit,
     "keep_mb": _limit,
     "prefix": _topic,

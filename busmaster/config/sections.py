@@ -16,6 +16,7 @@ from busmaster.config.point_section import PointSection
 from busmaster.config.ports import read_port
 from busmaster.config.recording import Outputs, read_outputs
 from busmaster.config.safe import SafeSection, read_safe
+from busmaster.config.service import ServiceSection, read_service
 from busmaster.config.source import Source
 from busmaster.config.table import Table
 from busmaster.config.templates import read_points
@@ -32,6 +33,7 @@ from busmaster.transport.tcp import TcpPort
 
 NODE_KEYS = ("protocol", "address", "timing", "retries", "reply_time", "template", "points")
 """What every node's table may say; its kind's options come to it."""
+TABLES = ("protocols", "nodes", "groups", "outputs", "safe", "service", "emulator")
 PRIORITIES = {"poll": Priority.POLL, "background": Priority.BACKGROUND}
 
 
@@ -87,6 +89,7 @@ class LineFile:
     groups: Mapping[str, GroupSection]
     outputs: Outputs
     safe: SafeSection
+    service: ServiceSection
     emulator: EmulatorSection
     table: Table = field(compare=False, repr=False)
 
@@ -99,9 +102,7 @@ def load(path: str | os.PathLike[str]) -> LineFile:
 def read(source: Source) -> LineFile:
     """Read what a source says of a line. Raises FileError, naming line and key, for what is wrong in it."""
     top = Table(source)
-    top.only(
-        "title", "port", "strict", "timing", "learned", "protocols", "nodes", "groups", "outputs", "safe", "emulator"
-    )
+    top.only("title", "port", "strict", "timing", "learned", *TABLES)
     nodes = {node.name: node for node in _nodes(top, _defaults(top))}
     groups = {table.name: _group(table) for table in top.tables("groups")}
     file = LineFile(
@@ -114,6 +115,7 @@ def read(source: Source) -> LineFile:
         groups=groups,
         outputs=read_outputs(top.table("outputs"), groups),
         safe=read_safe(top.table("safe")),
+        service=read_service(top.table("service")),
         emulator=read_emulator(top.table("emulator"), {node.name: node.kind for node in nodes.values()}),
         table=top,
     )

@@ -455,3 +455,16 @@ def test_r15_an_unanswered_check_costs_the_first_one_no_more_than_its_lateness()
     assert asked == [request_of(1), request_of(2), request_of(1)]
     assert isinstance(read.error, NoReply)
     assert bench.now - start < 3 * (REQUEST + 0.150 + TAU) + 0.01
+
+
+def test_r15_what_a_node_owed_that_was_removed_is_not_believed_of_it_once_it_is_added_again() -> None:
+    removed, again, other = (
+        NodeRecord(hcp2.PROFILE, address, hcp2.PROFILE.timings, 0, "the line") for address in (9, 9, 5)
+    )
+    owed = InStep()
+    owed.owe((b"\x02reply",), removed, 0.0, 0.1)
+    owed.answered(other, 1.0, 1.1, 0.0)
+    assert not owed.clashes((b"\x02reply",), 5.0, other), "the channel keeps the order"
+    assert owed.clashes((b"\x02reply",), 5.0, again)
+    owed.answered(again, 6.0, 6.1, 0.0)
+    assert not owed.debts, "a node answers in the order in which it was asked"

@@ -1,0 +1,64 @@
+"""`busmaster status`: the lines that run, and how they are."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import click
+
+from busmaster.cli.app import FAILED, OK
+from busmaster.cli.arguments import json_option
+from busmaster.cli.ending import until_ended
+from busmaster.cli.output import columns, emit, emit_all, json_line, note
+from busmaster.errors import BusError
+from busmaster.service.folder import Owner, owners
+from busmaster.service.remote import connect
+
+ANSWER_WITHIN = 2.0
+"""Seconds in which a program that owns a line has to say how it is."""
+
+
+@click.command(short_help="List this user's lines that run.")
+@json_option
+def command(as_json: bool) -> int:
+    """List the lines that programs of this user serve: name, port, process, programs that use it, how busy it is, and
+    how many of its nodes are up. The exit status is 1 if one does not answer.
+    """
+    return until_ended(status, as_json)
+
+
+async def status(as_json: bool) -> int:
+    """Ask every line how it is, print that, and return the exit status."""
+    lines = await asyncio.gather(*map(ask, owners()))
+    if as_json:
+        emit_all(json_line(**line) for line in lines)
+    elif not lines:
+        note("no line of this user is served: start busmaster run LINE.toml")
+    else:
+        emit(*columns([("NAME", "PORT", "PROCESS", "PROGRAMS", "BUSY", "NODES UP"), *map(cells, lines)], {2, 3, 4, 5}))
+    return FAILED if any(line["error"] for line in lines) else OK
+
+
+async def ask(owner: Owner) -> dict[str, Any]:
+    """Return how a line is, or why its owner does not say so."""
+    line: dict[str, Any] = {"name": owner.name, "port": owner.port, "address": owner.address, "process": owner.pid}
+    line |= {"programs": None, "utilisation": None, "up": None, "nodes": None, "error": None}
+    try:
+        async with asyncio.timeout(ANSWER_WITHIN), connect(owner.address) as remote:
+            nodes = remote.about["nodes"]
+            line["programs"] = remote.about["clients"] - 1  # without this one
+            line["up"] = sum(node["health"] == "up" for node in nodes)
+            line["nodes"] = len(nodes)
+            line["utilisation"] = (await remote.statistics()).utilisation
+    except (BusError, TimeoutError) as error:
+        line["error"] = error.what if isinstance(error, BusError) else "it does not answer"
+    return line
+
+
+def cells(line: dict[str, Any]) -> tuple[str, ...]:
+    """Return a line as the cells of its row."""
+    first = line["name"], line["port"], str(line["process"])
+    if line["error"]:
+        return *first, "", "", line["error"]
+    return *first, str(line["programs"]), f"{line['utilisation']:.1%}", f"{line['up']}/{line['nodes']}"

@@ -1,0 +1,287 @@
+"""One program that has come to the line's owner: what it asks is done here, and ends when it goes."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Hashable, Mapping
+from functools import partial
+from typing import Any
+
+from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.transaction import Priority
+from busmaster.bus.node import Node
+from busmaster.bus.polling import PollGroup
+from busmaster.bus.requester import checked_priority
+from busmaster.contract.arguments import seconds, whole_number
+from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
+from busmaster.service.errands import Errand, Line
+from busmaster.service.failures import said_error
+from busmaster.service.messages import (
+    MOST_NODES,
+    MOST_POINTS,
+    MOST_REQUESTS,
+    MOST_STREAMS,
+    MOST_URGENT,
+    NO_METHOD,
+    Malformed,
+    timings_of,
+    written,
+)
+from busmaster.service.outbox import Outbox
+from busmaster.service.peers import Peer
+from busmaster.service.streams import Broadcast, GroupBroadcast
+from busmaster.service.telling import point_of, protocol_of, said_statistics
+
+NodeKey = tuple[str, int]
+
+
+class Client:
+    """One program with a connection. `take` takes its messages, in their order; `leave` ends all that it asked for."""
+
+    def __init__(self, line: Line, peer: Peer, number: int, outbox: Outbox) -> None:
+        self.peer = peer
+        self.dropped: dict[Hashable, int] = {}
+        """Of each stream, how many messages the client was too slow for."""
+        self.outbox = outbox
+        self._line = line
+        self._number = number
+        self._nodes: dict[NodeKey, Node] = {}
+        self._stops: dict[NodeKey, int] = {}
+        """How often each had been told to stop when this client named it: the client counts from there."""
+        self._refused: dict[NodeKey, str] = {}
+        """Why a node that it named may not be asked as it said; its requests are refused until it names it rightly."""
+        self._running: dict[int, asyncio.Task[None]] = {}
+        self._errands: dict[int, Errand] = {}
+        self._streams: dict[int, Broadcast] = {}
+        self._groups: dict[int, PollGroup] = {}
+        self._log = logging.getLogger("busmaster.service")
+
+    @property
+    def errands(self) -> tuple[Errand, ...]:
+        """Return what it asked for that is not done yet."""
+        return tuple(self._errands.values())
+
+    # what is said to it
+
+    def tell(self, stream: int, method: str, body: str) -> None:
+        """Say something of a stream; it is dropped where the client does not keep up."""
+        dropped = self.dropped.get(stream, 0)
+        head = f'{{"jsonrpc":"2.0","method":"{method}","params":{{"stream":{stream},"dropped":{dropped},"body":'
+        self.outbox.put_news(stream, f"{head}{body}}}}}")
+
+    def tell_surely(self, stream: int, method: str, body: dict[str, Any]) -> None:
+        """Say something of a stream that replaces what was said of it before."""
+        params = {"stream": stream, "dropped": self.dropped.get(stream, 0), "body": body}
+        self.outbox.put_latest((stream, method), written({"method": method, "params": params}))
+
+    def tell_stops(self, node: NodeRecord) -> None:
+        """Say how often a node was told to stop, if this client knows it."""
+        key = (node.profile.name, node.address)
+        if key in self._nodes:
+            params = {"protocol": key[0], "address": key[1], "stops": node.stops - self._stops[key]}
+            self.outbox.put_latest(("stops", key), written({"method": "stops", "params": params}))
+
+    # what it says
+
+    def take(self, said: Mapping[str, Any]) -> None:
+        """Do what a message asks. Raises Malformed for what no client of this version says."""
+        number, method, params = said.get("id"), said.get("method"), said.get("params", {})
+        if not isinstance(method, str) or not isinstance(params, dict):
+            raise Malformed("a message has a method, and its parameters by name")
+        if number is None:
+            try:
+                self._notified(method, params)
+            except TypeError as error:  # a list for a number
+                raise Malformed(f"{method[:40]}: {error}") from None
+            return
+        if isinstance(number, bool) or not isinstance(number, int):
+            raise Malformed("the id of a request is a whole number")
+        if number in self._running:
+            raise Malformed(f"request {number} is under way already")
+        if method == "request":
+            self._begin(number, params)
+            return
+        try:
+            answer = self._answer(method, params)
+        except (BusError, InvalidCommand, Malformed) as error:
+            self._refuse(number, error)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            self._refuse(number, InvalidCommand(f"{method}: {type(error).__name__}: {error}"))
+        else:
+            self._say({"id": number, "result": answer})
+
+    def _notified(self, method: str, params: Mapping[str, Any]) -> None:
+        match method:
+            case "cancel":
+                task = self._running.get(params.get("id", -1))
+                if task is not None:
+                    task.cancel()
+            case "end":
+                self._end_stream(params.get("stream", -1))
+            case "stop":
+                node = self._nodes.get((str(params.get("protocol")), params.get("address", -1)))
+                if node is not None:
+                    node.note_stop()
+
+    def _answer(self, method: str, params: Mapping[str, Any]) -> Any:
+        """Return what a request is answered at once. Raises InvalidCommand, BusError, or Malformed."""
+        match method:
+            case "node":
+                return self._name_node(params)
+            case "statistics":
+                return said_statistics(self._line.bus.statistics())
+            case "groups":
+                return [{"name": group.name, "period": group.period} for group in self._line.bus.groups]
+            case "subscribe":
+                group = next((one for one in self._line.bus.groups if one.name == params["group"]), None)
+                if group is None:
+                    names = ", ".join(one.name for one in self._line.bus.groups) or "none"
+                    raise InvalidCommand(f"no poll group {params['group']!r}; there are: {names}")
+                return self._follow(params, self._line.broadcast_of(group))
+            case "events":
+                return self._follow(params, self._line.events())
+            case "poll":
+                return self._poll(params)
+        raise Malformed(f"no method {method[:40]!r}", NO_METHOD)
+
+    # nodes
+
+    def _name_node(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        key = params["protocol"], params["address"]
+        self._refused.pop(key, None)
+        try:
+            node = self.node(*key, params.get("timings"), params.get("retries"))
+        except InvalidCommand as error:
+            if len(self._refused) < MOST_NODES:
+                self._refused[key] = str(error)
+            raise
+        return {"label": node.label, "health": node.health.value}
+
+    def node(self, name: str, address: int, timings: Any = None, retries: int | None = None) -> Node:
+        """Return a node, which this client has until it leaves. Raises InvalidCommand as `Bus.node` does."""
+        if refused := self._refused.get((name, address)):
+            raise InvalidCommand(refused)
+        known = self._nodes.get((name, address))
+        protocol = protocol_of(name)
+        if known is not None and timings is None and retries is None:
+            return known
+        if known is None and len(self._nodes) >= MOST_NODES:
+            raise InvalidCommand(f"one program names {MOST_NODES} nodes at most")
+        bus = self._line.bus
+        node = bus.lend_node(protocol.profile, address, timings=timings_of(timings), retries=retries)
+        if known is not None:
+            bus.give_back(node)  # it was asked for its complaint alone
+        self._nodes[name, address] = node
+        self._stops.setdefault((name, address), node.stops)
+        return node
+
+    def stops_before(self, node: Node) -> int:
+        """Return how often a node had been told to stop when this client named it."""
+        return self._stops[node.profile.name, node.address]
+
+    # requests
+
+    def _begin(self, number: int, params: Mapping[str, Any]) -> None:
+        try:
+            priority = checked_priority(params.get("options", {}).get("priority", Priority.COMMAND))
+            if len(self._running) >= MOST_REQUESTS + (MOST_URGENT if priority is Priority.URGENT else 0):
+                raise BacklogFull(f"{len(self._running)} requests of this program are not answered yet")
+            errand = Errand.of(params, self, self._line)
+        except (BusError, InvalidCommand) as error:
+            self._refuse(number, error)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            self._refuse(number, InvalidCommand(f"request: {type(error).__name__}: {error}"))
+        else:
+            self._errands[number] = errand
+            self._running[number] = task = asyncio.ensure_future(self._run(number, errand))
+            task.add_done_callback(partial(self._ended, number, errand))
+
+    async def _run(self, number: int, errand: Errand) -> None:
+        try:
+            value = await errand.run()
+            self._say({"id": number, "result": value})
+        except (BusError, InvalidCommand) as error:
+            self._refuse(number, error)
+        except Exception as bug:  # of a protocol: the client is told, and the line goes on
+            self._log.exception("a request of %s failed", self.peer)
+            self._refuse(number, errand.unforeseen(bug))
+
+    def _ended(self, number: int, errand: Errand, _: object) -> None:
+        del self._running[number], self._errands[number]
+        errand.give_up()  # a task that is cancelled before its first step runs nothing of it
+
+    def _say(self, message: Mapping[str, Any]) -> None:
+        self.outbox.put(written(message))
+
+    def _refuse(self, number: int, error: Exception) -> None:
+        if isinstance(error, Malformed):
+            self._say({"id": number, "error": {"code": error.code, "message": str(error)}})
+        else:
+            self._say({"id": number, "error": said_error(error)})
+
+    # streams
+
+    def _follow(self, params: Mapping[str, Any], source: Broadcast) -> dict[str, Any]:
+        stream = whole_number(params["stream"], 0, 2**53, "a stream")
+        if stream in self._streams or len(self._streams) >= MOST_STREAMS:
+            raise InvalidCommand(f"one program has {MOST_STREAMS} streams at most, each with a number of its own")
+        self._streams[stream] = source
+        source.join(self, stream)
+        return {"period": source.group.period} if isinstance(source, GroupBroadcast) else {}
+
+    def _poll(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        points = params["points"]
+        if not isinstance(points, list) or len(points) > MOST_POINTS:
+            raise InvalidCommand(f"a poll group of a program has {MOST_POINTS} points at most")
+        if len(self._groups) >= MOST_STREAMS:
+            raise InvalidCommand(f"one program has {MOST_STREAMS} poll groups at most")
+        read = [point_of(point, self.node) for point in points]
+        if any(point.command.writes for point in read):
+            raise InvalidCommand("a poll group reads: it writes nothing")
+        phase = params.get("phase")
+        group = self._line.bus.poll_group(
+            f"{str(params['name'])[:40]} ({self.peer.program} {self.peer.pid}-{self._number})",
+            period=seconds(params["period"], "a period"),
+            points=read,
+            phase=None if phase is None else seconds(phase, "a phase"),
+            priority=checked_priority(max(Priority.POLL, params.get("priority", Priority.POLL))),
+        )
+        try:
+            answer = self._follow(params, self._line.broadcast_of(group))
+        except BaseException:
+            group.close()
+            raise
+        self._groups[params["stream"]] = group
+        return answer
+
+    def _end_stream(self, stream: int) -> None:
+        source = self._streams.pop(stream, None)
+        if source is not None:
+            source.leave(self, stream)
+        group = self._groups.pop(stream, None)
+        if group is not None:
+            group.close()
+        self.dropped.pop(stream, None)
+
+    # its end
+
+    def release(self) -> None:
+        """Tell it truthfully what becomes of all that it asked for: the service ends, and the bus perhaps with it."""
+        for number, errand in list(self._errands.items()):
+            self._running[number].cancel()
+            unsure = errand.command.writes and errand.journey.sent
+            kind: type[BusError] = WriteUnconfirmed if unsure else BusClosed
+            self._refuse(number, kind("the program that owns the line ends", node=errand.node, command=errand.text))
+
+    async def leave(self) -> None:
+        """End all that it asked for, and give back its nodes."""
+        for stream in list(self._streams):
+            self._end_stream(stream)
+        tasks = list(self._running.values())
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for node in self._nodes.values():
+            self._line.bus.give_back(node)
+        self._nodes.clear()

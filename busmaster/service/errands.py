@@ -1,0 +1,206 @@
+"""One request of a client: a command that is built here again, and so checked again, and runs on the line."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Collection, Hashable, Mapping
+from typing import Any, Protocol, cast
+
+from busmaster.bus.bus import Bus
+from busmaster.bus.node import Journey, Node
+from busmaster.bus.points import Point
+from busmaster.bus.polling import PollGroup
+from busmaster.bus.requester import CommandOptions, RequestOptions
+from busmaster.contract.arguments import seconds
+from busmaster.contract.exchange import Command
+from busmaster.contract.places import Changing, Placed
+from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
+from busmaster.gate.gate import FRESH, Gate, Wish
+from busmaster.service.peers import Peer
+from busmaster.service.streams import Broadcast
+from busmaster.service.telling import protocol_of
+
+OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
+"""Of a request, those that a client may say."""
+DOOR = "service"
+
+
+class Line(Protocol):
+    """What clients share."""
+
+    @property
+    def bus(self) -> Bus: ...
+
+    @property
+    def gate(self) -> Gate: ...
+
+    def broadcast_of(self, group: PollGroup, /) -> Broadcast:
+        """Return what tells the cycles of a poll group."""
+        ...
+
+    def events(self) -> Broadcast:
+        """Return what tells of line and nodes."""
+        ...
+
+    def named(self, node: Node, places: Collection[Hashable], /) -> Point[Any] | None:
+        """Return the point of a poll group that reads these places of a node."""
+        ...
+
+
+class Asker(Protocol):
+    """Who asks for it."""
+
+    @property
+    def peer(self) -> Peer: ...
+
+    def node(self, name: str, address: int, /) -> Node:
+        """Return a node of the line. Raises InvalidCommand."""
+        ...
+
+    def stops_before(self, node: Node, /) -> int:
+        """Return the stops of a node from which this client counts."""
+        ...
+
+
+class Errand:
+    """One command with its options, for one client."""
+
+    def __init__(
+        self,
+        node: Node,
+        command: Command[Any],
+        touches: Command[Any] | None,
+        options: CommandOptions,
+        *,
+        line: Line,
+        peer: Peer,
+        stops_seen: int | None,
+        stop: bool,
+        asked: float,
+    ) -> None:
+        self.node = node
+        self.command = command
+        self.journey = Journey()
+        self._touches = touches
+        self._options = options
+        self._line = line
+        self._peer = peer
+        self._stops_seen = stops_seen
+        self._stop = stop
+        self._asked = asked
+        self._begun = False
+
+    @classmethod
+    def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
+        """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
+        node = asker.node(params["protocol"], params["address"])
+        protocol = protocol_of(params["protocol"])
+        command = protocol.read_back(params["command"])
+        touches = params.get("touches")
+        given = cast("CommandOptions", dict(params.get("options", {})))
+        if not set(given) <= OPTIONS:
+            raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
+        RequestOptions.of(given, node.label)  # checked here, before it may wait
+        now, stops_seen = line.bus.now(), params.get("stops_seen")
+        return cls(
+            node,
+            command,
+            None if touches is None else protocol.read_back(touches),
+            given,
+            line=line,
+            peer=asker.peer,
+            stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
+            stop=params.get("stop") is True and _check_stop(node, command),
+            asked=min(now, seconds(params.get("asked", now), "asked")),
+        )
+
+    @property
+    def text(self) -> str:
+        return str(self.command)
+
+    async def run(self) -> Any:
+        """Run it and return its value. Raises BusError or InvalidCommand; every write passes the gate."""
+        self._begun = True
+        if not self.command.writes:
+            return await self._request()
+        wish = self._wish()
+        passage = self._line.gate.begin(wish)
+        try:
+            if refusal := self._line.gate.refusal(wish):
+                raise InvalidCommand(f"{self.node.label}: {refusal}")
+            if (age := self._line.bus.now() - self._asked) > FRESH:
+                raise NotStarted(f"it came {age:.1f} s after it was asked for", node=self.node, command=self.text)
+            value = await self._request()
+        except BaseException as error:
+            passage.end(self._truth(error))
+            raise
+        passage.end(None)
+        return value
+
+    def give_up(self) -> None:
+        """Keep the record of a write that was given up before it was run."""
+        if self.command.writes and not self._begun:
+            self._line.gate.begin(self._wish()).end(self._truth(asyncio.CancelledError()))
+
+    def unforeseen(self, bug: Exception) -> BusError:
+        """Return the error for a request that failed by a mistake in the program."""
+        what = f"the program that owns the line failed: {type(bug).__name__}: {bug}"
+        kind = WriteUnconfirmed if self.command.writes and self.journey.sent else BusError
+        return kind(what, node=self.node, command=self.text)
+
+    def _truth(self, error: BaseException) -> BaseException:
+        """Return what is kept of a write that ended so: one that was given up may never have been sent."""
+        if isinstance(error, Exception):
+            return error
+        if self.journey.sent:
+            return WriteUnconfirmed("its program gave up before it was answered")
+        return NotStarted("its program gave up before it was sent")
+
+    async def _request(self) -> Any:
+        return await self.node.followed_request(
+            self.command,
+            self.journey,
+            touches=self._touches,
+            stops_seen=self._stops_seen,
+            stop=self._stop,
+            **self._left(),
+        )
+
+    def _left(self) -> CommandOptions:
+        """Return the options, less the time that the request took to come here."""
+        options: dict[str, Any] = dict(self._options)
+        age = self._line.bus.now() - self._asked
+        for name in ("start_within", "finish_within"):
+            limit = options.get(name)
+            if isinstance(limit, int | float):
+                options[name] = max(0.0, limit - age)
+        return cast("CommandOptions", options)
+
+    def _wish(self) -> Wish:
+        """Return what is on record of it: by the name of a point and in its unit, where the owner polls that."""
+        command, point = self.command, None
+        value: Any = self.text
+        if isinstance(command, Changing):
+            changes = command.changes(self.node.profile)
+            point = self._line.named(self.node, changes.keys())
+            if point is not None:
+                value = _value(point, changes, value)
+        point = point or Point(self.node, self.text, command)
+        return Wish(door=DOOR, by=str(self._peer), name=point.key, point=point, value=value)
+
+
+def _check_stop(node: Node, command: Command[Any]) -> bool:
+    """Return True for what stops. Raises InvalidCommand for what does more: a stop passes whatever the limits."""
+    changes = command.changes(node.profile) if isinstance(command, Changing) else {"": None}
+    if any(value != 0 for value in changes.values()):
+        raise InvalidCommand(f"{node.label}: {command} is no stop, which writes 0 and nothing else: leave out `stop`")
+    return True
+
+
+def _value(point: Point[Any], changes: Mapping[Hashable, Any], otherwise: Any) -> Any:
+    """Return what the point will read after these changes, in its unit."""
+    assert isinstance(point.command, Placed)
+    try:
+        return point.value_of(point.command.shown(changes))
+    except Exception:  # of a decoder; the record then says what was sent
+        return otherwise

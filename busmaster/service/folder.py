@@ -1,0 +1,244 @@
+"""Where the sockets of lines are, and whose they are.
+
+Beside each socket NAME.sock is NAME.line, which its owner has locked: it says which process serves which port. The
+lock, and not the socket, says who may listen, so that of two that start at once one alone succeeds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import re
+import socket
+import stat
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+
+from busmaster.errors import InvalidCommand
+
+SYSTEM = Path("/run/busmaster")
+"""Where the lines are that systemd runs."""
+LONGEST_NAME = 60
+LONGEST_PATH = 107
+"""Bytes of a Unix socket's path that the kernel takes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Owner:
+    """Who serves a line: its name, its port, the socket, and the process; of the port, what it was opened with."""
+
+    name: str
+    port: str
+    socket: str
+    pid: int
+    baudrate: int | None = None
+    framing: str | None = None
+    echo: bool = False
+
+    @property
+    def address(self) -> str:
+        """Return what `connect` takes."""
+        return f"unix:{self.socket}"
+
+
+def line_name(text: str) -> str:
+    """Return what a line is called after its file or its port: /dev/ttyUSB0 is "ttyUSB0"."""
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", os.path.basename(text.rstrip("/")) or text).strip(".-")[:LONGEST_NAME]
+    return name or "line"
+
+
+def runtime_folder() -> Path:
+    """Return this user's folder for sockets, made if it is not there.
+
+    Raises InvalidCommand where others may write there: they could pose as its lines.
+    """
+    folder = _folder()
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+    except OSError as error:
+        raise InvalidCommand(f"{folder} cannot be made: {error.strerror}; set XDG_RUNTIME_DIR") from None
+    if not _is_ours(folder):
+        raise InvalidCommand(f"others may write in {folder}, and could pose as its lines: remove it")
+    return folder
+
+
+def _folder() -> Path:
+    if given := os.environ.get("RUNTIME_DIRECTORY"):  # from systemd
+        return Path(given.split(":")[0])
+    if given := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(given, "busmaster")
+    return Path("/tmp", f"busmaster-{os.getuid()}")
+
+
+def _is_ours(folder: Path) -> bool:
+    """Return whether a folder is this user's, or root's, and nobody else may write there."""
+    try:
+        found = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid in (os.getuid(), 0) and not found.st_mode & 0o022
+
+
+def owners() -> Iterator[Owner]:
+    """Yield the lines that are served in this user's folder, and by systemd, as far as this user may see them."""
+    seen: set[str] = set()
+    for folder in (*filter(_is_ours, [_folder()]), SYSTEM, *_inside(SYSTEM)):
+        for path in sorted(folder.glob("*.line")):
+            owner = _read(path)
+            if owner is not None and owner.socket not in seen and _listens(owner.socket):
+                seen.add(owner.socket)
+                yield owner
+
+
+def find_owner(port: str) -> Owner | None:
+    """Return who serves the line that has this name, or whose port this is, however the port is written."""
+    device = _device(port)
+    return next((owner for owner in owners() if owner.name == port or _device(owner.port) == device), None)
+
+
+def _device(port: str) -> str:
+    """Return what a port is, whatever leads to it and is said of it: a device, or HOST:PORT."""
+    name = port.partition("?")[0].removeprefix("socket://")
+    return os.path.realpath(name) if name.startswith("/") else name
+
+
+def owner_of(port: str) -> Owner | None:
+    """Return who serves `unix:PATH`, or the line that has this name or port; None if nobody says so."""
+    if port.startswith("unix:"):
+        return _read(Path(socket_path(port)).with_suffix(".line"))
+    return find_owner(port)
+
+
+def socket_path(address: str) -> str:
+    """Return the socket that `unix:PATH`, or a line's or a port's name, stands for. Raises InvalidCommand."""
+    if address.startswith("unix:"):
+        return address.removeprefix("unix:").removeprefix("//")
+    owner = find_owner(address)
+    if owner is None:
+        names = ", ".join(owner.name for owner in owners()) or "none"
+        raise InvalidCommand(f"no program of this user serves {address!r}; use unix:PATH, or the name of: {names}")
+    return owner.socket
+
+
+class ServedSocket:
+    """The socket of its owner's line, listening, in `with`. Raises InvalidCommand, naming the process, where one does
+    so already.
+
+    What a process that has died left there is replaced. `mode` is the socket's; `group` is a group's number.
+    """
+
+    def __init__(self, owner: Owner, *, mode: int = 0o600, group: int | None = None) -> None:
+        self.owner = owner
+        self.socket: socket.socket
+        self._path = Path(owner.socket)
+        self._mode = mode
+        self._group = group
+        self._lock = -1
+
+    def __enter__(self) -> ServedSocket:
+        if len(os.fsencode(self._path)) > LONGEST_PATH:
+            raise InvalidCommand(f"{self._path} is too long for a socket: {LONGEST_PATH} bytes at most")
+        try:
+            self._take_lock()
+            try:
+                self._listen()
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    self._line.unlink()
+                os.close(self._lock)
+                raise
+        except OSError as error:
+            raise InvalidCommand(f"{self._path} cannot be served: {error.strerror}") from None
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.socket.close()
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+        with contextlib.suppress(OSError):
+            self._line.unlink()
+        os.close(self._lock)  # last: until then nobody else begins
+
+    @property
+    def _line(self) -> Path:
+        return self._path.with_suffix(".line")
+
+    def _take_lock(self) -> None:
+        while True:
+            self._lock = os.open(self._line, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # One that is just leaving has unlinked it: another might lock a new file of that name.
+                if os.path.exists(self._line) and os.path.samestat(os.fstat(self._lock), os.stat(self._line)):
+                    break
+            except BlockingIOError:
+                os.close(self._lock)
+                other = _read(self._line)
+                who = f"process {other.pid}, for {other.port}" if other is not None else "another process"
+                raise InvalidCommand(f"{self._path} is served already by {who}: use it, or end that first") from None
+            os.close(self._lock)
+        os.ftruncate(self._lock, 0)
+        os.write(self._lock, json.dumps(asdict(self.owner)).encode())
+
+    def _listen(self) -> None:
+        with contextlib.suppress(FileNotFoundError):
+            if not stat.S_ISSOCK(self._path.lstat().st_mode):
+                raise InvalidCommand(f"{self._path} is no socket: it is left alone")
+            if _listens(self._path):
+                raise InvalidCommand(f"{self._path} is the socket of another program: it is left alone")
+            self._path.unlink()
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        try:
+            self._bind()
+        except BaseException:
+            self.socket.close()
+            raise
+
+    def _bind(self) -> None:
+        before = os.umask(0o177)
+        try:
+            self.socket.bind(str(self._path))
+        finally:
+            os.umask(before)
+        try:
+            if self._group is not None:
+                os.chown(self._path, -1, self._group)
+            os.chmod(self._path, self._mode)
+            self.socket.listen()
+        except BaseException:
+            self._path.unlink()
+            raise
+
+
+def _read(path: Path) -> Owner | None:
+    try:
+        said = json.loads(path.read_text())
+        return Owner(**said)
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+def _listens(path: Path | str) -> bool:
+    """Return whether somebody listens there; True too where this user may not ask."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except OSError:
+            return True
+    return True
+
+
+def _inside(folder: Path) -> list[Path]:
+    try:
+        return sorted(entry for entry in folder.iterdir() if entry.is_dir())
+    except OSError:
+        return []

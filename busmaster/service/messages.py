@@ -1,0 +1,134 @@
+"""What is said between a line's owner and its clients: JSON-RPC 2.0, and the bounds of all of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from math import inf, isnan
+from typing import Any
+
+from busmaster.contract.learning import Learned
+from busmaster.contract.timing import ReplyTiming, Timings
+from busmaster.errors import InvalidCommand
+
+VERSIONS = (1,)
+"""Of what is said. The first message of a client says which ones it knows, and the highest that both know holds."""
+LONGEST_MESSAGE = 1 << 20
+"""Bytes of one message, either way."""
+MOST_CLIENTS = 64
+MOST_REQUESTS = 256
+"""Requests of one client that have not been answered."""
+MOST_URGENT = 16
+"""Urgent ones that are taken beyond those."""
+MOST_UNREAD = 256
+"""Messages of streams that one client has not read: beyond it the oldest is dropped, and counted."""
+MOST_WAITING = MOST_UNREAD + 2 * MOST_REQUESTS
+"""Messages for one client that are not sent yet, beyond which nothing more is taken from it."""
+MOST_NODES = 1024
+MOST_STREAMS = 32
+MOST_POINTS = 1000
+HELLO_WITHIN = 10.0
+"""Seconds in which a client's first message has to come."""
+
+LONGEST_REPLY = 5.0
+"""Seconds for which a program may have the line wait for a reply: nothing else is sent meanwhile."""
+
+PARSE_ERROR, INVALID_REQUEST, NO_METHOD, INVALID_PARAMS, INTERNAL, BUS_ERROR = (
+    -32700,
+    -32600,
+    -32601,
+    -32602,
+    -32603,
+    -32000,
+)
+
+
+class Malformed(Exception):
+    """This is no message: `code` says of JSON-RPC's errors which."""
+
+    def __init__(self, what: str, code: int = INVALID_REQUEST) -> None:
+        super().__init__(what)
+        self.code = code
+
+
+def written(message: Mapping[str, Any]) -> str:
+    """Return a message as text. Raises TypeError for what cannot be said in it."""
+    return encoded({"jsonrpc": "2.0", **message})
+
+
+def encoded(value: Any) -> str:
+    """Return a value as JSON. Raises TypeError for what it cannot say."""
+    try:
+        return _encode(value)
+    except ValueError:  # a number that JSON does not have
+        return _encode(_finite(value))
+
+
+def read(text: str | bytes) -> dict[str, Any]:
+    """Return a message. Raises Malformed for what is none."""
+    if not isinstance(text, str):
+        raise Malformed("a message is text")
+    try:
+        said = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise Malformed(f"this is no JSON: {error}", PARSE_ERROR) from None
+    if not isinstance(said, dict) or said.get("jsonrpc") != "2.0":
+        raise Malformed("this is no message of JSON-RPC 2.0")
+    return said
+
+
+def value_of(said: Any) -> Any:
+    """Return a value as it was before it was said: a list was a tuple."""
+    if isinstance(said, list):
+        return tuple(map(value_of, said))
+    if isinstance(said, dict):
+        if set(said) == {"float"}:
+            return float(said["float"])
+        return {name: value_of(part) for name, part in said.items()}
+    return said
+
+
+def said_timings(timings: Timings | Learned | None) -> Any:
+    """Return the reply times of a node as they are said."""
+    if isinstance(timings, Learned):
+        return {"learned": said_timings(timings.document)}
+    if timings is None:
+        return None
+    return {leg: _said_timing(getattr(timings, leg)) for leg in ("read", "write", "packet")}
+
+
+def timings_of(said: Any) -> Timings | Learned | None:
+    """Return the reply times that were said. Raises InvalidCommand for what are none."""
+    if said is None:
+        return None
+    try:
+        if set(said) == {"learned"}:
+            document = timings_of(said["learned"])
+            if isinstance(document, Learned):
+                raise TypeError("learned twice")
+            return Learned(document)
+        legs = {leg: ReplyTiming(**timing) for leg, timing in said.items()}
+        times = Timings(**legs)
+    except (TypeError, KeyError) as error:
+        raise InvalidCommand(f"these are no reply times: {error}") from None
+    for leg in legs.values():
+        if max(leg.lateness, leg.byte_gap, leg.turnaround, leg.silence or 0.0) > LONGEST_REPLY:
+            raise InvalidCommand(f"a program may have the line wait {LONGEST_REPLY:g} s for a reply, and no longer")
+    return times
+
+
+def _said_timing(timing: ReplyTiming) -> dict[str, float]:
+    names = ("nominal", "window", "lateness", "byte_gap", "turnaround", "silence")
+    return {name: value for name in names if (value := getattr(timing, name)) is not None}
+
+
+def _finite(value: Any) -> Any:
+    """Return the same with numbers that JSON does not have as {"float": "inf"}."""
+    if isinstance(value, float) and (isnan(value) or value in (inf, -inf)):
+        return {"float": str(value)}
+    if isinstance(value, dict):
+        return {name: _finite(part) for name, part in value.items()}
+    return list(map(_finite, value)) if isinstance(value, list | tuple) else value
+
+
+_encode = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode

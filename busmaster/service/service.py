@@ -1,0 +1,314 @@
+"""The socket of one line, at which other programs ask its nodes."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections.abc import Collection, Hashable
+from functools import partial
+from http import HTTPStatus
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from busmaster.arbiter.health import NodeRecord
+from busmaster.bus.bus import Bus
+from busmaster.bus.node import Node
+from busmaster.bus.points import Point
+from busmaster.bus.polling import PollGroup
+from busmaster.contract.places import Placed
+from busmaster.errors import InvalidCommand
+from busmaster.gate.gate import Gate
+from busmaster.service.client import Client
+from busmaster.service.folder import Owner, ServedSocket, line_name, runtime_folder
+from busmaster.service.messages import (
+    HELLO_WITHIN,
+    INVALID_PARAMS,
+    LONGEST_MESSAGE,
+    MOST_CLIENTS,
+    VERSIONS,
+    Malformed,
+    read,
+    written,
+)
+from busmaster.service.outbox import Outbox
+from busmaster.service.peers import peer_of
+from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.http11 import Request, Response
+
+HOSTS = ("localhost", "busmaster")
+"""What a client calls us: a page that was tricked into asking here would say another name."""
+SEND_WITHIN = 20.0
+"""Seconds in which a client has to take a message: one that stands still is let go, with all that it asked for."""
+READ_AT_ONCE = 4096
+"""Bytes of a connection that are taken in one turn of the line's loop: of small messages it holds hundreds."""
+CLOSE_WITHIN = 1.0
+"""Seconds that a client has to hear the last of it."""
+POLICY, GOING_AWAY = 1008, 1001
+
+
+class Service:
+    """Serve a bus that is open, on a Unix socket, in `async with`. It ends before the bus is closed.
+
+    `path` is the socket's; without it, it is NAME.sock in this user's runtime folder, where `name` is that of the
+    line, by default its port's. Every write passes `gate`: without one, its own, which keeps a record in the log
+    "busmaster.audit". `mode` and `group`, a number, are the socket's. Entering raises InvalidCommand where the socket
+    is served by another process, which it names, or cannot be made.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        *,
+        gate: Gate | None = None,
+        name: str | None = None,
+        path: Path | str | None = None,
+        mode: int = 0o600,
+        group: int | None = None,
+    ) -> None:
+        self.bus = bus
+        self.gate = gate or Gate(bus)
+        self.name = name or line_name(bus.endpoint.name)
+        self.refused = 0
+        """Connections that were one too many, or that began with what no client says."""
+        self._path = None if path is None else Path(path).absolute()
+        self._mode = mode
+        self._group = group
+        self._served: ServedSocket
+        self._server: Server
+        self._clients: dict[Client, ServerConnection] = {}
+        self._count = 0
+        self._groups: dict[PollGroup, GroupBroadcast] = {}
+        self._events: EventBroadcast | None = None
+        self._points: dict[object, Point[Any]] = {}
+        self._points_of: list[tuple[str, tuple[Point[Any], ...]]] = []
+        self._log = logging.getLogger("busmaster.service")
+
+    @property
+    def address(self) -> str:
+        """Return what `connect` takes."""
+        return self._served.owner.address
+
+    @property
+    def clients(self) -> tuple[Client, ...]:
+        """Return the programs that are connected."""
+        return tuple(self._clients)
+
+    async def __aenter__(self) -> Service:
+        serve = _websockets()
+        path = self._path or runtime_folder() / f"{self.name}.sock"
+        endpoint = self.bus.endpoint
+        settings = endpoint.settings
+        owner = Owner(
+            self.name,
+            endpoint.name,
+            str(path),
+            os.getpid(),
+            None if settings is None else settings.baudrate,
+            None if settings is None else settings.framing,
+            endpoint.echo,
+        )
+        served = ServedSocket(owner, mode=self._mode, group=self._group)
+        self._served = served.__enter__()
+        try:
+            self._server = await serve(
+                self._serve,
+                sock=self._served.socket,
+                process_request=self._check_request,
+                origins=[None],
+                compression=None,
+                max_size=LONGEST_MESSAGE,
+                close_timeout=CLOSE_WITHIN,
+                server_header=None,
+                logger=_quiet(),
+            )
+        except BaseException:
+            served.__exit__(None, None, None)
+            raise
+        self.bus.on_stop.append(self._tell_stop)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Let nobody in any more, tell all clients what became of their requests, and let them go."""
+        self.bus.on_stop.remove(self._tell_stop)
+        self._server.close(close_connections=False)
+        for client in self.clients:
+            client.release()
+        try:
+            async with asyncio.timeout(CLOSE_WITHIN):
+                await asyncio.gather(*(self._bid_farewell(*of) for of in list(self._clients.items())))
+        except TimeoutError:
+            pass  # one that does not listen
+        finally:
+            for connection in self._clients.values():
+                connection.transport.abort()
+            try:
+                await self._server.wait_closed()
+            finally:
+                self._served.__exit__(None, None, None)
+
+    # what clients share
+
+    def broadcast_of(self, group: PollGroup) -> Broadcast:
+        """Return what tells the cycles of a poll group."""
+        if group not in self._groups:
+            self._groups[group] = GroupBroadcast(group, partial(self._forget_group, group))
+        return self._groups[group]
+
+    def events(self) -> Broadcast:
+        """Return what tells of line and nodes."""
+        if self._events is None:
+            self._events = EventBroadcast(self.bus, self._end_events)
+        return self._events
+
+    def named(self, node: Node, places: Collection[Hashable]) -> Point[Any] | None:
+        """Return the point of a poll group that reads these places of a node."""
+        groups = [(group.name, group.points) for group in self.bus.groups]
+        if groups != self._points_of:
+            self._points_of = groups
+            self._points = {
+                (point.node, frozenset(point.command.places)): point
+                for _, points in groups
+                for point in points
+                if isinstance(point.command, Placed)
+            }
+        return self._points.get((node, frozenset(places)))
+
+    def _forget_group(self, group: PollGroup) -> None:
+        self._groups.pop(group, None)
+
+    def _end_events(self) -> None:
+        self._events = None
+
+    def _tell_stop(self, record: NodeRecord) -> None:
+        for client in self._clients:
+            client.tell_stops(record)
+
+    # one connection
+
+    def _check_request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Refuse whoever is one too many, and what may be a page's: its Origin is refused by the library."""
+        host = request.headers.get("Host", "").partition(":")[0]
+        if host not in HOSTS:
+            self.refused += 1
+            return connection.respond(HTTPStatus.FORBIDDEN, f"no such host: {host[:40]!r}\n")
+        if len(self._clients) >= MOST_CLIENTS:
+            self.refused += 1
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_CLIENTS} programs are here already\n")
+        return None
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        peer = peer_of(connection.transport.get_extra_info("socket"))
+        connection.transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]
+        self._count += 1
+
+        def drop(stream: object) -> None:
+            client.dropped[stream] = client.dropped.get(stream, 0) + 1
+
+        client = Client(self, peer, self._count, Outbox(partial(_send, connection), drop))
+        self._clients[client] = connection
+        sending = asyncio.ensure_future(client.outbox.run())
+        try:
+            async with asyncio.timeout(HELLO_WITHIN):
+                self._welcome(client, read(await connection.recv()))
+            async for text in connection:
+                client.take(read(text))
+                await client.outbox.room()
+                await asyncio.sleep(0)  # what came together is taken one by one: the line goes between
+        except (Malformed, TimeoutError) as error:
+            self.refused += 1
+            code = error.code if isinstance(error, Malformed) else INVALID_PARAMS
+            what = str(error) or "no hello came"
+            client.outbox.put(written({"id": None, "error": {"code": code, "message": what}}))
+            await self._last_words(client)
+            await connection.close(POLICY, what[:100])
+        except _closed():
+            pass
+        finally:
+            sending.cancel()
+            try:
+                await client.leave()
+                await asyncio.gather(sending, return_exceptions=True)
+            finally:
+                del self._clients[client]
+
+    def _welcome(self, client: Client, said: dict[str, Any]) -> None:
+        params = said.get("params", {})
+        wanted = params.get("versions") if isinstance(params, dict) else None
+        if said.get("method") != "hello" or not isinstance(wanted, list):
+            raise Malformed("the first message is hello, with the versions that its client knows")
+        common = [version for version in VERSIONS if version in wanted]
+        if not common:
+            raise Malformed(f"versions {wanted} are not spoken here, but {list(VERSIONS)}", INVALID_PARAMS)
+        owner = self._served.owner
+        nodes = [
+            {
+                "protocol": node.profile.name,
+                "address": node.address,
+                "label": node.label,
+                "health": node.health.value,
+            }
+            for node in self.bus.nodes
+        ]
+        result = {
+            "version": max(common),
+            "name": owner.name,
+            "line": owner.port,
+            "baudrate": owner.baudrate,
+            "framing": owner.framing,
+            "echo": owner.echo,
+            "process": owner.pid,
+            "read_only": self.gate.read_only,
+            "clients": len(self._clients),
+            "nodes": nodes,
+        }
+        client.outbox.put(written({"id": said.get("id"), "result": result}))
+
+    async def _bid_farewell(self, client: Client, connection: ServerConnection) -> None:
+        await self._last_words(client)
+        await connection.close(GOING_AWAY, "the program that owns the line ends")
+
+    async def _last_words(self, client: Client) -> None:
+        try:
+            async with asyncio.timeout(CLOSE_WITHIN):
+                await client.outbox.flushed()
+        except TimeoutError:
+            pass
+
+
+async def _send(connection: ServerConnection, text: str) -> None:
+    try:
+        async with asyncio.timeout(SEND_WITHIN):
+            await connection.send(text)
+    except TimeoutError:
+        connection.transport.abort()  # the library's pings wait behind what is not taken, and find nothing out
+        raise
+
+
+def _websockets() -> Any:
+    """Return what serves. Raises InvalidCommand, with what to install, where it is missing."""
+    try:
+        from websockets.asyncio.server import unix_serve
+    except ImportError:
+        raise InvalidCommand("the service needs websockets: pip install 'busmaster[service]'") from None
+    return unix_serve
+
+
+def _closed() -> type[Exception]:
+    from websockets.exceptions import ConnectionClosed
+
+    return ConnectionClosed
+
+
+def _quiet() -> logging.Logger:
+    """Return a log for what the library says of connections that come and go: it is no news of the line's."""
+    log = logging.getLogger("busmaster.service.connections")
+    log.addHandler(logging.NullHandler())
+    log.propagate = False
+    return log

@@ -1,0 +1,118 @@
+"""What happens on the line, told to those clients that asked for it: said once, whoever and how many they are."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable
+from typing import Any, Protocol
+
+from busmaster.bus.bus import Bus
+from busmaster.bus.points import Point
+from busmaster.bus.polling import PollGroup
+from busmaster.errors import BusError, InvalidCommand
+from busmaster.service.messages import encoded
+from busmaster.service.telling import said_event, said_points, said_snapshot
+
+
+class Reader(Protocol):
+    """A client with a stream."""
+
+    def tell(self, stream: int, method: str, body: str) -> None:
+        """Say something of a stream; it is dropped where the client does not keep up."""
+        ...
+
+    def tell_surely(self, stream: int, method: str, body: dict[str, Any]) -> None:
+        """Say something of a stream that replaces what was said of it before."""
+        ...
+
+
+Place = tuple[Reader, int]
+"""A client, and the number of the stream there."""
+
+
+class Broadcast:
+    """One source and those who read it. It runs while there is one, and then tells its owner by `on_end`."""
+
+    def __init__(self, on_end: Callable[[], None]) -> None:
+        self.readers: list[Place] = []
+        self._on_end = on_end
+        self._task: asyncio.Task[None] | None = None
+
+    def join(self, reader: Reader, stream: int) -> None:
+        """Have this client told, from now on."""
+        self.readers.append((reader, stream))
+        if self._task is None:
+            self._task = asyncio.ensure_future(self._run())
+
+    def leave(self, reader: Reader, stream: int) -> None:
+        """Tell this client no more."""
+        if (reader, stream) in self.readers:
+            self.readers.remove((reader, stream))
+        if not self.readers and self._task is not None:
+            self._task.cancel()
+            self._on_end()
+
+    async def _run(self) -> None:
+        try:
+            async for method, body in self._bodies():
+                for reader, stream in self.readers:
+                    reader.tell(stream, method, body)
+        except (TypeError, BusError, InvalidCommand):  # what has a value that cannot be said, or is closed already
+            logging.getLogger("busmaster.service").exception("a stream ended")
+        self._on_end()
+        for reader, stream in self.readers:
+            reader.tell_surely(stream, "ended", {})
+
+    def _bodies(self) -> AsyncIterator[tuple[str, str]]:
+        raise NotImplementedError
+
+
+class GroupBroadcast(Broadcast):
+    """The cycles of one poll group."""
+
+    def __init__(self, group: PollGroup, on_end: Callable[[], None]) -> None:
+        super().__init__(on_end)
+        self.group = group
+        self._points: tuple[Point[Any], ...] = group.points
+        self._set = 0
+
+    def join(self, reader: Reader, stream: int) -> None:
+        """Have this client told which points there are, and then of each cycle."""
+        self._tell_points((reader, stream))
+        super().join(reader, stream)
+
+    def _tell_points(self, *places: Place) -> None:
+        points = said_points(self._points)
+        for reader, stream in places:
+            reader.tell_surely(stream, "points", {"set": self._set, "points": points})
+
+    async def _bodies(self) -> AsyncIterator[tuple[str, str]]:
+        stream = self.group.subscribe()
+        try:
+            async for snapshot in stream:
+                points = tuple(snapshot)
+                if points != self._points:
+                    self._points = points
+                    self._set += 1
+                    self._tell_points(*self.readers)
+                yield "snapshot", encoded({"set": self._set, **said_snapshot(snapshot)})
+        finally:
+            stream.close()
+
+
+class EventBroadcast(Broadcast):
+    """What happens to line and nodes."""
+
+    def __init__(self, bus: Bus, on_end: Callable[[], None]) -> None:
+        super().__init__(on_end)
+        self._bus = bus
+
+    async def _bodies(self) -> AsyncIterator[tuple[str, str]]:
+        stream = self._bus.events()
+        try:
+            async for event in stream:
+                if said := said_event(event):
+                    yield "event", encoded(said)
+        finally:
+            stream.close()

@@ -1,0 +1,169 @@
+"""How snapshots, events and statistics are said, and what a client makes of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Protocol, cast
+
+from busmaster.arbiter.counters import DriverErrors, LineStatistics, Quantiles
+from busmaster.arbiter.events import (
+    LatenessLowered,
+    LatenessRaised,
+    LineChange,
+    LineChanged,
+    NodeChanged,
+    PortFailed,
+)
+from busmaster.arbiter.health import Health, NodeRecord
+from busmaster.arbiter.transaction import Timeline
+from busmaster.bus.alarms import AlarmChanged, BusEvent
+from busmaster.bus.points import Point
+from busmaster.bus.requester import Requester
+from busmaster.bus.samples import Quality, Sample
+from busmaster.bus.snapshots import Snapshot
+from busmaster.errors import GarbledReply, InvalidCommand
+from busmaster.registry import Protocol as BusProtocol
+from busmaster.registry import protocols
+from busmaster.service.failures import bus_error_of, error_data
+from busmaster.service.messages import value_of
+
+
+class FindNode(Protocol):
+    """Returns the node that a protocol's name and an address stand for."""
+
+    def __call__(self, protocol: str, address: int, /) -> Requester: ...
+
+
+def protocol_of(name: Any) -> BusProtocol:
+    """Return the protocol of a name. Raises InvalidCommand if there is none."""
+    for protocol in protocols():
+        if protocol.name == name:
+            return protocol
+    raise InvalidCommand(f"no such protocol {name!r}; there are {', '.join(one.name for one in protocols())}")
+
+
+# snapshots
+
+
+def said_points(points: Iterable[Point[Any]]) -> list[dict[str, Any]]:
+    """Return points as they are said: what they are called, and what they read."""
+    return [
+        {
+            "key": point.key,
+            "item": point.item,
+            "unit": point.unit,
+            "protocol": point.node.profile.name,
+            "address": point.node.address,
+            "command": protocol_of(point.node.profile.name).write_down(point.command),
+        }
+        for point in points
+    ]
+
+
+def point_of(said: Mapping[str, Any], find: FindNode) -> Point[Any]:
+    """Return a point that was said. It takes values as they come: they were decoded where they were read."""
+    protocol = protocol_of(said.get("protocol"))
+    node = find(protocol.name, said["address"])
+    command = protocol.read_back(said["command"])
+    return Point(node, str(said.get("item", "")), command, str(said.get("unit", "")))
+
+
+def said_snapshot(snapshot: Snapshot) -> dict[str, Any]:
+    """Return a cycle as it is said; its samples are in the order of its points."""
+    names = ("cycle", "due", "started", "finished", "missed", "wall")
+    said = {name: getattr(snapshot, name) for name in names}
+    said["samples"] = [_said_sample(sample) for sample in snapshot.samples.values()]
+    return said
+
+
+def snapshot_of(said: Mapping[str, Any], group: str, points: Sequence[Point[Any]]) -> Snapshot:
+    """Return the cycle that was said."""
+    names = ("cycle", "due", "started", "finished", "missed", "wall")
+    samples = {point: _sample_of(one, point) for point, one in zip(points, said["samples"], strict=True)}
+    return Snapshot(group=group, samples=samples, **{name: said[name] for name in names})
+
+
+def _said_sample(sample: Sample[Any]) -> list[Any]:
+    error = None if sample.error is None else error_data(sample.error)
+    times = (sample.due, sample.started, sample.finished, sample.wall)
+    return [sample.value, error, *times, sample.quality.value, sample.timeline]
+
+
+def _sample_of(said: Sequence[Any], point: Point[Any]) -> Sample[Any]:
+    value, error, due, started, finished, wall, quality, timeline = said
+    failed = None if error is None else bus_error_of(error)
+    how_good = Quality(quality)
+    value = value_of(value)
+    if failed is None:
+        try:
+            value = point.value_of(value)
+        except GarbledReply as bad:
+            value, failed, how_good = None, bad, Quality.BAD
+    return Sample(value, failed, due, started, finished, how_good, Timeline(*timeline), wall)
+
+
+# events
+
+
+def said_event(event: BusEvent) -> dict[str, Any] | None:
+    """Return an event as it is said; None for one that no client hears."""
+    said: dict[str, Any] = {"event": type(event).__name__}
+    match event:
+        case NodeChanged():
+            said |= {"before": event.before.value, "after": event.after.value, "returning": event.returning}
+        case LatenessRaised():
+            said |= {"age": event.age, "lateness": event.lateness}
+        case LatenessLowered():
+            said |= {"lateness": event.lateness}
+        case LineChanged():
+            return said | {"change": event.change.value, "cause": event.cause}
+        case PortFailed():
+            bug = None if event.bug is None else f"{type(event.bug).__name__}: {event.bug}"
+            return said | {"cause": event.cause, "hint": event.hint, "bug": bug}
+        case AlarmChanged():
+            [point] = said_points([event.point])
+            told = {name: getattr(event, name) for name in ("limit", "bound", "value", "active")}
+            return said | {"point": point, **told}
+        case _:
+            return None
+    node = event.node
+    return said | {"protocol": node.profile.name, "address": node.address, "label": node.label}
+
+
+def event_of(said: Mapping[str, Any], find: FindNode) -> BusEvent | None:
+    """Return the event that was said; its `node` is the client's own. None for one of a later version."""
+    name = said["event"]
+    if name == "LineChanged":
+        return LineChanged(LineChange(said["change"]), said["cause"])
+    if name == "PortFailed":
+        return PortFailed(said["cause"], said["hint"], None if said["bug"] is None else Exception(said["bug"]))
+    if name == "AlarmChanged":
+        point = point_of(said["point"], find)
+        return AlarmChanged(point, said["limit"], said["bound"], said["value"], said["active"])
+    if name not in ("NodeChanged", "LatenessRaised", "LatenessLowered"):
+        return None
+    # It has all that an event's reader asks of a node: label, address, profile, line.
+    node = cast("NodeRecord", find(said["protocol"], said["address"]))
+    if name == "NodeChanged":
+        return NodeChanged(node, Health(said["before"]), Health(said["after"]), said["returning"])
+    if name == "LatenessRaised":
+        return LatenessRaised(node, said["age"], said["lateness"])
+    return LatenessLowered(node, said["lateness"])
+
+
+# statistics
+
+
+def said_statistics(statistics: LineStatistics) -> dict[str, Any]:
+    """Return the counts of a line as they are said."""
+    return {**dataclasses.asdict(statistics), "utilisation": statistics.utilisation}
+
+
+def statistics_of(said: Mapping[str, Any]) -> LineStatistics:
+    """Return the counts that were said."""
+    known = {part.name for part in dataclasses.fields(LineStatistics)}
+    counts: dict[str, Any] = {name: value for name, value in said.items() if name in known}
+    counts["waits"] = tuple(Quantiles(**wait) for wait in said["waits"])
+    counts["driver"] = None if said["driver"] is None else DriverErrors(**said["driver"])
+    return LineStatistics(**counts)

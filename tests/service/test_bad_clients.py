@@ -1,0 +1,444 @@
+"""What no client should do: it costs the others nothing, and the audit stays true."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import random
+import socket
+import stat
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, Service, connect
+from busmaster.emulator.line import Line
+from busmaster.errors import BacklogFull, InvalidCommand
+from busmaster.service import messages
+from busmaster.service.folder import Owner, ServedSocket, find_owner, line_name, owners, runtime_folder, socket_path
+from busmaster.service.outbox import Outbox
+from tests.patience import PATIENCE
+from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, served, until
+
+READ = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
+
+UPGRADE = (
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+)
+
+
+def on_a_line(folder: Path, story: Callable[[Served], Awaitable[None]], *, read_only: bool = False) -> None:
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE), served(folder, read_only=read_only) as line:
+            await story(line)
+
+    asyncio.run(run())
+
+
+# the gate
+
+
+def test_a_write_is_on_record_with_who_wrote_what_and_what_it_was_before(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        point = Hcp2Controller(line.bus, 5).point("1")
+        group = line.bus.poll_group("axes", period=0.02, points=[point])
+        async for snapshot in group:
+            if snapshot[point].value == 0.0:
+                break
+        await Hcp2Controller(remote, 5).point("1").write(2.5)
+        [record] = line.records
+        assert (record.door, record.point, record.before, record.value) == ("service", "5/1", 0.0, 2.5)
+        assert record.by.endswith(f"(process {os.getpid()})")
+        assert record.ok
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_read_only_line_lets_no_program_write(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller = Hcp2Controller(remote, 5)
+        with pytest.raises(InvalidCommand, match="node 5: this line is read-only"):
+            await controller.write(1, 1)
+        assert await controller.read(1) == 0
+        assert [outcome for _, outcome in line.audit()] == ["refused"]
+
+    on_a_served_line(tmp_path, story, read_only=True)
+
+
+def test_a_write_that_took_long_to_come_is_not_sent(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            write = {"command": "write", "element": 1, "values": [1]}
+            said = await client.ask("request", **{**READ, "command": write}, asked=line.bus.now() - 5)
+            assert said["error"]["data"]["error"] == "NotStarted"
+            assert "it came 5.0 s after it was asked for" in said["error"]["message"]
+        assert [outcome for _, outcome in line.audit()] == ["not started"]
+
+    on_a_line(tmp_path, story)
+
+
+def test_the_audit_is_true_of_a_program_that_is_killed_mid_write(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with connect(line.address) as remote:
+            sent = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
+            await line.sent()
+            waiting = asyncio.ensure_future(Hcp2Controller(remote, 5).write(1, 1))
+            await until(lambda: line.bus.statistics().backlog)
+            remote.link._connection.transport.abort()  # type: ignore[union-attr]  # it is open
+            await asyncio.gather(sent, waiting, return_exceptions=True)
+        await line.alone()
+        assert sorted(line.audit()) == [
+            ("5/write element 1 = 1", "not started"),
+            ("9/write element 1 = 1", "unconfirmed"),
+        ]
+        assert line.bus.nodes == ()
+
+    on_a_line(tmp_path, story)
+
+
+# what is said wrongly
+
+
+@pytest.mark.parametrize(
+    ("said", "complaint"),
+    [
+        ("{", "this is no JSON"),
+        ("[" * 100_000, "this is no JSON"),
+        ("[]", "this is no message of JSON-RPC 2.0"),
+        ('{"jsonrpc": "2.0", "id": 2, "method": 3}', "a message has a method"),
+        ('{"jsonrpc": "2.0", "method": "cancel", "params": {"id": [1]}}', "cancel: "),
+        ('{"jsonrpc": "2.0", "id": true, "method": "groups"}', "the id of a request is a whole number"),
+        (b"\x00\xff", "a message is text"),
+    ],
+    ids=range(7),
+)
+def test_garbage_ends_the_conversation_with_its_reason(said: str | bytes, complaint: str, tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            await client.connection.send(said)
+            assert complaint in (await client.hear())["error"]["message"]
+            with pytest.raises(ConnectionClosed):
+                await client.hear()
+        await line.alone()
+        assert line.service.refused == 1
+
+    on_a_line(tmp_path, story)
+
+
+@pytest.mark.parametrize(
+    ("method", "params", "complaint"),
+    [
+        ("request", {}, "protocol"),
+        ("request", {**READ, "protocol": "profibus"}, "no such protocol"),
+        ("request", {**READ, "address": 999}, "address 999 does not exist"),
+        ("request", {**READ, "address": [5]}, "request: TypeError"),
+        ("request", {**READ, "command": {"command": "read", "element": 1000}}, "element"),
+        ("request", {**READ, "command": 3}, "request"),
+        ("request", {**READ, "options": {"safe": True}}, "a request has the options"),
+        ("request", {**READ, "options": {"retries": -1}}, "retries"),
+        ("request", {**READ, "options": {"priority": 9}}, "priority"),
+        ("request", {**READ, "asked": "now"}, "asked"),
+        ("node", {"protocol": "hcp2", "address": 6, "timings": {"read": 3}}, "reply times"),
+        ("subscribe", {"group": "axes", "stream": 1}, "no poll group 'axes'"),
+        ("poll", {"name": "x", "stream": 1, "period": 0, "points": []}, "period"),
+        ("poll", {"name": "x", "stream": 1, "period": 1, "points": [{**READ, "command": {}}]}, "has no command"),
+        ("events", {"stream": -1}, "a stream"),
+        ("erase", {}, "no method 'erase'"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_asked_is_refused_in_words_and_the_conversation_goes_on(
+    method: str, params: dict[str, Any], complaint: str, tmp_path: Path
+) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            said = await client.ask(method, **params)
+            assert complaint in said["error"]["message"]
+            assert (await client.ask("groups"))["result"] == []
+            assert (await client.ask("request", **READ))["result"] == 0
+        await line.alone()
+        assert (line.bus.nodes, line.bus.groups) == ((), ())
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_message_of_ten_megabytes_ends_its_program_alone(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        reader, writer = await asyncio.open_unix_connection(line.address.removeprefix("unix:"))
+        writer.write(UPGRADE)
+        assert (await reader.readuntil(b"\r\n\r\n")).startswith(b"HTTP/1.1 101")
+        writer.write(b"\x81\xff" + (10_000_000).to_bytes(8, "big") + bytes(4) + bytes(10_000_000))
+        last = await reader.read(4)
+        assert (last[0], last[2:]) == (0x88, (1009).to_bytes(2, "big"))  # too big, and closed
+        writer.transport.abort()
+        await until(lambda: len(line.service.clients) == 1)
+        assert await Hcp2Controller(remote, 5).read(1) == 0
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_version_that_is_not_spoken_is_said(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line, hello=False) as client:
+            said = await client.ask("hello", versions=[0, 99])
+            assert said["error"]["message"] == "versions [0, 99] are not spoken here, but [1]"
+        async with raw(line, hello=False) as client:
+            assert "the first message is hello" in (await client.ask("groups"))["error"]["message"]
+
+    on_a_line(tmp_path, story)
+
+
+def test_pages_cannot_use_it(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        offers: tuple[dict[str, Any], ...] = (
+            {"origin": "http://evil.example"},
+            {"origin": "null"},
+            {"uri": "ws://evil.example/"},
+        )
+        for options in offers:
+            with pytest.raises(InvalidStatus, match="403"):
+                async with raw(line, **options):
+                    pass
+        assert line.service.clients == ()
+
+    on_a_line(tmp_path, story)
+
+
+# how much
+
+
+def test_one_program_has_so_many_requests_and_a_few_urgent_ones_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.service.client.MOST_REQUESTS", 3)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller = Hcp2Controller(remote, 5)
+        ended = await asyncio.gather(*(controller.read(n) for n in range(1, 6)), return_exceptions=True)
+        assert [type(end) for end in ended if isinstance(end, Exception)] == [BacklogFull] * 2
+        urgent = (controller.read(n, priority=0) for n in range(1, 6))  # type: ignore[arg-type]  # a number will do
+        assert await asyncio.gather(*urgent) == [0] * 5
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_so_many_programs_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.service.service.MOST_CLIENTS", 1)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        with pytest.raises(InvalidStatus, match="503"):
+            async with raw(line):
+                pass
+        await remote.__aexit__(None, None, None)
+        await line.alone()
+        async with raw(line):
+            pass
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_program_that_does_not_read_loses_its_own_news_and_nothing_else() -> None:
+    async def run() -> None:
+        said: list[str] = []
+        free = asyncio.Event()
+
+        async def send(text: str) -> None:
+            await free.wait()
+            said.append(text)
+
+        dropped: list[object] = []
+        outbox = Outbox(send, dropped.append)
+        running = asyncio.ensure_future(outbox.run())
+        outbox.put("first")
+        await asyncio.sleep(0)
+        for number in range(messages.MOST_UNREAD + 2):
+            outbox.put_news(7, f"news {number}")
+        outbox.put("an answer")
+        for number in range(3):
+            outbox.put_latest("stops", f"stops {number}")
+        free.set()
+        await outbox.flushed()
+        assert said[:2] == ["first", "news 2"]
+        assert said[-2:] == ["an answer", "stops 2"]
+        assert len(said) == messages.MOST_UNREAD + 3
+        assert dropped == [7, 7]
+        running.cancel()
+
+    asyncio.run(run())
+
+
+def test_a_program_that_does_not_read_its_answers_is_not_read_either() -> None:
+    async def run() -> None:
+        free = asyncio.Event()
+
+        async def send(text: str) -> None:
+            await free.wait()
+
+        outbox = Outbox(send, print)
+        running = asyncio.ensure_future(outbox.run())
+        taken = 0
+
+        async def take() -> None:
+            nonlocal taken
+            while taken < 2 * messages.MOST_WAITING:
+                taken += 1
+                outbox.put("an answer")
+                await outbox.room()
+
+        taking = asyncio.ensure_future(take())
+        await until(lambda: outbox.waiting >= messages.MOST_WAITING)
+        assert taken == messages.MOST_WAITING
+        free.set()
+        await taking
+        assert taken > messages.MOST_WAITING
+        running.cancel()
+
+    asyncio.run(run())
+
+
+def test_a_program_that_is_lost_while_it_does_not_read_leaves_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.service.outbox.MOST_WAITING", 3)
+
+    async def story(line: Served) -> None:
+        async with raw(line, max_queue=1) as client:
+
+            async def flood() -> None:
+                for number in range(2, 10_000_000):
+                    await client.say(id=number, method="statistics", params={})
+
+            flooding = asyncio.ensure_future(flood())
+            await until(lambda: line.service.clients[0].outbox.waiting >= 3)
+            client.connection.transport.abort()
+            await asyncio.gather(flooding, return_exceptions=True)
+            await line.alone()
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_thousand_programs_come_and_go_as_they_like_and_leave_nothing(tmp_path: Path) -> None:
+    chance = random.Random(1)
+    half_open: list[asyncio.StreamWriter] = []
+
+    async def visit(line: Served) -> None:
+        _, writer = await asyncio.open_unix_connection(line.address.removeprefix("unix:"))
+        kind = chance.randrange(4)
+        if kind:
+            writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n" if kind == 1 else chance.randbytes(40))
+        if kind == 3:
+            half_open.append(writer)
+        elif chance.random() < 0.5:
+            writer.transport.abort()
+        else:
+            writer.close()
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        group = line.bus.poll_group("axes", period=0.05, points=[Hcp2Controller(line.bus, 5).point("1")])
+        for _ in range(10):
+            await asyncio.gather(*(visit(line) for _ in range(95)), *(read(line) for _ in range(5)))
+        assert await Hcp2Controller(remote, 6).read(1) == 0
+        await until(lambda: len(line.service.clients) == 1)
+        await until(lambda: len(line.bus.nodes) == 2)
+        assert group.statistics().bad == 0
+        for writer in half_open:
+            writer.transport.abort()
+
+    async def read(line: Served) -> None:
+        async with connect(line.address) as remote:
+            assert await Hcp2Controller(remote, 5).read(1) == 0
+
+    on_a_served_line(tmp_path, story)
+
+
+# the socket
+
+
+def test_a_socket_is_this_users_alone_unless_it_is_given_to_a_group(tmp_path: Path) -> None:
+    path = tmp_path / "a.sock"
+    with ServedSocket(Owner("a", "/dev/ttyUSB0", str(path), os.getpid())):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    with ServedSocket(Owner("a", "/dev/ttyUSB0", str(path), os.getpid()), mode=0o660, group=os.getgid()):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o660
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_socket_that_is_served_names_its_process_and_one_of_a_dead_process_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "a.sock"
+    with (
+        ServedSocket(Owner("a", "/dev/ttyUSB0", str(path), os.getpid())),
+        pytest.raises(InvalidCommand, match=rf"served already by process {os.getpid()}, for /dev/ttyUSB0"),
+        ServedSocket(Owner("a", "/dev/ttyUSB1", str(path), os.getpid())),
+    ):
+        pass
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(path))
+    path.with_suffix(".line").write_text("{")
+    with ServedSocket(Owner("a", "/dev/ttyUSB0", str(path), os.getpid())) as served_again:
+        assert json.loads(path.with_suffix(".line").read_text())["pid"] == os.getpid()
+        assert served_again.owner.address == f"unix:{path}"
+
+
+def test_what_is_no_socket_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.sock"
+    path.write_text("mine")
+    with (
+        pytest.raises(InvalidCommand, match="is no socket: it is left alone"),
+        ServedSocket(Owner("a", "b", str(path), os.getpid())),
+    ):
+        pass
+    assert path.read_text() == "mine"
+
+
+def test_a_line_is_found_by_its_name_and_by_its_port_however_that_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "port").touch()
+    (tmp_path / "by-id").symlink_to(tmp_path / "port")
+    path = runtime_folder() / "slitter.sock"
+    with ServedSocket(Owner("slitter", str(tmp_path / "port"), str(path), os.getpid())) as found:
+        for name in ("slitter", str(tmp_path / "port"), f"{tmp_path}/by-id?baudrate=9600"):
+            assert find_owner(name) == found.owner
+        assert socket_path("slitter") == socket_path(f"unix:{path}") == str(path)
+        assert find_owner("/dev/null") is None
+    path.with_suffix(".line").write_text(json.dumps({"name": "slitter", "port": "x", "socket": str(path), "pid": 1}))
+    assert list(owners()) == []
+
+
+def test_systemd_says_where_its_lines_have_their_sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", f"{tmp_path}/slitter")
+    assert runtime_folder() == tmp_path / "slitter"
+
+
+def test_a_folder_that_others_could_enter_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "busmaster").mkdir()
+    (tmp_path / "busmaster").chmod(0o777)
+    with pytest.raises(InvalidCommand, match="others may write in"):
+        runtime_folder()
+
+
+@pytest.mark.parametrize(
+    ("port", "name"), [("/dev/ttyUSB0", "ttyUSB0"), ("socket://10.0.0.1:502", "10.0.0.1-502"), ("..", "line")]
+)
+def test_a_line_is_called_after_its_port(port: str, name: str) -> None:
+    assert line_name(port) == name
+
+
+def test_a_bus_is_served_again_after_it_was(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with Bus(MemoryPort(Line(Hcp2Controller.profile.line))) as bus:
+            for _ in range(2):
+                async with Service(bus, path=tmp_path / "a.sock") as service, connect(service.address) as remote:
+                    assert await remote.groups() == ()
+            assert bus.on_stop == []
+
+    asyncio.run(run())

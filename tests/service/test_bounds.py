@@ -1,0 +1,167 @@
+"""What one program may have of a served line, and of its owner's time and memory."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+from pathlib import Path
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+
+from busmaster import Hcp2Controller, RemoteBus
+from busmaster.contract.timing import ReplyTiming, Timings
+from busmaster.errors import InvalidCommand
+from busmaster.service import messages
+from busmaster.service.client import Client
+from busmaster.service.folder import Owner, ServedSocket
+from busmaster.service.outbox import Outbox
+from busmaster.service.service import READ_AT_ONCE
+from tests.service.lines import ABSENT, Served, on_a_served_line, raw, until
+
+
+def test_news_that_were_dropped_take_no_memory() -> None:
+    async def run() -> None:
+        async def send(_: str) -> None:
+            await asyncio.Event().wait()
+
+        outbox = Outbox(send, lambda _: None)
+        running = asyncio.ensure_future(outbox.run())
+        outbox.put("an answer that is not read")
+        await asyncio.sleep(0)
+        for number in range(10 * messages.MOST_UNREAD):
+            outbox.put_news(7, f"news {number}")
+        assert outbox.waiting == messages.MOST_UNREAD + 1
+        running.cancel()
+
+    asyncio.run(run())
+
+
+def test_a_write_that_is_given_up_before_its_first_step_is_on_record_and_leaves_nothing(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        [client] = line.service.clients
+        command = {"command": "write", "element": 1, "values": [7.0]}
+        client.take({"id": 70, "method": "request", "params": {"protocol": "hcp2", "address": 5, "command": command}})
+        client.take({"method": "cancel", "params": {"id": 70}})
+        await until(lambda: not client.errands)
+        assert line.audit() == [("5/write element 1 = 7", "not started")]
+        assert await Hcp2Controller(line.bus, 5).read(1) == 0
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_what_is_cancelled_before_it_was_handed_over_is_never_said(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller = Hcp2Controller(remote, 5)
+        await controller.read(1)
+        writing = asyncio.ensure_future(controller.write(1, 7))
+        await asyncio.sleep(0)
+        writing.cancel()
+        await asyncio.gather(writing, return_exceptions=True)
+        assert await controller.read(1) == 0
+        assert line.records == []
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_only_what_stops_passes_the_limits_as_a_stop(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        own = Hcp2Controller(line.bus, 5)
+        own.point("1").limit(maximum=10)
+        async with raw(line) as client:
+            write = {"command": "write", "element": 1, "values": [11.0]}
+            said = await client.ask("request", protocol="hcp2", address=5, command=write, stop=True)
+            assert "is no stop" in said["error"]["message"]
+        assert await own.read(1) == 0
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_program_cannot_have_the_line_wait_as_long_as_it_likes(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        long = Timings.uniform(ReplyTiming(0.01, 0.01, messages.LONGEST_REPLY + 1, 0.01))
+        with pytest.raises(InvalidCommand, match="may have the line wait 5 s"):
+            await Hcp2Controller(remote, ABSENT, timings=long).read(1)
+        assert line.bus.nodes == ()
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_the_socket_of_another_program_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "other.sock"
+    with socket.socket(socket.AF_UNIX) as other, socket.socket(socket.AF_UNIX) as friend:
+        other.bind(str(path))
+        other.listen()
+        with pytest.raises(InvalidCommand, match="another program: it is left alone"):
+            ServedSocket(Owner("other", "x", str(path), 1)).__enter__()
+        friend.connect(str(path))
+    assert os.listdir(tmp_path) == ["other.sock"]
+
+
+def test_a_socket_that_cannot_be_given_to_its_group_is_not_left_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def chown(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "chown", chown)
+    with pytest.raises(InvalidCommand, match="cannot be served: Operation not permitted"):
+        ServedSocket(Owner("line", "x", str(tmp_path / "line.sock"), 1), group=1).__enter__()
+    assert os.listdir(tmp_path) == []
+
+
+def test_messages_that_come_together_are_taken_one_in_a_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    turn = 0
+    taken: list[int] = []
+    take = Client.take
+
+    def note(client: Client, said: dict[str, object]) -> None:
+        taken.append(turn)
+        take(client, said)
+
+    monkeypatch.setattr(Client, "take", note)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        def count() -> None:
+            nonlocal turn
+            turn += 1
+            asyncio.get_running_loop().call_soon(count)
+
+        count()
+        await remote.groups()
+        taken.clear()
+        [connection] = line.service._clients.values()
+        sizes: list[int] = []
+        receive = connection.data_received
+
+        def received(data: bytes) -> None:
+            sizes.append(len(data))
+            receive(data)
+
+        monkeypatch.setattr(connection, "data_received", received)
+        for _ in range(1000):
+            remote.link.tell("end", {"stream": 7})
+        await until(lambda: len(taken) >= 1000)
+        assert len(set(taken)) == len(taken)
+        assert max(sizes) <= READ_AT_ONCE
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_program_that_stands_still_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.service.service.SEND_WITHIN", 0.05)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with raw(line, max_queue=1) as client:
+            client.connection.transport.pause_reading()
+            with contextlib.suppress(ConnectionClosed):
+                while True:
+                    await client.say(id=2, method="statistics", params={})
+                    await asyncio.sleep(0)
+            await until(lambda: len(line.service.clients) == 1)
+            client.connection.transport.abort()
+        assert await Hcp2Controller(remote, 5).read(1) == 0
+
+    on_a_served_line(tmp_path, story)
