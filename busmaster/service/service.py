@@ -205,7 +205,7 @@ class Service:
 
     async def _serve(self, connection: ServerConnection) -> None:
         peer = peer_of(connection.transport.get_extra_info("socket"))
-        connection.transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]
+        connection.transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]  # asyncio's own, not declared
         self._count += 1
 
         def drop(stream: object) -> None:

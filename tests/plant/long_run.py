@@ -36,7 +36,7 @@ class ExamplePlant(Plant):
 
     nodes = ("winder", "unwinder", "drive4", "drive5", "drive6", "drive7")
     telling = ()
-    names = {"csv": "line.csv", "jsonl": "line.jsonl", "sqlite": "line.sqlite"}  # noqa: RUF012
+    names = {"csv": "line.csv", "jsonl": "line.jsonl", "sqlite": "line.sqlite"}  # noqa: RUF012  never changed
 
     def text(self) -> str:
         text = (ROOT / "examples" / "line.toml").read_text()

@@ -61,16 +61,16 @@ class World:
             strict=setup.strict,
         )
         # The stand-ins (shipped.py) have what is asked of them, not the types: hence what is ignored here.
-        arbiter._counters = arbiter._unasked._counters = arbiter.dispatcher.counters = NO_COUNTERS  # type: ignore[assignment]
-        arbiter.dispatcher.probes.budget = BUDGET  # type: ignore[assignment]
+        arbiter._counters = arbiter._unasked._counters = arbiter.dispatcher.counters = NO_COUNTERS  # type: ignore[assignment]  # stand-in
+        arbiter.dispatcher.probes.budget = BUDGET  # type: ignore[assignment]  # one that may or may not
         if not setup.in_step:
-            arbiter._in_step = arbiter._choice._in_step = arbiter._trust._in_step = ANY_STEP  # type: ignore[assignment]
+            arbiter._in_step = arbiter._choice._in_step = arbiter._trust._in_step = ANY_STEP  # type: ignore[assignment]  # any R15
         several = 1 + max(self.kind.commands[place][0] for place in setup.commands)
         for place in range(several):
             timings = Timings.uniform(SECOND_TIMING) if setup.second_timing and place else None
             address = place + 1 if profile.addressed else 0
             node = arbiter.add_node(profile, address, 0.0, timings=timings, retries=setup.retries)
-            node.counters = NO_COUNTERS  # type: ignore[assignment]
+            node.counters = NO_COUNTERS  # type: ignore[assignment]  # a stand-in that counts nothing
         self.nodes = tuple(arbiter.dispatcher.nodes)
         self.now = now
         self.owed: list[Owed] = []
