@@ -29,7 +29,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "emulator.memory": {"emulator", "transport"} | BASE,
     "registry": {"registry", "bus.handle", "emulator.device", "emulator.traceable", "capture.decode"} | BASE,
     "gate": {"gate", "bus", "arbiter"} | BASE,
-    "service": {"service", "gate", "registry", "bus", "arbiter", "planning"} | BASE,
+    "service": {"service", "gate", "registry", "bus", "arbiter", "planning", "outputs.values"} | BASE,
     "outputs": {"outputs", "gate", "bus", "arbiter"} | BASE,
     "capture": {"capture", "wire", "registry", "arbiter.tap"} | BASE,
     "doctor": {"doctor", "registry", "capture", "transport", "arbiter", "outputs.values"} | BASE,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Collection, Hashable, Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 from busmaster.bus.bus import Bus
@@ -16,6 +17,8 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
 from busmaster.gate.gate import FRESH, Gate, Wish
+from busmaster.service.messages import value_of
+from busmaster.service.overview import Journal
 from busmaster.service.peers import Peer
 from busmaster.service.streams import Broadcast
 from busmaster.service.telling import protocol_of
@@ -42,6 +45,25 @@ class Line(Protocol):
         """Return what tells of line and nodes."""
         ...
 
+    def overview(self) -> Broadcast:
+        """Return what tells what a person sees of it."""
+        ...
+
+    @property
+    def journal(self) -> Journal: ...
+
+    def group(self, name: str, /) -> PollGroup:
+        """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
+        ...
+
+    def point(self, group: str, key: str, /) -> tuple[PollGroup, Point[Any]]:
+        """Return a point of a poll group, and the group. Raises InvalidCommand if there is none."""
+        ...
+
+    def node(self, protocol: str, address: int, /) -> Node:
+        """Return a node that is on the line. Raises InvalidCommand if there is none."""
+        ...
+
     def named(self, node: Node, places: Collection[Hashable], /) -> Point[Any] | None:
         """Return the point of a poll group that reads these places of a node."""
         ...
@@ -62,14 +84,40 @@ class Asker(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is asked for: a command for a node, and what reads what it writes (`touches`); perhaps its point."""
+
+    node: Node
+    command: Command[Any]
+    touches: Command[Any] | None
+    value: Any
+    """As the record of a write has it."""
+    point: Point[Any] | None = None
+
+    @classmethod
+    def of_node(cls, params: Mapping[str, Any], asker: Asker) -> Task:
+        """Return a command that a client names. Raises InvalidCommand for what the protocol does not have."""
+        node, protocol = asker.node(params["protocol"], params["address"]), protocol_of(params["protocol"])
+        command, touches = protocol.read_back(params["command"]), params.get("touches")
+        return cls(node, command, None if touches is None else protocol.read_back(touches), str(command))
+
+    @classmethod
+    def of_point(cls, params: Mapping[str, Any], line: Line) -> Task:
+        """Return the write of a value to a point of a poll group. Raises InvalidCommand for what cannot be written."""
+        _, point = line.point(params["point"]["group"], params["point"]["key"])
+        value = value_of(params["value"])
+        if point.encode is None or not isinstance(point.node, Node):
+            raise InvalidCommand(f"{point.key} is read-only")
+        return cls(point.node, point.encode(value), point.command, value, point)
+
+
 class Errand:
     """One command with its options, for one client."""
 
     def __init__(
         self,
-        node: Node,
-        command: Command[Any],
-        touches: Command[Any] | None,
+        task: Task,
         options: CommandOptions,
         *,
         line: Line,
@@ -78,10 +126,10 @@ class Errand:
         stop: bool,
         asked: float,
     ) -> None:
-        self.node = node
-        self.command = command
+        self.node = task.node
+        self.command = task.command
         self.journey = Journey()
-        self._touches = touches
+        self._task = task
         self._options = options
         self._line = line
         self._peer = peer
@@ -93,19 +141,15 @@ class Errand:
     @classmethod
     def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
-        node = asker.node(params["protocol"], params["address"])
-        protocol = protocol_of(params["protocol"])
-        command = protocol.read_back(params["command"])
-        touches = params.get("touches")
+        task = Task.of_point(params, line) if "point" in params else Task.of_node(params, asker)
+        node, command = task.node, task.command
         given = cast("CommandOptions", dict(params.get("options", {})))
         if not set(given) <= OPTIONS:
             raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
         RequestOptions.of(given, node.label)  # checked here, before it may wait
         now, stops_seen = line.bus.now(), params.get("stops_seen")
         return cls(
-            node,
-            command,
-            None if touches is None else protocol.read_back(touches),
+            task,
             given,
             line=line,
             peer=asker.peer,
@@ -160,7 +204,7 @@ class Errand:
         return await self.node.followed_request(
             self.command,
             self.journey,
-            touches=self._touches,
+            touches=self._task.touches,
             stops_seen=self._stops_seen,
             stop=self._stop,
             **self._left(),
@@ -178,9 +222,8 @@ class Errand:
 
     def _wish(self) -> Wish:
         """Return what is on record of it: by the name of a point and in its unit, where the owner polls that."""
-        command, point = self.command, None
-        value: Any = self.text
-        if isinstance(command, Changing):
+        command, point, value = self.command, self._task.point, self._task.value
+        if point is None and isinstance(command, Changing):
             changes = command.changes(self.node.profile)
             point = self._line.named(self.node, changes.keys())
             if point is not None:

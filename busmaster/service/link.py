@@ -20,7 +20,7 @@ from busmaster.errors import (
 )
 from busmaster.service.failures import error_of
 from busmaster.service.folder import socket_path
-from busmaster.service.messages import LONGEST_MESSAGE, VERSIONS, Malformed, read, written
+from busmaster.service.messages import GOING_AWAY, LONGEST_MESSAGE, VERSIONS, Malformed, read, written
 
 if TYPE_CHECKING:
     from websockets.asyncio.client import ClientConnection
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 GRACE = 0.25
 """Seconds beyond `finish_within` in which the line's owner, who knows more, may say what became of a request."""
 CONNECT_WITHIN = 10.0
+ENDED = "the program that owns the line has ended"
 GONE = "the connection to the program that owns the line was lost"
 AGAIN = "see whether it runs, and connect again"
 
@@ -137,14 +138,18 @@ class Link:
         command: str | None = None,
     ) -> Asked:
         """Ask something, after all that was said before; its future has the answer. Raises LineDown or BusClosed."""
-        if self._over is not None:
-            kind, what, hint = self._over
-            raise kind(what, node=node, command=command, hint=hint)
+        self.check(node, command)
         self._count += 1
         asked = Asked(self._count, asyncio.get_running_loop().create_future(), writes, node, command)
         self._asked[asked.number] = asked
         self._put(written({"id": asked.number, "method": method, "params": params}), asked)
         return asked
+
+    def check(self, node: Addressed | None = None, command: str | None = None) -> None:
+        """Raise LineDown or BusClosed, saying why, once the connection is over."""
+        if self._over is not None:
+            kind, what, hint = self._over
+            raise kind(what, node=node, command=command, hint=hint)
 
     async def answer(self, asked: Asked, finish_within: float | None = None) -> Any:
         """Wait for an answer. Cancelling it cancels the request at the line too."""
@@ -212,6 +217,8 @@ class Link:
             pass
         except (Malformed, KeyError, TypeError, ValueError, AttributeError, InvalidCommand) as error:
             why = f"the program that owns the line said what is not understood: {error}"
+        if self._connection.close_code == GOING_AWAY:
+            why = ENDED
         self._end(LineDown, why, AGAIN)
 
     def _take(self, said: Mapping[str, Any]) -> None:

@@ -43,6 +43,10 @@ PARSE_ERROR, INVALID_REQUEST, NO_METHOD, INVALID_PARAMS, INTERNAL, BUS_ERROR = (
 )
 
 
+GOING_AWAY = 1001
+"""With which an owner that ends in good order closes a connection."""
+
+
 class Malformed(Exception):
     """This is no message: `code` says of JSON-RPC's errors which."""
 

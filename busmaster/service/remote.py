@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import AsyncIterator, Hashable, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Hashable, Iterable, Mapping
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, TypeVar, Unpack
@@ -25,6 +25,7 @@ from busmaster.errors import BusClosed, InvalidCommand
 from busmaster.planning.merging import Merge
 from busmaster.service.link import Asked, Link
 from busmaster.service.messages import said_timings, value_of
+from busmaster.service.remote_overview import RemoteOverview
 from busmaster.service.telling import (
     event_of,
     point_of,
@@ -238,7 +239,7 @@ class RemoteBus:
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
         """Those of them of which the owner knows."""
-        self._groups: dict[int, RemoteGroup] = {}
+        self._streams: dict[int, RemoteGroup | RemoteOverview] = {}
         self._count = 0
         self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
@@ -372,12 +373,19 @@ class RemoteBus:
             self.link.ask("events", {"stream": 0})
         return stream
 
+    async def overview(self, hear: Callable[[str, Mapping[str, Any]], None]) -> RemoteOverview:
+        """Have `hear` told what a person sees of the line, some times a second, as docs/service.md has it."""
+        self._count += 1
+        overview = self._streams[self._count] = RemoteOverview(self.link, self.now, hear)
+        await self._ask("overview", {"stream": self._count})
+        return overview
+
     def end_stream(self, number: int) -> None:
         """Have a stream told no more."""
-        group = self._groups.pop(number, None)
-        if group is not None:
+        stream = self._streams.pop(number, None)
+        if stream is not None:
             self.link.tell("end", {"stream": number})
-            group.end()
+            stream.end()
 
     # inside
 
@@ -390,7 +398,7 @@ class RemoteBus:
     ) -> RemoteGroup:
         self._count += 1
         number = self._count
-        group = self._groups[number] = RemoteGroup(self, name, number, points)
+        group = self._streams[number] = RemoteGroup(self, name, number, points)
         asked: Asked = self.link.ask(method, {**params, "stream": number})
         try:
             group.period = (await self.link.answer(asked))["period"]
@@ -409,11 +417,11 @@ class RemoteBus:
             for stream in self._events:
                 if event is not None:
                     stream.put(event)
-        elif (group := self._groups.get(params.get("stream", -1))) is not None:
-            group.hear(method, params)
+        elif (listener := self._streams.get(params.get("stream", -1))) is not None:
+            listener.hear(method, params)
 
     def _lost(self) -> None:
-        for group in list(self._groups.values()):
-            group.end()
+        for listener in list(self._streams.values()):
+            listener.end()
         for stream in list(self._events):
             stream.close()

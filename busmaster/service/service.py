@@ -23,6 +23,7 @@ from busmaster.gate.gate import Gate
 from busmaster.service.client import Client
 from busmaster.service.folder import Owner, ServedSocket, line_name, runtime_folder
 from busmaster.service.messages import (
+    GOING_AWAY,
     HELLO_WITHIN,
     INVALID_PARAMS,
     LONGEST_MESSAGE,
@@ -33,6 +34,7 @@ from busmaster.service.messages import (
     written,
 )
 from busmaster.service.outbox import Outbox
+from busmaster.service.overview import Journal, Overview, state_text
 from busmaster.service.peers import peer_of
 from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
 
@@ -48,7 +50,7 @@ READ_AT_ONCE = 4096
 """Bytes of a connection that are taken in one turn of the line's loop: of small messages it holds hundreds."""
 CLOSE_WITHIN = 1.0
 """Seconds that a client has to hear the last of it."""
-POLICY, GOING_AWAY = 1008, 1001
+POLICY = 1008
 
 
 class Service:
@@ -57,7 +59,7 @@ class Service:
     `path` is the socket's; without it, it is NAME.sock in this user's runtime folder, where `name` is that of the
     line, by default its port's. Every write passes `gate`: without one, its own, which keeps a record in the log
     "busmaster.audit". `mode` and `group`, a number, are the socket's. Entering raises InvalidCommand where the socket
-    is served by another process, which it names, or cannot be made.
+    is served by another process, which it names, or cannot be made. `title` is written over what a person sees of it.
     """
 
     def __init__(
@@ -69,10 +71,14 @@ class Service:
         path: Path | str | None = None,
         mode: int = 0o600,
         group: int | None = None,
+        title: str = "",
     ) -> None:
         self.bus = bus
         self.gate = gate or Gate(bus)
         self.name = name or line_name(bus.endpoint.name)
+        self.title = title or self.name
+        """What is written over what a person sees of the line."""
+        self.journal: Journal
         self.refused = 0
         """Connections that were one too many, or that began with what no client says."""
         self._path = None if path is None else Path(path).absolute()
@@ -84,6 +90,7 @@ class Service:
         self._count = 0
         self._groups: dict[PollGroup, GroupBroadcast] = {}
         self._events: EventBroadcast | None = None
+        self._overview: Overview | None = None
         self._points: dict[object, Point[Any]] = {}
         self._points_of: list[tuple[str, tuple[Point[Any], ...]]] = []
         self._log = logging.getLogger("busmaster.service")
@@ -130,6 +137,7 @@ class Service:
             served.__exit__(None, None, None)
             raise
         self.bus.on_stop.append(self._tell_stop)
+        self.journal = Journal(self.bus)
         return self
 
     async def __aexit__(
@@ -152,6 +160,7 @@ class Service:
                 await self._server.wait_closed()
             finally:
                 self._served.__exit__(None, None, None)
+                await self.journal.close()
 
     # what clients share
 
@@ -166,6 +175,35 @@ class Service:
         if self._events is None:
             self._events = EventBroadcast(self.bus, self._end_events)
         return self._events
+
+    def overview(self) -> Broadcast:
+        """Return what tells what a person sees of the line."""
+        if self._overview is None:
+            self._overview = Overview(self.bus, self.gate, self.journal, lambda: self.title, self._end_overview)
+        return self._overview
+
+    def group(self, name: str) -> PollGroup:
+        """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
+        found = next((group for group in self.bus.groups if group.name == name), None)
+        if found is None:
+            names = ", ".join(group.name for group in self.bus.groups) or "none"
+            raise InvalidCommand(f"no poll group {name!r}; there are: {names}")
+        return found
+
+    def point(self, group: str, key: str) -> tuple[PollGroup, Point[Any]]:
+        """Return a point of a poll group, and the group. Raises InvalidCommand if there is none."""
+        found = self.group(group)
+        for point in found.points:
+            if point.key == key:
+                return found, point
+        raise InvalidCommand(f"poll group {group!r} has no point {key!r}")
+
+    def node(self, protocol: str, address: int) -> Node:
+        """Return a node that is on the line. Raises InvalidCommand if there is none."""
+        for node in self.bus.nodes:
+            if (node.profile.name, node.address) == (protocol, address):
+                return node
+        raise InvalidCommand(f"there is no node {address} of {protocol} on this line")
 
     def named(self, node: Node, places: Collection[Hashable]) -> Point[Any] | None:
         """Return the point of a poll group that reads these places of a node."""
@@ -185,6 +223,9 @@ class Service:
 
     def _end_events(self) -> None:
         self._events = None
+
+    def _end_overview(self) -> None:
+        self._overview = None
 
     def _tell_stop(self, record: NodeRecord) -> None:
         for client in self._clients:
@@ -266,6 +307,7 @@ class Service:
             "process": owner.pid,
             "read_only": self.gate.read_only,
             "clients": len(self._clients),
+            "state": state_text(self.bus),
             "nodes": nodes,
         }
         client.outbox.put(written({"id": said.get("id"), "result": result}))

@@ -22,8 +22,8 @@ class Reader(Protocol):
         """Say something of a stream; it is dropped where the client does not keep up."""
         ...
 
-    def tell_surely(self, stream: int, method: str, body: dict[str, Any]) -> None:
-        """Say something of a stream that replaces what was said of it before."""
+    def tell_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
+        """Say something of a part of a stream that replaces what was said of it before."""
         ...
 
 
@@ -55,14 +55,17 @@ class Broadcast:
 
     async def _run(self) -> None:
         try:
-            async for method, body in self._bodies():
-                for reader, stream in self.readers:
-                    reader.tell(stream, method, body)
+            await self._tell()
         except (TypeError, BusError, InvalidCommand):  # what has a value that cannot be said, or is closed already
             logging.getLogger("busmaster.service").exception("a stream ended")
         self._on_end()
         for reader, stream in self.readers:
-            reader.tell_surely(stream, "ended", {})
+            reader.tell_surely(stream, "ended", "{}")
+
+    async def _tell(self) -> None:
+        async for method, body in self._bodies():
+            for reader, stream in self.readers:
+                reader.tell(stream, method, body)
 
     def _bodies(self) -> AsyncIterator[tuple[str, str]]:
         raise NotImplementedError
@@ -83,9 +86,9 @@ class GroupBroadcast(Broadcast):
         super().join(reader, stream)
 
     def _tell_points(self, *places: Place) -> None:
-        points = said_points(self._points)
+        body = encoded({"set": self._set, "points": said_points(self._points)})
         for reader, stream in places:
-            reader.tell_surely(stream, "points", {"set": self._set, "points": points})
+            reader.tell_surely(stream, "points", body)
 
     async def _bodies(self) -> AsyncIterator[tuple[str, str]]:
         stream = self.group.subscribe()
