@@ -274,7 +274,7 @@ def test_the_checks_see_an_import_inside_a_function_and_skip_one_for_types() -> 
 
 def test_what_the_core_may_import_outside_the_package_is_its_three_dependencies() -> None:
     """The extras stay optional: nothing below the command line and the outputs needs them."""
-    optional = {"click", "rich", "textual", "msgspec", "aiomqtt", "prometheus_client", "matplotlib"}
+    optional = {"click", "rich", "textual", "aiomqtt", "prometheus_client", "matplotlib"}
     optional |= {"websockets"}
     holders = {"cli", "config", "capture", "doctor", "outputs", "service", "testing", "__main__"}
     for module in modules():

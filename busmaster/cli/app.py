@@ -31,6 +31,7 @@ COMMANDS = (
     "run",
     "serve",
     "status",
+    "top",
     "safe",
     "plan",
     "points",

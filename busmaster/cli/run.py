@@ -16,7 +16,7 @@ from busmaster.cli.hangups import Hangups
 from busmaster.cli.lines import file_argument, load, other_port, port_option
 from busmaster.cli.output import Level, note, number_text
 from busmaster.cli.safe import tell_unsafe
-from busmaster.cli.serving import served
+from busmaster.cli.serving import served, service_of
 from busmaster.cli.systemd import ServiceManager
 from busmaster.cli.watching import Watch, follow
 from busmaster.config import ConfiguredLine, LineFile
@@ -100,10 +100,11 @@ class Running:
         """Run the line until it is told to end, send its safe state, and return the exit status."""
         entered = False
         self.line.outputs.tell = self._tell_of_output
+        service = service_of(self.line, wanted=self._view.silent)  # now: it keeps what happens as the line is opened
         try:
             async with self.line:
                 entered = True
-                async with served(self.line, tell=self._view.silent):
+                async with served(service, tell=self._view.silent) as self._watch.service:
                     try:
                         return await self._poll()
                     finally:
@@ -153,7 +154,8 @@ class Running:
         except (InvalidCommand, OSError) as error:
             note(f"the file was read again, and nothing of it taken: {error}", Level.ERROR)
         else:
-            self._watch.title = file.title
+            if self._watch.service is not None:
+                self._watch.service.title = file.title
             self._watch.replace_groups(self.line.groups.values())
             note(f"{self._path} was read again", Level.NOTICE)
             self._say_what_is_polled()

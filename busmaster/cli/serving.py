@@ -14,28 +14,38 @@ from busmaster.service.folder import line_name
 from busmaster.service.service import Service
 
 
-@asynccontextmanager
-async def served(line: ConfiguredLine, *, tell: bool) -> AsyncIterator[None]:
-    """Serve the line to other programs, unless its file says otherwise. One that cannot be served runs all the same.
+def service_of(line: ConfiguredLine, *, wanted: bool) -> Service | None:
+    """Return what is to serve the line to other programs; None where its file does not want that.
 
-    Says where it is served if it is to `tell`.
+    It is not missed either where its extra is not installed, unless the file asks for it, or it is `wanted`.
     """
     section = line.file.service
     said = bool(section.table.data)
-    if not section.enabled or (find_spec("websockets") is None and not (said or tell)):
-        yield
-        return
+    if not section.enabled or (find_spec("websockets") is None and not (said or wanted)):
+        return None
     name = line_name(os.path.basename(line.file.path).removesuffix(".toml"))
-    service = Service(line.bus, gate=line.gate, name=name, mode=section.mode, group=section.group)
+    title = line.file.title
+    return Service(line.bus, gate=line.gate, name=name, mode=section.mode, group=section.group, title=title)
+
+
+@asynccontextmanager
+async def served(service: Service | None, *, tell: bool) -> AsyncIterator[Service | None]:
+    """Serve a line, and yield what serves it; None for a line that cannot be served, which runs all the same.
+
+    Says where it is served if it is to `tell`.
+    """
+    if service is None:
+        yield None
+        return
     try:
         await service.__aenter__()
     except InvalidCommand as error:
         note(f"no other program can use this line: {error}", Level.WARNING)
-        yield
+        yield None
         return
     try:
         if tell:
-            note(f"{line.file.title} is served at {service.address}", Level.NOTICE)
-        yield
+            note(f"{service.title} is served at {service.address}", Level.NOTICE)
+        yield service
     finally:
         await service.__aexit__(None, None, None)

@@ -16,7 +16,7 @@ from busmaster.contract.arguments import seconds
 from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
-from busmaster.gate.gate import FRESH, Gate, Wish
+from busmaster.gate.gate import FRESH, NEVER_SENT, Gate, Wish, outcome_of
 from busmaster.service.messages import value_of
 from busmaster.service.overview import Journal
 from busmaster.service.peers import Peer
@@ -103,13 +103,23 @@ class Task:
         return cls(node, command, None if touches is None else protocol.read_back(touches), str(command))
 
     @classmethod
-    def of_point(cls, params: Mapping[str, Any], line: Line) -> Task:
-        """Return the write of a value to a point of a poll group. Raises InvalidCommand for what cannot be written."""
+    def of_point(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Task:
+        """Return the write of a value to a point of a poll group.
+
+        Raises InvalidCommand, and keeps a record of it, for what cannot be written.
+        """
         _, point = line.point(params["point"]["group"], params["point"]["key"])
         value = value_of(params["value"])
-        if point.encode is None or not isinstance(point.node, Node):
-            raise InvalidCommand(f"{point.key} is read-only")
-        return cls(point.node, point.encode(value), point.command, value, point)
+        assert isinstance(point.node, Node)
+        try:
+            if point.encode is None:
+                raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
+            return cls(point.node, point.encode(value), point.command, value, point)
+        except NEVER_SENT as error:
+            wish = Wish(door=DOOR, by=str(asker.peer), name=point.key, point=point, value=value)
+            refusal = line.gate.refusal(wish) or outcome_of(error)[1]
+            line.gate.refuse(wish, refusal)
+            raise InvalidCommand(refusal) from None
 
 
 class Errand:
@@ -141,7 +151,7 @@ class Errand:
     @classmethod
     def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
-        task = Task.of_point(params, line) if "point" in params else Task.of_node(params, asker)
+        task = Task.of_point(params, asker, line) if "point" in params else Task.of_node(params, asker)
         node, command = task.node, task.command
         given = cast("CommandOptions", dict(params.get("options", {})))
         if not set(given) <= OPTIONS:

@@ -19,7 +19,7 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.samples import Sample
-from busmaster.bus.snapshots import Snapshot, Stream
+from busmaster.bus.snapshots import Snapshot
 from busmaster.contract.places import Placed
 from busmaster.gate.gate import Gate
 from busmaster.outputs.values import event_text, value_text
@@ -51,7 +51,11 @@ class Journal:
         self.entries: deque[tuple[float, str]] = deque(maxlen=KEPT_EVENTS)
         """Each with when it was noted, by the bus's clock."""
         self._bus = bus
-        self._stream: Stream[Any] = bus.events()
+        self._stream = bus.events()
+        self._task: asyncio.Task[None] | None = None
+
+    def begin(self) -> None:
+        """Take in what has happened since it was made, and what will."""
         self._task = asyncio.ensure_future(self._listen())
 
     def note(self, text: str) -> None:
@@ -61,7 +65,8 @@ class Journal:
     async def close(self) -> None:
         """Listen no more."""
         self._stream.close()
-        await self._task
+        if self._task is not None:
+            await self._task
 
     async def _listen(self) -> None:
         async for event in self._stream:
@@ -304,7 +309,7 @@ def _said_node(node: Node) -> dict[str, Any]:
         "address": node.address,
         "health": "suspended" if node.suspended else node.health.value,
         "requests": counts.attempts,
-        "failed": counts.no_reply + counts.garbled + counts.refused,
+        "failed": counts.fruitless,
         "late": counts.late,
         "p50": counts.latency.p50,
         "p99": counts.latency.p99,

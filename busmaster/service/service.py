@@ -78,7 +78,8 @@ class Service:
         self.name = name or line_name(bus.endpoint.name)
         self.title = title or self.name
         """What is written over what a person sees of the line."""
-        self.journal: Journal
+        self.journal = Journal(bus)
+        """What happens from now on, also before it is entered."""
         self.refused = 0
         """Connections that were one too many, or that began with what no client says."""
         self._path = None if path is None else Path(path).absolute()
@@ -137,7 +138,7 @@ class Service:
             served.__exit__(None, None, None)
             raise
         self.bus.on_stop.append(self._tell_stop)
-        self.journal = Journal(self.bus)
+        self.journal.begin()
         return self
 
     async def __aexit__(

@@ -13,9 +13,6 @@ import pytest
 
 from busmaster.bus.node import Node
 from busmaster.bus.requester import Priority
-from busmaster.cli.arguments import View
-from busmaster.cli.messages import Action
-from busmaster.cli.watching import Watch
 from busmaster.cli.write import pass_on, prepare, wish_of
 from busmaster.config import ConfiguredLine, emulated_line
 from busmaster.config.sections import read
@@ -32,6 +29,9 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
+from busmaster.service.errands import Errand
+from busmaster.service.peers import Peer
+from busmaster.service.service import Service
 from busmaster.testing.virtual_time import run_in_virtual_time
 
 FILE = """
@@ -170,13 +170,22 @@ def by_mqtt(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     return write
 
 
+class Person:
+    """Who looks at the line, and writes by a key."""
+
+    peer = Peer(1, "operator", "busmaster")
+
+    def node(self, name: str, address: int, /) -> Node:
+        raise AssertionError("a person names points")
+
+    def stops_before(self, node: Node, /) -> int:
+        return 0
+
+
 def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
-        watch = Watch(plant.line.bus, "", View(plain=True), gate=plant.line.gate)
-        for group in plant.line.groups.values():
-            watch.add(group)
-        await watch.act(Action("write", "drive", name, str(value)))
-        raise_if(plant.records[-1].error)
+        params = {"point": {"group": "all", "key": f"drive/{name}"}, "value": value}
+        await Errand.of(params, Person(), Service(plant.line.bus, gate=plant.line.gate)).run()
 
     return write
 
