@@ -113,12 +113,12 @@ def test_the_demo_ends_by_itself_after_its_seconds() -> None:
 class Terminal:
     """A real pseudo-terminal of 80 by 24, and what was drawn on it."""
 
-    def __init__(self, *arguments: str) -> None:
+    def __init__(self, *arguments: str, program: tuple[str, ...] = ("-m", "busmaster")) -> None:
         self.master, slave = pty.openpty()
         ioctl(slave, TIOCSWINSZ, pack("HHHH", 24, 80, 0, 0))
         self.before = tcgetattr(slave)
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "busmaster", *arguments],
+            [sys.executable, *program, *arguments],
             cwd=ROOT,
             env=ENVIRONMENT | {"TERM": "xterm-256color", "PYTHONWARNINGS": ""},
             stdin=slave,

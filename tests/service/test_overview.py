@@ -199,7 +199,8 @@ def test_what_happened_before_somebody_looks_is_told(tmp_path: Path) -> None:
         await until(lambda: picture.frame is not None)
         assert picture.frame is not None
         first, *_, last = [text for _, text in picture.frame.events]
-        assert (first, last) == ("the winder was threaded", "node 8 is down, was suspect")
+        assert first == "the winder was threaded"
+        assert last.startswith("node 8 is down")
 
     on_a_served_line(tmp_path, story)
 
