@@ -159,12 +159,13 @@ def gauge_line(frame: Frame, width: int) -> Text:
 def group_line(group: Group, width: int) -> Text:
     """Draw the line of one poll group: its periods in milliseconds, and its cycles."""
     line = Text.assemble(" ", (group.name, "bold"))
-    line.append("  paused" if group.paused else "", "bold reverse")
-    line.append(f" every {group.period * 1000:g} ms")
+    if group.paused:
+        line = Text.assemble(line, "  ", ("paused", "bold reverse"), " ")
+    line.append(f" every {group.period * 1000:g} ms  ")
+    line.append(f"missed {group.missed}", "bold" if group.missed else "")
+    line.append(f"  cycle {group.cycles}")
     if group.achieved:
         line.append(f", achieved {group.achieved * 1000:.1f}, late p99 {group.jitter * 1000:.1f}")
-    line.append(f"  cycle {group.cycles}  ")
-    line.append(f"missed {group.missed}", "bold" if group.missed else "")
     line.truncate(width, overflow="ellipsis")
     return line
 

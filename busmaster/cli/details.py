@@ -41,7 +41,7 @@ def _facts(
         yield "error", f"{row.error}; {told['hint']}" if told.get("hint") else row.error
     if node is not None:
         state = "offline" if frame and frame.state == "offline" else node.health
-        times = f"p50 {node.p50 * 1000:.1f} ms, p99 {node.p99 * 1000:.1f} ms"
+        times = f"p50 {node.p50 * 1000:.1f}, p99 {node.p99 * 1000:.1f} ms"
         counts = f"{node.requests} requests, {node.failed} failed, {node.late} late, {times}"
         yield "node", f"{node.protocol} {node.address}, {state}: {counts}"
     if group is not None:
@@ -77,7 +77,7 @@ def _exchange_text(times: Mapping[str, Any]) -> str:
         return f"{attempts} attempts, none answered" if attempts else "not sent"
     parts = [f"waited {_ms(started - queued)}"]
     if times["exchanges_ahead"]:
-        parts[0] += f" behind {times['exchanges_ahead']} others"
+        parts[0] += f" behind {times['exchanges_ahead']}"
     if times["settling_ahead"]:
         parts[0] += f", {_ms(times['settling_ahead'])} of it while the line settled"
     if times["first_byte"] is not None:

@@ -129,7 +129,6 @@ class Screen(App[int]):
 
     def on_resize(self) -> None:
         """Fit the picture to the terminal's new size."""
-        self._widths = column_widths(self.size.width)
         self.call_after_refresh(self.draw)
 
     # drawing
@@ -147,6 +146,7 @@ class Screen(App[int]):
         frame = self.picture.frame
         if frame is None:
             return
+        self._widths = column_widths(self.size.width)
         self._of_node = self.picture.nodes
         groups = self.picture.groups
         self._of_group = {group.name: group for group in groups}

@@ -218,7 +218,7 @@ class Link:
         except (Malformed, KeyError, TypeError, ValueError, AttributeError, InvalidCommand) as error:
             why = f"the program that owns the line said what is not understood: {error}"
         if self._connection.close_code == GOING_AWAY:
-            why = ENDED
+            self._end(LineDown, ENDED, "start it, and connect again")
         self._end(LineDown, why, AGAIN)
 
     def _take(self, said: Mapping[str, Any]) -> None:

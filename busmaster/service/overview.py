@@ -30,9 +30,9 @@ INTERVAL = 0.2
 """Seconds between two pictures."""
 COUNTED_EVERY = 0.5
 """Seconds between two looks at the counts of nodes and groups."""
-PART = 100
+PART = 50
 """Points that are said in one message, and worked out in one turn of the line's loop."""
-COUNTED_AT_ONCE = 10
+COUNTED_AT_ONCE = 5
 """Nodes, or groups, that are."""
 MOST_POINTS = 10_000
 """Points of a picture; of those beyond it, it is said how many there are."""

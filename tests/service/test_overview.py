@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,7 +22,7 @@ from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from busmaster.service import overview
-from busmaster.service.overview import INTERVAL, PART
+from busmaster.service.overview import COUNTED_AT_ONCE, INTERVAL, PART, Part
 from busmaster.service.remote_overview import RemoteOverview
 from tests.service.lines import PATIENT, Served, on_a_served_line, raw, until
 from tests.stories import in_virtual_time
@@ -234,6 +235,42 @@ def test_one_that_does_not_read_sees_fewer_pictures_and_no_other_fewer(tmp_path:
             await until(lambda: picture.frame and picture.frame.now > seen + 10 * INTERVAL)
             assert client.outbox.waiting < 10
             client.outbox._sending = False
+
+    on_a_watched_line(tmp_path, story)
+
+
+def test_the_line_goes_between_one_part_and_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    turn, worked = 0, list[int]()
+
+    async def turns() -> None:
+        nonlocal turn
+        while True:
+            turn += 1
+            await asyncio.sleep(0)
+
+    for name in ("say_values", "_said_groups", "_said_nodes"):
+        owner = Part if name == "say_values" else overview
+        plain = getattr(owner, name)
+
+        def noted(*arguments: Any, plain: Any = plain) -> Any:
+            told = plain(*arguments)
+            if told:
+                worked.append(turn)
+            return told
+
+        monkeypatch.setattr(owner, name, noted)
+
+    async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
+        controller = Hcp2Controller(line.bus, 5)
+        points: list[Point[object]] = [replace(controller.point("10"), item=f"p{n}") for n in range(5 * PART)]
+        line.bus.poll_group("many", period=0.02, points=points)
+        for address in range(20, 20 + 2 * COUNTED_AT_ONCE):
+            Hcp2Controller(line.bus, address)
+        turning = asyncio.ensure_future(turns())
+        worked.clear()
+        await until(lambda: len(worked) > 50)
+        turning.cancel()
+        assert len(worked) == len(set(worked))
 
     on_a_watched_line(tmp_path, story)
 
