@@ -16,7 +16,7 @@ START = 0
 
 
 def misheard(data: bytes, sent: LineSettings, heard: LineSettings) -> Iterator[tuple[int, bool]]:
-    """Yield the bytes that a receiver set to `heard` makes of contiguous ones sent as `sent`, and whether each is whole.
+    """Yield the bytes that one set to `heard` makes of contiguous ones sent as `sent`, and whether each is whole.
 
     One whose parity or stop bit is wrong is not.
     """

@@ -254,8 +254,9 @@ def flood(server: socket.socket) -> None:
 
 def test_where_nobody_answers_that_is_one_finding() -> None:
     findings = examined(line_of("hcp2", [hcp2(5)]), (6, 7))
-    assert findings.wrong == {"nodes"}
+    assert findings.wrong == {"nodes", "settings"}
     assert findings.on("nodes").what == "no answer from nodes 6, 7 at 57600 8N1"
+    assert findings.on("settings").what == "nodes 6, 7: no answer with 20 other settings either"
 
 
 def test_what_learned_windows_would_come_to_is_said() -> None:
