@@ -8,6 +8,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from statistics import median
 
 from busmaster.config.rewriting import toml_text
 from busmaster.contract.profile import LineSettings
@@ -30,7 +31,8 @@ def line_text(port: SerialPort | TcpPort, discovery: Discovery) -> str:
     names = {node: _name(node, found) for node in found}
     polled = [node for node in found if not node.refuses]
     lines = [
-        f"# What answered on {port.name}: {summary(discovery)}. `busmaster items PROTOCOL` lists what else can be read.",
+        f"# What answered on {port.name}: {summary(discovery)}.",
+        "# `busmaster items PROTOCOL` lists what else can be read.",
         "",
         'title = "Discovered line"',
         "",
@@ -96,13 +98,13 @@ def _port(port: SerialPort | TcpPort, discovery: Discovery) -> Iterator[str]:
 def _node(name: str, node: Found) -> Iterator[str]:
     kind = node.protocol.kinds[0]
     others = [other.name for other in node.protocol.kinds[1:]]
-    times = " / ".join(map(milliseconds, (node.starts[0], percentile(node.starts))))
+    times = " / ".join(map(milliseconds, (node.starts[0], median(node.starts), percentile(node.starts))))
     yield f"[nodes.{name}]"
-    yield f"# it said: {' '.join(node.text.split())}; replies began after {times} ms (least / p99)"
+    yield f"# it said: {' '.join(node.text.split())}; replies began after {times} ms (least / median / p99)"
     yield f"protocol = {toml_text(kind.name)}" + (f"  # or {', '.join(map(toml_text, others))}" if others else "")
     if node.protocol.profile.addressed:
         yield f"address = {node.address}"
-    yield f"reply_time = {max(0.001, round(percentile(node.starts), 4)):g}"
+    yield f"reply_time = {max(0.001, round(median(node.starts), 4)):g}"
     window = node.protocol.profile.timings.read.window
     slowest = node.starts[-1]
     if slowest > NEAR * window:
