@@ -15,19 +15,20 @@ from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit_all, note
 from busmaster.cli.parsing import parsed
-from busmaster.config.sections import read
-from busmaster.config.source import Source
 from busmaster.contract.profile import LineSettings
 from busmaster.discovery.search import Discovery, Search
 from busmaster.discovery.steps import LISTENING, Step, seconds, steps, untuned_steps
 from busmaster.discovery.writing import lasting, line_text, summary
+from busmaster.doctor.diagnosis import speed
 from busmaster.doctor.probing import opened
+from busmaster.errors import InvalidCommand
 from busmaster.registry import Protocol, find, kinds, protocols
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
 FAILED = 1
+SERVED = ("unix:", "tcp:")
 USUAL = LineSettings(9600)
 """What a port is opened with until something is tried."""
 
@@ -77,7 +78,6 @@ def command(
     if discovery is None:
         return FAILED
     text = line_text(lasting(errand.port), discovery)
-    read(Source(output or "LINE.toml", text))  # what is written is what `run` takes, or this is a bug
     note(f"found {summary(discovery)}")
     if output is None:
         emit_all(text.splitlines())
@@ -91,6 +91,8 @@ def what_to_try(
     port: str, names: Sequence[str], nodes: Sequence[int] | None
 ) -> tuple[SerialPort | TcpPort, Sequence[Step]]:
     """Return the port, and what is tried there. Raises InvalidCommand."""
+    if port.startswith(SERVED):
+        raise InvalidCommand(f"{port} is a line that a program owns and knows: discover needs the port itself")
     wanted: Sequence[Protocol] = list(dict.fromkeys(find(name).protocol for name in names)) or protocols()
     where = endpoint(port, defaults=USUAL)
     if isinstance(where, TcpPort):
@@ -104,11 +106,18 @@ def what_to_try(
 def tell_plan(errand: Errand) -> None:
     """Say what will be tried, and for how long."""
     tried = errand.tried
-    settings = dict.fromkeys(step.settings for step in tried)
+    settings = list(dict.fromkeys(step.settings for step in tried))
     titles = dict.fromkeys(step.protocol.profile.title for step in tried)
     requests = sum(len(step.addresses) for step in tried)
-    at = "at the server's own rate" if None in settings else f"at {len(settings)} settings of the line"
-    note(f"{errand.port.name}: listen for {LISTENING:g} s; then {requests} reads, {at}, in {', '.join(titles)}")
+    match settings:
+        case [None]:
+            at = "at the server's own rate"
+        case [LineSettings() as only]:
+            at = f"at {speed(only)}"
+        case _:
+            at = f"at {len(settings)} settings of the line"
+    reads = "1 read" if requests == 1 else f"{requests} reads"
+    note(f"{errand.port.name}: listen for {LISTENING:g} s; then {reads}, {at}, in {', '.join(titles)}")
     note(f"that takes {seconds(tried):.0f} s at most where nobody answers; nothing is written to any node")
 
 

@@ -77,7 +77,7 @@ def _name(node: Found, found: Sequence[Found]) -> str:
     if not node.protocol.profile.addressed:
         return "drive"
     alone = len({other.protocol.name for other in found}) == 1
-    return f"node{node.address}" if alone else f"{node.protocol.kinds[0].name}{node.address}"
+    return f"node{node.address}" if alone else f"{node.protocol.kinds[0].name}_{node.address}"
 
 
 def _port(port: SerialPort | TcpPort, discovery: Discovery) -> Iterator[str]:

@@ -158,7 +158,8 @@ class Probe:
     """One request and what was heard of it, without an echo.
 
     `start`: seconds from the request's end on the wire to the first byte, None if there was none. `text` is the command
-    and its value or refusal, or what was wrong. `again`: bytes that came after the reply, to which nobody was entitled.
+    and its value or refusal, or what was wrong. `raw` is all that came, and `again` what of it came after the reply, to
+    which nobody was entitled.
     """
 
     outcome: Outcome
@@ -273,7 +274,8 @@ class _Hearing:
         text = value_text(result) if verdict is Verdict.OK else result
         left_over = b"" if self.driver.ending is None else self.driver.ending.rest
         told = f"{self._command}: {text}"
-        return Probe(Outcome.ANSWERED, self.start, told, self._raw, left_over + rest, verdict is Verdict.REFUSED)
+        raw = self._raw + rest
+        return Probe(Outcome.ANSWERED, self.start, told, raw, left_over + rest, verdict is Verdict.REFUSED)
 
     def _hear(self, now: float, data: bytes) -> None:
         if self.start is None:
