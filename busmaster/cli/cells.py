@@ -35,8 +35,14 @@ STYLES = {
     "offline": "bold reverse",
 }
 """Of a health. Nothing is told by its colour alone; those that a light or a dark ground swallows are not used."""
-MARKS = {"error": ("!", "bold red"), "late": ("~", "magenta"), "stale": ("?", "magenta")}
-"""Beside a value: it could not be read; it came late; it is older than a write to it."""
+MARKS = {
+    "error": ("!", "bold red"),
+    "high": ("↑", "bold magenta"),
+    "low": ("↓", "bold magenta"),
+    "late": ("~", "magenta"),
+    "stale": ("?", "magenta"),
+}
+"""Beside a value: it could not be read; it is beyond its limit; it came late; it is older than a write to it."""
 
 
 def sparkline(numbers: Sequence[float | None]) -> str:
@@ -201,7 +207,7 @@ def row_line(
     row: Row, node: Node | None, group: Group | None, frame: Frame, widths: dict[str, int], selected: bool = False
 ) -> Text:
     """Draw the line of one point."""
-    fault = "error" if row.error else row.quality
+    fault = "error" if row.error else row.alarm or row.quality
     mark, style = MARKS.get(fault, ("", ""))
     age = None if row.asked is None else max(0.0, frame.now - row.asked)
     paused = group is not None and group.paused
@@ -219,7 +225,7 @@ def row_line(
     if "TREND" in widths:
         numbers = [number for _, number in row.past][-widths["TREND"] :]
         cells["TREND"] = left(sparkline(numbers), widths["TREND"])
-        cells["P50ms"] = right(f"{node.p50 * 1000:.1f}" if node and node.requests else "", widths["P50ms"])
+        cells["P50ms"] = right(f"{node.p50 * 1000:.1f}" if node and node.p50 else "-", widths["P50ms"])
     line = Text(" ").join(cells[name] for name in widths)
     if selected:
         line.stylize("reverse")

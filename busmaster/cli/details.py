@@ -11,6 +11,8 @@ from busmaster.cli.cells import age_text, sparkline
 from busmaster.cli.output import number_text, value_text
 from busmaster.cli.picture import Frame, Group, Node, Row, made_printable
 
+RECENT = 6
+"""Values that are shown as numbers."""
 QUALITIES = {"late": "came late", "stale": "older than a write to it"}
 
 
@@ -25,6 +27,8 @@ def details_text(
     if numbers:
         trend = [number for _, number in row.past][-width:]
         lines.append(Text(sparkline(trend)))
+        recent = [value_text(number, row.precision) for number in reversed(trend[-RECENT:])]
+        lines.append(Text(f"of late {'  '.join(recent)}"))
         span = row.past[-1][0] - row.past[0][0]
         lowest, highest = (value_text(one, row.precision) for one in (min(numbers), max(numbers)))
         lines.append(Text(f"{len(row.past)} values in {span:.1f} s, {lowest} to {highest}"))
@@ -37,6 +41,8 @@ def _facts(
     value = f"{value_text(row.value, row.precision)} {row.unit}".rstrip()
     age = f", asked for {age_text(frame.now - row.asked)} ago" if frame and row.asked is not None else ""
     yield "value", value + (f", {QUALITIES[row.quality]}" if row.quality in QUALITIES else "") + age
+    if row.alarm:
+        yield "alarm", f"it has left its {row.alarm} limit"
     if row.error:
         yield "error", f"{row.error}; {told['hint']}" if told.get("hint") else row.error
     if node is not None:

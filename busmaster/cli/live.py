@@ -47,19 +47,20 @@ KEYS = (
     ("d", "poll now"),
 )
 HELP = """\
-?          these keys
-↑ ↓        another row; also Page up, Page down, Home, End
-Enter      all that is known of the row: its limits, its last exchange, its past
-/          show only rows with some words: a node, an item, a group, a unit, a health
-o          another order: as listed by node, by item, the oldest first, trouble first
-p   P      pause the row's group, or all groups; again to go on
-d   D      poll the row's group now, or all groups
-s          suspend the row's node for 60 s, or let it go on; it is asked whether that is meant
-w          write the row's point; it is asked whether that is meant
-q          {leave}
-Ctrl-C     the same, with exit status 130
+?       these keys
+↑ ↓     another row; also Page up, Page down, Home, End
+Enter   details of the row: limits, last exchange, past
+/       only rows with some words: node, item, group, health
+o       order: by node, by item, oldest first, trouble first
+p P     pause the row's group, all groups; again: go on
+d D     poll the row's group now, all groups
+s       suspend the row's node, or let it go on (asks)
+w       write the row's point (asks)
+q       {leave}
+Ctrl-C  the same, with exit status 130
 
-!  could not be read: its last good value, growing old     ~  came late     ?  older than a write to it"""
+!  could not be read: its last good value, growing old
+↑ ↓  beyond its limit     ~  came late     ?  older than a write to it"""
 
 
 class Line(Protocol):

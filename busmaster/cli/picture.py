@@ -35,6 +35,8 @@ class Row:
     asked: float | None = None
     error: str = ""
     """What went wrong in the last cycle."""
+    alarm: str = ""
+    """The limit that it has left: low or high."""
     past: deque[tuple[float, float | None]] = field(default_factory=lambda: deque(maxlen=KEPT_VALUES))
     """When it was asked for, and the number; None for no value."""
     number: int = 0
@@ -49,11 +51,11 @@ class Row:
         """Node and item."""
         return f"{self.node} {self.item}"
 
-    def take(self, value: Any, quality: str, asked: float, error: str) -> None:
+    def take(self, value: Any, quality: str, asked: float, error: str, alarm: str, *_: Any) -> None:
         """Take the outcome of a cycle, once."""
         if self.past and self.past[-1][0] == asked:
             return
-        self.error = error
+        self.error, self.alarm = error, alarm
         self.past.append((asked, value if isinstance(value, int | float) and not error else None))
         if not error:
             self.value, self.quality, self.asked = value, quality, asked
@@ -62,7 +64,7 @@ class Row:
         """Go on from what was known of the same point."""
         if (self.protocol, self.address, self.unit) == (before.protocol, before.address, before.unit):
             self.value, self.quality, self.asked = before.value, before.quality, before.asked
-            self.error, self.past = before.error, before.past
+            self.error, self.alarm, self.past = before.error, before.alarm, before.past
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +215,9 @@ def made_printable(told: Any) -> Any:
 def matching(rows: list[Row], nodes: Mapping[tuple[str, int], Node], words: str) -> Iterator[Row]:
     """Yield the rows in whose names, group, unit, health or error each of the words is."""
     wanted = words.lower().split()
+    if not wanted:
+        yield from rows
+        return
     for row in rows:
         node = nodes.get((row.protocol, row.address))
         text = f"{row.node} {row.item} {row.key} {row.group} {row.unit} {node.health if node else ''} {row.error}"

@@ -25,7 +25,7 @@ from busmaster.cli.drawing import draw, served_here
 from busmaster.cli.output import Level, SteadyOutput, emit_all, json_line, note, value_text
 from busmaster.cli.top import what_is_missing
 from busmaster.doctor import uart
-from busmaster.errors import BusError
+from busmaster.errors import BusError, InvalidCommand
 from busmaster.gate.gate import Gate
 from busmaster.outputs.values import cycle_fields, event_text
 from busmaster.service.service import Service
@@ -228,7 +228,11 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
 
     async with AsyncExitStack() as stack:
         if shown_on_screen(view) and watch.service is None:
-            watch.service = await stack.enter_async_context(served_here(watch.gate, watch.title))
+            try:
+                watch.service = await stack.enter_async_context(served_here(watch.gate, watch.title))
+            except (OSError, InvalidCommand) as error:  # no folder for it, say: the line runs all the same
+                note(f"there is no live view: {error}; plain lines instead", Level.WARNING)
+                watch.view = view = replace(view, plain=True)
         try:
             with anyio.move_on_after(view.seconds):
                 async with anyio.create_task_group() as tasks:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
 from operator import is_
 from typing import Any
 
 from busmaster.arbiter.state import LineState
+from busmaster.bus.alarms import AlarmChanged
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
@@ -91,13 +92,13 @@ class Part:
         self.rows = encoded({"set": number, "first": self.first, "rows": rows})
         self.values = encoded({"set": number, "first": self.first, "values": []})
 
-    def say_values(self, number: int) -> bool:
+    def say_values(self, number: int, alarms: Mapping[Point[Any], AlarmChanged | None]) -> bool:
         """Work out what these points hold, and return whether there is a cycle since they were last looked at."""
         snapshot = self.group.latest
         if snapshot is None or snapshot is self._seen:
             return False
         self._seen = snapshot
-        values = [_said_value(point, snapshot.samples.get(point)) for point in self._points]
+        values = [_said_value(point, snapshot.samples.get(point), alarms.get(point)) for point in self._points]
         self.values = encoded({"set": number, "first": self.first, "values": values})
         return True
 
@@ -148,7 +149,7 @@ class Overview(Broadcast):
             if new:
                 part.say_rows(self._set)
             self._say("rows", number, part.rows, tuple(self.readers) if new else fresh)
-            changed = part.say_values(self._set)
+            changed = part.say_values(self._set, self._bus.alarms)
             self._say("values", number, part.values, tuple(self.readers) if changed else fresh)
             if new or changed:
                 await asyncio.sleep(0)
@@ -253,12 +254,16 @@ def _said_point(group: PollGroup, point: Point[Any]) -> dict[str, Any]:
     }
 
 
-def _said_value(point: Point[Any], sample: Sample[Any] | None) -> list[Any] | None:
-    """Return value, quality, when it was asked for and what went wrong; None where the cycle did not have the point."""
+def _said_value(point: Point[Any], sample: Sample[Any] | None, alarm: AlarmChanged | None = None) -> list[Any] | None:
+    """Return value, quality, when it was asked for, what went wrong, and the limit that it has left ("" for none).
+
+    None where the cycle did not have the point.
+    """
     if sample is None:
         return None
     asked = sample.finished if sample.started is None else sample.started
-    return [shown(point, sample.value), sample.quality.value, asked, "" if sample.error is None else sample.error.what]
+    error = "" if sample.error is None else sample.error.what
+    return [shown(point, sample.value), sample.quality.value, asked, error, "" if alarm is None else alarm.limit]
 
 
 def shown(point: Point[Any], value: Any) -> Any:

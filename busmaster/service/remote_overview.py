@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from busmaster.errors import BusError
 from busmaster.service.link import Link
 
 SOON = 1.0
@@ -33,9 +34,10 @@ class RemoteOverview:
         self._ended.set()
 
     async def over(self) -> None:
-        """Wait for the end. Raises LineDown, or BusClosed, with its cause."""
+        """Wait for the end. Raises LineDown, BusClosed, or another BusError, with its cause."""
         await self._ended.wait()
         self._link.check()
+        raise BusError("the program that owns the line shows it no more", hint="see its log")
 
     async def pause(self, group: str, paused: bool) -> None:
         """Have a poll group rest, or go on, for all who use the line. Raises InvalidCommand for one that is gone."""

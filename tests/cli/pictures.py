@@ -33,8 +33,8 @@ GROUP: dict[str, Any] = {
 
 
 def row(node: int = 5, item: str = "outputs", value: Any = 0, **said: Any) -> tuple[dict[str, Any], list[Any] | None]:
-    """A point and what it holds: `quality`, `asked` and `error` are of that, what else is said is of the point."""
-    held = [value, said.pop("quality", "good"), said.pop("asked", 1060.9), said.pop("error", "")]
+    """A point and what it holds: `quality`, `asked`, `error` and `alarm` are of that, the rest is of the point."""
+    held = [value, said.pop("quality", "good"), said.pop("asked", 1060.9), said.pop("error", ""), said.pop("alarm", "")]
     point = {
         "group": "axes",
         "key": f"{node}/{item}",

@@ -191,6 +191,13 @@ async def test_a_paused_group_rests_and_is_not_late() -> None:
 
 
 @pytest.mark.asyncio
+async def test_a_value_that_could_not_be_read_came_late_or_left_its_limits_has_a_mark() -> None:
+    rows = (row(1, error="no reply"), row(2, quality="late"), row(3, alarm="high"), row(4, alarm="low"))
+    async with drawn(tell(Picture(), *rows, row(5, quality="stale"), row(6))) as (screen, _, _):
+        assert [words[3] for words in table(screen)] == ["!", "~", "↑", "↓", "?", "0"]
+
+
+@pytest.mark.asyncio
 async def test_many_groups_leave_room_for_the_points_and_that_of_the_row_is_shown() -> None:
     groups = tuple({**GROUP, "name": f"group{number}"} for number in range(30))
     async with drawn(tell(Picture(), row(group="group17"), groups=groups), (60, 20)) as (screen, _, _):

@@ -137,6 +137,26 @@ def test_a_run_whose_line_is_served_to_nobody_has_its_own_view(busmaster: Comman
         assert gave_back(shown)
 
 
+NOWHERE = """
+import os, sys
+from busmaster.cli import main
+os.environ["TMPDIR"] = sys.argv[1]
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+def test_a_run_whose_view_cannot_be_served_prints_plain_lines(file: Path, tmp_path: Path) -> None:
+    file.write_text(file.read_text() + "[service]\nenabled = false\n")
+    long = tmp_path / ("x" * 100)
+    long.mkdir()
+    with terminal(str(long), "run", str(file), program=("-c", NOWHERE)) as shown:
+        shown.until(lambda drawn: b"winder/force 0" in drawn)
+        assert b"there is no live view: " in shown.drawn
+        assert b"is too long for a socket" in shown.drawn
+        shown.process.terminate()
+        assert shown.status() == 0
+
+
 WITHOUT = """
 import importlib.util as u, sys
 find = u.find_spec

@@ -85,6 +85,18 @@ def test_a_name_a_number_of_digits_and_a_cause_are_the_owners(tmp_path: Path) ->
     on_a_watched_line(tmp_path, story)
 
 
+def test_a_value_that_left_its_limits_says_so_until_it_is_back(tmp_path: Path) -> None:
+    async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
+        controller = Hcp2Controller(line.bus, 5)
+        line.bus.groups[0].add(replace(controller.point("11"), meaning=Meaning(high=5)))
+        await controller.write(11, 6)
+        await until(lambda: picture.rows[-1].item == "11" and picture.rows[-1].alarm == "high")
+        await controller.write(11, 1)
+        await until(lambda: picture.rows[-1].value == 1 and not picture.rows[-1].alarm)
+
+    on_a_watched_line(tmp_path, story)
+
+
 def test_points_that_come_and_go_are_shown_and_those_that_stay_keep_their_past(tmp_path: Path) -> None:
     async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
         await until(lambda: len(picture.rows[0].past) > 2)
@@ -228,13 +240,20 @@ def test_one_that_does_not_read_sees_fewer_pictures_and_no_other_fewer(tmp_path:
         async with raw(line) as stuck:
             await stuck.ask("overview", stream=3)
             client = line.service.clients[1]
-            client.outbox._send = asyncio.Event().wait  # type: ignore[assignment]  # nothing is taken any more
+            taken = asyncio.Event()
+            plain = client.outbox._send
+
+            async def stand_still(text: str) -> None:
+                await taken.wait()
+                await plain(text)
+
+            client.outbox._send = stand_still
+            await until(lambda: client.outbox.waiting > 1)
             seen = picture.frame.now if picture.frame else 0.0
-            await until(lambda: picture.frame and picture.frame.now > seen + 5 * INTERVAL)
-            assert client.outbox.waiting < 10
-            await until(lambda: picture.frame and picture.frame.now > seen + 10 * INTERVAL)
-            assert client.outbox.waiting < 10
-            client.outbox._sending = False
+            await until(lambda: picture.frame and picture.frame.now > seen + 4 * INTERVAL)
+            assert 1 < client.outbox.waiting < 10
+            taken.set()
+            await until(lambda: client.outbox.empty)
 
     on_a_watched_line(tmp_path, story)
 
