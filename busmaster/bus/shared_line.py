@@ -13,13 +13,14 @@ from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.bus.alarms import Alarms
+from busmaster.bus.answers import Answer, composed
 from busmaster.bus.limiter import Limiter
 from busmaster.bus.logbook import Logbook
 from busmaster.bus.points import Point
 from busmaster.bus.requester import Requester
 from busmaster.bus.samples import Sample
 from busmaster.bus.snapshots import Snapshot
-from busmaster.errors import BusClosed, InvalidCommand
+from busmaster.errors import BusClosed, GarbledReply, InvalidCommand
 from busmaster.transport.pump import Pump
 
 CLOCK_WAS_SET = 0.005
@@ -47,6 +48,8 @@ class SharedLine:
         """Told, at once, when a node is told to stop."""
         self.latest_of: dict[str, Snapshot] = {}
         """The latest snapshot of each poll group, by the group's name."""
+        self.answers_of: dict[str, list[Answer]] = {}
+        """What its last cycle brought, by the group's name."""
         self.last_touched = -inf
         """When the last write to anything ended."""
         self._all_touched = -inf
@@ -113,6 +116,23 @@ class SharedLine:
             if (youngest is None or sample.finished > youngest.finished) and not self.is_stale(point, sample.started):
                 youngest = sample
         return youngest
+
+    def held(self, node: NodeRecord, point: Point[Any]) -> Any:
+        """Return what a point would have read last, by what was read under whatever name, alone or with others.
+
+        None where that is not known, or may have been written since.
+        """
+        answers = [answer for cycle in self.answers_of.values() for answer in cycle if answer.node is point.node]
+        answers.sort(key=lambda answer: answer.started)
+        found = [raw for one in answers if not self.is_stale(point, one.started) for raw in one.found(point.command)]
+        # stale is what a write changed by its name: a part of it may have another
+        if not found:
+            untouched = (one for one in answers if not self.written_since(node, one.started))
+            found = composed(point.command, untouched, node.profile)
+        try:
+            return point.value_of(found[-1]) if found else None
+        except GarbledReply:
+            return None
 
     # nodes
 
