@@ -71,11 +71,11 @@ def test_the_owner_knows_the_value_before_of_each_place_that_a_program_changes(t
             gate.record = records.append
             await unit.write("holding:10", 11, 12, 13)
             group = bus.poll_group("all", period=0.02, points=[unit.point("holding:10:3")])
-            async with Service(bus, gate=gate, path=tmp_path / "line.sock") as service:
-                async with connect(service.address) as remote:
-                    for item, values in (("holding:11", (1,)), ("holding:10", (2, 3))):
-                        await anext(aiter(group))
-                        await ModbusUnit(remote, 5).write(item, *values)
+            path = tmp_path / "line.sock"
+            async with Service(bus, gate=gate, path=path) as service, connect(service.address) as remote:
+                for item, values in (("holding:11", (1,)), ("holding:10", (2, 3))):
+                    await anext(aiter(group))
+                    await ModbusUnit(remote, 5).write(item, *values)
             assert [record.before for record in records] == [12, (11, 1)]
 
     asyncio.run(run())
