@@ -20,6 +20,7 @@ from busmaster.bus.points import Point
 from busmaster.bus.requester import Requester
 from busmaster.bus.samples import Sample
 from busmaster.bus.snapshots import Snapshot
+from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusClosed, GarbledReply, InvalidCommand
 from busmaster.transport.pump import Pump
 
@@ -162,6 +163,10 @@ class SharedLine:
         self._touched[write.touches] = self._written[write.node] = self.last_touched = when
         if write.node.address == write.node.profile.broadcast:
             self._all_touched = when
+        if isinstance(write.touches, tuple) and isinstance(write.command, Changing):
+            # what has another name, or is read in another run, may share a place with it
+            for place in write.command.changes(write.node.profile):
+                self._touched[write.touches[0], place] = when
 
     def written_since(self, node: NodeRecord, started: float) -> bool:
         """Return whether a write to this node, or to a point of it, has ended since then."""
@@ -171,7 +176,10 @@ class SharedLine:
         """Return whether a write to the point's quantity, or to all of its node, has ended since its read began."""
         touched = self._touched
         # Of the quantity: points of other names and scales read it too. A read that starts as the write ends is fresh.
-        return max(touched.get(point.quantity, -inf), touched.get(point.node, -inf), self._all_touched) > started
+        if max(touched.get(point.quantity, -inf), touched.get(point.node, -inf), self._all_touched) > started:
+            return True
+        places = point.command.places if isinstance(point.command, Placed) else ()
+        return any(touched.get((point.node, place), -inf) > started for place in places)
 
     # misuse
 
