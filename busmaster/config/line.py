@@ -119,6 +119,8 @@ class ConfiguredLine:
                 del self.groups[name]
                 group.close()
         self._start_groups()
+        # Up to here in one turn of the loop. A command that an output still takes while it is closed is written by the
+        # scale that it was sent for, within the limits of now: those are of the quantity.
         await self.outputs.replace(dict(self._wanted_outputs()), self.groups.values())
 
     def point(self, name: str) -> NamedPoint:

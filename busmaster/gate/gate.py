@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, TypeAlias
 
 from busmaster.bus.bus import Bus
+from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.errors import (
     BusError,
@@ -189,8 +190,7 @@ class Gate:
 
 def _before(point: Point[Any] | None) -> Any:
     """Return what it held when it was last read, None if that may not be so any more."""
-    sample = None if point is None else point.node.latest(point)
-    return None if sample is None else sample.value
+    return None if point is None else Node.of(point).held(point)
 
 
 def _shown(value: Any) -> Any:

@@ -32,7 +32,7 @@ import termios
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -165,13 +165,13 @@ class MqttOutput(SpillingOutput):
         async with self._connection() as client, anyio.create_task_group() as tasks:
             self._published.clear()
             self._alarms = None
-            await self._send(client, self._status("online"))
-            self.up()
-            if self._commands:
-                await client.subscribe(self._topic("set/#"), qos=1)
             tasks.start_soon(self._listen, client)
             answer = partial(self._answer, client)
             tasks.start_soon(self._arriving.serve, self._write, self._keep, answer, partial(unread, client))
+            if self._commands:
+                await client.subscribe(self._topic("set/#"), qos=1)
+            await self._send(client, self._status("online"))  # only now: who waits for it may send commands
+            self.up()
             stopped = False
             while not stopped:
                 stopped = self._stop.is_set()  # looked at first, so that a last round sends what waits
@@ -318,7 +318,8 @@ class MqttOutput(SpillingOutput):
     def _keep(self, wish: Wish, error: str) -> None:
         """Put on record, on that loop too, what was refused."""
         assert self._owner is not None
-        self._owner.call_soon_threadsafe(self._gate.refuse, wish, error)
+        with suppress(RuntimeError):  # that loop has ended
+            self._owner.call_soon_threadsafe(self._gate.refuse, wish, error)
 
     async def _answer(self, client: Client, answer: Answer) -> None:
         topic = self._topic("result", answer.name) if answer.name else self._topic("result")

@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import anyio
@@ -13,7 +14,7 @@ import anyio
 from busmaster.bus.points import Point
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import MOST_AT_ONCE, Gate, Wish
-from busmaster.gate.payload import LONGEST, read_payload
+from busmaster.gate.payload import LONGEST, NoCommand, read_payload
 from busmaster.gate.record import WriteRecord
 
 if TYPE_CHECKING:
@@ -32,6 +33,10 @@ TOLD_EVERY = 10.0
 LONGEST_NAME = 256
 """Characters of a point's name; a longer one is answered without it."""
 EXPIRY = "MessageExpiryInterval"
+PROPERTIES = "UserProperty"
+SENDER = "by"
+"""The user property in which a sender may say who it is: no broker tells a subscriber, and nobody checks it."""
+LONGEST_SENDER = 100
 
 
 class Answer(NamedTuple):
@@ -71,7 +76,7 @@ class Commands:
         self.unanswered = 0
         self.queued: deque[Wish] = deque()
         self._tell = tell
-        self._prefix = prefix
+        self._asked = f"{prefix}/set/"
         self._gate = gate
         self._points = points
         self._now = now
@@ -86,25 +91,32 @@ class Commands:
 
     def arrive(self, message: Message) -> None:
         """Take in one message. Never waits, never raises."""
-        self._bytes_read += LEAST + len(str(message.topic)) + len(message.payload)
-        name = str(message.topic).removeprefix(f"{self._prefix}/set/")
+        topic = str(message.topic)
+        self._bytes_read += LEAST + len(topic) + len(message.payload)
+        name = topic.removeprefix(self._asked)
+        point = self._points.get(name)
+        if point is None and len(self._answers) >= MOST_WAITING:
+            self._count_alone()  # before anything is made of it: what is in a flood is to cost nothing
+            return
         shown = name if len(name) <= LONGEST_NAME else ""
         wish = Wish(
             door="mqtt",
-            by=str(message.topic)[:LONGEST_NAME],
+            by=_sender(topic[:LONGEST_NAME], message),
             name=shown or name[:40],
-            point=self._points.get(name),
+            point=point,
             value=bytes(message.payload[:LONGEST]).decode(errors="replace"),
             arrived=self._looked,
         )
         try:
             wish = self._read(wish, message)  # first: whatever becomes of it, its value and its id are told
-            if wish.point is None:
+            if point is None:
                 raise InvalidCommand(self._gate.refusal(wish))
             if message.retain:
                 raise InvalidCommand("a retained command is not obeyed: nobody knows how old it is")
             if len(self.queued) >= MOST_WAITING:
                 raise InvalidCommand(f"{MOST_WAITING} commands are waiting already")
+        except NoCommand as error:
+            self._refuse(replace(wish, id=error.id), shown, str(error))
         except InvalidCommand as error:
             self._refuse(wish, shown, str(error))
         else:
@@ -117,37 +129,38 @@ class Commands:
         interval = getattr(message.properties, EXPIRY, None)
         if interval is not None:
             ends.append(time.time() - (self._now() - self._looked) + interval)
-        return Wish(
-            door=wish.door,
-            by=wish.by,
-            name=wish.name,
-            point=wish.point,
-            value=said.value,
-            arrived=wish.arrived,
-            expires=min(ends, default=None),
-            id=said.id,
-        )
+        return replace(wish, value=said.value, expires=min(ends, default=None), id=said.id)
 
     def _refuse(self, wish: Wish, name: str, error: str) -> None:
-        self.refused += 1
         if len(self._answers) < MOST_WAITING:
+            self.refused += 1
             self._answers.append((wish, Answer(name, False, error, wish.id)))
         else:
-            self.unanswered += 1
+            self._count_alone()
+
+    def _count_alone(self) -> None:
+        self.refused += 1
+        self.unanswered += 1
 
     async def serve(
         self, write: Write, keep: Callable[[Wish, str], object], say: Say, unread: Callable[[], int]
     ) -> None:
-        """Write what is allowed and answer everything, until cancelled.
+        """Write what is allowed and answer everything, until cancelled; of what waits then a record is kept.
 
         `keep` is told of what was refused, and why. `unread` returns how many bytes have come and are not read yet.
         """
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(self._keep_looking, unread)
-            tasks.start_soon(self._answer_refusals, keep, say)
-            tasks.start_soon(self._tell_unanswered)
-            for _ in range(MOST_AT_ONCE):
-                tasks.start_soon(self._obey, write, say)
+        try:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(self._keep_looking, unread)
+                tasks.start_soon(self._answer_refusals, keep, say)
+                tasks.start_soon(self._tell_unanswered)
+                for _ in range(MOST_AT_ONCE):
+                    tasks.start_soon(self._obey, write, say)
+        finally:
+            for wish, answer in self._answers:
+                keep(wish, answer.error)
+            for wish in self.queued:
+                keep(wish, "the connection to the broker ended before it was its turn: nothing was sent")
 
     def look(self, unread: int) -> None:
         """Note when so many bytes had come and were not read yet: what is read behind them came later.
@@ -195,6 +208,12 @@ class Commands:
     async def _wait(self) -> None:
         self._something.clear()
         await self._something.wait()
+
+
+def _sender(topic: str, message: Message) -> str:
+    """Return by whom a command is: all that is known is its topic, and what its sender says of itself."""
+    said = dict(getattr(message.properties, PROPERTIES, ())).get(SENDER, "")[:LONGEST_SENDER]
+    return f"{topic}, says {said!r}" if said else topic
 
 
 class Inbox(asyncio.Queue["Message"]):
