@@ -35,14 +35,14 @@ FAREWELL = 2.0
 @capture_option
 @viewed
 def command(path: str, port: str | None, capture: str | None, view: View) -> int:
-    """Poll the groups of LINE.toml until Ctrl-C or SIGTERM, and feed the outputs that it enables.
+    """Poll the groups of LINE.toml until a signal ends it, and feed the outputs that it enables.
 
     On a terminal a live table; else, or with --plain, a line a value; with --json a line a cycle. A summary on
     standard error ends it: of groups, of nodes, and of what each output has written and dropped. An output that is
     slow or down never holds up the line. A port that is missing is waited for. SIGHUP has the file read again.
 
     When it ends, however it ends, the writes of the file's [safe] are sent first. The exit status is 1 if one was not
-    confirmed; else 0 after SIGTERM, 130 after Ctrl-C.
+    confirmed; else 0 after SIGTERM, 130 after Ctrl-C, and 128 and its number after another signal.
     """
     with Hangups() as hangups:  # first of all: SIGHUP ends a process that does not hear it
         return run(path, port, capture, view, hangups)
@@ -71,12 +71,9 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
             ending.patience = running.line.safe_state.within + FAREWELL
         try:
             status = until_ended(running.run)
-        except KeyboardInterrupt:
-            if running.left_safely:
-                raise
-            return FAILED
-        except SystemExit as ended:
-            if ended.code != 128 + signal.SIGTERM:
+        except (KeyboardInterrupt, SystemExit) as ended:
+            stopped = isinstance(ended, SystemExit) and ended.code == 128 + signal.SIGTERM
+            if running.left_safely and not stopped:
                 raise
             status = OK  # how a service is stopped is no failure of it
         return status if running.left_safely else FAILED

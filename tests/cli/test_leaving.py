@@ -80,7 +80,10 @@ def polls(process: subprocess.Popen[str]) -> None:
     assert process.stdout.readline()
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+LEAVING = [(signal.SIGTERM, 0), (signal.SIGINT, 130), (signal.SIGQUIT, 131), (signal.SIGUSR1, 128 + signal.SIGUSR1)]
+
+
+@pytest.mark.parametrize(("number", "status"), LEAVING)
 def test_a_run_that_is_told_to_end_leaves_the_drive_in_its_safe_state(
     path: Path, winder: TcpServer, number: signal.Signals, status: int
 ) -> None:
@@ -94,11 +97,29 @@ def test_a_run_that_is_told_to_end_leaves_the_drive_in_its_safe_state(
     assert "the safe state is confirmed: winder/force" in err
 
 
-def test_a_safe_write_that_is_not_confirmed_is_named_and_the_status_is_1(path: Path, winder: TcpServer) -> None:
+def test_what_a_shell_made_deaf_to_the_terminal_goes_on(path: Path) -> None:
+    with subprocess.Popen(
+        ["sh", "-c", 'trap "" INT QUIT; exec "$@"', "sh", sys.executable, "-m", "busmaster", "run", str(path), "--plain"],
+        cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        polls(process)
+        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGQUIT)
+        process.send_signal(signal.SIGHUP)
+        told(process, "was read again")
+        process.terminate()
+        process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGQUIT])
+def test_a_safe_write_that_is_not_confirmed_is_named_and_the_status_is_1(
+    path: Path, winder: TcpServer, number: signal.Signals
+) -> None:
     with started("run", str(path), "--plain") as process:
         polls(process)
         winder.call(lambda line, now: line.cut(now, line.device(1)))
-        process.terminate()
+        process.send_signal(number)
         _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1
     assert "the safe state of winder/force is not confirmed: " in err
