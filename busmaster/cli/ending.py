@@ -16,8 +16,8 @@ import click
 
 T = TypeVar("T")
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU)
-"""Those that somebody sends, and that would end the process where it stands. Not SIGABRT, by which a supervisor ends one
-that hangs: it would hang on."""
+"""Those that somebody sends, and that would end the process where it stands. Not SIGABRT, by which a supervisor ends
+one that hangs: it would hang on."""
 PATIENCE = 2.0
 
 

@@ -102,13 +102,16 @@ def outcome_of(error: BaseException | None) -> tuple[Outcome, str]:
 
 
 class Gate:
-    """What all doors of one line pass. `read_only` lets no write through; `record` is told of every one.
+    """What all doors of one line pass. `read_only` lets no write through, nor does it once the line is `leaving`.
+
+    `record` is told of every one.
 
     `write` never raises but when it is cancelled: whatever somebody sends, it ends as a record.
     """
 
     def __init__(self, bus: Bus, *, read_only: bool = False) -> None:
         self.read_only = read_only
+        self.leaving = False
         self.record: Callable[[WriteRecord], None] = lambda _: None
         self.bus = bus
         self._log = logging.getLogger("busmaster.audit")
@@ -118,6 +121,8 @@ class Gate:
 
     def refusal(self, wish: Wish) -> str:
         """Return why it is not let through, "" if it is."""
+        if self.leaving:
+            return "the line is being left: nothing was sent"
         if self.read_only:
             return "this line is read-only"
         if wish.point is None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import anyio
@@ -82,11 +83,19 @@ class Commands:
         self._looks: deque[tuple[float, int]] = deque()
         """Later looks, each with what will have been read when all is that lay there then."""
         self._answers: deque[tuple[Wish, Answer]] = deque()
+        self._answering = 0
+        """Commands that are neither waiting nor answered yet."""
+        self._told = 0
+        self._closed = False
         self._something = asyncio.Event()
 
     def arrive(self, message: Message) -> None:
         """Take in one message. Never waits, never raises."""
         self._bytes_read += LEAST + len(str(message.topic)) + len(message.payload)
+        if self._closed:
+            self.refused += 1
+            self.unanswered += 1
+            return
         name = str(message.topic).removeprefix(f"{self._prefix}/set/")
         shown = name if len(name) <= LONGEST_NAME else ""
         wish = Wish(
@@ -145,7 +154,7 @@ class Commands:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(self._keep_looking, unread)
             tasks.start_soon(self._answer_refusals, keep, say)
-            tasks.start_soon(self._tell_unanswered)
+            tasks.start_soon(self._keep_telling)
             for _ in range(MOST_AT_ONCE):
                 tasks.start_soon(self._obey, write, say)
 
@@ -169,8 +178,9 @@ class Commands:
         while True:
             if self.queued:
                 wish = self.queued.popleft()
-                record = await write(wish)
-                await say(Answer(wish.name, record.ok, record.error, wish.id))
+                with self._one_more():
+                    record = await write(wish)
+                    await say(Answer(wish.name, record.ok, record.error, wish.id))
             else:
                 await self._wait()
 
@@ -178,19 +188,43 @@ class Commands:
         while True:
             if self._answers:
                 wish, answer = self._answers.popleft()
-                keep(wish, answer.error)
-                await say(answer)
+                with self._one_more():
+                    keep(wish, answer.error)
+                    await say(answer)
                 await anyio.sleep(BREATH)
             else:
                 await self._wait()
 
-    async def _tell_unanswered(self) -> None:
-        told = 0
+    @contextmanager
+    def _one_more(self) -> Iterator[None]:
+        self._answering += 1
+        try:
+            yield
+        finally:
+            self._answering -= 1
+
+    async def answered(self) -> None:
+        """Return when all that has come is answered."""
+        while self.queued or self._answers or self._answering:  # noqa: ASYNC110  many have a hand in it
+            await anyio.sleep(LOOK)
+
+    def close(self) -> None:
+        """Take in nothing any more. What was not answered is counted alone, as is what still comes."""
+        self._closed = True
+        self.unanswered += len(self.queued) + len(self._answers)
+        self.queued.clear()
+        self._answers.clear()
+
+    async def _keep_telling(self) -> None:
         while True:
             await anyio.sleep(TOLD_EVERY)
-            if self.unanswered > told:
-                self._tell(f"{self.unanswered - told} refused commands were neither answered nor put on record")
-                told = self.unanswered
+            self.tell_unanswered()
+
+    def tell_unanswered(self) -> None:
+        """Tell how many refusals were counted alone, if there are any that were not told."""
+        if self.unanswered > self._told:
+            self._tell(f"{self.unanswered - self._told} refused commands were neither answered nor put on record")
+            self._told = self.unanswered
 
     async def _wait(self) -> None:
         self._something.clear()

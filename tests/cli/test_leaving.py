@@ -99,7 +99,7 @@ def test_a_run_that_is_told_to_end_leaves_the_drive_in_its_safe_state(
 
 def test_what_a_shell_made_deaf_to_the_terminal_goes_on(path: Path) -> None:
     with subprocess.Popen(
-        ["sh", "-c", 'trap "" INT QUIT; exec "$@"', "sh", sys.executable, "-m", "busmaster", "run", str(path), "--plain"],
+        ["sh", "-c", 'trap "" INT QUIT; exec "$0" -m busmaster run "$1" --plain', sys.executable, str(path)],
         cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         polls(process)

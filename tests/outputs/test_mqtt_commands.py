@@ -228,6 +228,29 @@ async def test_read_only_means_mqtt_too(broker: Broker) -> None:
 
 
 @pytest.mark.asyncio
+async def test_while_the_line_is_left_commands_are_refused_and_recorded(broker: Broker) -> None:
+    async with plant(broker) as there:
+        there.gate.leaving = True
+        assert "the line is being left" in (await there.ask('{"value": 7, "id": "late"}'))["error"]
+        assert [(record.id, record.outcome) for record in there.records] == [("late", Outcome.REFUSED)]
+        assert await there.controller.read(1) == 0
+
+
+@pytest.mark.asyncio
+async def test_behind_a_closed_door_nothing_is_carried_out_answered_or_recorded(broker: Broker) -> None:
+    async with plant(broker) as there:
+        assert (await there.ask("7"))["ok"]
+        await asyncio.to_thread(there.output.close_door)
+        await there.send("8")
+        assert there.output._arriving.unanswered == 0  # the broker keeps it: nobody listens
+        there.output._arriving.arrive(cast("Message", Arrived(b"9")))  # what it had sent before that
+        await asyncio.to_thread(there.output.close, PATIENCE)
+        assert [record.value for record in there.records] == [7]
+        assert there.output._arriving.unanswered == 1
+        assert await there.controller.read(1) == 7
+
+
+@pytest.mark.asyncio
 async def test_a_stop_passes_while_commands_are_refused(broker: Broker) -> None:
     async with plant(broker) as there:
         for _ in range(300):
