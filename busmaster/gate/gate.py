@@ -187,7 +187,9 @@ class Gate:
             took=took,
             id=wish.id,
         )
-        self._log.info("%s", record.text)
+        # of one that is unconfirmed somebody has to find out what became of it
+        level = logging.WARNING if outcome is Outcome.UNCONFIRMED else logging.INFO
+        self._log.log(level, "%s", record.text)
         self.record(record)
         return record
 

@@ -95,6 +95,8 @@ def test_a_run_that_is_told_to_end_leaves_the_drive_in_its_safe_state(
     assert (process.returncode, force(winder)) == (status, 15)
     assert "safe state: when this ends, winder/force = 1.5 within 1 s" in err
     assert "the safe state is confirmed: winder/force" in err
+    assert "busmaster: audit: winder/force = 1.5" in err
+    assert f"by safe {number.name}" in err
 
 
 def test_what_a_shell_made_deaf_to_the_terminal_goes_on(path: Path) -> None:

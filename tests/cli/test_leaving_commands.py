@@ -74,7 +74,7 @@ class Commander:
         self._client.disconnect()
         self._client.loop_stop()
 
-    def _begin(self, *_: object) -> None:
+    def _begin(self, *said: object) -> None:
         for _ in range(UNDER_WAY):
             self._send()
 
