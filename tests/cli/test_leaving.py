@@ -18,9 +18,10 @@ import pytest
 from busmaster.bus.requester import Priority
 from busmaster.config import open_line
 from busmaster.emulator.line import Line
-from busmaster.emulator.serve import TcpServer
+from busmaster.emulator.serve import TcpServer, serve_pty
 from busmaster.errors import Superseded, WriteUnconfirmed
 from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.registry import find, make_device
 from tests.cli.conftest import ENVIRONMENT, ROOT, Command, serve, started
 from tests.cli.test_processes import Terminal
 from tests.patience import PATIENCE
@@ -154,6 +155,40 @@ def test_what_cannot_be_a_safe_write_is_refused_when_the_file_is_read(
     outcome = busmaster("run", str(path), "--seconds", "0.1")
     assert outcome.status == 2
     assert error in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("port", "reason"),
+    [
+        ("FOLDER/away", "FOLDER/away does not exist"),
+        ("FOLDER/line.toml", "FOLDER/line.toml is no serial port"),
+        ("socket://127.0.0.1:FREE", "127.0.0.1:FREE refused the connection"),
+    ],
+)
+def test_safe_says_why_the_port_is_refused_and_names_each_point(
+    busmaster: Command, path: Path, port: str, reason: str
+) -> None:
+    free = str(free_port())
+    path.write_text(path.read_text().replace("within = 1.0", "within = 0.2"))
+    port, reason = (text.replace("FOLDER", str(path.parent)).replace("FREE", free) for text in (port, reason))
+    outcome = busmaster("safe", str(path), "--port", port)
+    first, *rest = outcome.err.splitlines()
+    assert (outcome.status, outcome.out) == (1, "")
+    assert first.startswith(f"busmaster: cannot connect: {reason}")
+    assert [line.partition(" is not")[0] for line in rest] == ["busmaster: the safe state of winder/force"]
+
+
+def test_safe_says_who_has_the_port(busmaster: Command, path: Path) -> None:
+    with serve_pty(Line(find("hcp2").profile.line, [make_device("hcp2", 1)], paced=False)) as served:
+        path.write_text((TEXT + SAFE).replace("PORT", served.path).replace("within = 1.0", "within = 0.2"))
+        with started("run", str(path), "--plain") as process:
+            polls(process)
+            outcome = busmaster("safe", str(path))
+            process.terminate()
+            process.communicate(timeout=PATIENCE)
+    assert outcome.status == 1
+    assert f"{served.path} is in use by " in outcome.err
+    assert "the safe state of winder/force is not confirmed: " in outcome.err
 
 
 def test_safe_without_a_safe_state_is_wrong_usage(busmaster: Command, path: Path) -> None:
