@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from busmaster.contract.arguments import Between
 from busmaster.errors import InvalidCommand
+from busmaster.files import MODE
 
 BUFFER = 50_000
 """Values that may wait, some 500 bytes each: ten minutes of 80 a second."""
@@ -31,9 +32,11 @@ class Settings:
 class SpillingSettings(Settings):
     """`spill` is a file for what waits while the output is down, which then survives a restart: `spill_values` at most.
 
-    It is best on another disk than what it stands in for.
+    It is best on another disk than what it stands in for. `mode` is what new files may be used for and by whom,
+    narrowed by the process's umask.
     """
 
+    mode: int = MODE
     spill: str | None = None
     spill_values: Annotated[int, Between(1, MOST_SPILLED)] = 1_000_000
 
@@ -42,26 +45,20 @@ class SpillingSettings(Settings):
 class FileSettings(SpillingSettings):
     """`path` may hold fields of a date (%Y/line-%m-%d.csv): a new file begins when the name changes.
 
-    `mode` is what a new file may be used for and by whom, narrowed by the process's umask. `sync_every`: after so many
-    seconds at most what was written survives a loss of power too; 0 for after each batch.
+    `sync_every`: after so many seconds at most what was written survives a loss of power too; 0 for after each batch.
     """
 
     path: str
-    mode: int = 0o640
     sync_every: Annotated[float, Between(0)] = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SqliteSettings(SpillingSettings):
-    """What is older than `keep_days` is deleted, and the oldest of more than `keep_mb` megabytes; None keeps all.
-
-    `mode` is that of a new file, narrowed by the process's umask.
-    """
+    """What is older than `keep_days` is deleted, and the oldest of more than `keep_mb` megabytes; None keeps all."""
 
     path: str
     keep_days: float | None = None
     keep_mb: float | None = None
-    mode: int = 0o640
 
     def __post_init__(self) -> None:
         for name in ("keep_days", "keep_mb"):
