@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from math import inf
 from typing import Annotated, Literal
@@ -12,6 +13,9 @@ from busmaster.files import MODE
 
 BUFFER = 50_000
 """Values that may wait, some 500 bytes each: ten minutes of 80 a second."""
+DATE_FIELD = re.compile("%(-?.?)", re.DOTALL)
+DATE_FIELDS = frozenset("YCyGgmbBhdejaAuwUWVHIklMSspPFTRrXzZ")
+"""What may stand behind a % in the path of a file, or behind %-: what makes slashes or ends of lines is none of it."""
 MOST_BUFFERED = 1_000_000
 MOST_SPILLED = 100_000_000
 
@@ -43,13 +47,21 @@ class SpillingSettings(Settings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileSettings(SpillingSettings):
-    """`path` may hold fields of a date (%Y/line-%m-%d.csv): a new file begins when the name changes.
+    """`path` may hold fields of a date (%Y/line-%m-%d.csv): a new file begins when the name changes; %% is a %.
 
     `sync_every`: after so many seconds at most what was written survives a loss of power too; 0 for after each batch.
     """
 
     path: str
     sync_every: Annotated[float, Between(0)] = 10.0
+
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)  # super() does not work in a class with slots
+        for field in DATE_FIELD.findall(self.path):
+            if field != "%" and field.removeprefix("-") not in DATE_FIELDS:
+                raise InvalidCommand(
+                    f"{self.path}: %{field} is no field of a date: use those of strftime (%Y %m %d %H), and %% for a %"
+                )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
