@@ -23,7 +23,7 @@ POLL = ("--protocol", "hcp2", "--nodes", "1", "--items", "1", "--period", "0.02"
 
 @pytest.fixture
 def ending() -> Iterator[Ending]:
-    # All of them: one that was heard leaves them ignored, and so they would be in every process that a later test starts.
+    # All of them: one that was heard leaves them ignored, and so they would be in what a later test starts.
     before = {number: signal.getsignal(number) for number in SIGNALS}
     with Ending() as ending:
         yield ending
