@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from busmaster.discovery.writing import lasting, line_text, summary
 from busmaster.doctor.diagnosis import speed
 from busmaster.doctor.probing import opened
 from busmaster.errors import InvalidCommand
+from busmaster.files import open_file
 from busmaster.registry import Protocol, find, kinds, protocols
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
@@ -82,7 +84,8 @@ def command(
     if output is None:
         emit_all(text.splitlines())
     else:
-        Path(output).write_text(text)
+        with open(open_file(output, os.O_WRONLY | os.O_EXCL), "w", encoding="utf-8") as file:
+            file.write(text)
         note(f"written to {output}: `busmaster run {output}` polls it")
     return 0
 

@@ -87,6 +87,7 @@ class ConfiguredLine:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Close the line first; the outputs then have a few seconds to write what they still hold."""
+        self.gate.leaving = True
         try:
             await self.bus.__aexit__(kind, error, traceback)
         finally:

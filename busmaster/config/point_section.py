@@ -185,6 +185,8 @@ SORTS: Mapping[type, str] = {
     int: "whole",
     float: "float",
     str: "text",
+    bytes: "text",
     tuple: "run",
+    list: "run",
 }
 """In this order: a bit is an int too, and so may be a word."""

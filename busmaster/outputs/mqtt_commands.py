@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -87,12 +88,19 @@ class Commands:
         self._looks: deque[tuple[float, int]] = deque()
         """Later looks, each with what will have been read when all is that lay there then."""
         self._answers: deque[tuple[Wish, Answer]] = deque()
+        self._answering = 0
+        """Commands that are neither waiting nor answered yet."""
+        self._told = 0
+        self._closed = False
         self._something = asyncio.Event()
 
     def arrive(self, message: Message) -> None:
         """Take in one message. Never waits, never raises."""
         topic = str(message.topic)
         self._bytes_read += LEAST + len(topic) + len(message.payload)
+        if self._closed:
+            self._count_alone()
+            return
         name = topic.removeprefix(self._asked)
         point = self._points.get(name)
         if point is None and len(self._answers) >= MOST_WAITING:
@@ -145,22 +153,16 @@ class Commands:
     async def serve(
         self, write: Write, keep: Callable[[Wish, str], object], say: Say, unread: Callable[[], int]
     ) -> None:
-        """Write what is allowed and answer everything, until cancelled; of what waits then a record is kept.
+        """Write what is allowed and answer everything, until cancelled.
 
         `keep` is told of what was refused, and why. `unread` returns how many bytes have come and are not read yet.
         """
-        try:
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(self._keep_looking, unread)
-                tasks.start_soon(self._answer_refusals, keep, say)
-                tasks.start_soon(self._tell_unanswered)
-                for _ in range(MOST_AT_ONCE):
-                    tasks.start_soon(self._obey, write, say)
-        finally:
-            for wish, answer in self._answers:
-                keep(wish, answer.error)
-            for wish in self.queued:
-                keep(wish, "the connection to the broker ended before it was its turn: nothing was sent")
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(self._keep_looking, unread)
+            tasks.start_soon(self._answer_refusals, keep, say)
+            tasks.start_soon(self._keep_telling)
+            for _ in range(MOST_AT_ONCE):
+                tasks.start_soon(self._obey, write, say)
 
     def look(self, unread: int) -> None:
         """Note when so many bytes had come and were not read yet: what is read behind them came later.
@@ -182,8 +184,9 @@ class Commands:
         while True:
             if self.queued:
                 wish = self.queued.popleft()
-                record = await write(wish)
-                await say(Answer(wish.name, record.ok, record.error, wish.id))
+                with self._one_more():
+                    record = await write(wish)
+                    await say(Answer(wish.name, record.ok, record.error, wish.id))
             else:
                 await self._wait()
 
@@ -191,19 +194,46 @@ class Commands:
         while True:
             if self._answers:
                 wish, answer = self._answers.popleft()
-                keep(wish, answer.error)
-                await say(answer)
+                with self._one_more():
+                    keep(wish, answer.error)
+                    await say(answer)
                 await anyio.sleep(BREATH)
             else:
                 await self._wait()
 
-    async def _tell_unanswered(self) -> None:
-        told = 0
+    @contextmanager
+    def _one_more(self) -> Iterator[None]:
+        self._answering += 1
+        try:
+            yield
+        finally:
+            self._answering -= 1
+
+    async def answered(self) -> None:
+        """Return when all that has come is answered."""
+        while self.queued or self._answers or self._answering:  # noqa: ASYNC110  many have a hand in it
+            await anyio.sleep(LOOK)
+
+    def close(self, keep: Callable[[Wish, str], object]) -> None:
+        """Take in nothing any more. `keep` is told of what was not answered; what still comes is counted alone."""
+        self._closed = True
+        for wish, answer in self._answers:
+            keep(wish, answer.error)
+        for wish in self.queued:
+            keep(wish, "the connection to the broker ended before it was its turn: nothing was sent")
+        self.queued.clear()
+        self._answers.clear()
+
+    async def _keep_telling(self) -> None:
         while True:
             await anyio.sleep(TOLD_EVERY)
-            if self.unanswered > told:
-                self._tell(f"{self.unanswered - told} refused commands were neither answered nor put on record")
-                told = self.unanswered
+            self.tell_unanswered()
+
+    def tell_unanswered(self) -> None:
+        """Tell how many refusals were counted alone, if there are any that were not told."""
+        if self.unanswered > self._told:
+            self._tell(f"{self.unanswered - self._told} refused commands were neither answered nor put on record")
+            self._told = self.unanswered
 
     async def _wait(self) -> None:
         self._something.clear()

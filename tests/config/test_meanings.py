@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from math import inf
 from typing import Any
@@ -12,7 +13,7 @@ from busmaster.bus.alarms import AlarmChanged
 from busmaster.bus.meaning import Meaning, Named
 from busmaster.bus.points import Point
 from busmaster.config import ConfiguredLine, FileError, LineFile, emulated_line
-from busmaster.config.point_section import POINT_KEYS, check_suits
+from busmaster.config.point_section import POINT_KEYS, check_suits, sort_of
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.emulator.memory import MemoryPort
@@ -224,6 +225,12 @@ def test_a_text_has_nothing_of_a_number(said: str) -> None:
         check_suits(section, text, find("hcp2"))
 
 
+@pytest.mark.parametrize(("decode", "sort"), [(str, "text"), (lambda value: b"\0", "text"), (lambda value: [1], "run")])
+def test_what_is_no_number_is_known_before_it_is_read(decode: Callable[[Any], Any], sort: str) -> None:
+    point: Point[Any] = replace(parse("hcp2", "").nodes["w"].point("10"), decode=decode)
+    assert sort_of(point, find("hcp2")) == sort
+
+
 def test_a_text_may_be_told_by_exception() -> None:
     section = file("hcp2", 'a = { item = "10", deadband = 0, heartbeat = 60 }').nodes["w"].points["a"]
     text: Point[Any] = replace(parse("hcp2", "").nodes["w"].point("10"), decode=str)
@@ -253,6 +260,8 @@ def test_a_bit_that_was_not_named_is_guessed() -> None:
     [
         ("modbus", '"holding:1:4"', 'metrics]\ngroups = "axes"', "metrics.groups: cannot take w/a: it is a run, and"),
         ("msc", '"flags"', 'metrics]\ngroups = "axes"', "metrics.groups: cannot take w/a: it is a set, and a gauge"),
+        ("msc", '"2008:32"', 'metrics]\ngroups = "axes"', "metrics.groups: cannot take w/a: it is a run, and a gauge"),
+        ("hcp2", '"10"', 'csv]\npath = "%Q-line.csv"', "csv: %Q-line.csv: %Q is no field of a date: use those of strf"),
         ("hcp2", '"10"', 'mqtt]\nprefix = "a\\u0001"', "mqtt.prefix: a topic has neither"),
     ],
 )

@@ -243,6 +243,29 @@ async def test_read_only_means_mqtt_too(broker: Broker) -> None:
 
 
 @pytest.mark.asyncio
+async def test_while_the_line_is_left_commands_are_refused_and_recorded(broker: Broker) -> None:
+    async with plant(broker) as there:
+        there.gate.leaving = True
+        assert "the line is being left" in (await there.ask('{"value": 7, "id": "late"}'))["error"]
+        assert [(record.id, record.outcome) for record in there.records] == [("late", Outcome.REFUSED)]
+        assert await there.controller.read(1) == 0
+
+
+@pytest.mark.asyncio
+async def test_behind_a_closed_door_nothing_is_carried_out_answered_or_recorded(broker: Broker) -> None:
+    async with plant(broker) as there:
+        assert (await there.ask("7"))["ok"]
+        await asyncio.to_thread(there.output.close_door)
+        await there.send("8")
+        assert there.output._arriving.unanswered == 0  # the broker keeps it: nobody listens
+        there.output._arriving.arrive(cast("Message", Arrived(b"9")))  # what it had sent before that
+        await asyncio.to_thread(there.output.close, PATIENCE)
+        assert [record.value for record in there.records] == [7]
+        assert there.output._arriving.unanswered == 1
+        assert await there.controller.read(1) == 7
+
+
+@pytest.mark.asyncio
 async def test_a_stop_passes_while_commands_are_refused(broker: Broker) -> None:
     async with plant(broker) as there:
         for _ in range(300):
@@ -333,12 +356,14 @@ async def test_what_waits_when_the_connection_ends_is_on_record_each_once() -> N
     async def say(_: object) -> None:
         await asyncio.Future()
 
-    serving = asyncio.ensure_future(
-        commands.serve(write, lambda wish, why: kept.append((wish.value, why)), say, lambda: 0)
-    )
+    def keep(wish: Wish, why: str) -> None:
+        kept.append((wish.value, why))
+
+    serving = asyncio.ensure_future(commands.serve(write, keep, say, lambda: 0))
     await until(lambda: len(under_way) == MOST_AT_ONCE and len(kept) == 1)
     serving.cancel()
     await asyncio.gather(serving, return_exceptions=True)
+    commands.close(keep)
     assert [value for value, _ in kept] == ["on", "off", MOST_AT_ONCE, MOST_AT_ONCE + 1]
     assert "before it was its turn" in kept[-1][1]
 
