@@ -16,6 +16,7 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import WriteOptions
+from busmaster.config.access import access_of
 from busmaster.config.kept_times import KeptTimes
 from busmaster.config.names import expanded, listed
 from busmaster.config.point_section import PointSection, check_suits, sort_of
@@ -64,7 +65,7 @@ class ConfiguredLine:
         self._limits = list(self._held_limits())
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
-        self.gate = Gate(self.bus, read_only=read_only)
+        self.gate = Gate(self.bus, read_only=read_only, access=access_of(file.service, self))
         self.outputs = Distributor(self.bus, tell, gate=self.gate)
         self._kept_times = KeptTimes(self.bus, self._tell)
         self.gate.record = self.outputs.record
@@ -112,6 +113,7 @@ class ConfiguredLine:
             node.lift(limit)
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
+        self.gate.access = access_of(file.service, self, self.gate.access.secrets)
         for name, group in list(self.groups.items()):
             same = before.groups[name] == file.groups.get(name) and wanted[name] == self._wanted[name]
             # by identity: points are equal whatever their scale and unit, which may be what changed
@@ -130,6 +132,10 @@ class ConfiguredLine:
         if not slash or node not in self.nodes:
             raise InvalidCommand(f"no such point {name!r}: use NODE/ITEM with one of {', '.join(self.nodes)}")
         return self._point(node, item)
+
+    def points_named(self, text: str) -> Iterator[NamedPoint]:
+        """Yield the points that `drive4-8/speed,current` names. Raises InvalidCommand for what is no point of the line."""
+        return (self._point(*name) for name in self._names(text))
 
     def prepare_write(self, name: str, values: Sequence[float], **options: Unpack[WriteOptions]) -> Send:
         """Return what writes a value to the point that the file calls so, or the values of a run, in the point's unit.

@@ -15,6 +15,7 @@ from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import checked_priority
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
+from busmaster.gate.permission import Permission
 from busmaster.service.errands import Errand, Line
 from busmaster.service.failures import said_error
 from busmaster.service.messages import (
@@ -56,6 +57,11 @@ class Client:
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
         self._log = logging.getLogger("busmaster.service")
+
+    @property
+    def permission(self) -> Permission:
+        """Return what it may do, as it is now."""
+        return self.peer.permission(self._line.gate.access)
 
     @property
     def errands(self) -> tuple[Errand, ...]:
@@ -121,7 +127,7 @@ class Client:
                 self._end_stream(params.get("stream", -1))
             case "stop":
                 node = self._nodes.get((str(params.get("protocol")), params.get("address", -1)))
-                if node is not None:
+                if node is not None and self.permission.reaches(node):
                     node.note_stop()
 
     def _answer(self, method: str, params: Mapping[str, Any]) -> Any:
@@ -241,7 +247,7 @@ class Client:
             raise InvalidCommand("a poll group reads: it writes nothing")
         phase = params.get("phase")
         group = self._line.bus.poll_group(
-            f"{str(params['name'])[:40]} ({self.peer.program} {self.peer.pid}-{self._number})",
+            f"{str(params['name'])[:40]} ({self.peer.short}-{self._number})",
             period=seconds(params["period"], "a period"),
             points=read,
             phase=None if phase is None else seconds(phase, "a phase"),

@@ -16,6 +16,7 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
 from busmaster.gate.gate import FRESH, Gate, Wish
+from busmaster.gate.permission import Permission
 from busmaster.service.peers import Peer
 from busmaster.service.streams import Broadcast
 from busmaster.service.telling import protocol_of
@@ -53,6 +54,9 @@ class Asker(Protocol):
     @property
     def peer(self) -> Peer: ...
 
+    @property
+    def permission(self) -> Permission: ...
+
     def node(self, name: str, address: int, /) -> Node:
         """Return a node of the line. Raises InvalidCommand."""
         ...
@@ -73,7 +77,7 @@ class Errand:
         options: CommandOptions,
         *,
         line: Line,
-        peer: Peer,
+        asker: Asker,
         stops_seen: int | None,
         stop: bool,
         asked: float,
@@ -84,7 +88,7 @@ class Errand:
         self._touches = touches
         self._options = options
         self._line = line
-        self._peer = peer
+        self._asker = asker
         self._stops_seen = stops_seen
         self._stop = stop
         self._asked = asked
@@ -108,7 +112,7 @@ class Errand:
             None if touches is None else protocol.read_back(touches),
             given,
             line=line,
-            peer=asker.peer,
+            asker=asker,
             stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
             stop=params.get("stop") is True and _check_stop(node, command),
             asked=min(now, seconds(params.get("asked", now), "asked")),
@@ -186,7 +190,15 @@ class Errand:
             if point is not None:
                 value = _value(point, changes, value)
         point = point or Point(self.node, self.text, command)
-        return Wish(door=DOOR, by=str(self._peer), name=point.key, point=point, value=value)
+        return Wish(
+            door=DOOR,
+            by=str(self._asker.peer),
+            name=point.key,
+            point=point,
+            value=value,
+            command=command,
+            permission=self._asker.permission,
+        )
 
 
 def _check_stop(node: Node, command: Command[Any]) -> bool:
