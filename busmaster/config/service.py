@@ -165,4 +165,3 @@ def _private_text(path: str) -> str:
 
 def _no_device(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC)
-

@@ -23,7 +23,7 @@ from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed, InvalidCommand
 from busmaster.planning.merging import Merge
-from busmaster.service.link import Asked, Link
+from busmaster.service.link import TCP, Asked, Link
 from busmaster.service.messages import said_timings, value_of
 from busmaster.service.telling import (
     event_of,
@@ -38,12 +38,14 @@ T = TypeVar("T")
 EVENT_BUFFER = 256
 
 
-def connect(address: str) -> RemoteBus:
-    """Return the bus that another program of this machine owns, for `async with`, which connects.
+def connect(address: str, *, token: str | None = None) -> RemoteBus:
+    """Return the bus that another program owns, for `async with`, which connects.
 
-    `address` is `unix:PATH`, or the name of a line or of its port, as `busmaster status` lists them.
+    `address` is `unix:PATH`, or the name of a line or of its port, as `busmaster status` lists them; or
+    `tcp://HOST:PORT`, where a `token` that the line's owner knows may be needed. The token goes over the network as it
+    is. Raises InvalidCommand for a token anywhere else: there the kernel says who comes.
     """
-    return RemoteBus(address)
+    return RemoteBus(address, token=token)
 
 
 class RemoteNode:
@@ -227,8 +229,13 @@ class RemoteBus:
     InvalidCommand for a name that nobody's line has. A lost connection is not made again: enter a new RemoteBus.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, *, token: str | None = None) -> None:
+        if token is not None and not address.startswith(TCP):
+            raise InvalidCommand(f"{address} takes no token: it is for tcp://HOST:PORT")
+        if token is not None and not (token.isascii() and token.isprintable() and token.split() == [token]):
+            raise InvalidCommand("a token is of letters, digits and signs, without spaces")
         self.address = address
+        self._token = token
         self.line = ""
         """The name of the line's port, once it is entered."""
         self.about: Mapping[str, Any] = {}
@@ -246,7 +253,7 @@ class RemoteBus:
     async def __aenter__(self) -> RemoteBus:
         if self._link is not None:
             raise InvalidCommand(f"the bus of {self.address} was entered already: enter it once, and share it")
-        link = Link(self.address, self._hear, self._lost)
+        link = Link(self.address, self._token, self._hear, self._lost)
         self._link = link
         said = await link.open(sys.argv[0])
         self.about, self.line = said, said["line"]
