@@ -63,6 +63,8 @@ class ServiceSection:
             return {}
         with self.table.at("token_file"):
             secrets = dict(_tokens(self.token_file))
+            if not secrets:
+                raise InvalidCommand(f"there are no tokens in {self.token_file}: a line is a name and its token")
         for name, role in self.tokens.items():
             if name not in secrets:
                 raise role.table.error(f"there is no token {name!r} in {self.token_file}")
