@@ -15,6 +15,7 @@ from busmaster.cli.lines import is_line_file, keep, load
 from busmaster.cli.output import emit, json_line, note
 from busmaster.cli.parsing import parse_assignment, parsed
 from busmaster.cli.protocols import ItemCommand
+from busmaster.cli.reaching import reach
 from busmaster.config import ConfiguredLine
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Wish
@@ -52,7 +53,7 @@ def command(
 
 async def write(connection: Connection, address: int, pairs: Pairs, verify: bool, as_json: bool) -> None:
     """Write the pairs to one node, one after another, and print each; all are checked before the first is sent."""
-    bus = connection.reach()
+    bus = reach(connection)
     handle = connection.open_handle(bus, address)
     prepared = [(item, handle.prepare_write(item, values, verify=verify)) for item, values in pairs]
     async with bus:

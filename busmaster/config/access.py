@@ -28,7 +28,7 @@ class Names(Protocol):
 
 
 def access_of(section: ServiceSection, names: Names, secrets: Mapping[str, bytes] | None = None) -> Access:
-    """Return who may do what. Raises FileError, with line and key, for a name that is no point, or cannot be allowed."""
+    """Return who may do what. Raises FileError for a name that is no point, or of what cannot be allowed alone."""
     return Access(
         users={uid: _permission(role, names) for uid, role in section.users.items()},
         groups={gid: _permission(role, names) for gid, role in section.groups.items()},

@@ -134,7 +134,7 @@ class ConfiguredLine:
         return self._point(node, item)
 
     def points_named(self, text: str) -> Iterator[NamedPoint]:
-        """Yield the points that `drive4-8/speed,current` names. Raises InvalidCommand for what is no point of the line."""
+        """Yield the points that `drive4-8/speed,current` names. Raises InvalidCommand for what is none of the line."""
         return (self._point(*name) for name in self._names(text))
 
     def prepare_write(self, name: str, values: Sequence[float], **options: Unpack[WriteOptions]) -> Send:

@@ -135,6 +135,10 @@ class Client:
         match method:
             case "node":
                 return self._name_node(params)
+            case "check":
+                for command in params["commands"]:
+                    Errand.of({**params, "command": command}, self, self._line).check()
+                return None
             case "statistics":
                 return said_statistics(self._line.bus.statistics())
             case "groups":

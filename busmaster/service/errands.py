@@ -122,6 +122,17 @@ class Errand:
     def text(self) -> str:
         return str(self.command)
 
+    def check(self) -> None:
+        """Raise InvalidCommand for a write that would be refused now: a record is kept of that."""
+        wish = self._wish()
+        try:
+            if self.command.writes and (refusal := self._line.gate.refusal(wish)):
+                raise InvalidCommand(f"{self.node.label}: {refusal}")
+            self.node.check(self.command, stop=self._stop)
+        except InvalidCommand as error:
+            self._line.gate.refuse(wish, str(error))
+            raise
+
     async def run(self) -> Any:
         """Run it and return its value. Raises BusError or InvalidCommand; every write passes the gate."""
         self._begun = True

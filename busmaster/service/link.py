@@ -105,7 +105,7 @@ class Link:
                 proxy=None,
             )
         except (OSError, TimeoutError, refused) as error:
-            raise _unreachable(where, error) from error
+            raise _unreachable(where, error, shown=self._token is not None) from error
         self._connection = connection
         hello = Asked(0, asyncio.get_running_loop().create_future(), False, None, None)
         self._asked[0] = hello
@@ -245,11 +245,12 @@ def _where(address: str) -> tuple[str, dict[str, Any]]:
     return path, {"path": path, "unix": True}
 
 
-def _unreachable(where: str, error: Exception) -> LineDown:
+def _unreachable(where: str, error: Exception, *, shown: bool) -> LineDown:
     response = getattr(error, "response", None)
     match None if response is None else response.status_code:
         case 401:
-            return LineDown(f"{where} does not know this token", hint="give one of its token_file")
+            what = "does not know this token" if shown else "wants a token"
+            return LineDown(f"{where} {what}", hint="its owner has the tokens in a file, see [service] of LINE.toml")
         case 503:
             return LineDown(f"{where} has too many programs already", hint="end one, see busmaster status")
     why = getattr(error, "strerror", None) or str(error) or "it does not answer"

@@ -98,7 +98,11 @@ class RemoteNode:
         raise InvalidCommand(f"{self.label}: limits are held by the program that owns the line: set {limit.name} there")
 
     def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
-        """Do nothing: the line checks each write as it comes. Of several writes, those before a bad one are written."""
+        """Have the line check these writes when the bus is entered: entering raises InvalidCommand for a bad one.
+
+        Later it does nothing: the line checks each write as it comes. Of several, those before a bad one are written.
+        """
+        self._bus.prepare(self, commands, stop is True)
 
     async def request(
         self,
@@ -149,6 +153,11 @@ class RemoteNode:
         if given := {name: value for name, value in options.items() if value is not None and name not in LEFT_OUT}:
             params["options"] = given
         return params
+
+    def said_check(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
+        """Return writes of this node as the line is asked whether it would take them."""
+        said = [self._protocol.write_down(command) for command in commands]
+        return {"protocol": self.profile.name, "address": self.address, "commands": said, "stop": stop}
 
 
 LEFT_OUT = ("verify", "safe")
@@ -226,7 +235,8 @@ class RemoteBus:
     Handles take it as they take a Bus: `MicroFlexDrive(remote, 7)`. What is safe lives with the line: a stop of any
     program counts for all, limits and the record of writes are the owner's. A node that the owner does not have is
     asked as this program says, and leaves the line with it. Entering raises LineDown if nobody serves the line, and
-    InvalidCommand for a name that nobody's line has. A lost connection is not made again: enter a new RemoteBus.
+    InvalidCommand for a name that nobody's line has, and for a write that was prepared before and that the line would
+    not take. A lost connection is not made again: enter a new RemoteBus.
     """
 
     def __init__(self, address: str, *, token: str | None = None) -> None:
@@ -249,6 +259,8 @@ class RemoteBus:
         self._count = 0
         self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
+        self._prepared: list[tuple[RemoteNode, tuple[Command[Any], ...], bool]] = []
+        """Writes that are to be checked before the first of them is sent."""
 
     async def __aenter__(self) -> RemoteBus:
         if self._link is not None:
@@ -263,6 +275,12 @@ class RemoteBus:
                 node.label = known["label"]
         for node in self._named:
             self._name(node)
+        try:
+            for node, commands, stop in self._prepared:
+                await self._ask("check", node.said_check(commands, stop))
+        except BaseException:
+            await link.close()
+            raise
         return self
 
     async def __aexit__(
@@ -283,6 +301,11 @@ class RemoteBus:
         if self._link is None:
             raise BusClosed("the bus is not open", node=node, command=command)
         return self._link
+
+    def prepare(self, node: RemoteNode, commands: tuple[Command[Any], ...], stop: bool) -> None:
+        """Have these writes checked when the bus is entered, if it is not yet."""
+        if self._link is None:
+            self._prepared.append((node, commands, stop))
 
     def now(self) -> float:
         """Return the time of the line's clock, in seconds: that of the machine, which is the same for all programs."""

@@ -346,7 +346,7 @@ async def _send(connection: ServerConnection, text: str) -> None:
 
 
 def _websockets() -> tuple[Any, Any]:
-    """Return what serves a Unix socket, and a port. Raises InvalidCommand, with what to install, where it is missing."""
+    """Return what serves a Unix socket, and a port. Raises InvalidCommand where it is not installed."""
     try:
         from websockets.asyncio.server import serve, unix_serve
     except ImportError:

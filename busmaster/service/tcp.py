@@ -32,7 +32,7 @@ def check_listening(listen: HostPort, *, tokens: bool) -> None:
 
 
 def listening(listen: HostPort) -> socket.socket:
-    """Open a socket that listens there; port 0 is any free one. It may take its time for a name. Raises InvalidCommand."""
+    """Open a socket that listens there; port 0 is any free one. A name may take its time. Raises InvalidCommand."""
     host, port = listen
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
@@ -44,7 +44,7 @@ def listening(listen: HostPort) -> socket.socket:
 
 
 def is_our_name(host: str, listen: HostPort) -> bool:
-    """Return whether a Host header names us: by an address, or as we listen. A page that was tricked has another name."""
+    """Return whether a Host header names us: by an address, or as we listen. A page would have another name."""
     name = host.rpartition("]")[0].lstrip("[") if host.startswith("[") else host.partition(":")[0]
     try:
         ipaddress.ip_address(name)

@@ -84,9 +84,11 @@ def test_a_program_with_a_token_that_reads_writes_nothing_and_stops_nothing(tmp_
 
 def test_nobody_comes_by_tcp_without_a_token_that_is_known(tmp_path: Path) -> None:
     async def story(line: Served, address: str) -> None:
-        for token in (None, "a-token-of-nobody-at-all", SECRETS["hmi"][:-1]):
+        for token in ("a-token-of-nobody-at-all", SECRETS["hmi"][:-1]):
             with pytest.raises(LineDown, match="does not know this token"):
                 await connect(address, token=token).__aenter__()
+        with pytest.raises(LineDown, match="wants a token"):
+            await connect(address).__aenter__()
         for authorization in ("", "Basic aG1pOmE=", f"Basic {SECRETS['hmi']}", "Bearer", "Bearer \u00fc"):
             assert await refused(address, additional_headers={"Authorization": authorization}) == 401
         assert line.service.clients == ()
