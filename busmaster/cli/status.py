@@ -43,10 +43,10 @@ async def status(as_json: bool) -> int:
 async def ask(owner: Owner) -> dict[str, Any]:
     """Return how a line is, or why its owner does not say so."""
     line: dict[str, Any] = {"name": owner.name, "port": owner.port, "address": owner.address, "process": owner.pid}
-    line |= {"programs": None, "utilisation": None, "up": None, "nodes": None, "error": None}
+    line |= {"tcp": None, "programs": None, "utilisation": None, "up": None, "nodes": None, "error": None}
     try:
         async with asyncio.timeout(ANSWER_WITHIN), connect(owner.address) as remote:
-            nodes = remote.about["nodes"]
+            nodes, line["tcp"] = remote.about["nodes"], remote.about["tcp"]
             line["programs"] = remote.about["clients"] - 1  # without this one
             line["up"] = sum(node["health"] == "up" for node in nodes)
             line["nodes"] = len(nodes)

@@ -317,6 +317,7 @@ class Service:
             "baudrate": owner.baudrate,
             "framing": owner.framing,
             "echo": owner.echo,
+            "tcp": self.tcp_address,
             "process": owner.pid,
             "read_only": self.gate.read_only or not client.permission.writes,
             "clients": len(self._clients),

@@ -225,3 +225,122 @@ def test_the_section_of_the_service_is_checked_with_its_line(busmaster: Command,
         assert ran.status == 2
         assert complaint in ran.err
         assert "slitter.toml" in ran.err
+
+
+# every command with a PORT
+
+
+def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, controllers: TcpServer) -> None:
+    with owner("serve", str(file)) as (process, address):
+        port = controllers.path.removeprefix("socket://")
+        said = f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n"
+        ran = busmaster("scan", controllers.path, *HCP2, "--nodes", "2-4", "--timeout", "20")
+        assert (ran.status, [line.split()[0] for line in ran.lines]) == (0, ["2", "3"])
+        assert ran.err.startswith(said)
+        options = ("--nodes", "2,3", "--items", "1", "--period", "0.02", "--seconds", "0.3")
+        ran = busmaster("poll", controllers.path, *HCP2, *options)
+        assert ran.status == 0
+        assert {line.split()[1] for line in ran.lines} == {"2/1", "3/1"}
+        assert ran.err.startswith(said)
+        assert re.search(r"poll: \d+ cycles, \d+ missed, period", ran.err)
+        ran = busmaster("poll", address, *HCP2, *options, "--json")
+        cycle = json.loads(ran.lines[0])
+        assert (cycle["group"], cycle["samples"]["2/1"]["value"]) == ("poll", 0)
+
+
+def test_a_poll_whose_owner_ends_says_so(file: Path, controllers: TcpServer) -> None:
+    with (
+        owner("serve", str(file)) as (process, address),
+        started("poll", address, *HCP2, "--nodes", "2", "--items", "1", "--period", "0.02") as polling,
+    ):
+        assert polling.stdout is not None
+        polling.stdout.readline()
+        process.terminate()
+        _, err = polling.communicate(timeout=PATIENCE)
+        assert polling.returncode == 1
+        assert "the connection to the program that owns the line was lost" in err
+
+
+def test_nothing_is_written_through_an_owner_unless_all_may_be(
+    busmaster: Command, file: Path, controllers: TcpServer
+) -> None:
+    with owner("serve", str(file)) as (process, address):
+        for refused in ("10=501", "300=1", "1=nothing"):
+            ran = busmaster("write", address, *HCP2, "--node", "1", "1=5", refused, "2=6")
+            assert (ran.status, ran.out) == (2, "")
+        assert busmaster("read", address, *HCP2, "--node", "1", "1", "2").lines == ["1 0", "2 0"]
+        ran = busmaster("write", address, *HCP2, "--node", "1", "1=5", "10=500", "2=6")
+        assert ran.lines == ["1 ok", "10 ok", "2 ok"]
+        process.terminate()
+        process.wait(PATIENCE)
+    assert [(row[1], row[3]) for row in audit(file.parent)] == [
+        ("winder/force", "refused"),
+        ("1/write element 1 = 5", "written"),
+        ("winder/force", "written"),
+        ("1/write element 2 = 6", "written"),
+    ]
+
+
+def test_commands_that_need_a_port_of_their_own_say_so_of_a_line_that_is_served(busmaster: Command, file: Path) -> None:
+    for command in (
+        ("monitor", "unix:/run/line.sock", *HCP2),
+        ("doctor", "tcp://127.0.0.1:7420", *HCP2),
+        ("doctor", "unix:/run/line.sock"),
+        ("run", str(file), "--port", "unix:/run/line.sock"),
+    ):
+        ran = busmaster(*command)
+        assert (ran.status, ran.out) == (2, "")
+        assert "is a line that a busmaster serves, which read, write, poll and scan take" in ran.err
+        assert ran.err.count("\n") == 1
+
+
+# by TCP
+
+
+def test_commands_come_by_tcp_with_the_token_of_the_environment(
+    busmaster: Command, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tokens = tmp_path / "slitter.tokens"
+    tokens.write_text("hmi a-token-of-the-hmi-0001\nlogger a-token-of-the-logger-2\n")
+    tokens.chmod(0o600)
+    file.write_text(f"""{file.read_text()}
+[service]
+listen = "127.0.0.1:0"
+token_file = "{tokens}"
+tokens.hmi = {{ role = "write", allow_writes = ["winder/*"] }}
+""")
+    with owner("serve", str(file)) as (process, _):
+        [line] = (line for line in (json.loads(text) for text in busmaster("status", "--json").lines))
+        address = line["tcp"]
+        assert address.startswith("tcp://127.0.0.1:")
+        assert "wants a token" in busmaster("read", address, *HCP2, "--node", "2", "1").err
+        monkeypatch.setenv("BUSMASTER_TOKEN", "a-token-of-the-logger-2")
+        assert busmaster("read", address, *HCP2, "--node", "2", "1").out == "1 0\n"
+        ran = busmaster("write", address, *HCP2, "--node", "1", "1=5")
+        assert (ran.status, ran.out) == (2, "")
+        assert "token logger may read this line and not write" in ran.err
+        monkeypatch.setenv("BUSMASTER_TOKEN", "a-token-of-the-hmi-0001")
+        assert busmaster("write", address, *HCP2, "--node", "1", "1=5").out == "1 ok\n"
+        ran = busmaster("write", address, *HCP2, "--node", "2", "1=5")
+        assert (ran.status, ran.out) == (2, "")
+        assert "token hmi may not write this: see allow_writes" in ran.err
+        ran = busmaster("read", address, *HCP2, "--baud", "9600", "--node", "2", "1")
+        assert (ran.status, ran.out) == (2, "")
+        assert "not 9600 baud" in ran.err
+        tokens.write_text("hmi another-token-0003\n")
+        process.send_signal(signal.SIGHUP)
+        assert process.stderr is not None
+        while "was read again" not in process.stderr.readline():
+            pass
+        assert "does not know this token" in busmaster("read", address, *HCP2, "--node", "2", "1").err
+
+
+def test_tokens_that_others_may_read_keep_a_line_from_starting(busmaster: Command, file: Path, tmp_path: Path) -> None:
+    tokens = tmp_path / "slitter.tokens"
+    tokens.write_text("hmi a-token-of-the-hmi-0001\n")
+    tokens.chmod(0o644)
+    file.write_text(f'{file.read_text()}\n[service]\nlisten = "127.0.0.1:0"\ntoken_file = "{tokens}"\n')
+    ran = busmaster("serve", str(file))
+    assert ran.status == 2
+    assert f"service.token_file: others may read {tokens}, or change it: chmod 600 {tokens}" in ran.err
+    assert busmaster("plan", str(file)).status != 2  # no affair of those who only read the file
