@@ -101,8 +101,8 @@ async def poll_served(remote: RemoteBus, points: Sequence[Point[Any]], period: f
         note("the live view of a line that another program owns is busmaster top; plain lines instead")
     cycles = Cycles(remote, view)
     try:
-        with anyio.move_on_after(view.seconds):
-            async with remote:
+        async with remote:
+            with anyio.move_on_after(view.seconds):
                 await cycles.show(await remote.poll_group("poll", period=period, points=points))
                 await remote.groups()  # it ended without us: this says why
     finally:
