@@ -66,6 +66,7 @@ class ConfiguredLine:
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         self.gate = Gate(self.bus, read_only=read_only, access=access_of(file.service, self))
+        self.gate.safe_state = self.safe_state
         self.outputs = Distributor(self.bus, tell, gate=self.gate)
         self._kept_times = KeptTimes(self.bus, self._tell)
         self.gate.record = self.outputs.record
@@ -113,6 +114,7 @@ class ConfiguredLine:
             node.lift(limit)
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
+        self.gate.safe_state = self.safe_state
         self.gate.access = access_of(file.service, self, self.gate.access.secrets)
         for name, group in list(self.groups.items()):
             same = before.groups[name] == file.groups.get(name) and wanted[name] == self._wanted[name]

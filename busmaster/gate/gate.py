@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import inf
 from types import TracebackType
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
@@ -60,6 +60,23 @@ class Wish:
 
 Keep: TypeAlias = Callable[[Wish, Outcome, str, Any, float], WriteRecord]
 """Keeps a record: of what was wished, what became of it and why, the value before, and the seconds that it took."""
+
+
+class SafeWrites(Protocol):
+    """The safe state of a line."""
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Return the value of each of its points, by its name; of no point where there is no safe state."""
+        ...
+
+    def refusal(self, permission: Permission, /) -> str:
+        """Return why somebody may not have it sent, "" if he may."""
+        ...
+
+    async def enter(self, gate: Gate, by: str, /, *, leaving: bool = True) -> Mapping[str, BusError | None]:
+        """Send it, and return by point why it was not confirmed, None if it was."""
+        ...
 
 
 class Passage:
@@ -117,6 +134,8 @@ class Gate:
     def __init__(self, bus: Bus, *, read_only: bool = False, access: Access | None = None) -> None:
         self.read_only = read_only
         self.access = access or Access()
+        self.safe_state: SafeWrites | None = None
+        """What the line's file calls safe; None of a line without a file."""
         self.on_access: list[Callable[[], None]] = []
         """Called when other tokens hold."""
         self.record: Callable[[WriteRecord], None] = lambda _: None

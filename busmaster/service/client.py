@@ -108,6 +108,9 @@ class Client:
         if method == "request":
             self._begin(number, params)
             return
+        if method == "safe":
+            self._begin_safe(number, params)
+            return
         try:
             answer = self._answer(method, params)
         except (BusError, InvalidCommand, Malformed) as error:
@@ -220,6 +223,23 @@ class Client:
     def _ended(self, number: int, errand: Errand, _: object) -> None:
         del self._running[number], self._errands[number]
         errand.give_up()  # a task that is cancelled before its first step runs nothing of it
+
+    def _begin_safe(self, number: int, params: Mapping[str, Any]) -> None:
+        try:
+            sending = self._line.safe_wishes.begin(params["writes"], self.peer)
+        except InvalidCommand as error:
+            self._refuse(number, error)
+        except (KeyError, TypeError, ValueError) as error:
+            self._refuse(number, InvalidCommand(f"safe: {type(error).__name__}: {error}"))
+        else:
+            sending.add_done_callback(partial(self._safe_sent, number))
+
+    def _safe_sent(self, number: int, sending: asyncio.Task[dict[str, Any]]) -> None:
+        error = WriteUnconfirmed("the program that owns the line ends") if sending.cancelled() else sending.exception()
+        if error is None:
+            self._say({"id": number, "result": sending.result()})
+        else:
+            self._refuse(number, error if isinstance(error, Exception) else BusError(str(error)))
 
     def _say(self, message: Mapping[str, Any]) -> None:
         self.outbox.put(written(message))

@@ -18,6 +18,7 @@ from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfir
 from busmaster.gate.gate import FRESH, Gate, Wish
 from busmaster.gate.permission import Permission
 from busmaster.service.peers import Peer
+from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast
 from busmaster.service.telling import protocol_of
 
@@ -34,6 +35,9 @@ class Line(Protocol):
 
     @property
     def gate(self) -> Gate: ...
+
+    @property
+    def safe_wishes(self) -> SafeWishes: ...
 
     def broadcast_of(self, group: PollGroup, /) -> Broadcast:
         """Return what tells the cycles of a poll group."""

@@ -21,10 +21,11 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
-from busmaster.errors import BusClosed, InvalidCommand
+from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.planning.merging import Merge
 from busmaster.service.link import TCP, Asked, Link
 from busmaster.service.messages import said_timings, value_of
+from busmaster.service.safe import outcomes_of
 from busmaster.service.telling import (
     event_of,
     point_of,
@@ -390,6 +391,14 @@ class RemoteBus:
         params |= {"phase": phase, "priority": priority}
         return await self._follow("poll", name, wanted, params)
 
+    async def enter_safe_state(self, values: Mapping[str, float]) -> dict[str, BusError | None]:
+        """Have the line's owner send its safe state, and return by point why it was not confirmed, None if it was.
+
+        `values` is what the caller takes that to be, by the names of the file's points. Raises InvalidCommand, and
+        nothing is sent, if it is something else, or this program may not write all of it.
+        """
+        return outcomes_of(await self._ask("safe", {"writes": dict(values)}, writes=True))
+
     async def groups(self) -> tuple[str, ...]:
         """Return the names of the line's poll groups."""
         return tuple(group["name"] for group in await self._ask("groups", {}))
@@ -411,8 +420,8 @@ class RemoteBus:
 
     # inside
 
-    async def _ask(self, method: str, params: Mapping[str, Any]) -> Any:
-        asked = self.link.ask(method, params)
+    async def _ask(self, method: str, params: Mapping[str, Any], *, writes: bool = False) -> Any:
+        asked = self.link.ask(method, params, writes=writes)
         return await self.link.answer(asked)
 
     async def _follow(

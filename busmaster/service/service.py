@@ -35,6 +35,7 @@ from busmaster.service.messages import (
 )
 from busmaster.service.outbox import Outbox
 from busmaster.service.peers import Peer, process_of
+from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
 from busmaster.service.tcp import HostPort, check_listening, holder, is_our_name, listening
 
@@ -79,6 +80,7 @@ class Service:
         self.gate = gate or Gate(bus)
         if listen is not None:
             check_listening(listen, tokens=bool(self.gate.access.secrets))
+        self.safe_wishes = SafeWishes(self.gate)
         self.name = name or line_name(bus.endpoint.name)
         self.refused = 0
         """Connections that were one too many, or that began with what no client says."""
@@ -151,6 +153,7 @@ class Service:
         """Let nobody in any more, tell all clients what became of their requests, and let them go."""
         self.bus.on_stop.remove(self._tell_stop)
         self.gate.on_access.remove(self._let_go)
+        await self.safe_wishes.close()
         for server in self._servers:
             server.close(close_connections=False)
         for client in self.clients:

@@ -344,3 +344,31 @@ def test_tokens_that_others_may_read_keep_a_line_from_starting(busmaster: Comman
     assert ran.status == 2
     assert f"service.token_file: others may read {tokens}, or change it: chmod 600 {tokens}" in ran.err
     assert busmaster("plan", str(file)).status != 2  # no affair of those who only read the file
+
+
+# the safe state
+
+SAFE = '[safe]\nwithin = 2.0\nrepeatable = ["winder/force"]\nwrites = { "winder/force" = 1.5 }\n'
+
+
+def test_safe_has_the_owner_send_the_safe_state_and_the_line_goes_on(
+    busmaster: Command, file: Path, controllers: TcpServer
+) -> None:
+    file.write_text(file.read_text() + SAFE)
+    with owner("serve", str(file)) as (process, address):
+        assert busmaster("write", address, *HCP2, "--node", "1", "10=300").status == 0
+        ran = busmaster("safe", str(file))
+        assert (ran.status, ran.out) == (0, "winder/force ok\n")
+        port = controllers.path.removeprefix("socket://")
+        assert ran.err == f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n"
+        assert busmaster("read", address, *HCP2, "--node", "1", "10").out == "10 15\n"
+        assert busmaster("write", address, *HCP2, "--node", "1", "10=30").status == 0
+        other = file.with_name("other.toml")
+        other.write_text(file.read_text().replace('"winder/force" = 1.5', '"winder/force" = 2'))
+        ran = busmaster("safe", str(other))
+        assert (ran.status, ran.out) == (2, "")
+        assert "has the safe state winder/force = 1.5, and not winder/force = 2" in ran.err
+        assert busmaster("read", address, *HCP2, "--node", "1", "10").out == "10 30\n"
+        process.terminate()
+        process.wait(PATIENCE)
+    assert [row for row in audit(file.parent) if row[0] == "safe"] == [("safe", "winder/force", 1.5, "written")] * 2
