@@ -21,6 +21,7 @@ from busmaster.gate.record import WriteRecord
 from busmaster.registry import make_device
 from busmaster.service.messages import read, written
 from tests.patience import PATIENCE
+from tests.service.schema import check_owner
 
 PATIENT = Timings.uniform(ReplyTiming(0.3, 0.3, 0.3, 0.02))
 """Of a node that is not there: what is asked of it is on the wire for a while."""
@@ -95,7 +96,9 @@ class Raw:
         await self.connection.send(written(message))
 
     async def hear(self) -> dict[str, Any]:
-        return read(await self.connection.recv())
+        said = read(await self.connection.recv())
+        check_owner(said)
+        return said
 
     async def ask(self, method: str, **params: Any) -> dict[str, Any]:
         await self.say(id=1, method=method, params=params)
