@@ -20,7 +20,7 @@ import pytest
 from busmaster import Hcp2Controller, connect
 from busmaster.emulator.serve import TcpServer
 from busmaster.service.folder import find_owner
-from tests.cli.conftest import ENVIRONMENT, ROOT, Command, serve, started
+from tests.cli.conftest import ENVIRONMENT, ROOT, Command, ended_once, serve, started
 from tests.patience import PATIENCE
 
 TEXT = """
@@ -237,15 +237,16 @@ def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, cont
         ran = busmaster("scan", controllers.path, *HCP2, "--nodes", "2-4", "--timeout", "20")
         assert (ran.status, [line.split()[0] for line in ran.lines]) == (0, ["2", "3"])
         assert ran.err.startswith(said)
-        options = ("--nodes", "2,3", "--items", "1", "--period", "0.02", "--seconds", "0.3")
-        ran = busmaster("poll", controllers.path, *HCP2, *options)
-        assert ran.status == 0
+        options = ("--nodes", "2,3", "--items", "1", "--period", "0.02")
+        ran = ended_once(lambda lines: len(lines) >= 5, "poll", controllers.path, *HCP2, *options)
+        assert ran.status == 130
         assert {line.split()[1] for line in ran.lines} == {"2/1", "3/1"}
         assert ran.err.startswith(said)
         assert re.search(r"poll: \d+ cycles, \d+ missed, period", ran.err)
-        ran = busmaster("poll", address, *HCP2, *options, "--json")
+        ran = ended_once(lambda lines: len(lines) >= 1, "poll", address, *HCP2, *options, "--json")
         cycle = json.loads(ran.lines[0])
         assert (cycle["group"], cycle["samples"]["2/1"]["value"]) == ("poll", 0)
+        assert busmaster("poll", address, *HCP2, *options, "--seconds", "0").status == 0
 
 
 def test_a_poll_whose_owner_ends_says_so(file: Path, controllers: TcpServer) -> None:
@@ -372,3 +373,16 @@ def test_safe_has_the_owner_send_the_safe_state_and_the_line_goes_on(
         process.terminate()
         process.wait(PATIENCE)
     assert [row for row in audit(file.parent) if row[0] == "safe"] == [("safe", "winder/force", 1.5, "written")] * 2
+
+
+def test_options_of_a_node_that_differ_from_the_owners_are_named_with_its_own(
+    busmaster: Command, file: Path, controllers: TcpServer
+) -> None:
+    with owner("serve", str(file)) as (_, address):
+        for options, complaint in (
+            (("--timeout", "7"), "other timings (a reply window of 7 ms, not 100 ms)"),
+            (("--retries", "9"), "other retries (9, not 2)"),
+        ):
+            ran = busmaster("read", address, *HCP2, *options, "--node", "1", "1")
+            assert (ran.status, ran.out) == (2, "")
+            assert complaint in ran.err
