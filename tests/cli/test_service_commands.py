@@ -7,10 +7,11 @@ import json
 import os
 import re
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -246,7 +247,7 @@ def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, cont
         ran = ended_once(lambda lines: len(lines) >= 1, "poll", address, *HCP2, *options, "--json")
         cycle = json.loads(ran.lines[0])
         assert (cycle["group"], cycle["samples"]["2/1"]["value"]) == ("poll", 0)
-        assert busmaster("poll", address, *HCP2, *options, "--seconds", "0").status == 0
+        assert busmaster("poll", address, *HCP2, *options, "--seconds", "0.05").status == 0
 
 
 def test_a_poll_whose_owner_ends_says_so(file: Path, controllers: TcpServer) -> None:
@@ -386,3 +387,39 @@ def test_options_of_a_node_that_differ_from_the_owners_are_named_with_its_own(
             ran = busmaster("read", address, *HCP2, *options, "--node", "1", "1")
             assert (ran.status, ran.out) == (2, "")
             assert complaint in ran.err
+
+
+# lines of the system
+
+
+def test_status_lists_the_lines_of_the_system_too_and_which_of_them_are_not_for_this_user(
+    busmaster: Command, file: Path, tmp_path: Path, controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = tmp_path / "run" / "busmaster"
+    folder = system / "slitter"
+    folder.mkdir(parents=True)
+    monkeypatch.setattr("busmaster.service.folder.SYSTEM", system)
+    monkeypatch.setitem(ENVIRONMENT, "RUNTIME_DIRECTORY", str(folder))  # as systemd says it
+    with owner("serve", str(file)) as (process, address):
+        assert address == f"unix:{folder}/slitter.sock"
+        ran = busmaster("status", "--json")
+        said = json.loads(ran.out)
+        assert (said["address"], said["process"], said["error"]) == (address, process.pid, None)
+        assert busmaster("read", controllers.path, *HCP2, "--node", "2", "1").out == "1 0\n"
+        # Root may connect whatever the mode, so that the socket itself cannot show this.
+        monkeypatch.setattr(socket.socket, "connect", refuse(socket.socket.connect))
+        ran = busmaster("status")
+        assert ran.status == 0
+        assert ran.lines[1].split()[:3] == ["slitter", controllers.path.removeprefix("socket://"), str(process.pid)]
+        assert ran.lines[1].endswith("not for this user")
+
+
+def refuse(connect: Callable[[socket.socket, Any], None]) -> Callable[[socket.socket, Any], None]:
+    """What the kernel answers whoever is not in the group of a socket."""
+
+    def refused(self: socket.socket, address: Any) -> None:
+        if self.family == socket.AF_UNIX:
+            raise PermissionError(13, "Permission denied")
+        connect(self, address)
+
+    return refused
