@@ -60,10 +60,15 @@ def reach(connection: Connection) -> Bus | RemoteBus:
         if owner is None:
             return connection.open_bus()
         address = owner.address
-        note(f"{owner.port} is owned by process {owner.pid}: asking through {address}")
+        tell_owner(owner)
     if connection.capture is not None:
         raise click.UsageError(f"{address} is a line of another program: record it there, not by --capture")
     return ReachedLine(address, connection)
+
+
+def tell_owner(owner: Owner) -> None:
+    """Say on standard error through whom it goes."""
+    note(f"{owner.port} is owned by process {owner.pid}: asking through {owner.address}")
 
 
 def owner_of(endpoint: Endpoint) -> Owner | None:

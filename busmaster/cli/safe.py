@@ -10,7 +10,7 @@ from busmaster.cli.app import FAILED, OK
 from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import file_argument, keep, load, other_port, port_option
 from busmaster.cli.output import Level, emit, note
-from busmaster.cli.reaching import owner_of
+from busmaster.cli.reaching import owner_of, tell_owner
 from busmaster.config import ConfiguredLine
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.gate.record import WriteRecord
@@ -34,7 +34,7 @@ def command(path: str, port: str | None) -> int:
         raise click.UsageError(f"{path} has no safe state: its writes stand in [safe]")
     owner = owner_of(line.bus.endpoint)
     if owner is not None:
-        note(f"{owner.port} is owned by process {owner.pid}: asking through {owner.address}")
+        tell_owner(owner)
         return until_ended(leave_through, connect(owner.address), line.safe_state.values)
     return until_ended(leave, line)
 

@@ -423,3 +423,20 @@ def refuse(connect: Callable[[socket.socket, Any], None]) -> Callable[[socket.so
         connect(self, address)
 
     return refused
+
+
+def test_points_of_a_file_are_written_through_its_lines_owner(
+    busmaster: Command, file: Path, controllers: TcpServer
+) -> None:
+    with owner("serve", str(file)) as (process, address):
+        ran = busmaster("write", str(file), "winder/force=30", "winder/2=7", "--verify")
+        assert (ran.status, ran.out) == (0, "winder/force ok\nwinder/2 ok\n")
+        assert f"is owned by process {process.pid}: asking through {address}" in ran.err
+        ran = busmaster("write", str(file), "winder/2=8", "winder/force=51")
+        assert (ran.status, ran.out) == (2, "")
+        assert busmaster("read", address, *HCP2, "--node", "1", "10", "2").lines == ["10 300", "2 7"]
+        process.terminate()
+        process.wait(PATIENCE)
+    assert [(row[0], row[1], row[2], row[3]) for row in audit(file.parent)][:1] == [
+        ("service", "winder/force", 30.0, "written")
+    ]
