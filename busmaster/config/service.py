@@ -91,7 +91,7 @@ def read_service(table: Table) -> ServiceSection:
         listen=listen,
         token_file=token_file,
         users={_user(each): _role(each, "user") for each in table.tables("users")},
-        groups={_group(each, None, each.name): _role(each, "group") for each in table.tables("groups")},
+        groups={_group(each, None, each.name): _of_group(each, mode) for each in table.tables("groups")},
         tokens={_token(each, token_file): _role(each, "token") for each in table.tables("tokens")},
         table=table,
     )
@@ -104,6 +104,12 @@ def _role(table: Table, kind: str) -> RoleSection:
     if only is not None and not (writes and only):
         raise table.error('names what a role = "write" may write: leave it out for all of the line', "allow_writes")
     return RoleSection(f"{kind} {table.name}", writes, only, table)
+
+
+def _of_group(table: Table, mode: int) -> RoleSection:
+    if not mode & 0o066:
+        raise table.error(f"no group comes to a socket of mode {mode:04o}: say whose it is, as group = {table.name!r}")
+    return _role(table, "group")
 
 
 def _user(table: Table) -> int:

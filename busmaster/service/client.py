@@ -19,6 +19,7 @@ from busmaster.gate.permission import Permission
 from busmaster.service.errands import Errand, Line
 from busmaster.service.failures import said_error
 from busmaster.service.messages import (
+    MOST_CHECKED,
     MOST_NODES,
     MOST_POINTS,
     MOST_REQUESTS,
@@ -139,6 +140,8 @@ class Client:
             case "node":
                 return self._name_node(params)
             case "check":
+                if len(params["commands"]) > MOST_CHECKED:
+                    raise InvalidCommand(f"{MOST_CHECKED} writes are checked at once, and no more")
                 for command in params["commands"]:
                     Errand.of({**params, "command": command}, self, self._line).check()
                 return None

@@ -24,7 +24,7 @@ from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.planning.merging import Merge
 from busmaster.service.link import TCP, Asked, Link
-from busmaster.service.messages import said_timings, value_of
+from busmaster.service.messages import MOST_CHECKED, said_timings, value_of
 from busmaster.service.safe import outcomes_of
 from busmaster.service.telling import (
     event_of,
@@ -278,7 +278,8 @@ class RemoteBus:
             self._name(node)
         try:
             for node, commands, stop in self._prepared:
-                await self._ask("check", node.said_check(commands, stop))
+                for first in range(0, len(commands), MOST_CHECKED):
+                    await self._ask("check", node.said_check(commands[first : first + MOST_CHECKED], stop))
         except BaseException:
             await link.close()
             raise

@@ -17,17 +17,18 @@ class SafeWishes:
 
     def __init__(self, gate: Gate) -> None:
         self._gate = gate
-        self._sending: set[asyncio.Task[dict[str, Any]]] = set()
+        self._sending: asyncio.Task[dict[str, Any]] | None = None
 
     @property
-    def under_way(self) -> int:
-        """How many are being sent."""
-        return len(self._sending)
+    def under_way(self) -> bool:
+        """Whether it is being sent."""
+        return self._sending is not None and not self._sending.done()
 
     def begin(self, wanted: Mapping[str, Any], peer: Peer) -> asyncio.Task[dict[str, Any]]:
         """Send the safe state, if that is what somebody expects; the task returns what is said of each point.
 
-        Raises InvalidCommand where he may not, and where he expects something else.
+        Whoever asks while it is being sent has a part in that. Raises InvalidCommand where he may not, and where he
+        expects something else.
         """
         state = self._gate.safe_state
         if state is None or not state.values:
@@ -42,17 +43,15 @@ class SafeWishes:
         )
         if refusal:
             raise InvalidCommand(refusal)
-        sending = asyncio.ensure_future(self._send(state, str(peer)))
-        self._sending.add(sending)
-        sending.add_done_callback(self._sending.discard)
-        return sending
+        if self._sending is None or self._sending.done():
+            self._sending = asyncio.ensure_future(self._send(state, str(peer)))
+        return self._sending
 
     async def close(self) -> None:
         """End what is being sent: the program that ends sends its own."""
-        sending = list(self._sending)
-        for task in sending:
-            task.cancel()
-        await asyncio.gather(*sending, return_exceptions=True)
+        if self._sending is not None:
+            self._sending.cancel()
+            await asyncio.wait([self._sending])
 
     async def _send(self, state: SafeWrites, by: str) -> dict[str, Any]:
         outcomes = await state.enter(self._gate, by, leaving=False)

@@ -83,7 +83,10 @@ def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, con
         port = controllers.path.removeprefix("socket://")
         assert ran.err == (f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n")
         ran = busmaster("read", address, *HCP2, "--node", "2", "1")
+        assert (ran.status, ran.out, ran.err) == (0, "1 123.456\n", "")
+        ran = busmaster("read", controllers.path.replace("127.0.0.1", "localhost"), *HCP2, "--node", "2", "1")
         assert (ran.status, ran.out) == (0, "1 123.456\n")
+        assert "is owned by process" in ran.err
 
         async def program() -> None:
             async with connect("slitter") as remote:

@@ -54,6 +54,7 @@ def test_a_role_is_of_a_user_a_group_or_a_token(tmp_path: Path) -> None:
     (tmp_path / "tokens").write_text(HMI)
     (tmp_path / "tokens").chmod(0o600)
     file = parse(f"""{TEXT}[service]
+group = "{GROUP}"
 listen = "0.0.0.0:7420"
 token_file = "{tmp_path}/tokens"
 users.{USER}.role = "read"
@@ -108,6 +109,7 @@ def test_what_is_no_point_that_could_be_written_is_refused_with_its_place(said: 
         ('tokens.hmi.role = "read"', "service.tokens.hmi: a token is written in a file of its own"),
         ('users.nobody-at-all.role = "read"', "there is no user 'nobody-at-all' on this machine"),
         ('groups.nobody-at-all.role = "read"', "there is no group 'nobody-at-all' on this machine"),
+        (f'groups.{GROUP}.role = "read"', "no group comes to a socket of mode 0600: say whose it is, as group = "),
         (f'users.{USER}.role = "admin"', "no such role 'admin'; there are read, write"),
         (f"users.{USER} = {{}}", "'role' is missing"),
         (f'users.{USER} = {{ role = "read", allow_writes = "winder/force" }}', 'names what a role = "write" may'),
