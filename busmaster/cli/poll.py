@@ -90,8 +90,8 @@ class Cycles:
             return
         text = f"poll: {self._last.cycle} cycles, {self._last.missed} missed"
         periods = [later - earlier for earlier, later in pairwise(self._started)]
-        if (p99 := p99_of(periods)) is not None:
-            text += f", period {fmean(periods) * 1000:.2f} ms mean, {p99 * 1000:.2f} ms p99"
+        if periods:
+            text += f", period {fmean(periods) * 1000:.2f} ms mean, {(p99_of(periods) or 0.0) * 1000:.2f} ms p99"
         note(text)
 
 

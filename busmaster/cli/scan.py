@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from busmaster.bus.requester import Requester
+from busmaster.bus.requester import Priority, Requester
 from busmaster.cli.arguments import Connection, connected, json_option, nodes_option, nodes_to_ask
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit, json_line, json_value, value_text
@@ -48,7 +48,8 @@ async def ask(node: Requester) -> tuple[object, str] | None:
     """Ask a node once, and return the value and what happened in words; None if nothing was heard of it."""
     probe = node.profile.probe
     try:
-        value = await node.request(probe, retries=0)
+        # behind all that other programs ask of the line: a node that is not there takes its whole reply window
+        value = await node.request(probe, retries=0, priority=Priority.BACKGROUND)
     except (NoReply, NodeDown):
         return None
     except Refused:
