@@ -8,10 +8,15 @@ from contextlib import asynccontextmanager
 from importlib.util import find_spec
 
 from busmaster.cli.output import Level, note
-from busmaster.config import ConfiguredLine
+from busmaster.config import ConfiguredLine, LineFile
 from busmaster.errors import InvalidCommand
 from busmaster.service.folder import line_name
 from busmaster.service.service import Service
+
+
+def secrets_of(file: LineFile) -> dict[str, bytes]:
+    """Return the digests of the tokens with which programs may come to a line. Raises FileError, as their file does."""
+    return file.service.secrets() if file.service.enabled else {}
 
 
 def service_of(line: ConfiguredLine, *, wanted: bool) -> Service | None:
@@ -24,8 +29,15 @@ def service_of(line: ConfiguredLine, *, wanted: bool) -> Service | None:
     if not section.enabled or (find_spec("websockets") is None and not (said or wanted)):
         return None
     name = line_name(os.path.basename(line.file.path).removesuffix(".toml"))
-    title = line.file.title
-    return Service(line.bus, gate=line.gate, name=name, mode=section.mode, group=section.group, title=title)
+    return Service(
+        line.bus,
+        gate=line.gate,
+        name=name,
+        mode=section.mode,
+        group=section.group,
+        listen=section.listen,
+        title=line.file.title,
+    )
 
 
 @asynccontextmanager
@@ -45,7 +57,8 @@ async def served(service: Service | None, *, tell: bool) -> AsyncIterator[Servic
         return
     try:
         if tell:
-            note(f"{service.title} is served at {service.address}", Level.NOTICE)
+            by_tcp = "" if service.tcp_address is None else f" and {service.tcp_address}"
+            note(f"{service.title} is served at {service.address}{by_tcp}", Level.NOTICE)
         yield service
     finally:
         await service.__aexit__(None, None, None)

@@ -15,6 +15,7 @@ from busmaster.cli.app import FAILED
 from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import is_line_file, load
 from busmaster.cli.picture import Picture
+from busmaster.cli.reaching import token_for
 from busmaster.errors import LineDown
 from busmaster.service.folder import find_owner, line_name, owners
 from busmaster.service.remote import connect
@@ -80,10 +81,10 @@ async def top(address: str, read_only: bool = False, of_owner: bool = False) -> 
         if method == "frame" and screen is not None:
             screen.take_picture()
 
-    async with connect(address) as remote:
+    async with connect(address, token=token_for(address)) as remote:
         overview = await remote.overview(hear)
         leave = "end the run" if of_owner else "leave"
-        screen = Screen(picture, overview, read_only=read_only, leave=leave)
+        screen = Screen(picture, overview, read_only=read_only or remote.about["read_only"], leave=leave)
         ended = asyncio.ensure_future(overview.over())
         looking = asyncio.ensure_future(hang_up(screen))
         ended.add_done_callback(lambda _: screen.exit(FAILED))  # the terminal is given back, then it is said why

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Coroutine, Iterable, Iterator
 from contextlib import AsyncExitStack
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import anyio
 from anyio.abc import TaskGroup
@@ -89,8 +89,8 @@ class Watch:
         """Tell on standard error what happens to the bus and matters, until cancelled."""
         async for event in self._heard:
             level = self._level(event)
-            if (text := event_text(event)) and level is not None:
-                self._note(text, level)
+            if (text := event_text(event)) and level is not None and self.may_print():
+                note(text, level)
 
     def _level(self, event: BusEvent) -> Level | None:
         """Return how much an event matters to whoever is not looking: a loss, and its end, once each.
@@ -130,11 +130,12 @@ class Watch:
     def announce(self, text: str, level: Level = Level.NOTICE) -> None:
         """Add to the last events; print a line on standard error, unless the screen that shows them is there."""
         self.tell(text)
-        self._note(text, level)
-
-    def _note(self, text: str, level: Level) -> None:
-        if not (shown_on_screen(self.view) and sys.stderr.isatty()):  # a line there would tear the picture
+        if self.may_print():
             note(text, level)
+
+    def may_print(self) -> bool:
+        """Tell whether a line may be printed on standard error: it must not tear the picture that is drawn there."""
+        return not (shown_on_screen(self.view) and sys.stderr.isatty())
 
     def summarise(self) -> None:
         """Print the summary on standard error: cycles, missed, achieved period, utilisation; a line for each node."""
@@ -174,12 +175,22 @@ def p99_of(periods: Iterable[float]) -> float:
     return ordered[math.ceil(0.99 * len(ordered)) - 1]
 
 
-def json_cycle(watch: Watch, snapshot: Snapshot) -> str:
+class Clock(Protocol):
+    """What printed times begin at."""
+
+    start: float
+
+    def since(self, time: float, /) -> float:
+        """Return a time of the bus in seconds since the start."""
+        ...
+
+
+def json_cycle(watch: Clock, snapshot: Snapshot) -> str:
     """Return a cycle as one JSON object."""
     return json_line(**cycle_fields(snapshot, watch.since))
 
 
-def plain_cycle(watch: Watch, snapshot: Snapshot) -> Iterator[str]:
+def plain_cycle(watch: Clock, snapshot: Snapshot) -> Iterator[str]:
     """Yield a line a sample: seconds since the start, node and item, the value, or what went wrong."""
     for point, sample in snapshot.samples.items():
         value = error_text(sample.error) if sample.error else value_text(sample.value, point.meaning.precision)

@@ -17,9 +17,11 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
 from busmaster.gate.gate import FRESH, NEVER_SENT, Gate, Wish, outcome_of
+from busmaster.gate.permission import Permission
 from busmaster.service.messages import value_of
 from busmaster.service.overview import Journal
 from busmaster.service.peers import Peer
+from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast
 from busmaster.service.telling import protocol_of
 
@@ -36,6 +38,9 @@ class Line(Protocol):
 
     @property
     def gate(self) -> Gate: ...
+
+    @property
+    def safe_wishes(self) -> SafeWishes: ...
 
     def broadcast_of(self, group: PollGroup, /) -> Broadcast:
         """Return what tells the cycles of a poll group."""
@@ -75,6 +80,9 @@ class Asker(Protocol):
     @property
     def peer(self) -> Peer: ...
 
+    @property
+    def permission(self) -> Permission: ...
+
     def node(self, name: str, address: int, /) -> Node:
         """Return a node of the line. Raises InvalidCommand."""
         ...
@@ -108,7 +116,7 @@ class Task:
 
         Raises InvalidCommand, and keeps a record of it, for what cannot be written.
         """
-        _, point = line.point(params["point"]["group"], params["point"]["key"])
+        _, point = line.point(params["group"], params["key"])
         value = value_of(params["value"])
         assert isinstance(point.node, Node)
         try:
@@ -116,7 +124,8 @@ class Task:
                 raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
             return cls(point.node, point.encode(value), point.command, value, point)
         except NEVER_SENT as error:
-            wish = Wish(door=DOOR, by=str(asker.peer), name=point.key, point=point, value=value)
+            by, permission = str(asker.peer), asker.permission
+            wish = Wish(door=DOOR, by=by, name=point.key, point=point, value=value, permission=permission)
             refusal = line.gate.refusal(wish) or outcome_of(error)[1]
             line.gate.refuse(wish, refusal)
             raise InvalidCommand(refusal) from None
@@ -131,7 +140,7 @@ class Errand:
         options: CommandOptions,
         *,
         line: Line,
-        peer: Peer,
+        asker: Asker,
         stops_seen: int | None,
         stop: bool,
         asked: float,
@@ -142,7 +151,7 @@ class Errand:
         self._task = task
         self._options = options
         self._line = line
-        self._peer = peer
+        self._asker = asker
         self._stops_seen = stops_seen
         self._stop = stop
         self._asked = asked
@@ -151,7 +160,7 @@ class Errand:
     @classmethod
     def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
-        task = Task.of_point(params, asker, line) if "point" in params else Task.of_node(params, asker)
+        task = Task.of_point(params, asker, line) if "key" in params else Task.of_node(params, asker)
         node, command = task.node, task.command
         given = cast("CommandOptions", dict(params.get("options", {})))
         if not set(given) <= OPTIONS:
@@ -162,7 +171,7 @@ class Errand:
             task,
             given,
             line=line,
-            peer=asker.peer,
+            asker=asker,
             stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
             stop=params.get("stop") is True and _check_stop(node, command),
             asked=min(now, seconds(params.get("asked", now), "asked")),
@@ -171,6 +180,17 @@ class Errand:
     @property
     def text(self) -> str:
         return str(self.command)
+
+    def check(self) -> None:
+        """Raise InvalidCommand for a write that would be refused now: a record is kept of that."""
+        wish = self._wish()
+        try:
+            if self.command.writes and (refusal := self._line.gate.refusal(wish)):
+                raise InvalidCommand(f"{self.node.label}: {refusal}")
+            self.node.check(self.command, stop=self._stop)
+        except InvalidCommand as error:
+            self._line.gate.refuse(wish, str(error))
+            raise
 
     async def run(self) -> Any:
         """Run it and return its value. Raises BusError or InvalidCommand; every write passes the gate."""
@@ -239,7 +259,15 @@ class Errand:
             if point is not None:
                 value = _value(point, changes, value)
         point = point or Point(self.node, self.text, command)
-        return Wish(door=DOOR, by=str(self._peer), name=point.key, point=point, value=value)
+        return Wish(
+            door=DOOR,
+            by=str(self._asker.peer),
+            name=point.key,
+            point=point,
+            value=value,
+            command=command,
+            permission=self._asker.permission,
+        )
 
 
 def _check_stop(node: Node, command: Command[Any]) -> bool:

@@ -13,13 +13,14 @@ import pytest
 
 from busmaster.bus.node import Node
 from busmaster.bus.requester import Priority
-from busmaster.cli.write import pass_on, prepare, wish_of
+from busmaster.cli.write import pass_on, prepare
 from busmaster.config import ConfiguredLine, emulated_line
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.contract.exchange import Command
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BusError, InvalidCommand, Superseded
+from busmaster.gate.permission import EVERYTHING
 from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.outputs.mqtt_commands import Answer, Commands
 from busmaster.protocols.ct_ansi import codec as ct_ansi
@@ -30,7 +31,7 @@ from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
 from busmaster.service.errands import Errand
-from busmaster.service.peers import Peer
+from busmaster.service.peers import Process
 from busmaster.service.service import Service
 from busmaster.testing.virtual_time import run_in_virtual_time
 
@@ -173,7 +174,8 @@ def by_mqtt(name: str) -> Callable[[Plant, int], Awaitable[None]]:
 class Person:
     """Who looks at the line, and writes by a key."""
 
-    peer = Peer(1, "operator", "busmaster")
+    peer = Process(1, 0, (), "operator", "busmaster")
+    permission = EVERYTHING
 
     def node(self, name: str, address: int, /) -> Node:
         raise AssertionError("a person names points")
@@ -184,7 +186,7 @@ class Person:
 
 def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
-        params = {"point": {"group": "all", "key": f"drive/{name}"}, "value": value}
+        params = {"group": "all", "key": f"drive/{name}", "value": value}
         await Errand.of(params, Person(), Service(plant.line.bus, gate=plant.line.gate)).run()
 
     return write
@@ -193,7 +195,7 @@ def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
 def by_command_line(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
         key = f"drive/{name or plant.kind.item}"
-        await pass_on(plant.line, wish_of(plant.line, key, (value,)), prepare(plant.line, key, (value,), False))
+        await pass_on(plant.line, *prepare(plant.line, key, (value,), False))
 
     return write
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from busmaster.bus.polling import PollGroup
 from busmaster.cli.picture import Picture
 from busmaster.emulator.line import Line
 from busmaster.errors import BusError, InvalidCommand, LineDown
+from busmaster.gate.permission import Access, Permission
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from busmaster.service import overview
@@ -179,6 +181,27 @@ def test_a_read_only_line_says_so_and_writes_nothing(tmp_path: Path) -> None:
         assert line.audit() == [("5/outputs", "refused")]
 
     on_a_watched_line(tmp_path, story, read_only=True)
+
+
+def test_who_may_only_read_looks_and_neither_pauses_nor_suspends_nor_writes(tmp_path: Path) -> None:
+    async def story(line: Served, picture: Picture, view: RemoteOverview) -> None:
+        line.gate.access = Access(users={os.getuid(): Permission("user me", False)})
+        for wish in (view.pause("axes", True), view.suspend("hcp2", 5, 60.0), view.write("axes", "5/outputs", 5)):
+            with pytest.raises(InvalidCommand, match="user me may"):
+                await wish
+        await view.demand("axes")
+        line.gate.access = Access(users={os.getuid(): Permission("user me", True, {("hcp2", 6): None})})
+        with pytest.raises(InvalidCommand, match="user me may not have this rest"):
+            await view.pause("axes", True)
+        await view.suspend("hcp2", 6, 60.0)
+        assert [node.label for node in line.bus.nodes if node.suspended] == ["node 6"]
+        assert not line.bus.groups[0].paused
+
+    async def with_another_node(line: Served, picture: Picture, view: RemoteOverview) -> None:
+        Hcp2Controller(line.bus, 6)
+        await story(line, picture, view)
+
+    on_a_watched_line(tmp_path, with_another_node)
 
 
 def test_details_have_limits_alarms_and_the_last_exchange(tmp_path: Path) -> None:
