@@ -15,14 +15,18 @@ from busmaster.cli.app import FAILED
 from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import is_line_file, load
 from busmaster.cli.picture import Picture
-from busmaster.cli.reaching import token_for
+from busmaster.cli.reaching import owner_of, token_for
+from busmaster.contract.profile import LineSettings
 from busmaster.errors import LineDown
 from busmaster.service.folder import find_owner, line_name, owners
 from busmaster.service.remote import connect
+from busmaster.transport.endpoints import endpoint, is_served
 
 if TYPE_CHECKING:
     from busmaster.cli.live import Screen
 
+ANY_RATE = LineSettings(9600)
+"""Of a port whose owner is looked for: which rate it has is nothing to that."""
 TERMINAL_LOOKED_AT = 1.0
 """Seconds between two looks at whether the terminal is still there."""
 
@@ -54,19 +58,22 @@ def what_is_missing() -> str:
 def address_of(line: str | None) -> str:
     """Return the address of the line that is meant. Raises LineDown if none runs, UsageError if it is not clear."""
     if line is None:
-        running = list(owners())
+        running = [owner for owner in owners() if os.access(owner.socket, os.W_OK)]
         if not running:
             raise LineDown("no line of this user is served", hint="start busmaster run LINE.toml")
         if len(running) > 1:
             names = ", ".join(owner.name for owner in running)
             raise click.UsageError(f"several lines run: say which, one of {names}")
         return running[0].address
-    if is_line_file(line):
-        owner = find_owner(line_name(os.path.basename(line).removesuffix(".toml"))) or find_owner(load(line).port.name)
-        if owner is None:
-            raise LineDown(f"no program of this user serves the line of {line}", hint=f"start busmaster run {line}")
-        return owner.address
-    return line
+    if is_served(line):
+        return line
+    if not is_line_file(line):
+        owner = find_owner(line) or owner_of(endpoint(line, defaults=ANY_RATE))
+        return line if owner is None else owner.address  # for what is said of a name that nobody has
+    owner = find_owner(line_name(os.path.basename(line).removesuffix(".toml"))) or owner_of(load(line).port)
+    if owner is None:
+        raise LineDown(f"no program of this user serves the line of {line}", hint=f"start busmaster run {line}")
+    return owner.address
 
 
 async def top(address: str, read_only: bool = False, of_owner: bool = False) -> int:

@@ -13,6 +13,7 @@ import pytest
 
 from busmaster.cli import top
 from busmaster.emulator.serve import TcpServer
+from busmaster.errors import LineDown
 from tests.cli.conftest import Command, serve, started
 from tests.cli.test_processes import Terminal
 from tests.cli.test_service_commands import TEXT, owner
@@ -185,6 +186,21 @@ def test_top_without_a_terminal_is_wrong_usage(file: Path) -> None:
         _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 2
     assert err.startswith("busmaster: top draws on a terminal")
+
+
+def test_a_line_is_meant_by_its_name_its_file_its_port_or_its_address(
+    file: Path, tmp_path: Path, controllers: TcpServer
+) -> None:
+    with pytest.raises(LineDown, match="start busmaster run"):
+        top.address_of(str(file))
+    with owner("serve", str(file)) as (_, address):
+        other_name = tmp_path / "other.toml"
+        other_name.write_text(file.read_text())
+        port = controllers.path.removeprefix("socket://")
+        for meant in ("slitter", str(file), str(other_name), controllers.path, port, address, None):
+            assert top.address_of(meant) == address
+    assert top.address_of("unix:/x") == "unix:/x"
+    assert top.address_of("nobody") == "nobody"
 
 
 def test_top_names_the_lines_where_several_run_and_says_where_none_does(file: Path, tmp_path: Path) -> None:
