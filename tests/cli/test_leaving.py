@@ -180,7 +180,8 @@ def test_safe_says_why_the_port_is_refused_and_names_each_point(
 
 def test_safe_says_who_has_the_port(busmaster: Command, path: Path) -> None:
     with serve_pty(Line(find("hcp2").profile.line, [make_device("hcp2", 1)], paced=False)) as served:
-        path.write_text((TEXT + SAFE).replace("PORT", served.path).replace("within = 1.0", "within = 0.2"))
+        text = (TEXT + SAFE).replace("PORT", served.path).replace("within = 1.0", "within = 0.2")
+        path.write_text(f"{text}[service]\nenabled = false\n")  # else its owner would send it
         with started("run", str(path), "--plain") as process:
             polls(process)
             outcome = busmaster("safe", str(path))
