@@ -35,6 +35,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from functools import partial
+from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import anyio
@@ -56,17 +57,21 @@ from busmaster.outputs.values import cycle_fields, json_line, micros, sample_fie
 
 if TYPE_CHECKING:
     from aiomqtt import Client, Message
+    from paho.mqtt.properties import Properties
 
 AT_ONCE = 100
 """Messages on their way to the broker, not yet acknowledged."""
 UNREAD = 32_768
 """Bytes that wait in our socket, some: what is more waits at the broker. Behind a flood of refused commands in a socket
 of megabytes, those that are allowed would grow too old."""
+MOST_UNREAD = 2_000
+"""Commands that the broker may send before we have taken in the first. The others wait in its queue, where its
+acknowledgements overtake them. More than these fit in our socket, so that what grows old there is known to be old."""
 PIECE = 10
 BREATH = 0.002
 """Seconds for which the interpreter is let go of after so many messages: when a broker returns, thousands may wait."""
 TIMEOUT = 5.0
-"""Seconds in which a broker must answer."""
+"""Seconds in which a broker must answer, or send whatever else."""
 KEEP_ALIVE = 15
 ALARMS = "alarms/"
 COMMANDS = "set/#"
@@ -235,6 +240,7 @@ class MqttOutput(SpillingOutput):
             tls_context=tls,
             will=aiomqtt.Will(self._topic("status"), "offline", qos=1, retain=True) if self._in_charge else None,
             keepalive=KEEP_ALIVE,
+            properties=taking_in(MOST_UNREAD),
             socket_options=[(socket.SOL_SOCKET, socket.SO_RCVBUF, UNREAD)],
             timeout=TIMEOUT,
             max_inflight_messages=AT_ONCE,
@@ -248,18 +254,32 @@ class MqttOutput(SpillingOutput):
         under_way: deque[asyncio.Task[None]] = deque()
         try:
             for number, (topic, payload, retain) in enumerate(messages, 1):
-                work = client.publish(topic, payload, qos=self._settings.qos, retain=retain)
+                work = client.publish(topic, payload, qos=self._settings.qos, retain=retain, timeout=inf)
                 under_way.append(asyncio.ensure_future(work))
                 if number % PIECE == 0:
                     await anyio.sleep(BREATH)
                 if len(under_way) == AT_ONCE:
-                    await under_way.popleft()
+                    await self._acknowledged(under_way.popleft())
             while under_way:
-                await under_way.popleft()
+                await self._acknowledged(under_way.popleft())
         finally:
             for task in under_way:
                 task.cancel()
             await asyncio.gather(*under_way, return_exceptions=True)
+
+    async def _acknowledged(self, publishing: asyncio.Task[None]) -> None:
+        """Return when it is. Raises ConnectionError where the broker sends nothing at all for too long.
+
+        Commands that come are a life sign, too: an acknowledgement may have to wait behind thousands of them.
+        """
+        done = publishing.done()
+        while not done:
+            heard = self._arriving.bytes_read
+            done = bool((await asyncio.wait({publishing}, timeout=TIMEOUT))[0])
+            if not done and self._arriving.bytes_read == heard:
+                publishing.cancel()
+                raise ConnectionError(f"{self._settings.host}:{self._settings.port} did not answer in {TIMEOUT:g} s")
+        await publishing
 
     def hold(self, most: int) -> bool:
         """Hold up to `most` values, and return whether there are any. What was not acknowledged comes first."""
@@ -362,6 +382,16 @@ class MqttOutput(SpillingOutput):
     async def _answer(self, client: Client, answer: Answer) -> None:
         topic = self._topic("result", answer.name) if answer.name else self._topic("result")
         await self._send(client, [Outgoing(topic, json_line(**answer.fields))])
+
+
+def taking_in(most: int) -> Properties:
+    """Return what tells a broker to send no more than so many messages ahead of our acknowledgements."""
+    from paho.mqtt.packettypes import PacketTypes
+    from paho.mqtt.properties import Properties
+
+    properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # the library's
+    properties.ReceiveMaximum = most
+    return properties
 
 
 def unread(client: Client) -> int:

@@ -83,7 +83,7 @@ class Commands:
         self._now = now
         self._looked = now()
         """What is read next came after this look."""
-        self._bytes_read = 0
+        self.bytes_read = 0
         """Bytes that were read, at least."""
         self._looks: deque[tuple[float, int]] = deque()
         """Later looks, each with what will have been read when all is that lay there then."""
@@ -97,7 +97,7 @@ class Commands:
     def arrive(self, message: Message) -> None:
         """Take in one message. Never waits, never raises."""
         topic = str(message.topic)
-        self._bytes_read += LEAST + len(topic) + len(message.payload)
+        self.bytes_read += LEAST + len(topic) + len(message.payload)
         if self._closed:
             self._count_alone()
             return
@@ -171,8 +171,8 @@ class Commands:
         """
         if not unread:
             self._looks.clear()
-        self._looks.append((self._now(), self._bytes_read + unread))
-        while self._looks and self._looks[0][1] <= self._bytes_read:
+        self._looks.append((self._now(), self.bytes_read + unread))
+        while self._looks and self._looks[0][1] <= self.bytes_read:
             self._looked, _ = self._looks.popleft()
 
     async def _keep_looking(self, unread: Callable[[], int]) -> None:
