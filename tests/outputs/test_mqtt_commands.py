@@ -248,20 +248,24 @@ async def test_what_came_while_we_stood_still_is_too_old_to_the_last_however_muc
     broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """This broker sends no more than 20 ahead to whom asks for nothing else, and would send the rest afterwards."""
-    asked, stands, go = threading.Event(), threading.Event(), threading.Event()
+    asked, go = threading.Event(), threading.Event()
+    stands: list[Client] = []
 
     def unread_then(client: Client) -> int:
         if asked.is_set():
-            stands.set()
+            stands.append(client)
             go.wait(PATIENCE)
         return unread(client)
 
     monkeypatch.setattr(mqtt, "unread", unread_then)
+    monkeypatch.setattr(mqtt_commands, "LOOK", 0.0)
     async with plant(broker) as there:
         asked.set()
-        assert await asyncio.to_thread(stands.wait, PATIENCE)
-        for number in range(60):
+        await asyncio.to_thread(outside_until, lambda: bool(stands))
+        for number in range(10, 70):
             await there.send(str(number))
+        size = 7 + len("line/set/5/1" + "10")
+        await asyncio.to_thread(outside_until, lambda: unread(stands[0]) >= 60 * size)
         there.output._arriving._looked -= PATIENCE + 1
         go.set()
         answers = await there.answers(60)
