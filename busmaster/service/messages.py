@@ -13,9 +13,13 @@ from busmaster.errors import InvalidCommand
 
 VERSIONS = (1,)
 """Of what is said. The first message of a client says which ones it knows, and the highest that both know holds."""
-LONGEST_MESSAGE = 1 << 20
-"""Bytes of one message, either way."""
+LONGEST_REQUEST = 1 << 16
+"""Bytes of one message of a client: what it takes to understand one holds up the line."""
+LONGEST_ANSWER = 1 << 20
+"""Bytes of one message to a client."""
 MOST_CLIENTS = 64
+MOST_STRANGERS = 64
+"""Connections of which no first message has come: one more costs the oldest of them."""
 MOST_REQUESTS = 256
 """Requests of one client that have not been answered."""
 MOST_URGENT = 16

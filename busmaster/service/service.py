@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-from collections.abc import Collection, Hashable
+from collections.abc import Collection, Hashable, Iterable, Mapping
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
@@ -18,37 +18,34 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.contract.places import Placed
-from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
 from busmaster.service.client import Client
+from busmaster.service.connection import CLOSE_WITHIN, ServedConnection, check_installed
 from busmaster.service.folder import Owner, ServedSocket, line_name, runtime_folder
 from busmaster.service.messages import (
-    HELLO_WITHIN,
     INVALID_PARAMS,
-    LONGEST_MESSAGE,
+    LONGEST_REQUEST,
     MOST_CLIENTS,
+    MOST_STRANGERS,
     VERSIONS,
     Malformed,
-    read,
     written,
 )
 from busmaster.service.outbox import Outbox
 from busmaster.service.peers import peer_of
 from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
+from busmaster.service.visit import Turns, Visit
 
 if TYPE_CHECKING:
-    from websockets.asyncio.server import Server, ServerConnection
-    from websockets.http11 import Request, Response
+    from websockets.http11 import Request
 
 HOSTS = ("localhost", "busmaster")
 """What a client calls us: a page that was tricked into asking here would say another name."""
-SEND_WITHIN = 20.0
-"""Seconds in which a client has to take a message: one that stands still is let go, with all that it asked for."""
-READ_AT_ONCE = 4096
-"""Bytes of a connection that are taken in one turn of the line's loop: of small messages it holds hundreds."""
-CLOSE_WITHIN = 1.0
-"""Seconds that a client has to hear the last of it."""
-POLICY, GOING_AWAY = 1008, 1001
+READ_AT_ONCE = 512
+"""Bytes of a connection that are taken in one turn of the line's loop: two or three requests, eighty of the smallest
+frames that there are."""
+MOST_WAITING_TO_CONNECT = 100
+TOO_MANY = f"{MOST_CLIENTS} programs are here already"
 
 
 class Service:
@@ -79,9 +76,13 @@ class Service:
         self._mode = mode
         self._group = group
         self._served: ServedSocket
-        self._server: Server
-        self._clients: dict[Client, ServerConnection] = {}
+        self._server: asyncio.Server
+        self._clients: dict[Client, Visit] = {}
+        self._strangers: dict[Visit, None] = {}
+        """Connections of which no first message has come, the oldest first."""
+        self._leaving: set[asyncio.Task[None]] = set()
         self._count = 0
+        self.turns = Turns()
         self._groups: dict[PollGroup, GroupBroadcast] = {}
         self._events: EventBroadcast | None = None
         self._points: dict[object, Point[Any]] = {}
@@ -99,7 +100,7 @@ class Service:
         return tuple(self._clients)
 
     async def __aenter__(self) -> Service:
-        serve = _websockets()
+        check_installed()
         path = self._path or runtime_folder() / f"{self.name}.sock"
         endpoint = self.bus.endpoint
         settings = endpoint.settings
@@ -115,17 +116,10 @@ class Service:
         served = ServedSocket(owner, mode=self._mode, group=self._group)
         self._served = served.__enter__()
         try:
-            self._server = await serve(
-                self._serve,
-                sock=self._served.socket,
-                process_request=self._check_request,
-                origins=[None],
-                compression=None,
-                max_size=LONGEST_MESSAGE,
-                close_timeout=CLOSE_WITHIN,
-                server_header=None,
-                logger=_quiet(),
-            )
+            # One connection is taken in a turn of the loop; that others wait for theirs is the kernel's affair.
+            loop = asyncio.get_running_loop()
+            self._server = await loop.create_unix_server(self._visited, sock=self._served.socket, backlog=1)
+            self._served.socket.listen(MOST_WAITING_TO_CONNECT)
         except BaseException:
             served.__exit__(None, None, None)
             raise
@@ -137,19 +131,24 @@ class Service:
     ) -> None:
         """Let nobody in any more, tell all clients what became of their requests, and let them go."""
         self.bus.on_stop.remove(self._tell_stop)
-        self._server.close(close_connections=False)
-        for client in self.clients:
+        self._server.close()
+        visits = [*self._clients.values(), *self._strangers]
+        for client in self._clients:
             client.release()
+        for visit in visits:
+            visit.bid_farewell()
         try:
             async with asyncio.timeout(CLOSE_WITHIN):
-                await asyncio.gather(*(self._bid_farewell(*of) for of in list(self._clients.items())))
+                await _closed(visits)
         except TimeoutError:
             pass  # one that does not listen
         finally:
-            for connection in self._clients.values():
-                connection.transport.abort()
+            for visit in visits:
+                visit.connection.abort()
             try:
-                await self._server.wait_closed()
+                await _closed(visits)
+                while self._leaving:
+                    await asyncio.wait(self._leaving)
             finally:
                 self._served.__exit__(None, None, None)
 
@@ -190,55 +189,36 @@ class Service:
         for client in self._clients:
             client.tell_stops(record)
 
-    # one connection
+    # those who come
 
-    def _check_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Refuse whoever is one too many, and what may be a page's: its Origin is refused by the library."""
-        host = request.headers.get("Host", "").partition(":")[0]
-        if host not in HOSTS:
+    def _visited(self) -> asyncio.BaseProtocol:
+        """Return the end of a connection that was made just now. Of strangers, the oldest goes for one too many."""
+        if len(self._strangers) >= MOST_STRANGERS:
             self.refused += 1
-            return connection.respond(HTTPStatus.FORBIDDEN, f"no such host: {host[:40]!r}\n")
+            next(iter(self._strangers)).connection.abort()
+        visit = Visit(
+            self,
+            partial(
+                ServedConnection, longest=LONGEST_REQUEST, read_at_once=READ_AT_ONCE, refusal=self._refusal
+            ),
+        )
+        self._strangers[visit] = None
+        return visit.connection
+
+    def _refusal(self, request: Request) -> tuple[HTTPStatus, str] | None:
+        """Return what stands against a request to connect: one too many, or what may be a page's. An Origin is refused
+        by the library."""
+        hosts = [host.partition(":")[0] for host in request.headers.get_all("Host")]
+        if len(hosts) != 1 or hosts[0] not in HOSTS:
+            self.refused += 1
+            return HTTPStatus.FORBIDDEN, f"no such host: {', '.join(hosts)[:40]!r}\n"
         if len(self._clients) >= MOST_CLIENTS:
             self.refused += 1
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_CLIENTS} programs are here already\n")
+            return HTTPStatus.SERVICE_UNAVAILABLE, f"{TOO_MANY}\n"
         return None
 
-    async def _serve(self, connection: ServerConnection) -> None:
-        peer = peer_of(connection.transport.get_extra_info("socket"))
-        connection.transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]  # asyncio's own, not declared
-        self._count += 1
-
-        def drop(stream: object) -> None:
-            client.dropped[stream] = client.dropped.get(stream, 0) + 1
-
-        client = Client(self, peer, self._count, Outbox(partial(_send, connection), drop))
-        self._clients[client] = connection
-        sending = asyncio.ensure_future(client.outbox.run())
-        try:
-            async with asyncio.timeout(HELLO_WITHIN):
-                self._welcome(client, read(await connection.recv()))
-            async for text in connection:
-                client.take(read(text))
-                await client.outbox.room()
-                await asyncio.sleep(0)  # what came together is taken one by one: the line goes between
-        except (Malformed, TimeoutError) as error:
-            self.refused += 1
-            code = error.code if isinstance(error, Malformed) else INVALID_PARAMS
-            what = str(error) or "no hello came"
-            client.outbox.put(written({"id": None, "error": {"code": code, "message": what}}))
-            await self._last_words(client)
-            await connection.close(POLICY, what[:100])
-        except _closed():
-            pass
-        finally:
-            sending.cancel()
-            try:
-                await client.leave()
-                await asyncio.gather(sending, return_exceptions=True)
-            finally:
-                del self._clients[client]
-
-    def _welcome(self, client: Client, said: dict[str, Any]) -> None:
+    def welcome(self, visit: Visit, said: Mapping[str, Any], /) -> Client:
+        """Let a program in by its first message, and answer that. Raises Malformed."""
         params = said.get("params", {})
         wanted = params.get("versions") if isinstance(params, dict) else None
         if said.get("method") != "hello" or not isinstance(wanted, list):
@@ -246,6 +226,40 @@ class Service:
         common = [version for version in VERSIONS if version in wanted]
         if not common:
             raise Malformed(f"versions {wanted} are not spoken here, but {list(VERSIONS)}", INVALID_PARAMS)
+        if len(self._clients) >= MOST_CLIENTS:
+            raise Malformed(TOO_MANY)
+
+        def drop(stream: object) -> None:
+            client.dropped[stream] = client.dropped.get(stream, 0) + 1
+
+        self._count += 1
+        peer = peer_of(visit.connection.transport.get_extra_info("socket"))
+        client = Client(self, peer, self._count, Outbox(visit.connection, drop))
+        del self._strangers[visit]
+        self._clients[client] = visit
+        client.outbox.put(written({"id": said.get("id"), "result": self._about(max(common))}))
+        return client
+
+    def send_away(self, visit: Visit, /) -> None:
+        """Count one whose conversation is ended for what it said, or did not say."""
+        self.refused += 1
+
+    def over(self, visit: Visit, /) -> None:
+        """Have a program leave whose connection is over, with all that it asked for."""
+        self._strangers.pop(visit, None)
+        if visit.client is not None:
+            leaving = asyncio.ensure_future(self._see_off(visit.client))
+            self._leaving.add(leaving)
+            leaving.add_done_callback(self._leaving.discard)
+
+    async def _see_off(self, client: Client) -> None:
+        try:
+            await client.leave()
+        finally:
+            del self._clients[client]
+
+    def _about(self, version: int) -> dict[str, Any]:
+        """Return what a program is told of the line."""
         owner = self._served.owner
         nodes = [
             {
@@ -256,8 +270,8 @@ class Service:
             }
             for node in self.bus.nodes
         ]
-        result = {
-            "version": max(common),
+        return {
+            "version": version,
             "name": owner.name,
             "line": owner.port,
             "baudrate": owner.baudrate,
@@ -268,47 +282,8 @@ class Service:
             "clients": len(self._clients),
             "nodes": nodes,
         }
-        client.outbox.put(written({"id": said.get("id"), "result": result}))
-
-    async def _bid_farewell(self, client: Client, connection: ServerConnection) -> None:
-        await self._last_words(client)
-        await connection.close(GOING_AWAY, "the program that owns the line ends")
-
-    async def _last_words(self, client: Client) -> None:
-        try:
-            async with asyncio.timeout(CLOSE_WITHIN):
-                await client.outbox.flushed()
-        except TimeoutError:
-            pass
 
 
-async def _send(connection: ServerConnection, text: str) -> None:
-    try:
-        async with asyncio.timeout(SEND_WITHIN):
-            await connection.send(text)
-    except TimeoutError:
-        connection.transport.abort()  # the library's pings wait behind what is not taken, and find nothing out
-        raise
-
-
-def _websockets() -> Any:
-    """Return what serves. Raises InvalidCommand, with what to install, where it is missing."""
-    try:
-        from websockets.asyncio.server import unix_serve
-    except ImportError:
-        raise InvalidCommand("the service needs websockets: pip install 'busmaster[service]'") from None
-    return unix_serve
-
-
-def _closed() -> type[Exception]:
-    from websockets.exceptions import ConnectionClosed
-
-    return ConnectionClosed
-
-
-def _quiet() -> logging.Logger:
-    """Return a log for what the library says of connections that come and go: it is no news of the line's."""
-    log = logging.getLogger("busmaster.service.connections")
-    log.addHandler(logging.NullHandler())
-    log.propagate = False
-    return log
+async def _closed(visits: Iterable[Visit]) -> None:
+    for visit in visits:
+        await visit.connection.closed()

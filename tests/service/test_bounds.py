@@ -19,24 +19,17 @@ from busmaster.service.client import Client
 from busmaster.service.folder import Owner, ServedSocket
 from busmaster.service.outbox import Outbox
 from busmaster.service.service import READ_AT_ONCE
-from tests.service.lines import ABSENT, Served, on_a_served_line, raw, until
+from tests.service.lines import ABSENT, Served, SlowWay, on_a_served_line, raw, until
 
 
 def test_news_that_were_dropped_take_no_memory() -> None:
-    async def run() -> None:
-        async def send(_: str) -> None:
-            await asyncio.Event().wait()
-
-        outbox = Outbox(send, lambda _: None)
-        running = asyncio.ensure_future(outbox.run())
-        outbox.put("an answer that is not read")
-        await asyncio.sleep(0)
-        for number in range(10 * messages.MOST_UNREAD):
-            outbox.put_news(7, f"news {number}")
-        assert outbox.waiting == messages.MOST_UNREAD + 1
-        running.cancel()
-
-    asyncio.run(run())
+    way = SlowWay()
+    outbox = Outbox(way, lambda _: None)
+    way.full = True
+    outbox.put("an answer that is not read")
+    for number in range(10 * messages.MOST_UNREAD):
+        outbox.put_news(7, f"news {number}")
+    assert outbox.waiting == messages.MOST_UNREAD + 1
 
 
 def test_a_write_that_is_given_up_before_its_first_step_is_on_record_and_leaves_nothing(tmp_path: Path) -> None:
@@ -56,10 +49,15 @@ def test_what_is_cancelled_before_it_was_handed_over_is_never_said(tmp_path: Pat
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(remote, 5)
         await controller.read(1)
+        connection = remote.link._connection
+        assert connection is not None
+        connection.full = True
         writing = asyncio.ensure_future(controller.write(1, 7))
         await asyncio.sleep(0)
         writing.cancel()
         await asyncio.gather(writing, return_exceptions=True)
+        connection.full = False
+        remote.link.writable()
         assert await controller.read(1) == 0
         assert line.records == []
 
@@ -132,15 +130,15 @@ def test_messages_that_come_together_are_taken_one_in_a_turn(tmp_path: Path, mon
         count()
         await remote.groups()
         taken.clear()
-        [connection] = line.service._clients.values()
+        [visit] = line.service._clients.values()
         sizes: list[int] = []
-        receive = connection.data_received
+        receive = visit.connection.buffer_updated
 
-        def received(data: bytes) -> None:
-            sizes.append(len(data))
-            receive(data)
+        def received(count: int) -> None:
+            sizes.append(count)
+            receive(count)
 
-        monkeypatch.setattr(connection, "data_received", received)
+        monkeypatch.setattr(visit.connection, "buffer_updated", received)
         for _ in range(1000):
             remote.link.tell("end", {"stream": 7})
         await until(lambda: len(taken) >= 1000)
@@ -151,7 +149,7 @@ def test_messages_that_come_together_are_taken_one_in_a_turn(tmp_path: Path, mon
 
 
 def test_a_program_that_stands_still_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("busmaster.service.service.SEND_WITHIN", 0.05)
+    monkeypatch.setattr("busmaster.service.connection.SEND_WITHIN", 0.05)
 
     async def story(line: Served, remote: RemoteBus) -> None:
         async with raw(line, max_queue=1) as client:

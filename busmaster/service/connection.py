@@ -1,0 +1,280 @@
+"""One end of a WebSocket, without a task: what is said leaves in the turn of the loop in which it is said, and what
+comes is heard in that in which it came. The library knows the bytes; here are the transport, the time, and the end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+from busmaster.errors import InvalidCommand
+
+if TYPE_CHECKING:
+    from websockets.client import ClientProtocol
+    from websockets.frames import Frame
+    from websockets.http11 import Request, Response
+    from websockets.server import ServerProtocol
+
+PING_EVERY = 20.0
+"""Seconds between two pings. One that says nothing at all between two of them is let go."""
+SEND_WITHIN = 20.0
+"""Seconds in which the other end has to take a message: one that stands still is let go."""
+CLOSE_WITHIN = 1.0
+"""Seconds that the other end has to hear the last of it."""
+NORMAL, GOING_AWAY, NO_TEXT, POLICY = 1000, 1001, 1007, 1008
+
+_BINARY, _CONTROL, _OPEN = 2, 8, 1  # numbers of the WebSocket's standard, and of the library's states
+_ANY_URI = "ws://localhost/"
+
+
+class Hearer(Protocol):
+    """Who hears what comes. Nothing of it may raise: the connection would be lost."""
+
+    def opened(self) -> None:
+        """Hear that messages may be said, and will come."""
+        ...
+
+    def heard(self, message: str | bytes) -> None:
+        """Hear a message: bytes are none of JSON-RPC's."""
+        ...
+
+    def writable(self) -> None:
+        """Hear that the connection is not full any more."""
+        ...
+
+    def lost(self) -> None:
+        """Hear that the connection is over, for whatever reason: the last that is heard."""
+        ...
+
+
+class Connection(asyncio.BufferedProtocol):
+    """One end of a connection, for an event loop. `hearer` hears what comes, at most `read_at_once` bytes in a turn."""
+
+    def __init__(self, core: ServerProtocol | ClientProtocol, hearer: Hearer, read_at_once: int) -> None:
+        self.full = False
+        """Whether what was said last has not left yet: what is said now waits behind it in memory."""
+        self._core = core
+        self._hearer = hearer
+        self._buffer = memoryview(bytearray(read_at_once))
+        self._transport: asyncio.Transport | None = None
+        self._loop: asyncio.AbstractEventLoop
+        self._is_open = False
+        self._part = bytearray()
+        """The beginning of a message that comes in pieces."""
+        self._is_text = True
+        self._silent = False
+        self._unwanted = False
+        """Whether it is to end before it has begun."""
+        self._timers: dict[str, asyncio.TimerHandle] = {}
+        self._over = asyncio.Event()
+
+    # what its owner calls
+
+    @property
+    def transport(self) -> asyncio.Transport:
+        """Return what it runs on, once it is made."""
+        assert self._transport is not None
+        return self._transport
+
+    def say(self, text: str) -> None:
+        """Say a message: nothing where the connection ends already."""
+        if self._is_open and self._core.state == _OPEN:
+            self._core.send_text(text.encode())
+            self._write()
+
+    def close(self, code: int = NORMAL, reason: str = "") -> None:
+        """Say that this is the end, behind all that was said; the other end has CLOSE_WITHIN to agree."""
+        if self._is_open and self._core.state == _OPEN:
+            self._core.send_close(code, reason)
+            self._write()
+        elif not self._is_open:
+            self.abort()
+
+    def abort(self) -> None:
+        """End it at once."""
+        self._unwanted = True
+        if self._transport is not None:
+            self._transport.abort()
+
+    def pause(self) -> None:
+        """Read nothing until `resume`."""
+        self.transport.pause_reading()
+
+    def resume(self) -> None:
+        """Read on."""
+        self.transport.resume_reading()
+
+    async def closed(self) -> None:
+        """Return when the connection is over."""
+        await self._over.wait()
+
+    # what asyncio calls
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._transport = cast("asyncio.Transport", transport)
+        self._transport.set_write_buffer_limits(0)
+        if self._unwanted:
+            self.abort()
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        return self._buffer
+
+    def buffer_updated(self, count: int) -> None:
+        self._silent = False
+        self._core.receive_data(bytes(self._buffer[:count]))
+        self._write()
+        for event in self._core.events_received():
+            if self._is_open:
+                self._hear(cast("Frame", event))
+            else:
+                self._shake_hands(event)
+
+    def eof_received(self) -> None:
+        self._core.receive_eof()
+        self._write()
+
+    def pause_writing(self) -> None:
+        self.full = True
+        self._set_timer("taken", SEND_WITHIN, self.abort)
+
+    def resume_writing(self) -> None:
+        self.full = False
+        self._timers.pop("taken").cancel()
+        self._hearer.writable()
+
+    def connection_lost(self, cause: Exception | None) -> None:
+        for timer in self._timers.values():
+            timer.cancel()
+        self._core.receive_eof()
+        self._is_open = False
+        self._over.set()
+        self._hearer.lost()
+
+    # inside
+
+    def _shake_hands(self, event: Any) -> None:
+        raise NotImplementedError
+
+    def _open(self) -> None:
+        self._is_open = True
+        self._set_timer("ping", PING_EVERY, self._ping)
+        self._hearer.opened()
+
+    def _hear(self, frame: Frame) -> None:
+        if frame.opcode >= _CONTROL:
+            return
+        if frame.opcode:
+            self._is_text = frame.opcode != _BINARY
+        if not frame.fin or self._part:
+            self._part += frame.data
+            if not frame.fin:
+                return
+        data, self._part = self._part or frame.data, bytearray()
+        try:
+            message = str(data, "utf-8") if self._is_text else bytes(data)
+        except UnicodeDecodeError:
+            self._core.fail(NO_TEXT, "a message is text in UTF-8")
+            self._write()
+        else:
+            self._hearer.heard(message)
+
+    def _write(self) -> None:
+        transport = self.transport
+        for data in self._core.data_to_send():
+            if transport.is_closing():
+                return
+            if data:
+                transport.write(data)
+            else:
+                transport.write_eof()
+        if self._core.close_expected() and "close" not in self._timers:
+            self._set_timer("close", CLOSE_WITHIN, self.abort)
+
+    def _ping(self) -> None:
+        """Let go of one of whom nothing came since it was pinged. While nothing is read from it that says nothing."""
+        if self._silent and self.transport.is_reading():
+            self.abort()
+        elif self._core.state == _OPEN:
+            self._silent = True
+            self._core.send_ping(b"")
+            self._write()
+            self._set_timer("ping", PING_EVERY, self._ping)
+
+    def _set_timer(self, name: str, delay: float, call: Callable[[], object]) -> None:
+        self._timers[name] = self._loop.call_later(delay, call)
+
+
+class ServedConnection(Connection):
+    """The end of whoever serves. `refusal` returns, for a request to connect, status and words if it is refused."""
+
+    _core: ServerProtocol
+
+    def __init__(
+        self,
+        hearer: Hearer,
+        *,
+        longest: int,
+        read_at_once: int,
+        refusal: Callable[[Request], tuple[int, str] | None],
+    ) -> None:
+        server = check_installed()[0]
+        super().__init__(server(origins=[None], max_size=longest, logger=_quiet()), hearer, read_at_once)
+        self._refusal = refusal
+
+    def _shake_hands(self, event: Request) -> None:
+        refusal = self._refusal(event)
+        answer = self._core.accept(event) if refusal is None else self._core.reject(*refusal)
+        self._core.send_response(answer)
+        self._write()
+        if self._core.state == _OPEN:
+            self._open()
+
+
+class AskingConnection(Connection):
+    """The end of whoever connects. `complaint` is why it did not come to that, or ended."""
+
+    _core: ClientProtocol
+
+    def __init__(self, hearer: Hearer, *, longest: int, read_at_once: int) -> None:
+        _, client, parse_uri = check_installed()
+        super().__init__(client(parse_uri(_ANY_URI), max_size=longest, logger=_quiet()), hearer, read_at_once)
+
+    @property
+    def complaint(self) -> str | None:
+        """Return why the other end did not let us in, or let go of us, as far as it has said so."""
+        said = self._core.close_rcvd
+        if self._core.handshake_exc is not None:
+            return str(self._core.handshake_exc)
+        return None if said is None else said.reason
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self._core.send_request(self._core.connect())
+        self._write()
+
+    def _shake_hands(self, event: Response) -> None:
+        if self._core.state == _OPEN:
+            self._open()
+
+
+def check_installed() -> tuple[type[ServerProtocol], type[ClientProtocol], Callable[[str], Any]]:
+    """Return what knows the bytes of either end. Raises InvalidCommand, with what to install, where it is missing."""
+    try:
+        from websockets.client import ClientProtocol
+        from websockets.server import ServerProtocol
+        from websockets.uri import parse_uri
+    except ImportError:
+        raise InvalidCommand("lines are shared by way of websockets: pip install 'busmaster[service]'") from None
+    return ServerProtocol, ClientProtocol, parse_uri
+
+
+def _quiet() -> logging.Logger:
+    """Return a log for what the library says of connections that come and go: it is no news of the line's."""
+    log = logging.getLogger("busmaster.service.connections")
+    if not log.handlers:
+        log.addHandler(logging.NullHandler())
+        log.propagate = False
+    return log
