@@ -51,7 +51,6 @@ class Client:
         """How often each had been told to stop when this client named it: the client counts from there."""
         self._refused: dict[NodeKey, str] = {}
         """Why a node that it named may not be asked as it said; its requests are refused until it names it rightly."""
-        self._running: dict[int, asyncio.Task[None]] = {}
         self._errands: dict[int, Errand] = {}
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
@@ -97,7 +96,7 @@ class Client:
             return
         if isinstance(number, bool) or not isinstance(number, int):
             raise Malformed("the id of a request is a whole number")
-        if number in self._running:
+        if number in self._errands:
             raise Malformed(f"request {number} is under way already")
         if method == "request":
             self._begin(number, params)
@@ -114,9 +113,9 @@ class Client:
     def _notified(self, method: str, params: Mapping[str, Any]) -> None:
         match method:
             case "cancel":
-                task = self._running.get(params.get("id", -1))
-                if task is not None:
-                    task.cancel()
+                errand = self._errands.get(params.get("id", -1))
+                if errand is not None:
+                    errand.cancel()
             case "end":
                 self._end_stream(params.get("stream", -1))
             case "stop":
@@ -163,9 +162,9 @@ class Client:
         if refused := self._refused.get((name, address)):
             raise InvalidCommand(refused)
         known = self._nodes.get((name, address))
-        protocol = protocol_of(name)
         if known is not None and timings is None and retries is None:
             return known
+        protocol = protocol_of(name)
         if known is None and len(self._nodes) >= MOST_NODES:
             raise InvalidCommand(f"one program names {MOST_NODES} nodes at most")
         bus = self._line.bus
@@ -184,32 +183,32 @@ class Client:
 
     def _begin(self, number: int, params: Mapping[str, Any]) -> None:
         try:
-            priority = checked_priority(params.get("options", {}).get("priority", Priority.COMMAND))
-            if len(self._running) >= MOST_REQUESTS + (MOST_URGENT if priority is Priority.URGENT else 0):
-                raise BacklogFull(f"{len(self._running)} requests of this program are not answered yet")
+            if len(self._errands) >= MOST_REQUESTS + (MOST_URGENT if _is_urgent(params) else 0):
+                raise BacklogFull(f"{len(self._errands)} requests of this program are not answered yet")
             errand = Errand.of(params, self, self._line)
+            errand.begin(partial(self._ended, number, errand))
         except (BusError, InvalidCommand) as error:
             self._refuse(number, error)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             self._refuse(number, InvalidCommand(f"request: {type(error).__name__}: {error}"))
         else:
             self._errands[number] = errand
-            self._running[number] = task = asyncio.ensure_future(self._run(number, errand))
-            task.add_done_callback(partial(self._ended, number, errand))
 
-    async def _run(self, number: int, errand: Errand) -> None:
+    def _ended(self, number: int, errand: Errand, future: asyncio.Future[Any]) -> None:
+        del self._errands[number]
+        errand.give_up()  # a task that is cancelled before its first step runs nothing of it
+        if future.cancelled():
+            return
+        error = future.exception()
         try:
-            value = await errand.run()
-            self._say({"id": number, "result": value})
-        except (BusError, InvalidCommand) as error:
-            self._refuse(number, error)
+            if error is not None:
+                raise error
+            self._say({"id": number, "result": future.result()})
+        except (BusError, InvalidCommand) as refusal:
+            self._refuse(number, refusal)
         except Exception as bug:  # of a protocol: the client is told, and the line goes on
             self._log.exception("a request of %s failed", self.peer)
             self._refuse(number, errand.unforeseen(bug))
-
-    def _ended(self, number: int, errand: Errand, _: object) -> None:
-        del self._running[number], self._errands[number]
-        errand.give_up()  # a task that is cancelled before its first step runs nothing of it
 
     def _say(self, message: Mapping[str, Any]) -> None:
         self.outbox.put(written(message))
@@ -269,7 +268,7 @@ class Client:
     def release(self) -> None:
         """Tell it truthfully what becomes of all that it asked for: the service ends, and the bus perhaps with it."""
         for number, errand in list(self._errands.items()):
-            self._running[number].cancel()
+            errand.cancel()
             unsure = errand.command.writes and errand.journey.sent
             kind: type[BusError] = WriteUnconfirmed if unsure else BusClosed
             self._refuse(number, kind("the program that owns the line ends", node=errand.node, command=errand.text))
@@ -278,10 +277,14 @@ class Client:
         """End all that it asked for, and give back its nodes."""
         for stream in list(self._streams):
             self._end_stream(stream)
-        tasks = list(self._running.values())
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        for errand in self.errands:
+            errand.cancel()
+        while self._errands:
+            await asyncio.wait([errand.future for errand in self.errands])
         for node in self._nodes.values():
             self._line.bus.give_back(node)
         self._nodes.clear()
+
+
+def _is_urgent(params: Mapping[str, Any]) -> bool:
+    return bool(params.get("options", {}).get("priority") == Priority.URGENT)

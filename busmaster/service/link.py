@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from busmaster.contract.exchange import Command
 from busmaster.errors import (
     Addressed,
     BusClosed,
@@ -30,16 +31,15 @@ AGAIN = "see whether it runs, and connect again"
 
 
 class Asked:
-    """One question on its way. `writes`: of what it asks for, it must be said whether it may have been sent."""
+    """One question on its way. Of a command that writes it must be said whether it may have been sent."""
 
-    __slots__ = ("command", "future", "handed", "node", "number", "writes")
+    __slots__ = ("command", "future", "handed", "node", "number")
 
     def __init__(
-        self, number: int, future: asyncio.Future[Any], writes: bool, node: Addressed | None, command: str | None
+        self, number: int, future: asyncio.Future[Any], node: Addressed | None, command: Command[Any] | None
     ) -> None:
         self.number = number
         self.future = future
-        self.writes = writes
         self.node = node
         self.command = command
         self.handed = False
@@ -48,16 +48,20 @@ class Asked:
     def fail(self, kind: type[BusError], what: str, hint: str | None = None) -> None:
         """End it with an error, unless it has ended."""
         if not self.future.done():
-            self.future.set_exception(kind(what, node=self.node, command=self.command, hint=hint))
+            self.future.set_exception(kind(what, node=self.node, command=_text(self.command), hint=hint))
 
     def lost(self, kind: type[BusError], what: str, hint: str) -> None:
         """End it truthfully, as no answer will come: `kind` is for what changes nothing."""
-        if not self.writes:
+        if self.command is None or not self.command.writes:
             self.fail(kind, what, hint)
         elif self.handed:
             self.fail(WriteUnconfirmed, f"{what}, and the write may have been sent")
         else:
             self.fail(NotStarted, what, hint)
+
+
+def _text(command: Command[Any] | None) -> str | None:
+    return None if command is None else str(command)
 
 
 class Link:
@@ -81,7 +85,7 @@ class Link:
         """Connect, agree on a version, and return what the owner says of the line. Raises LineDown."""
         path = socket_path(self.address)
         loop = asyncio.get_running_loop()
-        self._asked[0] = hello = Asked(0, loop.create_future(), False, None, None)
+        self._asked[0] = hello = Asked(0, loop.create_future(), None, None)
         params = {"versions": list(VERSIONS), "program": program}
         self._waiting.appendleft((written({"id": 0, "method": "hello", "params": params}), hello))
         try:
@@ -116,16 +120,15 @@ class Link:
         method: str,
         params: Mapping[str, Any],
         *,
-        writes: bool = False,
         node: Addressed | None = None,
-        command: str | None = None,
+        command: Command[Any] | None = None,
     ) -> Asked:
         """Ask something, after all that was said before; its future has the answer. Raises LineDown or BusClosed."""
         if self._over is not None:
             kind, what, hint = self._over
-            raise kind(what, node=node, command=command, hint=hint)
+            raise kind(what, node=node, command=_text(command), hint=hint)
         self._count += 1
-        asked = Asked(self._count, asyncio.get_running_loop().create_future(), writes, node, command)
+        asked = Asked(self._count, asyncio.get_running_loop().create_future(), node, command)
         self._asked[asked.number] = asked
         self._put(written({"id": asked.number, "method": method, "params": params}), asked)
         return asked

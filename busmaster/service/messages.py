@@ -72,10 +72,13 @@ def read(text: str | bytes) -> dict[str, Any]:
     """Return a message. Raises Malformed for what is none."""
     if not isinstance(text, str):
         raise Malformed("a message is text")
+    text = text.strip()
     try:
-        said = json.loads(text)
+        said, end = _decode(text)
     except (ValueError, RecursionError) as error:
         raise Malformed(f"this is no JSON: {error}", PARSE_ERROR) from None
+    if end < len(text):
+        raise Malformed("this is no JSON: there is more behind it", PARSE_ERROR)
     if not isinstance(said, dict) or said.get("jsonrpc") != "2.0":
         raise Malformed("this is no message of JSON-RPC 2.0")
     return said
@@ -135,4 +138,5 @@ def _finite(value: Any) -> Any:
     return list(map(_finite, value)) if isinstance(value, list | tuple) else value
 
 
+_decode = json.JSONDecoder().raw_decode  # half of what `loads` takes, which looks for other encodings and blanks
 _encode = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode

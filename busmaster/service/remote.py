@@ -36,6 +36,8 @@ from busmaster.service.telling import (
 
 T = TypeVar("T")
 EVENT_BUFFER = 256
+LEFT_OUT = ("verify", "safe")
+"""Options that are of no use on another's line: where they are said, they are false."""
 
 
 def connect(address: str) -> RemoteBus:
@@ -119,8 +121,8 @@ class RemoteNode:
         if chosen.safe:
             raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
         params = self._said(command, options, touches, stops_seen, stop)
-        link = self._bus.opened(self, str(command))
-        asked = link.ask("request", params, writes=command.writes, node=self, command=str(command))
+        link = self._bus.opened(self, command)
+        asked = link.ask("request", params, node=self, command=command)
         value: T = value_of(await link.answer(asked, chosen.finish_within))
         return value
 
@@ -133,10 +135,10 @@ class RemoteNode:
         stop: bool,
     ) -> dict[str, Any]:
         params: dict[str, Any] = {
-            "protocol": self.profile.name,
-            "address": self.address,
+            "protocol": self._profile.name,
+            "address": self._address,
             "command": self._protocol.write_down(command),
-            "asked": self.now(),
+            "asked": time.monotonic(),
         }
         if touches is not None:
             params["touches"] = self._protocol.write_down(touches)
@@ -144,12 +146,10 @@ class RemoteNode:
             params["stops_seen"] = stops_seen
         if stop:
             params["stop"] = True
-        if given := {name: value for name, value in options.items() if value is not None and name not in LEFT_OUT}:
-            params["options"] = given
+        if options:
+            given = {name: value for name, value in options.items() if value is not None}
+            params["options"] = {name: given[name] for name in given if name not in LEFT_OUT}
         return params
-
-
-LEFT_OUT = ("verify", "safe")
 
 
 class RemoteGroup:
@@ -271,10 +271,10 @@ class RemoteBus:
             raise BusClosed("the bus is not open")
         return self._link
 
-    def opened(self, node: RemoteNode, command: str) -> Link:
+    def opened(self, node: RemoteNode, command: Command[Any]) -> Link:
         """Return the connection for a request. Raises BusClosed, naming it, before the bus is entered."""
         if self._link is None:
-            raise BusClosed("the bus is not open", node=node, command=command)
+            raise BusClosed("the bus is not open", node=node, command=str(command))
         return self._link
 
     def now(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import Any, Protocol, cast
 
 from busmaster.arbiter.counters import DriverErrors, LineStatistics, Quantiles
@@ -35,7 +36,8 @@ class FindNode(Protocol):
     def __call__(self, protocol: str, address: int, /) -> Requester: ...
 
 
-def protocol_of(name: Any) -> BusProtocol:
+@cache  # each request of a client asks
+def protocol_of(name: str) -> BusProtocol:
     """Return the protocol of a name. Raises InvalidCommand if there is none."""
     for protocol in protocols():
         if protocol.name == name:

@@ -296,8 +296,8 @@ def test_a_lost_connection_ends_each_request_truthfully(tmp_path: Path) -> None:
         writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
         reading = asyncio.ensure_future(Hcp2Controller(remote, 5).read(1))
         await line.sent()
-        [connection] = line.service._clients.values()
-        connection.transport.abort()
+        [visit] = line.service._clients.values()
+        visit.connection.abort()
         with pytest.raises(WriteUnconfirmed, match="the write may have been sent"):
             await writing
         with pytest.raises(LineDown, match="node 5: the connection to the program that owns the line was lost"):
@@ -316,6 +316,8 @@ def test_what_was_not_handed_over_when_the_connection_was_lost_was_not_started(t
         await asyncio.sleep(0)
         remote2 = connect(line.address)
         async with remote2:
+            assert remote2.link._connection is not None
+            remote2.link._connection.full = True
             waiting = asyncio.ensure_future(Hcp2Controller(remote2, 5).write(1, 1))
             await asyncio.sleep(0)
             remote2.link._end(LineDown, "it is lost", "connect again")
