@@ -196,9 +196,7 @@ class Protocol:
 
 
 def _arguments_of(command: Command[Any]) -> dict[str, Any]:
-    return {
-        name: value for name, default in _parts_of(type(command)) if (value := getattr(command, name)) != default
-    }
+    return {name: value for name, default in _parts_of(type(command)) if (value := getattr(command, name)) != default}
 
 
 @cache  # each remote request asks at either end

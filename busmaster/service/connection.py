@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from busmaster.errors import InvalidCommand
+from busmaster.service.frames import frame_size, is_whole_text, payload, text_frame
 
 if TYPE_CHECKING:
     from websockets.client import ClientProtocol
@@ -25,6 +26,9 @@ CLOSE_WITHIN = 1.0
 """Seconds that the other end has to hear the last of it."""
 NORMAL, GOING_AWAY, NO_TEXT, POLICY = 1000, 1001, 1007, 1008
 
+END_OF_HEAD = b"\r\n\r\n"
+LONGEST_HEAD = 14
+"""Bytes of a frame before its message."""
 _BINARY, _CONTROL, _OPEN = 2, 8, 1  # numbers of the WebSocket's standard, and of the library's states
 _ANY_URI = "ws://localhost/"
 
@@ -50,9 +54,14 @@ class Hearer(Protocol):
 
 
 class Connection(asyncio.BufferedProtocol):
-    """One end of a connection, for an event loop. `hearer` hears what comes, at most `read_at_once` bytes in a turn."""
+    """One end of a connection, for an event loop. `hearer` hears what comes, at most `read_at_once` bytes in a turn;
+    a message of more than `longest` bytes is the last."""
 
-    def __init__(self, core: ServerProtocol | ClientProtocol, hearer: Hearer, read_at_once: int) -> None:
+    _serves: bool
+
+    def __init__(
+        self, core: ServerProtocol | ClientProtocol, hearer: Hearer, *, longest: int, read_at_once: int
+    ) -> None:
         self.full = False
         """Whether what was said last has not left yet: what is said now waits behind it in memory."""
         self._core = core
@@ -61,7 +70,10 @@ class Connection(asyncio.BufferedProtocol):
         self._transport: asyncio.Transport | None = None
         self._loop: asyncio.AbstractEventLoop
         self._is_open = False
-        self._part = bytearray()
+        self._rest = bytearray()
+        """The beginning of a frame that has not come whole."""
+        self._longest = longest + LONGEST_HEAD
+        self._part: bytearray | None = None
         """The beginning of a message that comes in pieces."""
         self._is_text = True
         self._silent = False
@@ -80,9 +92,8 @@ class Connection(asyncio.BufferedProtocol):
 
     def say(self, text: str) -> None:
         """Say a message: nothing where the connection ends already."""
-        if self._is_open and self._core.state == _OPEN:
-            self._core.send_text(text.encode())
-            self._write()
+        if self._is_open and self._core.state == _OPEN and not self.transport.is_closing():
+            self.transport.write(text_frame(text.encode(), masked=not self._serves))
 
     def close(self, code: int = NORMAL, reason: str = "") -> None:
         """Say that this is the end, behind all that was said; the other end has CLOSE_WITHIN to agree."""
@@ -124,15 +135,26 @@ class Connection(asyncio.BufferedProtocol):
 
     def buffer_updated(self, count: int) -> None:
         self._silent = False
-        self._core.receive_data(bytes(self._buffer[:count]))
-        self._write()
-        for event in self._core.events_received():
-            if self._is_open:
-                self._hear(cast("Frame", event))
+        self._rest += self._buffer[:count]
+        while self._rest:
+            if not self._is_open:
+                end = self._rest.find(END_OF_HEAD)
+                size = end + len(END_OF_HEAD) if end >= 0 else len(self._rest) - len(END_OF_HEAD) + 1
+                if size <= 0:
+                    return
+                self._feed(self._cut(size))
+            elif self._core.state != _OPEN or (size := frame_size(self._rest)) > self._longest:
+                self._feed(self._cut(len(self._rest)))
+            elif len(self._rest) < size:
+                return
+            elif self._part is None and is_whole_text(self._rest, masked=self._serves):
+                self._tell(payload(self._cut(size)), is_text=True)
             else:
-                self._shake_hands(event)
+                self._feed(self._cut(size))
 
     def eof_received(self) -> None:
+        if self._rest:
+            self._feed(bytes(self._rest))
         self._core.receive_eof()
         self._write()
 
@@ -163,18 +185,35 @@ class Connection(asyncio.BufferedProtocol):
         self._set_timer("ping", PING_EVERY, self._ping)
         self._hearer.opened()
 
+    def _cut(self, size: int) -> bytes:
+        part = bytes(self._rest[:size])
+        del self._rest[:size]
+        return part
+
+    def _feed(self, data: bytes) -> None:
+        """Have the library see to what is no whole text."""
+        self._core.receive_data(data)
+        self._write()
+        for event in self._core.events_received():
+            if self._is_open:
+                self._hear(cast("Frame", event))
+            else:
+                self._shake_hands(event)
+
     def _hear(self, frame: Frame) -> None:
         if frame.opcode >= _CONTROL:
             return
         if frame.opcode:
-            self._is_text = frame.opcode != _BINARY
-        if not frame.fin or self._part:
-            self._part += frame.data
-            if not frame.fin:
-                return
-        data, self._part = self._part or frame.data, bytearray()
+            self._is_text, self._part = frame.opcode != _BINARY, bytearray()
+        assert self._part is not None  # the library lets nothing else pass
+        self._part += frame.data
+        if frame.fin:
+            data, self._part = bytes(self._part), None
+            self._tell(data, self._is_text)
+
+    def _tell(self, data: bytes, is_text: bool) -> None:
         try:
-            message = str(data, "utf-8") if self._is_text else bytes(data)
+            message = data.decode() if is_text else data
         except UnicodeDecodeError:
             self._core.fail(NO_TEXT, "a message is text in UTF-8")
             self._write()
@@ -211,6 +250,7 @@ class ServedConnection(Connection):
     """The end of whoever serves. `refusal` returns, for a request to connect, status and words if it is refused."""
 
     _core: ServerProtocol
+    _serves = True
 
     def __init__(
         self,
@@ -221,7 +261,8 @@ class ServedConnection(Connection):
         refusal: Callable[[Request], tuple[int, str] | None],
     ) -> None:
         server = check_installed()[0]
-        super().__init__(server(origins=[None], max_size=longest, logger=_quiet()), hearer, read_at_once)
+        core = server(origins=[None], max_size=longest, logger=_quiet())
+        super().__init__(core, hearer, longest=longest, read_at_once=read_at_once)
         self._refusal = refusal
 
     def _shake_hands(self, event: Request) -> None:
@@ -237,10 +278,12 @@ class AskingConnection(Connection):
     """The end of whoever connects. `complaint` is why it did not come to that, or ended."""
 
     _core: ClientProtocol
+    _serves = False
 
     def __init__(self, hearer: Hearer, *, longest: int, read_at_once: int) -> None:
         _, client, parse_uri = check_installed()
-        super().__init__(client(parse_uri(_ANY_URI), max_size=longest, logger=_quiet()), hearer, read_at_once)
+        core = client(parse_uri(_ANY_URI), max_size=longest, logger=_quiet())
+        super().__init__(core, hearer, longest=longest, read_at_once=read_at_once)
 
     @property
     def complaint(self) -> str | None:

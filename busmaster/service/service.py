@@ -198,9 +198,7 @@ class Service:
             next(iter(self._strangers)).connection.abort()
         visit = Visit(
             self,
-            partial(
-                ServedConnection, longest=LONGEST_REQUEST, read_at_once=READ_AT_ONCE, refusal=self._refusal
-            ),
+            partial(ServedConnection, longest=LONGEST_REQUEST, read_at_once=READ_AT_ONCE, refusal=self._refusal),
         )
         self._strangers[visit] = None
         return visit.connection

@@ -122,4 +122,15 @@ async def raw(line: Served, *, hello: bool = True, **options: Any) -> AsyncItera
         yield client
 
 
-__all__ = ["ABSENT", "PATIENT", "MicroFlexDrive", "Raw", "Served", "SlowWay", "on_a_served_line", "raw", "served", "until"]
+__all__ = [
+    "ABSENT",
+    "PATIENT",
+    "MicroFlexDrive",
+    "Raw",
+    "Served",
+    "SlowWay",
+    "on_a_served_line",
+    "raw",
+    "served",
+    "until",
+]
