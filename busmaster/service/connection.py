@@ -53,6 +53,14 @@ class Hearer(Protocol):
         ...
 
 
+class Doorkeeper(Hearer, Protocol):
+    """Who hears what comes to one that serves, and decides whether it may."""
+
+    def refusal(self, request: Request, /) -> tuple[int, str] | None:
+        """Return the HTTP status and words with which a request to connect is refused; None if it is not."""
+        ...
+
+
 class Connection(asyncio.BufferedProtocol):
     """One end of a connection, for an event loop. `hearer` hears what comes, at most `read_at_once` bytes in a turn;
     a message of more than `longest` bytes is the last."""
@@ -247,26 +255,19 @@ class Connection(asyncio.BufferedProtocol):
 
 
 class ServedConnection(Connection):
-    """The end of whoever serves. `refusal` returns, for a request to connect, status and words if it is refused."""
+    """The end of whoever serves."""
 
     _core: ServerProtocol
+    _hearer: Doorkeeper
     _serves = True
 
-    def __init__(
-        self,
-        hearer: Hearer,
-        *,
-        longest: int,
-        read_at_once: int,
-        refusal: Callable[[Request], tuple[int, str] | None],
-    ) -> None:
+    def __init__(self, hearer: Doorkeeper, *, longest: int, read_at_once: int) -> None:
         server = check_installed()[0]
         core = server(origins=[None], max_size=longest, logger=_quiet())
         super().__init__(core, hearer, longest=longest, read_at_once=read_at_once)
-        self._refusal = refusal
 
     def _shake_hands(self, event: Request) -> None:
-        refusal = self._refusal(event)
+        refusal = self._hearer.refusal(event)
         answer = self._core.accept(event) if refusal is None else self._core.reject(*refusal)
         self._core.send_response(answer)
         self._write()

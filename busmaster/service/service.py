@@ -20,11 +20,10 @@ from busmaster.bus.polling import PollGroup
 from busmaster.contract.places import Placed
 from busmaster.gate.gate import Gate
 from busmaster.service.client import Client
-from busmaster.service.connection import CLOSE_WITHIN, ServedConnection, check_installed
+from busmaster.service.connection import CLOSE_WITHIN, check_installed
 from busmaster.service.folder import Owner, ServedSocket, line_name, runtime_folder
 from busmaster.service.messages import (
     INVALID_PARAMS,
-    LONGEST_REQUEST,
     MOST_CLIENTS,
     MOST_STRANGERS,
     VERSIONS,
@@ -32,7 +31,7 @@ from busmaster.service.messages import (
     written,
 )
 from busmaster.service.outbox import Outbox
-from busmaster.service.peers import peer_of
+from busmaster.service.peers import find_name, peer_of
 from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
 from busmaster.service.visit import Turns, Visit
 
@@ -41,10 +40,9 @@ if TYPE_CHECKING:
 
 HOSTS = ("localhost", "busmaster")
 """What a client calls us: a page that was tricked into asking here would say another name."""
-READ_AT_ONCE = 512
-"""Bytes of a connection that are taken in one turn of the line's loop: two or three requests, eighty of the smallest
-frames that there are."""
 MOST_WAITING_TO_CONNECT = 100
+NAME_WITHIN = 1.0
+"""Seconds that the first client waits at most for this user's name: records then have his number."""
 TOO_MANY = f"{MOST_CLIENTS} programs are here already"
 
 
@@ -101,6 +99,8 @@ class Service:
 
     async def __aenter__(self) -> Service:
         check_installed()
+        if finding := find_name(os.getuid()):
+            await asyncio.wait([finding], timeout=NAME_WITHIN)
         path = self._path or runtime_folder() / f"{self.name}.sock"
         endpoint = self.bus.endpoint
         settings = endpoint.settings
@@ -196,16 +196,12 @@ class Service:
         if len(self._strangers) >= MOST_STRANGERS:
             self.refused += 1
             next(iter(self._strangers)).connection.abort()
-        visit = Visit(
-            self,
-            partial(ServedConnection, longest=LONGEST_REQUEST, read_at_once=READ_AT_ONCE, refusal=self._refusal),
-        )
+        visit = Visit(self)
         self._strangers[visit] = None
         return visit.connection
 
-    def _refusal(self, request: Request) -> tuple[HTTPStatus, str] | None:
-        """Return what stands against a request to connect: one too many, or what may be a page's. An Origin is refused
-        by the library."""
+    def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
+        """Note who has come. Refuse what may be a page's, and one too many; an Origin is refused by the library."""
         hosts = [host.partition(":")[0] for host in request.headers.get_all("Host")]
         if len(hosts) != 1 or hosts[0] not in HOSTS:
             self.refused += 1
@@ -213,6 +209,7 @@ class Service:
         if len(self._clients) >= MOST_CLIENTS:
             self.refused += 1
             return HTTPStatus.SERVICE_UNAVAILABLE, f"{TOO_MANY}\n"
+        visit.peer = peer_of(visit.connection.transport.get_extra_info("socket"))
         return None
 
     def welcome(self, visit: Visit, said: Mapping[str, Any], /) -> Client:
@@ -231,8 +228,7 @@ class Service:
             client.dropped[stream] = client.dropped.get(stream, 0) + 1
 
         self._count += 1
-        peer = peer_of(visit.connection.transport.get_extra_info("socket"))
-        client = Client(self, peer, self._count, Outbox(visit.connection, drop))
+        client = Client(self, visit.peer, self._count, Outbox(visit.connection, drop))
         del self._strangers[visit]
         self._clients[client] = visit
         client.outbox.put(written({"id": said.get("id"), "result": self._about(max(common))}))

@@ -10,7 +10,6 @@ from typing import Any, Protocol
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
-from busmaster.errors import BusError, InvalidCommand
 from busmaster.service.messages import encoded
 from busmaster.service.telling import said_event, said_points, said_snapshot
 
@@ -58,7 +57,7 @@ class Broadcast:
             async for method, body in self._bodies():
                 for reader, stream in self.readers:
                     reader.tell(stream, method, body)
-        except (TypeError, BusError, InvalidCommand):  # what has a value that cannot be said, or is closed already
+        except Exception:  # a value that cannot be said, a mistake in an encoder: those who read it are told it ended
             logging.getLogger("busmaster.service").exception("a stream ended")
         self._on_end()
         for reader, stream in self.readers:

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
 
 from busmaster.service.client import Client
-from busmaster.service.connection import GOING_AWAY, POLICY, Connection, Hearer
-from busmaster.service.messages import HELLO_WITHIN, INVALID_PARAMS, Malformed, read, written
+from busmaster.service.connection import GOING_AWAY, POLICY, ServedConnection
+from busmaster.service.messages import HELLO_WITHIN, INVALID_PARAMS, LONGEST_REQUEST, Malformed, read, written
+from busmaster.service.peers import Peer
+
+if TYPE_CHECKING:
+    from websockets.http11 import Request
+
+READ_AT_ONCE = 512
+"""Bytes of a connection that are taken in one turn of the line's loop: two or three requests, eighty of the smallest
+frames that there are."""
 
 
 class Turns:
@@ -46,6 +54,10 @@ class Host(Protocol):
     @property
     def turns(self) -> Turns: ...
 
+    def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
+        """Note who has come; return the HTTP status and words with which one is refused, None if it is not."""
+        ...
+
     def welcome(self, visit: Visit, said: Mapping[str, Any], /) -> Client:
         """Let a program in by its first message, and answer that. Raises Malformed."""
         ...
@@ -62,9 +74,11 @@ class Host(Protocol):
 class Visit:
     """One connection. It is a stranger's until its first message is taken, for which it has HELLO_WITHIN."""
 
-    def __init__(self, host: Host, connection: Callable[[Hearer], Connection]) -> None:
+    def __init__(self, host: Host) -> None:
         self.client: Client | None = None
-        self.connection = connection(self)
+        self.peer: Peer
+        """Set before it is opened."""
+        self.connection = ServedConnection(self, longest=LONGEST_REQUEST, read_at_once=READ_AT_ONCE)
         self._host = host
         self._messages: deque[str | bytes] = deque()
         self._queued = False
@@ -72,6 +86,10 @@ class Visit:
         self._stranger = asyncio.get_running_loop().call_later(HELLO_WITHIN, self._wait_no_longer)
 
     # what the connection tells
+
+    def refusal(self, request: Request, /) -> tuple[int, str] | None:
+        """Return what its host says."""
+        return self._host.refusal(self, request)
 
     def opened(self) -> None:
         """Wait for the first message."""

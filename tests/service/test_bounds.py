@@ -18,7 +18,7 @@ from busmaster.service import messages
 from busmaster.service.client import Client
 from busmaster.service.folder import Owner, ServedSocket
 from busmaster.service.outbox import Outbox
-from busmaster.service.service import READ_AT_ONCE
+from busmaster.service.visit import READ_AT_ONCE
 from tests.service.lines import ABSENT, Served, SlowWay, on_a_served_line, raw, until
 
 

@@ -31,6 +31,9 @@ class Ear:
         self.is_open = False
         self.is_over = False
 
+    def refusal(self, _: object) -> None:
+        return None
+
     def opened(self) -> None:
         self.is_open = True
 
@@ -86,8 +89,8 @@ def client() -> ClientProtocol:
     return ClientProtocol(parse_uri("ws://localhost/"))
 
 
-def served(ear: Ear, *, longest: int = LONGEST) -> tuple[ServedConnection, Wire]:
-    end, wire = ServedConnection(ear, longest=longest, read_at_once=512, refusal=lambda _: None), Wire()
+def served(ear: Ear) -> tuple[ServedConnection, Wire]:
+    end, wire = ServedConnection(ear, longest=LONGEST, read_at_once=512), Wire()
     end.connection_made(wire)
     return end, wire
 
