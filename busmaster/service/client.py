@@ -11,6 +11,7 @@ from typing import Any
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.node import Node
+from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import checked_priority
 from busmaster.contract.arguments import seconds, whole_number
@@ -54,6 +55,8 @@ class Client:
         self._errands: dict[int, Errand] = {}
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
+        self._gathered: dict[int, list[Point[Any]]] = {}
+        """Points for poll groups that it will make, by the streams of those."""
         self._log = logging.getLogger("busmaster.service")
 
     @property
@@ -140,6 +143,8 @@ class Client:
                 return self._follow(params, self._line.broadcast_of(group))
             case "events":
                 return self._follow(params, self._line.events())
+            case "points":
+                return self._gather(params)
             case "poll":
                 return self._poll(params)
         raise Malformed(f"no method {method[:40]!r}", NO_METHOD)
@@ -229,15 +234,25 @@ class Client:
         source.join(self, stream)
         return {"period": source.group.period} if isinstance(source, GroupBroadcast) else {}
 
-    def _poll(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        points = params["points"]
-        if not isinstance(points, list) or len(points) > MOST_POINTS:
-            raise InvalidCommand(f"a poll group of a program has {MOST_POINTS} points at most")
-        if len(self._groups) >= MOST_STREAMS:
+    def _gather(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        """Keep points for a poll group: a message is too short for as many as one may have."""
+        stream, points = whole_number(params["stream"], 0, 2**53, "a stream"), params.get("points", [])
+        if stream not in self._gathered and len(self._gathered) >= MOST_STREAMS:
             raise InvalidCommand(f"one program has {MOST_STREAMS} poll groups at most")
+        known = self._gathered.get(stream, [])
+        if not isinstance(points, list) or len(known) + len(points) > MOST_POINTS:
+            raise InvalidCommand(f"a poll group of a program has {MOST_POINTS} points at most")
         read = [point_of(point, self.node) for point in points]
         if any(point.command.writes for point in read):
             raise InvalidCommand("a poll group reads: it writes nothing")
+        self._gathered[stream] = known + read
+        return {}
+
+    def _poll(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        if len(self._groups) >= MOST_STREAMS:
+            raise InvalidCommand(f"one program has {MOST_STREAMS} poll groups at most")
+        self._gather(params)
+        read = self._gathered.pop(params["stream"])
         phase = params.get("phase")
         group = self._line.bus.poll_group(
             f"{str(params['name'])[:40]} ({self.peer.program} {self.peer.pid}-{self._number})",
@@ -258,6 +273,7 @@ class Client:
         source = self._streams.pop(stream, None)
         if source is not None:
             source.leave(self, stream)
+        self._gathered.pop(stream, None)
         group = self._groups.pop(stream, None)
         if group is not None:
             group.close()

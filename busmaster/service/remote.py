@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import AsyncIterator, Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from types import TracebackType
 from typing import Any, TypeVar, Unpack
 
@@ -16,26 +17,26 @@ from busmaster.bus.limits import Limit
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, RequestOptions
 from busmaster.bus.samples import Sample
-from busmaster.bus.snapshots import Snapshot, Stream
+from busmaster.bus.snapshots import Stream
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed, InvalidCommand
 from busmaster.planning.merging import Merge
-from busmaster.service.link import Asked, Link
+from busmaster.service.link import Link
 from busmaster.service.messages import said_timings, value_of
+from busmaster.service.remote_group import RemoteGroup
 from busmaster.service.telling import (
     event_of,
-    point_of,
     protocol_of,
     said_points,
-    snapshot_of,
     statistics_of,
 )
 
 T = TypeVar("T")
 EVENT_BUFFER = 256
+POINTS_IN_A_MESSAGE = 50
 LEFT_OUT = ("verify", "safe")
 """Options that are of no use on another's line: where they are said, they are false."""
 
@@ -150,72 +151,6 @@ class RemoteNode:
             given = {name: value for name, value in options.items() if value is not None}
             params["options"] = {name: given[name] for name in given if name not in LEFT_OUT}
         return params
-
-
-class RemoteGroup:
-    """A poll group of the line. Iterate it, or look at `latest`; close it when it is not read any more."""
-
-    def __init__(self, bus: RemoteBus, name: str, number: int, points: tuple[Point[Any], ...]) -> None:
-        self.name = name
-        self.period = 0.0
-        self.latest: Snapshot | None = None
-        """That of its last cycle."""
-        self.dropped = 0
-        """Cycles that this program was too slow for, counted by the line's owner."""
-        self._bus = bus
-        self._number = number
-        self._own = points
-        self._points = points
-        self._set = -1
-        self._consumers: list[Stream[Snapshot]] = []
-        self._over = False
-
-    @property
-    def points(self) -> tuple[Point[Any], ...]:
-        return self._points
-
-    def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
-        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
-        if self._over:
-            raise BusClosed(f"poll group {self.name!r} is closed")
-        return Stream(self._consumers, buffer)
-
-    async def __aiter__(self) -> AsyncIterator[Snapshot]:
-        consumer = self.subscribe()
-        try:
-            async for snapshot in consumer:
-                yield snapshot
-        finally:
-            consumer.close()
-
-    def close(self) -> None:
-        """Read it no more; one that this program made ends."""
-        if not self._over:
-            self._bus.end_stream(self._number)
-
-    def hear(self, method: str, params: Mapping[str, Any]) -> None:
-        """Take what the line's owner says of it."""
-        body = params["body"]
-        for consumer in self._consumers:
-            consumer.dropped += params["dropped"] - self.dropped
-        self.dropped = params["dropped"]
-        if method == "points":
-            self._set = body["set"]
-            # By its own points, a program gets the values that they decode.
-            if not self._own:
-                self._points = tuple(point_of(said, self._bus.find) for said in body["points"])
-        elif method == "snapshot" and body["set"] == self._set:
-            self.latest = snapshot_of(body, self.name, self._points)
-            for consumer in self._consumers:
-                consumer.put(self.latest)
-        elif method == "ended":
-            self._bus.end_stream(self._number)
-
-    def end(self) -> None:
-        """End those who read it, after what they hold."""
-        self._over = True
-        for consumer in list(self._consumers):
-            consumer.close()
 
 
 class RemoteBus:
@@ -355,10 +290,8 @@ class RemoteBus:
         priority: Priority = Priority.POLL,
     ) -> RemoteGroup:
         """Have `points` read every `period` seconds, as `Bus.poll_group`; it ends with this program."""
-        wanted = tuple(points)
-        params: dict[str, Any] = {"name": name, "period": period, "points": said_points(wanted)}
-        params |= {"phase": phase, "priority": priority}
-        return await self._follow("poll", name, wanted, params)
+        params = {"name": name, "period": period, "phase": phase, "priority": priority}
+        return await self._follow("poll", name, tuple(points), params)
 
     async def groups(self) -> tuple[str, ...]:
         """Return the names of the line's poll groups."""
@@ -390,10 +323,16 @@ class RemoteBus:
     ) -> RemoteGroup:
         self._count += 1
         number = self._count
-        group = self._groups[number] = RemoteGroup(self, name, number, points)
-        asked: Asked = self.link.ask(method, {**params, "stream": number})
+        group = RemoteGroup(name, points, find=self.find, end=partial(self.end_stream, number))
+        self._groups[number] = group
+        said = said_points(points)
         try:
-            group.period = (await self.link.answer(asked))["period"]
+            while len(said) > POINTS_IN_A_MESSAGE:
+                await self._ask("gather", {"stream": number, "points": said[:POINTS_IN_A_MESSAGE]})
+                del said[:POINTS_IN_A_MESSAGE]
+            if said:
+                params = {**params, "points": said}
+            group.period = (await self._ask(method, {**params, "stream": number}))["period"]
         except BaseException:
             self.end_stream(number)
             raise
