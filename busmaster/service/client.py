@@ -143,7 +143,7 @@ class Client:
                 return self._follow(params, self._line.broadcast_of(group))
             case "events":
                 return self._follow(params, self._line.events())
-            case "points":
+            case "gather":
                 return self._gather(params)
             case "poll":
                 return self._poll(params)

@@ -93,6 +93,14 @@ def on_a_served_line(
     asyncio.run(run())
 
 
+def on_a_line(folder: Path, story: Callable[[Served], Awaitable[None]], *, read_only: bool = False) -> None:
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE), served(folder, read_only=read_only) as line:
+            await story(line)
+
+    asyncio.run(run())
+
+
 class Raw:
     """A client that says what it is told, word for word."""
 
@@ -129,6 +137,7 @@ __all__ = [
     "Raw",
     "Served",
     "SlowWay",
+    "on_a_line",
     "on_a_served_line",
     "raw",
     "served",

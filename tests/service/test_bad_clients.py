@@ -8,7 +8,6 @@ import os
 import random
 import socket
 import stat
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,7 @@ from busmaster.errors import BacklogFull, InvalidCommand
 from busmaster.service import messages
 from busmaster.service.folder import Owner, ServedSocket, find_owner, line_name, owners, runtime_folder, socket_path
 from busmaster.service.outbox import Outbox
-from tests.patience import PATIENCE
-from tests.service.lines import ABSENT, PATIENT, Served, SlowWay, on_a_served_line, raw, served, until
+from tests.service.lines import ABSENT, PATIENT, Served, SlowWay, on_a_line, on_a_served_line, raw, until
 
 READ = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
 
@@ -30,14 +28,6 @@ UPGRADE = (
     b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
 )
-
-
-def on_a_line(folder: Path, story: Callable[[Served], Awaitable[None]], *, read_only: bool = False) -> None:
-    async def run() -> None:
-        async with asyncio.timeout(PATIENCE), served(folder, read_only=read_only) as line:
-            await story(line)
-
-    asyncio.run(run())
 
 
 # the gate

@@ -379,3 +379,23 @@ def test_limits_and_the_safe_state_stay_with_the_owner(tmp_path: Path) -> None:
         assert [outcome for _, outcome in line.audit()] == ["refused", "written", "not started"]
 
     on_a_served_line(tmp_path, story)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        '{"jsonrpc": "2.0", "id": 1, "error": 3}',
+        '{"jsonrpc": "2.0", "id": 1, "error": {"data": {"label": 3}}}',
+        "[]",
+        "{",
+    ],
+)
+def test_an_answer_that_is_not_understood_leaves_nobody_waiting(said: str, tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
+        await line.sent()
+        remote.link.heard(said.replace('"id": 1', f'"id": {remote.link._count}'))
+        with pytest.raises(WriteUnconfirmed, match="what is not understood"):
+            await writing
+
+    on_a_served_line(tmp_path, story)
