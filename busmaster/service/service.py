@@ -33,7 +33,7 @@ from busmaster.service.messages import (
 from busmaster.service.outbox import Outbox
 from busmaster.service.peers import find_name, peer_of
 from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
-from busmaster.service.visit import Turns, Visit
+from busmaster.service.visit import Reception, Visit
 
 if TYPE_CHECKING:
     from websockets.http11 import Request
@@ -80,7 +80,7 @@ class Service:
         """Connections of which no first message has come, the oldest first."""
         self._leaving: set[asyncio.Task[None]] = set()
         self._count = 0
-        self.turns = Turns()
+        self.reception = Reception()
         self._groups: dict[PollGroup, GroupBroadcast] = {}
         self._events: EventBroadcast | None = None
         self._points: dict[object, Point[Any]] = {}

@@ -20,7 +20,7 @@ READ_AT_ONCE = 512
 frames that there are."""
 
 
-class Turns:
+class Reception:
     """Whose message is taken next: one in a turn of the loop, whoever they are, so that the line goes between; and one
     of each program before the second of any.
     """
@@ -52,7 +52,7 @@ class Host(Protocol):
     """Who is visited."""
 
     @property
-    def turns(self) -> Turns: ...
+    def reception(self) -> Reception: ...
 
     def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
         """Note who has come; return the HTTP status and words with which one is refused, None if it is not."""
@@ -147,7 +147,7 @@ class Visit:
             self.connection.pause()  # `writable` comes here again
         elif self._messages:
             self._queued = True
-            self._host.turns.ask(self)
+            self._host.reception.ask(self)
         else:
             self.connection.resume()
 
