@@ -179,7 +179,7 @@ async def _audience(owner: Apart, address: str, options: Options, outcome: Outco
             async with AsyncExitStack() as stack:
                 heard = [await stack.enter_async_context(_reader(address)) for _ in range(READERS if listened else 0)]
                 said = await asyncio.to_thread(saturate)
-                cycles += sum(map(len, heard))
+            cycles += sum(map(len, heard))
             holds[listened] += said["holds"]
             rates[listened].append(said["rate"])
     owner.ask({"polls": False})
@@ -205,8 +205,7 @@ async def _reader(address: str) -> AsyncIterator[list[int]]:
         group = await bus.group(GROUP)
 
         async def hear() -> None:
-            async for snapshot in group:
-                heard.append(snapshot.cycle)
+            heard.extend([snapshot.cycle async for snapshot in group])
 
         hearing = asyncio.ensure_future(hear())
         yield heard
