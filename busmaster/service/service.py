@@ -19,6 +19,7 @@ from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.contract.places import Placed
 from busmaster.gate.gate import Gate
+from busmaster.registry import protocols
 from busmaster.service.client import Client
 from busmaster.service.connection import CLOSE_WITHIN, check_installed
 from busmaster.service.folder import Owner, ServedSocket, line_name, runtime_folder
@@ -97,8 +98,14 @@ class Service:
         """Return the programs that are connected."""
         return tuple(self._clients)
 
+    @property
+    def strangers(self) -> int:
+        """Return how many connections there are of which no first message has come."""
+        return len(self._strangers)
+
     async def __aenter__(self) -> Service:
         check_installed()
+        await asyncio.to_thread(protocols)  # they are imported for this: not when the first client asks
         if finding := find_name(os.getuid()):
             await asyncio.wait([finding], timeout=NAME_WITHIN)
         path = self._path or runtime_folder() / f"{self.name}.sock"

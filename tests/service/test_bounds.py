@@ -201,7 +201,7 @@ def test_of_those_who_never_say_hello_the_oldest_goes_for_one_too_many(
     async def story(line: Served, remote: RemoteBus) -> None:
         path = line.address.removeprefix("unix:")
         first, *others = [await asyncio.open_unix_connection(path) for _ in range(3)]
-        await until(lambda: len(line.service._strangers) == 3)
+        await until(lambda: line.service.strangers == 3)
         async with connect(line.address) as another:
             assert await first[0].read() == b""
             assert await Hcp2Controller(another, 5).read(1) == 0
@@ -222,6 +222,6 @@ def test_one_that_says_nothing_for_ten_seconds_is_let_go(tmp_path: Path, monkeyp
         reader, writer = await asyncio.open_unix_connection(line.address.removeprefix("unix:"))
         assert await reader.read() == b""
         writer.transport.abort()
-        await until(lambda: not line.service._strangers)
+        await until(lambda: not line.service.strangers)
 
     on_a_line(tmp_path, story)
