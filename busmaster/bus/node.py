@@ -125,6 +125,13 @@ class Node:
         """Return the youngest good sample of a point in any poll group, unless a write has made it stale."""
         return self.shared.latest(point)
 
+    def held(self, point: Any, /) -> Any:
+        """Return what a point of it would have read last, by whatever name it was polled, alone or with others.
+
+        None where that is not known, or may have been written since.
+        """
+        return self.shared.held(self.record, point)
+
     def planned(self) -> PlannedNode:
         """Return the node as the planner sees it, with its reply time as measured so far."""
         record = self.record

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,8 +11,9 @@ import click
 from busmaster.bus.handle import Handle
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.cli.ending import until_ended
-from busmaster.cli.output import emit, emit_all, json_line, json_value, value_text
+from busmaster.cli.output import emit, emit_all, json_line, json_value, name_fields, value_text
 from busmaster.cli.protocols import ItemCommand, Offer, read_options, take_options
+from busmaster.outputs.values import utc
 
 
 class ItemsReadCommand(ItemCommand):
@@ -43,7 +45,8 @@ async def read(
         for item, point in zip(items, points, strict=True):
             value = await handle.read_item(item, **how)
             if as_json:
-                emit(json_line(node=connection.node_number(address), item=item, value=json_value(value)))
+                fields = {"value": json_value(value), **name_fields(value), "time": utc(time.time())}
+                emit(json_line(node=connection.node_number(address), item=item, **fields))
             else:
                 emit_all(plain_lines(handle, item, value, point.meaning.precision))
 

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import anyio
 import click
 
+from busmaster.arbiter.events import PortFailed
+from busmaster.bus.alarms import BusEvent
+from busmaster.bus.polling import Stream
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import file_argument, keep, load, other_port, port_option
@@ -13,6 +17,7 @@ from busmaster.cli.output import Level, emit, note
 from busmaster.config import ConfiguredLine
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.gate.record import WriteRecord
+from busmaster.outputs.values import event_text
 
 
 @click.command(short_help="Send the safe state of a file, and verify it.")
@@ -22,7 +27,8 @@ def command(path: str, port: str | None) -> int:
     """Send the writes that [safe] in LINE.toml lists, urgently, read each back, and print `POINT ok`.
 
     Nothing is polled. The outputs keep a record of the writes, once those are over. What was not confirmed in the
-    file's time is named on standard error, and the exit status is 1. A port that is missing is waited for in that time.
+    file's time is named on standard error, and the exit status is 1. A port that cannot be opened is waited for in that
+    time, and named with the reason.
     """
     file = load(path)
     line = ConfiguredLine(file, port=other_port(file, port), outputs=False, wait_for_port=True)
@@ -35,8 +41,10 @@ async def leave(line: ConfiguredLine) -> int:
     """Send the safe state, print each point that was confirmed, and return the exit status."""
     records: list[WriteRecord] = []
     line.gate.record = records.append
-    async with line.bus:
-        outcomes = await line.safe_state.enter(line.gate, "busmaster safe")
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(tell_of_port, line.bus.events())
+        async with line.bus:
+            outcomes = await line.safe_state.enter(line.gate, "busmaster safe")
     for name, error in outcomes.items():
         if error is None:
             emit(f"{name} ok")
@@ -47,6 +55,13 @@ async def leave(line: ConfiguredLine) -> int:
     except InvalidCommand as error:
         note(f"no record is kept of what was written: {error}", Level.WARNING)
     return status
+
+
+async def tell_of_port(events: Stream[BusEvent]) -> None:
+    """Say on standard error why the port cannot be opened, until the bus is closed."""
+    async for event in events:
+        if isinstance(event, PortFailed):
+            note(event_text(event), Level.ERROR)
 
 
 def tell_unsafe(outcomes: Mapping[str, BusError | None]) -> int:

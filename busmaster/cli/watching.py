@@ -161,8 +161,12 @@ class Watch:
     def announce(self, text: str, level: Level = Level.NOTICE) -> None:
         """Add to the last events; print a line on standard error, unless the screen that shows them is there."""
         self.tell(text)
-        if not (shown_on_screen(self.view) and sys.stderr.isatty()):  # a line there would tear the picture
+        if self.may_print():
             note(text, level)
+
+    def may_print(self) -> bool:
+        """Tell whether a line may be printed on standard error: it must not tear the picture that is drawn there."""
+        return not (shown_on_screen(self.view) and sys.stderr.isatty())
 
     def picture(self) -> Frame:
         """Return the frame for the screen. Cheap: it is taken on the loop that owns the line."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import click
 
 from busmaster.bus.handle import Send
+from busmaster.bus.points import Point
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.cli.capturing import capturing
 from busmaster.cli.ending import until_ended
@@ -68,7 +70,7 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
     records: list[WriteRecord] = []
     line.gate.record = records.append
     try:
-        prepared = [(wish_of(line, name, values), prepare(line, name, values, verify)) for name, values in pairs]
+        prepared = [prepare(line, name, values, verify) for name, values in pairs]
         async with line.bus:
             for wish, send in prepared:
                 await pass_on(line, wish, send)
@@ -83,16 +85,21 @@ async def pass_on(line: ConfiguredLine, wish: Wish, send: Send) -> None:
         await send()
 
 
-def wish_of(line: ConfiguredLine, name: str, values: Sequence[float]) -> Wish:
-    """Return what a person wants to have written. Raises InvalidCommand for what is no point of the line."""
+def wish_of(name: str, values: Sequence[float], point: Point[Any] | None = None) -> Wish:
+    """Return what a person wants to have written; without a point, to what is none of the line."""
     value = values[0] if len(values) == 1 else tuple(values)
-    return Wish(door="command line", by="busmaster write", name=name, point=line.point(name), value=value)
+    return Wish(door="command line", by="busmaster write", name=name, point=point, value=value)
 
 
-def prepare(line: ConfiguredLine, name: str, values: Sequence[float], verify: bool) -> Send:
-    """Return what writes a point. Raises InvalidCommand, of which a record is kept, for what may not be written."""
+def prepare(line: ConfiguredLine, name: str, values: Sequence[float], verify: bool) -> tuple[Wish, Send]:
+    """Return what a person wants, and what writes it.
+
+    Raises InvalidCommand, of which a record is kept, for what may not be written, and for no point of the line.
+    """
+    wish = wish_of(name, values)
     try:
-        return line.prepare_write(name, values, verify=verify)
+        wish = wish_of(name, values, line.point(name))
+        return wish, line.prepare_write(name, values, verify=verify)
     except InvalidCommand as error:
-        line.gate.refuse(wish_of(line, name, values), str(error))
+        line.gate.refuse(wish, str(error))
         raise

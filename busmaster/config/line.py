@@ -87,6 +87,7 @@ class ConfiguredLine:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Close the line first; the outputs then have a few seconds to write what they still hold."""
+        self.gate.leaving = True
         try:
             await self.bus.__aexit__(kind, error, traceback)
         finally:
@@ -119,6 +120,8 @@ class ConfiguredLine:
                 del self.groups[name]
                 group.close()
         self._start_groups()
+        # Up to here in one turn of the loop. A command that an output still takes while it is closed is written by the
+        # scale that it was sent for, within the limits of now: those are of the quantity.
         await self.outputs.replace(dict(self._wanted_outputs()), self.groups.values())
 
     def point(self, name: str) -> NamedPoint:

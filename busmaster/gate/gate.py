@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, TypeAlias
 
 from busmaster.bus.bus import Bus
+from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.errors import (
     BusError,
@@ -102,13 +103,16 @@ def outcome_of(error: BaseException | None) -> tuple[Outcome, str]:
 
 
 class Gate:
-    """What all doors of one line pass. `read_only` lets no write through; `record` is told of every one.
+    """What all doors of one line pass. `read_only` lets no write through, nor does it once the line is `leaving`.
+
+    `record` is told of every one.
 
     `write` never raises but when it is cancelled: whatever somebody sends, it ends as a record.
     """
 
     def __init__(self, bus: Bus, *, read_only: bool = False) -> None:
         self.read_only = read_only
+        self.leaving = False
         self.record: Callable[[WriteRecord], None] = lambda _: None
         self.bus = bus
         self._log = logging.getLogger("busmaster.audit")
@@ -118,6 +122,8 @@ class Gate:
 
     def refusal(self, wish: Wish) -> str:
         """Return why it is not let through, "" if it is."""
+        if self.leaving:
+            return "the line is being left: nothing was sent"
         if self.read_only:
             return "this line is read-only"
         if wish.point is None:
@@ -182,15 +188,16 @@ class Gate:
             took=took,
             id=wish.id,
         )
-        self._log.info("%s", record.text)
+        # of one that is unconfirmed somebody has to find out what became of it
+        level = logging.WARNING if outcome is Outcome.UNCONFIRMED else logging.INFO
+        self._log.log(level, "%s", record.text)
         self.record(record)
         return record
 
 
 def _before(point: Point[Any] | None) -> Any:
     """Return what it held when it was last read, None if that may not be so any more."""
-    sample = None if point is None else point.node.latest(point)
-    return None if sample is None else sample.value
+    return None if point is None else Node.of(point).held(point)
 
 
 def _shown(value: Any) -> Any:
