@@ -185,9 +185,9 @@ class Protocol:
         if kind is None:
             raise InvalidCommand(f"{self.name} has no command {name!r}: use {', '.join(self.commands)}")
         arguments = {key: _frozen(value) for key, value in written.items() if key != "command"}
-        for part, default in _parts_of(kind):
+        for part in _options_of(kind):
             # An option has one form: neither a number nor a text stands for true.
-            if isinstance(default, bool) and not isinstance(arguments.get(part, False), bool):
+            if not isinstance(arguments.get(part, False), bool):
                 raise InvalidCommand(f"{self.name}: {name}: {part} is true or false, not {arguments[part]!r}")
         try:
             return kind(**arguments)
@@ -206,6 +206,12 @@ def _parts_of(kind: type[Command[Any]]) -> tuple[tuple[str, Any], ...]:
     """Return the names and defaults of what a command is made of."""
     fields = dataclasses.fields(kind)  # type: ignore[arg-type]  # every command is a dataclass
     return tuple((part.name, part.default) for part in fields if part.init)
+
+
+@cache
+def _options_of(kind: type[Command[Any]]) -> tuple[str, ...]:
+    """Return which of them are true or false."""
+    return tuple(name for name, default in _parts_of(kind) if isinstance(default, bool))
 
 
 def _frozen(value: Any) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import inf, isnan
 from typing import Any
 
@@ -138,5 +138,16 @@ def _finite(value: Any) -> Any:
     return list(map(_finite, value)) if isinstance(value, list | tuple) else value
 
 
+def _encoder() -> Callable[[Any], str]:
+    """Return what encodes a value: what Python makes anew for each, which takes longer than to use it, made once."""
+    usual = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
+    text = json.encoder.encode_basestring_ascii
+    try:
+        encode = json.encoder.c_make_encoder(None, usual.default, text, None, ":", ",", False, False, False)  # type: ignore[attr-defined]
+    except (AttributeError, TypeError):  # another Python
+        return usual.encode
+    return lambda value: "".join(encode(value, 0))
+
+
 _decode = json.JSONDecoder().raw_decode  # half of what `loads` takes, which looks for other encodings and blanks
-_encode = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+_encode = _encoder()
