@@ -84,6 +84,13 @@ class Client:
             params = {"protocol": key[0], "address": key[1], "stops": node.stops - self._stops[key]}
             self.outbox.put_latest(("stops", key), written({"method": "stops", "params": params}))
 
+    def tell_touched(self, node: NodeRecord, when: float) -> None:
+        """Say that a write to a node has ended, if this client has samples of its own poll groups."""
+        if self._groups:
+            key = (node.profile.name, node.address)
+            params = {"protocol": key[0], "address": key[1], "when": when}
+            self.outbox.put_latest(("touched", key), written({"method": "touched", "params": params}))
+
     # what it says
 
     def take(self, said: Mapping[str, Any]) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from math import inf
 from types import TracebackType
 from typing import Any, TypeVar, Unpack
 
@@ -86,9 +87,10 @@ class RemoteNode:
         """Return the time of the line's clock, in seconds: that of the machine, which is the same for all programs."""
         return self._bus.now()
 
-    def latest(self, point: Hashable, /) -> Sample[Any] | None:
-        """Return None: only the line knows of every write that makes a sample stale."""
-        return None
+    def latest(self, point: Any, /) -> Sample[Any] | None:
+        """Return the youngest good sample of a point in this program's poll groups, unless a write, by whatever
+        program, has made it stale: any write to the node does."""
+        return self._bus.latest(point)
 
     def merge_reads(self, merge: Merge, /) -> None:
         """Have the profile propose `merge`. What is merged on the line is its owner's affair."""
@@ -175,6 +177,8 @@ class RemoteBus:
         """Those of them of which the owner knows."""
         self._groups: dict[int, RemoteGroup] = {}
         self._count = 0
+        self._touched: dict[tuple[str, int], float] = {}
+        """When the last write to a node ended."""
         self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
 
@@ -293,6 +297,18 @@ class RemoteBus:
         params = {"name": name, "period": period, "phase": phase, "priority": priority}
         return await self._follow("poll", name, tuple(points), params)
 
+    def latest(self, point: Point[T]) -> Sample[T] | None:
+        """Return the youngest good sample of a point in a poll group of this program, unless a write to its node, by
+        whatever program, has ended since it was read."""
+        profile = point.node.profile
+        touched = [
+            self._touched.get((profile.name, address), -inf) for address in (point.node.address, profile.broadcast)
+        ]
+        snapshots = [group.latest for group in self._groups.values() if group.own and group.latest is not None]
+        samples = [snapshot.samples[point] for snapshot in snapshots if point in snapshot.samples]
+        good = (one for one in samples if one.error is None and one.started is not None and one.started > max(touched))
+        return max(good, key=lambda one: one.finished, default=None)
+
     async def groups(self) -> tuple[str, ...]:
         """Return the names of the line's poll groups."""
         return tuple(group["name"] for group in await self._ask("groups", {}))
@@ -343,6 +359,8 @@ class RemoteBus:
             node = self._nodes.get((params["protocol"], params["address"]))
             if node is not None:
                 node.stops = params["stops"]
+        elif method == "touched":
+            self._touched[params["protocol"], params["address"]] = params["when"]
         elif method == "event":
             event = event_of(params["body"], self.find)
             for stream in self._events:
@@ -354,5 +372,6 @@ class RemoteBus:
     def _lost(self) -> None:
         for group in list(self._groups.values()):
             group.end()
+        self._groups.clear()  # what is written from now on is not heard of any more
         for stream in list(self._events):
             stream.close()

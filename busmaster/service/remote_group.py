@@ -25,6 +25,11 @@ class RemoteGroup(Cycles):
         self._set = -1
 
     @property
+    def own(self) -> bool:
+        """Return whether this program made it: its values are then what this program's points decode."""
+        return bool(self._own)
+
+    @property
     def points(self) -> tuple[Point[Any], ...]:
         return self._points
 

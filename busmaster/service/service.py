@@ -131,6 +131,7 @@ class Service:
             served.__exit__(None, None, None)
             raise
         self.bus.on_stop.append(self._tell_stop)
+        self.bus.on_touched.append(self._tell_touched)
         return self
 
     async def __aexit__(
@@ -138,6 +139,7 @@ class Service:
     ) -> None:
         """Let nobody in any more, tell all clients what became of their requests, and let them go."""
         self.bus.on_stop.remove(self._tell_stop)
+        self.bus.on_touched.remove(self._tell_touched)
         self._server.close()
         visits = [*self._clients.values(), *self._strangers]
         for client in self._clients:
@@ -195,6 +197,10 @@ class Service:
     def _tell_stop(self, record: NodeRecord) -> None:
         for client in self._clients:
             client.tell_stops(record)
+
+    def _tell_touched(self, record: NodeRecord, when: float) -> None:
+        for client in self._clients:
+            client.tell_touched(record, when)
 
     # those who come
 

@@ -399,3 +399,24 @@ def test_an_answer_that_is_not_understood_leaves_nobody_waiting(said: str, tmp_p
             await writing
 
     on_a_served_line(tmp_path, story)
+
+
+def test_a_sample_of_a_program_serves_until_a_write_by_whatever_program_has_made_it_stale(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        mine, theirs = Hcp2Controller(remote, 5).point("1"), Hcp2Controller(line.bus, 5).point("1")
+        line.bus.poll_group("the owner's", period=60, points=[theirs])
+        assert await mine.read(max_age=60) == 0
+        group = await remote.poll_group("mine", period=60, points=[mine])
+        snapshot = await anext(aiter(group))
+        exchanges = line.bus.statistics().exchanges
+        assert mine.node.latest(mine) is snapshot[mine]
+        assert await mine.read(max_age=60) == 0
+        assert line.bus.statistics().exchanges == exchanges
+        await theirs.write(7)
+        assert await Hcp2Controller(remote, 6).read(1) == 0
+        assert mine.node.latest(mine) is None
+        assert await mine.read(max_age=60) == 7
+        group.close()
+        assert remote.latest(mine) is None
+
+    on_a_served_line(tmp_path, story)
