@@ -13,6 +13,7 @@ from busmaster.cli.arguments import Connection, connected, json_option, node_opt
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import emit, emit_all, json_line, json_value, name_fields, value_text
 from busmaster.cli.protocols import ItemCommand, Offer, read_options, take_options
+from busmaster.cli.reaching import reach
 from busmaster.outputs.values import utc
 
 
@@ -38,7 +39,7 @@ async def read(
     connection: Connection, address: int, items: tuple[str, ...], how: dict[str, Any], as_json: bool
 ) -> None:
     """Read the items of one node and print each; all are checked before the first is asked for."""
-    bus = connection.reach()
+    bus = reach(connection)
     handle = connection.open_handle(bus, address)
     points = [handle.point(item) for item in items]
     async with bus:

@@ -17,7 +17,7 @@ from busmaster.cli.hangups import Hangups
 from busmaster.cli.lines import file_argument, load, other_port, port_option
 from busmaster.cli.output import Level, note, number_text
 from busmaster.cli.safe import tell_unsafe
-from busmaster.cli.serving import served
+from busmaster.cli.serving import secrets_of, served
 from busmaster.cli.systemd import ServiceManager
 from busmaster.cli.watching import Watch, follow
 from busmaster.config import ConfiguredLine, LineFile
@@ -62,8 +62,10 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
     context.call_on_close(lambda: sys.setswitchinterval(usual))
     sys.setswitchinterval(SWITCH_INTERVAL)
     with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
+        line = ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only)
+        line.gate.take_secrets(secrets_of(file))
         running = Running(
-            ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only),
+            line,
             path,
             view,
             hangups,
@@ -148,8 +150,9 @@ class Running:
         self._manager.reloading()
         self.line.bus.accept_device()
         try:
-            file = await anyio.to_thread.run_sync(self._checked_file)
+            file, secrets = await anyio.to_thread.run_sync(self._checked_file)
             await self.line.take(file)
+            self.line.gate.take_secrets(secrets)
         except (InvalidCommand, OSError) as error:
             note(f"the file was read again, and nothing of it taken: {error}", Level.ERROR)
         else:
@@ -159,15 +162,15 @@ class Running:
             self._say_what_is_polled()
         self._manager.ready()
 
-    def _checked_file(self) -> LineFile:
-        """Load the file and check it.
+    def _checked_file(self) -> tuple[LineFile, dict[str, bytes]]:
+        """Load the file and its tokens, and check them.
 
         Raises OSError, and InvalidCommand, naming line and key, for what is wrong with the file.
         """
         file = load(self._path)
         # made for its complaints alone: `take` wants a file of which a line can be made
         ConfiguredLine(file, port=self.line.bus.endpoint)
-        return file
+        return file, secrets_of(file)
 
     def _tell_of_output(self, text: str) -> None:
         down = any(counts.error for counts in self.line.outputs.statistics())

@@ -30,7 +30,7 @@ END_OF_HEAD = b"\r\n\r\n"
 LONGEST_HEAD = 14
 """Bytes of a frame before its message."""
 _BINARY, _CONTROL, _OPEN = 2, 8, 1  # numbers of the WebSocket's standard, and of the library's states
-_ANY_URI = "ws://localhost/"
+_ANY_URI = "ws://busmaster/"
 
 
 class Hearer(Protocol):
@@ -276,15 +276,23 @@ class ServedConnection(Connection):
 
 
 class AskingConnection(Connection):
-    """The end of whoever connects. `complaint` is why it did not come to that, or ended."""
+    """The end of whoever connects, and shows a token if he has one."""
 
     _core: ClientProtocol
     _serves = False
 
-    def __init__(self, hearer: Hearer, *, longest: int, read_at_once: int) -> None:
+    def __init__(self, hearer: Hearer, *, token: str | None = None, longest: int, read_at_once: int) -> None:
         _, client, parse_uri = check_installed()
         core = client(parse_uri(_ANY_URI), max_size=longest, logger=_quiet())
         super().__init__(core, hearer, longest=longest, read_at_once=read_at_once)
+
+        self._token = token
+
+    @property
+    def status(self) -> int | None:
+        """Return the HTTP status with which the other end did not let us in, None if it did, or said none."""
+        response = getattr(self._core.handshake_exc, "response", None)
+        return None if response is None else int(response.status_code)
 
     @property
     def complaint(self) -> str | None:
@@ -296,7 +304,10 @@ class AskingConnection(Connection):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
-        self._core.send_request(self._core.connect())
+        request = self._core.connect()
+        if self._token is not None:
+            request.headers["Authorization"] = f"Bearer {self._token}"
+        self._core.send_request(request)
         self._write()
 
     def _shake_hands(self, event: Response) -> None:

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from busmaster.contract.arguments import host_and_port
 from busmaster.contract.exchange import Command
 from busmaster.errors import (
     Addressed,
@@ -26,20 +27,27 @@ GRACE = 0.25
 """Seconds beyond `finish_within` in which the line's owner, who knows more, may say what became of a request."""
 CONNECT_WITHIN = 10.0
 READ_AT_ONCE = 1 << 16
+TCP = "tcp://"
 GONE = "the connection to the program that owns the line was lost"
 AGAIN = "see whether it runs, and connect again"
 
 
 class Asked:
-    """One question on its way. Of a command that writes it must be said whether it may have been sent."""
+    """One question on its way. `writes`: of what it asks for, it must be said whether it may have been sent."""
 
-    __slots__ = ("command", "future", "handed", "node", "number")
+    __slots__ = ("command", "future", "handed", "node", "number", "writes")
 
     def __init__(
-        self, number: int, future: asyncio.Future[Any], node: Addressed | None, command: Command[Any] | None
+        self,
+        number: int,
+        future: asyncio.Future[Any],
+        writes: bool,
+        node: Addressed | None,
+        command: Command[Any] | None,
     ) -> None:
         self.number = number
         self.future = future
+        self.writes = writes
         self.node = node
         self.command = command
         self.handed = False
@@ -52,7 +60,7 @@ class Asked:
 
     def lost(self, kind: type[BusError], what: str, hint: str) -> None:
         """End it truthfully, as no answer will come: `kind` is for what changes nothing."""
-        if self.command is None or not self.command.writes:
+        if not self.writes:
             self.fail(kind, what, hint)
         elif self.handed:
             self.fail(WriteUnconfirmed, f"{what}, and the write may have been sent")
@@ -68,9 +76,14 @@ class Link:
     """One connection to the owner of a line. `on_news` is told, in its order, what comes unasked."""
 
     def __init__(
-        self, address: str, on_news: Callable[[str, Mapping[str, Any]], None], on_lost: Callable[[], None]
+        self,
+        address: str,
+        token: str | None,
+        on_news: Callable[[str, Mapping[str, Any]], None],
+        on_lost: Callable[[], None],
     ) -> None:
         self.address = address
+        self._token = token
         self._on_news = on_news
         self._on_lost = on_lost
         self._connection: AskingConnection | None = None
@@ -83,23 +96,23 @@ class Link:
 
     async def open(self, program: str) -> dict[str, Any]:
         """Connect, agree on a version, and return what the owner says of the line. Raises LineDown."""
-        path = socket_path(self.address)
+        where, place = _where(self.address)
         loop = asyncio.get_running_loop()
-        self._asked[0] = hello = Asked(0, loop.create_future(), None, None)
+        self._asked[0] = hello = Asked(0, loop.create_future(), False, None, None)
         params = {"versions": list(VERSIONS), "program": program}
         self._waiting.appendleft((written({"id": 0, "method": "hello", "params": params}), hello))
         try:
             async with asyncio.timeout(CONNECT_WITHIN):
-                await loop.create_unix_connection(self._connect, path)
+                if place is None:
+                    await loop.create_unix_connection(self._connect, where)
+                else:
+                    await loop.create_connection(self._connect, *place)
                 said: dict[str, Any] = await hello.future
         except BaseException as error:
-            complaint = None if self._connection is None else self._connection.complaint
+            connection = self._connection
             await self.close()
-            if isinstance(error, OSError) or complaint is not None:  # TimeoutError is one
-                what = complaint or getattr(error, "strerror", None) or str(error) or "it does not answer"
-                raise LineDown(
-                    f"no program serves {path}: {what}", hint="start busmaster run, or see busmaster status"
-                ) from error
+            if isinstance(error, OSError) or (connection is not None and connection.complaint is not None):
+                raise _unreachable(where, error, connection, shown=self._token is not None) from error
             raise
         return said
 
@@ -120,6 +133,7 @@ class Link:
         method: str,
         params: Mapping[str, Any],
         *,
+        writes: bool = False,
         node: Addressed | None = None,
         command: Command[Any] | None = None,
     ) -> Asked:
@@ -128,7 +142,7 @@ class Link:
             kind, what, hint = self._over
             raise kind(what, node=node, command=_text(command), hint=hint)
         self._count += 1
-        asked = Asked(self._count, asyncio.get_running_loop().create_future(), node, command)
+        asked = Asked(self._count, asyncio.get_running_loop().create_future(), writes, node, command)
         self._asked[asked.number] = asked
         self._put(written({"id": asked.number, "method": method, "params": params}), asked)
         return asked
@@ -151,7 +165,7 @@ class Link:
     # what the connection tells
 
     def _connect(self) -> AskingConnection:
-        self._connection = AskingConnection(self, longest=LONGEST_ANSWER, read_at_once=READ_AT_ONCE)
+        self._connection = AskingConnection(self, token=self._token, longest=LONGEST_ANSWER, read_at_once=READ_AT_ONCE)
         return self._connection
 
     def opened(self) -> None:
@@ -233,3 +247,23 @@ class Link:
             asked.future.set_exception(error)
         else:
             asked.future.set_result(said.get("result"))
+
+
+def _where(address: str) -> tuple[str, tuple[str, int] | None]:
+    """Return where that is for messages, and host and port, None of a Unix socket. Raises InvalidCommand."""
+    if not address.startswith(TCP):
+        return socket_path(address), None
+    text = address.removeprefix(TCP).rstrip("/")
+    return text, host_and_port(text)
+
+
+def _unreachable(where: str, error: BaseException, connection: AskingConnection | None, *, shown: bool) -> LineDown:
+    match None if connection is None else connection.status:
+        case 401:
+            what = "does not know this token" if shown else "wants a token"
+            return LineDown(f"{where} {what}", hint="its owner has the tokens in a file, see [service] of LINE.toml")
+        case 503:
+            return LineDown(f"{where} has too many programs already", hint="end one, see busmaster status")
+    complaint = None if connection is None else connection.complaint
+    why = complaint or getattr(error, "strerror", None) or str(error) or "it does not answer"
+    return LineDown(f"no program serves {where}: {why}", hint="start busmaster run, or see busmaster status")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-from collections.abc import Collection, Hashable, Iterable, Mapping
+import socket
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
@@ -32,11 +33,14 @@ from busmaster.service.messages import (
     written,
 )
 from busmaster.service.outbox import Outbox
-from busmaster.service.peers import find_name, peer_of
+from busmaster.service.peers import Peer, find_name, process_of
+from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
+from busmaster.service.tcp import HostPort, check_listening, holder, is_our_name, listening
 from busmaster.service.visit import Reception, Visit
 
 if TYPE_CHECKING:
+    from websockets.datastructures import Headers
     from websockets.http11 import Request
 
 HOSTS = ("localhost", "busmaster")
@@ -51,9 +55,11 @@ class Service:
     """Serve a bus that is open, on a Unix socket, in `async with`. It ends before the bus is closed.
 
     `path` is the socket's; without it, it is NAME.sock in this user's runtime folder, where `name` is that of the
-    line, by default its port's. Every write passes `gate`: without one, its own, which keeps a record in the log
-    "busmaster.audit". `mode` and `group`, a number, are the socket's. Entering raises InvalidCommand where the socket
-    is served by another process, which it names, or cannot be made.
+    line, by default its port's. Every write passes `gate`, which says who may do what: without one, its own, which
+    keeps a record in the log "busmaster.audit", and lets this user write and others read. `mode` and `group`, a number,
+    are the socket's. `listen` is a host and a port where programs may come by TCP too: off this machine only where the
+    gate knows tokens. Entering raises InvalidCommand where the socket is served by another process, which it names,
+    or cannot be made.
     """
 
     def __init__(
@@ -65,17 +71,22 @@ class Service:
         path: Path | str | None = None,
         mode: int = 0o600,
         group: int | None = None,
+        listen: HostPort | None = None,
     ) -> None:
         self.bus = bus
         self.gate = gate or Gate(bus)
+        if listen is not None:
+            check_listening(listen, tokens=bool(self.gate.access.secrets))
+        self.safe_wishes = SafeWishes(self.gate)
         self.name = name or line_name(bus.endpoint.name)
         self.refused = 0
         """Connections that were one too many, or that began with what no client says."""
         self._path = None if path is None else Path(path).absolute()
         self._mode = mode
         self._group = group
+        self._listen = listen
         self._served: ServedSocket
-        self._server: asyncio.Server
+        self._servers: list[asyncio.Server] = []
         self._clients: dict[Client, Visit] = {}
         self._strangers: dict[Visit, None] = {}
         """Connections of which no first message has come, the oldest first."""
@@ -92,6 +103,14 @@ class Service:
     def address(self) -> str:
         """Return what `connect` takes."""
         return self._served.owner.address
+
+    @property
+    def tcp_address(self) -> str | None:
+        """Return what `connect` takes of a program that comes by TCP; None where none can."""
+        if self._listen is None:
+            return None
+        host, port = self._servers[-1].sockets[0].getsockname()[:2]
+        return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
 
     @property
     def clients(self) -> tuple[Client, ...]:
@@ -123,15 +142,19 @@ class Service:
         served = ServedSocket(owner, mode=self._mode, group=self._group)
         self._served = served.__enter__()
         try:
-            # One connection is taken in a turn of the loop; that others wait for theirs is the kernel's affair.
-            loop = asyncio.get_running_loop()
-            self._server = await loop.create_unix_server(self._visited, sock=self._served.socket, backlog=1)
-            self._served.socket.listen(MOST_WAITING_TO_CONNECT)
+            sockets = [self._served.socket]
+            if self._listen is not None:
+                sockets.append(await asyncio.to_thread(listening, self._listen))
+            for opened in sockets:
+                self._servers.append(await self._serve_at(opened))
         except BaseException:
+            for server in self._servers:
+                server.close()
             served.__exit__(None, None, None)
             raise
         self.bus.on_stop.append(self._tell_stop)
         self.bus.on_touched.append(self._tell_touched)
+        self.gate.on_access.append(self._let_go)
         return self
 
     async def __aexit__(
@@ -140,7 +163,10 @@ class Service:
         """Let nobody in any more, tell all clients what became of their requests, and let them go."""
         self.bus.on_stop.remove(self._tell_stop)
         self.bus.on_touched.remove(self._tell_touched)
-        self._server.close()
+        self.gate.on_access.remove(self._let_go)
+        await self.safe_wishes.close()
+        for server in self._servers:
+            server.close()
         visits = [*self._clients.values(), *self._strangers]
         for client in self._clients:
             client.release()
@@ -204,6 +230,14 @@ class Service:
 
     # those who come
 
+    async def _serve_at(self, opened: socket.socket) -> asyncio.Server:
+        """Serve a socket. One connection is taken in a turn of the loop; that others wait is the kernel's affair."""
+        loop = asyncio.get_running_loop()
+        serve: Any = loop.create_unix_server if opened.family == socket.AF_UNIX else loop.create_server
+        server: asyncio.Server = await serve(self._visited, sock=opened, backlog=1)
+        opened.listen(MOST_WAITING_TO_CONNECT)
+        return server
+
     def _visited(self) -> asyncio.BaseProtocol:
         """Return the end of a connection that was made just now. Of strangers, the oldest goes for one too many."""
         if len(self._strangers) >= MOST_STRANGERS:
@@ -214,16 +248,41 @@ class Service:
         return visit.connection
 
     def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
-        """Note who has come. Refuse what may be a page's, and one too many; an Origin is refused by the library."""
-        hosts = [host.partition(":")[0] for host in request.headers.get_all("Host")]
-        if len(hosts) != 1 or hosts[0] not in HOSTS:
+        """Note who has come. Refuse what may be a page's, whoever shows no token, and one too many.
+
+        An Origin is refused by the library.
+        """
+        refusal = self._refusal(visit, request.headers)
+        if refusal is not None:
             self.refused += 1
+        return refusal
+
+    def _refusal(self, visit: Visit, headers: Headers) -> tuple[int, str] | None:
+        hosts, shown = headers.get_all("Host"), headers.get_all("Authorization")
+        if len(hosts) != 1 or not self._is_our_name(hosts[0]):
             return HTTPStatus.FORBIDDEN, f"no such host: {', '.join(hosts)[:40]!r}\n"
+        peer = self._peer(visit.connection.transport.get_extra_info("socket"), shown)
+        if peer is None:
+            return HTTPStatus.UNAUTHORIZED, "a token that is known here is needed\n"
         if len(self._clients) >= MOST_CLIENTS:
-            self.refused += 1
             return HTTPStatus.SERVICE_UNAVAILABLE, f"{TOO_MANY}\n"
-        visit.peer = peer_of(visit.connection.transport.get_extra_info("socket"))
+        visit.peer = peer
         return None
+
+    def _is_our_name(self, host: str) -> bool:
+        return host.partition(":")[0] in HOSTS or (self._listen is not None and is_our_name(host, self._listen))
+
+    def _peer(self, connected: socket.socket, shown: Sequence[str]) -> Peer | None:
+        """Return who has connected; None for whoever shows no token where one is needed."""
+        if connected.family == socket.AF_UNIX:
+            return process_of(connected)
+        return holder(connected, shown, self.gate.access)
+
+    def _let_go(self) -> None:
+        """Let those go whose token holds no more."""
+        for client, visit in self._clients.items():
+            if not client.peer.may_stay(self.gate.access):
+                visit.connection.abort()
 
     def welcome(self, visit: Visit, said: Mapping[str, Any], /) -> Client:
         """Let a program in by its first message, and answer that. Raises Malformed."""
@@ -236,6 +295,8 @@ class Service:
             raise Malformed(f"versions {wanted} are not spoken here, but {list(VERSIONS)}", INVALID_PARAMS)
         if len(self._clients) >= MOST_CLIENTS:
             raise Malformed(TOO_MANY)
+        if not visit.peer.may_stay(self.gate.access):
+            raise Malformed("this token is known no more")
 
         def drop(stream: object) -> None:
             client.dropped[stream] = client.dropped.get(stream, 0) + 1
@@ -244,7 +305,7 @@ class Service:
         client = Client(self, visit.peer, self._count, Outbox(visit.connection, drop))
         del self._strangers[visit]
         self._clients[client] = visit
-        client.outbox.put(written({"id": said.get("id"), "result": self._about(max(common))}))
+        client.outbox.put(written({"id": said.get("id"), "result": self._about(client, max(common))}))
         return client
 
     def send_away(self, visit: Visit, /) -> None:
@@ -265,7 +326,7 @@ class Service:
         finally:
             del self._clients[client]
 
-    def _about(self, version: int) -> dict[str, Any]:
+    def _about(self, client: Client, version: int) -> dict[str, Any]:
         """Return what a program is told of the line."""
         owner = self._served.owner
         nodes = [
@@ -279,13 +340,15 @@ class Service:
         ]
         return {
             "version": version,
+            "now": self.bus.now(),
             "name": owner.name,
             "line": owner.port,
             "baudrate": owner.baudrate,
             "framing": owner.framing,
             "echo": owner.echo,
+            "tcp": self.tcp_address,
             "process": owner.pid,
-            "read_only": self.gate.read_only,
+            "read_only": self.gate.read_only or not client.permission.writes,
             "clients": len(self._clients),
             "nodes": nodes,
         }

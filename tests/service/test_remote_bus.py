@@ -34,7 +34,10 @@ from busmaster.errors import (
 )
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.service.failures import error_of, said_error
+from busmaster.service.link import Link
 from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, served, until
+
+TAKE = Link._take
 
 
 def test_a_handle_reads_and_writes_on_another_programs_line(tmp_path: Path) -> None:
@@ -390,7 +393,11 @@ def test_limits_and_the_safe_state_stay_with_the_owner(tmp_path: Path) -> None:
         "{",
     ],
 )
-def test_an_answer_that_is_not_understood_leaves_nobody_waiting(said: str, tmp_path: Path) -> None:
+def test_an_answer_that_is_not_understood_leaves_nobody_waiting(
+    said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Link, "_take", TAKE)  # it is not held against the schema
+
     async def story(line: Served, remote: RemoteBus) -> None:
         writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
         await line.sent()
@@ -404,9 +411,8 @@ def test_an_answer_that_is_not_understood_leaves_nobody_waiting(said: str, tmp_p
 def test_a_sample_of_a_program_serves_until_a_write_by_whatever_program_has_made_it_stale(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         mine, theirs = Hcp2Controller(remote, 5).point("1"), Hcp2Controller(line.bus, 5).point("1")
-        line.bus.poll_group("the owner's", period=60, points=[theirs])
         assert await mine.read(max_age=60) == 0
-        group = await remote.poll_group("mine", period=60, points=[mine])
+        group = await remote.poll_group("mine", period=60, points=[mine], phase=0)
         snapshot = await anext(aiter(group))
         exchanges = line.bus.statistics().exchanges
         assert mine.node.latest(mine) is snapshot[mine]
