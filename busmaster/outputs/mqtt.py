@@ -14,9 +14,10 @@
     PREFIX/audit              each write, by whatever door: who, what, when, what became of it
 
 In names +, # and % are written %2B, %23 and %25. A command is written within a second of its arrival, or by `expires`
-or the message's own expiry where it has one; an older one is refused. Times are seconds since 1970. What was not
-acknowledged when the broker went away is sent again when it is back. With `spill`, what waits for it does so on disk,
-and is sent by the next process if this one ends before.
+or the message's own expiry where it has one; an older one is refused. What is not allowed comes on a connection of its
+own, so that no flood of it holds up what is. Times are seconds since 1970. What was not acknowledged when the broker
+went away is sent again when it is back. With `spill`, what waits for it does so on disk, and is sent by the next
+process if this one ends before.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from busmaster.gate.gate import Gate, Wish
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import PAUSE, TICK, Item, check_extra, size_of
 from busmaster.outputs.mqtt_commands import Answer, Commands, Inbox
-from busmaster.outputs.mqtt_connection import secrets, taking_in, unread
+from busmaster.outputs.mqtt_connection import secrets, taking_in, topic_part, unread
 from busmaster.outputs.mqtt_forbidden import Forbidden
 from busmaster.outputs.settings import MqttSettings
 from busmaster.outputs.spilling import SpillingOutput
@@ -396,8 +397,3 @@ class MqttOutput(SpillingOutput):
     async def _answer(self, client: Client, answer: Answer) -> None:
         topic = self._topic("result", answer.name) if answer.name else self._topic("result")
         await self._send(client, [Outgoing(topic, json_line(**answer.fields))])
-
-
-def topic_part(name: str) -> str:
-    """Return the name without what has a meaning in topics. Two names stay two."""
-    return name.replace("%", "%25").replace("+", "%2B").replace("#", "%23")

@@ -1,4 +1,4 @@
-"""What connections to a broker have in common: who we are, how much it may send ahead, what has come."""
+"""What connections to a broker have in common: who we are, what names are called, how much may come."""
 
 from __future__ import annotations
 
@@ -51,3 +51,8 @@ def unread(client: Client) -> int:
         return 0
     [waiting] = struct.unpack("i", fcntl.ioctl(connection, termios.FIONREAD, bytes(4)))
     return int(waiting) + (connection.pending() if isinstance(connection, ssl.SSLSocket) else 0)
+
+
+def topic_part(name: str) -> str:
+    """Return the name without what has a meaning in topics. Two names stay two."""
+    return name.replace("%", "%25").replace("+", "%2B").replace("#", "%23")
