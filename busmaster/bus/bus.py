@@ -258,6 +258,11 @@ class Bus:
         return self._line.on_stop
 
     @property
+    def on_touched(self) -> list[Callable[[NodeRecord, float], None]]:
+        """Return those who are told, at once, of which node a write is over, and when it ended."""
+        return self._line.on_touched
+
+    @property
     def groups(self) -> tuple[PollGroup, ...]:
         return tuple(self._groups.values())
 

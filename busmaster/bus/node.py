@@ -273,6 +273,22 @@ class Node:
         async with limiter.passing(self, command, chosen, stop) as left:
             return (await self._timed(command, left, touches, stops_seen, journey))[0]
 
+    def begin_reading(
+        self, command: Command[T], journey: Journey, *, stops_seen: int | None = None, **options: Unpack[CommandOptions]
+    ) -> asyncio.Future[T]:
+        """Begin a request of what writes nothing, and return its future: who cancels that calls `give_up` too.
+
+        Raises what `request` raises before anything is sent.
+        """
+        chosen = self._options(options) if options else ORDINARY
+        journey.transaction, future = self._start(command, chosen, stops_seen=stops_seen)
+        return future
+
+    def give_up(self, journey: Journey) -> None:
+        """Cancel what nobody waits for any more."""
+        if journey.transaction is not None:
+            self._give_up(journey.transaction)
+
     async def _timed(
         self,
         command: Command[T],

@@ -47,6 +47,8 @@ class SharedLine:
         self.loop_runs: Callable[[], bool] = lambda: False
         self.on_stop: list[Callable[[NodeRecord], None]] = []
         """Told, at once, when a node is told to stop."""
+        self.on_touched: list[Callable[[NodeRecord, float], None]] = []
+        """Told, at once, of which node a write is over, and when it ended."""
         self.latest_of: dict[str, Snapshot] = {}
         """The latest snapshot of each poll group, by the group's name."""
         self.answers_of: dict[str, list[Answer]] = {}
@@ -171,6 +173,8 @@ class SharedLine:
             # what has another name, or is read in another run, may share a place with it
             for place in write.command.changes(write.node.profile):
                 self._touched[write.touches[0], place] = when
+        for told in self.on_touched:
+            told(write.node, when)
 
     def written_since(self, node: NodeRecord, started: float) -> bool:
         """Return whether a write to this node, or to a point of it, has ended since then."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
+from math import inf
 from types import TracebackType
 from typing import Any, TypeVar, Unpack
 
@@ -16,28 +18,30 @@ from busmaster.bus.limits import Limit
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, RequestOptions
 from busmaster.bus.samples import Sample
-from busmaster.bus.snapshots import Snapshot, Stream
+from busmaster.bus.snapshots import Stream
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.planning.merging import Merge
-from busmaster.service.link import TCP, Asked, Link
+from busmaster.service.link import TCP, Link
 from busmaster.service.messages import MOST_CHECKED, said_timings, value_of
+from busmaster.service.remote_group import RemoteGroup
 from busmaster.service.remote_overview import RemoteOverview
 from busmaster.service.safe import outcomes_of
 from busmaster.service.telling import (
     event_of,
-    point_of,
     protocol_of,
     said_points,
-    snapshot_of,
     statistics_of,
 )
 
 T = TypeVar("T")
 EVENT_BUFFER = 256
+POINTS_IN_A_MESSAGE = 50
+LEFT_OUT = ("verify", "safe")
+"""Options that are of no use on another's line: where they are said, they are false."""
 
 
 def connect(address: str, *, token: str | None = None) -> RemoteBus:
@@ -84,12 +88,13 @@ class RemoteNode:
         self._bus.link.tell("stop", {"protocol": self.profile.name, "address": self.address})
 
     def now(self) -> float:
-        """Return the time of the line's clock, in seconds: that of the machine, which is the same for all programs."""
+        """Return the time of the line's clock, in seconds: that of its owner's machine."""
         return self._bus.now()
 
-    def latest(self, point: Hashable, /) -> Sample[Any] | None:
-        """Return None: only the line knows of every write that makes a sample stale."""
-        return None
+    def latest(self, point: Any, /) -> Sample[Any] | None:
+        """Return the youngest good sample of a point in this program's poll groups, unless a write, by whatever
+        program, has made it stale: any write to the node does."""
+        return self._bus.latest(point)
 
     def merge_reads(self, merge: Merge, /) -> None:
         """Have the profile propose `merge`. What is merged on the line is its owner's affair."""
@@ -127,8 +132,8 @@ class RemoteNode:
         if chosen.safe:
             raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
         params = self._said(command, options, touches, stops_seen, stop)
-        link = self._bus.opened(self, str(command))
-        asked = link.ask("request", params, writes=command.writes, node=self, command=str(command))
+        link = self._bus.opened(self, command)
+        asked = link.ask("request", params, writes=command.writes, node=self, command=command)
         value: T = value_of(await link.answer(asked, chosen.finish_within))
         return value
 
@@ -141,10 +146,10 @@ class RemoteNode:
         stop: bool,
     ) -> dict[str, Any]:
         params: dict[str, Any] = {
-            "protocol": self.profile.name,
-            "address": self.address,
+            "protocol": self._profile.name,
+            "address": self._address,
             "command": self._protocol.write_down(command),
-            "asked": self.now(),
+            "asked": self._bus.now(),
         }
         if touches is not None:
             params["touches"] = self._protocol.write_down(touches)
@@ -152,83 +157,15 @@ class RemoteNode:
             params["stops_seen"] = stops_seen
         if stop:
             params["stop"] = True
-        if given := {name: value for name, value in options.items() if value is not None and name not in LEFT_OUT}:
-            params["options"] = given
+        if options:
+            given = {name: value for name, value in options.items() if value is not None}
+            params["options"] = {name: given[name] for name in given if name not in LEFT_OUT}
         return params
 
     def said_check(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
         """Return writes of this node as the line is asked whether it would take them."""
         said = [self._protocol.write_down(command) for command in commands]
         return {"protocol": self.profile.name, "address": self.address, "commands": said, "stop": stop}
-
-
-LEFT_OUT = ("verify", "safe")
-
-
-class RemoteGroup:
-    """A poll group of the line. Iterate it, or look at `latest`; close it when it is not read any more."""
-
-    def __init__(self, bus: RemoteBus, name: str, number: int, points: tuple[Point[Any], ...]) -> None:
-        self.name = name
-        self.period = 0.0
-        self.latest: Snapshot | None = None
-        """That of its last cycle."""
-        self.dropped = 0
-        """Cycles that this program was too slow for, counted by the line's owner."""
-        self._bus = bus
-        self._number = number
-        self._own = points
-        self._points = points
-        self._set = -1
-        self._consumers: list[Stream[Snapshot]] = []
-        self._over = False
-
-    @property
-    def points(self) -> tuple[Point[Any], ...]:
-        return self._points
-
-    def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
-        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
-        if self._over:
-            raise BusClosed(f"poll group {self.name!r} is closed")
-        return Stream(self._consumers, buffer)
-
-    async def __aiter__(self) -> AsyncIterator[Snapshot]:
-        consumer = self.subscribe()
-        try:
-            async for snapshot in consumer:
-                yield snapshot
-        finally:
-            consumer.close()
-
-    def close(self) -> None:
-        """Read it no more; one that this program made ends."""
-        if not self._over:
-            self._bus.end_stream(self._number)
-
-    def hear(self, method: str, params: Mapping[str, Any]) -> None:
-        """Take what the line's owner says of it."""
-        body = params["body"]
-        for consumer in self._consumers:
-            consumer.dropped += params["dropped"] - self.dropped
-        self.dropped = params["dropped"]
-        if method == "points":
-            self._set = body["set"]
-            # By its own points, a program gets the values that they decode.
-            if not self._own:
-                self._points = tuple(point_of(said, self._bus.find) for said in body["points"])
-        elif method == "snapshot" and body["set"] == self._set:
-            self.latest = snapshot_of(body, self.name, self._points)
-            for consumer in self._consumers:
-                consumer.put(self.latest)
-        elif method == "ended":
-            self._bus.end_stream(self._number)
-
-    def end(self) -> None:
-        """End those who read it, after what they hold."""
-        self._over = True
-        for consumer in list(self._consumers):
-            consumer.close()
 
 
 class RemoteBus:
@@ -253,12 +190,16 @@ class RemoteBus:
         self.about: Mapping[str, Any] = {}
         """What the owner says of the line: its name, settings and process."""
         self._link: Link | None = None
+        self._ahead = 0.0
+        """Seconds by which the clock of the owner's machine is ahead of this one, less what its hello took to come."""
         self._nodes: dict[tuple[str, int], RemoteNode] = {}
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
         """Those of them of which the owner knows."""
         self._streams: dict[int, RemoteGroup | RemoteOverview] = {}
         self._count = 0
+        self._touched: dict[tuple[str, int], float] = {}
+        """When the last write to a node ended."""
         self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
         self._prepared: list[tuple[RemoteNode, tuple[Command[Any], ...], bool]] = []
@@ -271,6 +212,8 @@ class RemoteBus:
         self._link = link
         said = await link.open(sys.argv[0])
         self.about, self.line = said, said["line"]
+        if self.address.startswith(TCP):  # another machine, perhaps: its clock began at another moment
+            self._ahead = said["now"] - time.monotonic()
         for known in said["nodes"]:
             node = self._nodes.get((known["protocol"], known["address"]))
             if node is not None:
@@ -299,10 +242,10 @@ class RemoteBus:
             raise BusClosed("the bus is not open")
         return self._link
 
-    def opened(self, node: RemoteNode, command: str) -> Link:
+    def opened(self, node: RemoteNode, command: Command[Any]) -> Link:
         """Return the connection for a request. Raises BusClosed, naming it, before the bus is entered."""
         if self._link is None:
-            raise BusClosed("the bus is not open", node=node, command=command)
+            raise BusClosed("the bus is not open", node=node, command=str(command))
         return self._link
 
     def prepare(self, node: RemoteNode, commands: tuple[Command[Any], ...], stop: bool) -> None:
@@ -311,8 +254,8 @@ class RemoteBus:
             self._prepared.append((node, commands, stop))
 
     def now(self) -> float:
-        """Return the time of the line's clock, in seconds: that of the machine, which is the same for all programs."""
-        return time.monotonic()
+        """Return the time of the line's clock, in seconds: that of its owner's machine."""
+        return time.monotonic() + self._ahead
 
     # nodes
 
@@ -388,10 +331,20 @@ class RemoteBus:
         priority: Priority = Priority.POLL,
     ) -> RemoteGroup:
         """Have `points` read every `period` seconds, as `Bus.poll_group`; it ends with this program."""
-        wanted = tuple(points)
-        params: dict[str, Any] = {"name": name, "period": period, "points": said_points(wanted)}
-        params |= {"phase": phase, "priority": priority}
-        return await self._follow("poll", name, wanted, params)
+        params = {"name": name, "period": period, "phase": phase, "priority": priority}
+        return await self._follow("poll", name, tuple(points), params)
+
+    def latest(self, point: Point[T]) -> Sample[T] | None:
+        """Return the youngest good sample of a point in a poll group of this program, unless a write to its node, by
+        whatever program, has ended since it was read."""
+        node, profile = point.node, point.node.profile
+        addresses = (node.address,) if profile.broadcast is None else (node.address, profile.broadcast)
+        touched = [self._touched.get((profile.name, address), -inf) for address in addresses]
+        groups = [stream for stream in self._streams.values() if isinstance(stream, RemoteGroup)]
+        snapshots = [group.latest for group in groups if group.own and group.latest is not None]
+        samples = [snapshot.samples[point] for snapshot in snapshots if point in snapshot.samples]
+        good = (one for one in samples if one.error is None and one.started is not None and one.started > max(touched))
+        return max(good, key=lambda one: one.finished, default=None)
 
     async def enter_safe_state(self, values: Mapping[str, float]) -> dict[str, BusError | None]:
         """Have the line's owner send its safe state, and return by point why it was not confirmed, None if it was.
@@ -438,10 +391,16 @@ class RemoteBus:
     ) -> RemoteGroup:
         self._count += 1
         number = self._count
-        group = self._streams[number] = RemoteGroup(self, name, number, points)
-        asked: Asked = self.link.ask(method, {**params, "stream": number})
+        group = RemoteGroup(name, points, find=self.find, end=partial(self.end_stream, number))
+        self._streams[number] = group
+        said = said_points(points)
         try:
-            group.period = (await self.link.answer(asked))["period"]
+            while len(said) > POINTS_IN_A_MESSAGE:
+                await self._ask("gather", {"stream": number, "points": said[:POINTS_IN_A_MESSAGE]})
+                del said[:POINTS_IN_A_MESSAGE]
+            if said:
+                params = {**params, "points": said}
+            group.period = (await self._ask(method, {**params, "stream": number}))["period"]
         except BaseException:
             self.end_stream(number)
             raise
@@ -452,6 +411,8 @@ class RemoteBus:
             node = self._nodes.get((params["protocol"], params["address"]))
             if node is not None:
                 node.stops = params["stops"]
+        elif method == "touched":
+            self._touched[params["protocol"], params["address"]] = params["when"]
         elif method == "event":
             event = event_of(params["body"], self.find)
             for stream in self._events:
@@ -463,5 +424,6 @@ class RemoteBus:
     def _lost(self) -> None:
         for listener in list(self._streams.values()):
             listener.end()
+        self._streams.clear()  # what is written from now on is not heard of any more
         for stream in list(self._events):
             stream.close()

@@ -268,7 +268,7 @@ def test_a_poll_whose_owner_ends_says_so(file: Path, controllers: TcpServer) -> 
         process.terminate()
         _, err = polling.communicate(timeout=PATIENCE)
         assert polling.returncode == 1
-        assert "the connection to the program that owns the line was lost" in err
+        assert "the program that owns the line has ended" in err
 
 
 def test_nothing_is_written_through_an_owner_unless_all_may_be(

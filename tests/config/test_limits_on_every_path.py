@@ -174,7 +174,7 @@ def by_mqtt(name: str) -> Callable[[Plant, int], Awaitable[None]]:
 class Person:
     """Who looks at the line, and writes by a key."""
 
-    peer = Process(1, 0, (), "operator", "busmaster")
+    peer = Process(1, 0, (), "busmaster")
     permission = EVERYTHING
 
     def node(self, name: str, address: int, /) -> Node:
@@ -187,7 +187,9 @@ class Person:
 def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
         params = {"group": "all", "key": f"drive/{name}", "value": value}
-        await Errand.of(params, Person(), Service(plant.line.bus, gate=plant.line.gate)).run()
+        errand = Errand.of(params, Person(), Service(plant.line.bus, gate=plant.line.gate))
+        errand.begin(lambda _: None)
+        await errand.future
 
     return write
 
