@@ -13,13 +13,13 @@ from math import inf
 from typing import Any
 
 from busmaster.arbiter.backlog import Backlog
+from busmaster.arbiter.clients import Hold
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.endings import make_error, name_error, too_late
 from busmaster.arbiter.events import Event, Overdue, Polled, Sampled
 from busmaster.arbiter.expiries import Expiries
 from busmaster.arbiter.failing_transactions import FailingTransactions, take_out
-from busmaster.arbiter.clients import Hold
 from busmaster.arbiter.health import DOWN, UP, NodeRecord
 from busmaster.arbiter.node_watch import NodeWatch
 from busmaster.arbiter.probes import Probes

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import islice
 from math import inf
 
-from busmaster.arbiter.backlog import SEARCHED, SHARE, Backlog, new_queues
+from busmaster.arbiter.backlog import SHARE, Backlog, new_queues
 from busmaster.arbiter.clients import OWN, Hold, LineClient, turn_of
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo
-from busmaster.arbiter.transaction import BACKGROUND, PARKED, QUEUED, URGENT, Priority, Transaction
+from busmaster.arbiter.transaction import PARKED, QUEUED, URGENT, Priority, Transaction
 from busmaster.arbiter.turns import Turns
 from busmaster.arbiter.writes import Writes
 
@@ -80,8 +79,9 @@ class SharedBacklog(Backlog):
         if not isinstance(hold, Hold) or hold.holds or transaction.writes:
             return None
         write = self._writes.first_of(transaction.node, hold.client)
-        waits = write is not None and write.phase is QUEUED and write.queued <= transaction.queued
-        return write if waits else None
+        if write is None or write.client is hold or write.phase is not QUEUED or write.queued > transaction.queued:
+            return None
+        return write
 
     def _taken(self, transaction: Transaction | None, now: float) -> Transaction | None:
         """Note what goes next, and who pays for it."""
@@ -114,13 +114,20 @@ class SharedBacklog(Backlog):
     def pick(self, priority: Priority, suits: Callable[[Transaction], bool]) -> Transaction | None:
         """Take out the first of the first few of a class that suits, or return None; the others keep their places."""
         turns, hold = self._turns[priority], self.hold
-        found = turns.pick(suits) if hold is None or priority is URGENT else turns.pick_of(hold, suits)
+        if hold is None or priority is URGENT:
+            found = turns.pick(lambda one: self._write_before(one) is None and suits(one))
+        else:
+            found = turns.pick_of(hold, suits)
         return found and self._taken(found, self._since)
 
     def take(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
         """Take out one that suits, of whatever class, or return None: for what has to be asked now in any case."""
         hold = self.hold
-        found = super().take(suits if hold is None else lambda one: turn_of(one.client) is hold and suits(one))
+
+        def may(one: Transaction) -> bool:
+            return hold is None or turn_of(one.client) is hold
+
+        found = super().take(lambda one: may(one) and self._write_before(one) is None and suits(one))
         return found and self._taken(found, self._since)
 
     # holds
@@ -141,8 +148,6 @@ class SharedBacklog(Backlog):
         self._since = now
 
     def _hold_for(self, hold: Hold, priority: Priority) -> None:
-        if hold.holds:
-            return
         hold.priority = priority
         waiting = [transaction for turns in self._turns for transaction in turns if transaction.client is hold]
         for transaction in waiting:
