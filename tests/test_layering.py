@@ -47,6 +47,7 @@ OPEN: dict[str, set[str]] = {
             "arbiter",
             "backlog",
             "choice",
+            "clients",
             "counters",
             "echo",
             "events",
@@ -60,8 +61,8 @@ OPEN: dict[str, set[str]] = {
         *("tap", "transaction", "unasked"),
     },
     "bus": {
-        *("alarms", "bus", "handle", "limits", "meaning", "node", "points", "polling", "requester", "samples"),
-        *("snapshots", "suitability"),
+        *("alarms", "bus", "exclusive", "handle", "limits", "meaning", "node", "points", "polling", "requester"),
+        *("samples", "snapshots", "suitability"),
     },
     "capture": {"decode", "files", "frames", "pcapng", "recorder", "replay", "telegrams"},
     "cli": {""},

@@ -9,7 +9,7 @@ from busmaster.arbiter.backlog import SHARE, Backlog, new_queues
 from busmaster.arbiter.clients import OWN, Hold, LineClient, turn_of
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo
-from busmaster.arbiter.transaction import PARKED, QUEUED, URGENT, Priority, Transaction
+from busmaster.arbiter.transaction import COMMAND, PARKED, QUEUED, URGENT, Priority, Transaction
 from busmaster.arbiter.turns import Turns
 from busmaster.arbiter.writes import Writes
 
@@ -171,7 +171,10 @@ class SharedBacklog(Backlog):
         if hold.holds:
             self.hold = None
             self._deadlines.hold = inf
-            self._streak = SHARE
+            if hold.priority <= COMMAND:
+                self._streak = SHARE
+            if hold.priority == URGENT and hold.client is not OWN:
+                self._turns[URGENT].count_run(hold.client, URGENT_RUN)
             self._payer = None if self._last is None else self._payer
         for turns in self._turns:
             turns.forget(hold)

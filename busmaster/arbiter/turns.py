@@ -138,11 +138,11 @@ class Turns:
         if turn is self._next:
             self._next = None
 
-    def count_run(self, client: LineClient) -> None:
-        """Count that a client had a turn while lower classes waited."""
+    def count_run(self, client: LineClient, turns: int = 1) -> None:
+        """Count that a client had so many turns while lower classes waited."""
         turn = self._turns.get(client)
         if turn is not None:
-            turn.run += 1
+            turn.run += turns
 
     def begin_runs(self) -> None:
         """Note that a lower class had a turn."""

@@ -10,6 +10,7 @@ from threading import current_thread, get_ident
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.bus.alarms import Alarms
@@ -20,6 +21,7 @@ from busmaster.bus.requester import Requester
 from busmaster.bus.samples import Sample
 from busmaster.bus.snapshots import Snapshot
 from busmaster.errors import BusClosed, InvalidCommand
+from busmaster.planning import Sharing
 from busmaster.transport.pump import Pump
 
 CLOCK_WAS_SET = 0.005
@@ -37,6 +39,8 @@ class SharedLine:
         self.logbook = Logbook(name)
         self.limiter: Limiter | None = None
         """None while nothing is limited."""
+        self.clients = 0
+        """How many other programs share the line."""
         self.closed = False
         self.only_safe = False
         """Whether no write is accepted any more but those of the safe state."""
@@ -130,6 +134,26 @@ class SharedLine:
         self._written.pop(record, None)
         for touched in [what for what in self._touched if node in (what if isinstance(what, tuple) else (what,))]:
             del self._touched[touched]
+
+    def add_client(self, share: float) -> LineClient:
+        """Return a client, a program with which this one takes turns from now on; `share` weighs its line time."""
+        self.clients += 1
+        return self.arbiter.add_client(share)
+
+    def remove_client(self, client: LineClient) -> None:
+        """Forget a client: nothing is asked for it any more."""
+        self.clients -= 1
+        self.arbiter.remove_client(client)
+
+    @property
+    def sharing(self) -> Sharing:
+        """Return who shares the line, for the bounds of what a request waits."""
+        return Sharing(self.clients, self.arbiter.longest_hold)
+
+    def release(self, hold: Hold) -> None:
+        """Hold the line no longer for a sequence of requests."""
+        self.arbiter.release(hold, self.now())
+        self.pump.turn()
 
     def suspend(self, record: NodeRecord, seconds: float) -> None:
         """Do what `Node.suspend` does."""

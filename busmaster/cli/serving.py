@@ -26,7 +26,7 @@ async def served(line: ConfiguredLine, *, tell: bool) -> AsyncIterator[None]:
         yield
         return
     name = line_name(os.path.basename(line.file.path).removesuffix(".toml"))
-    service = Service(line.bus, gate=line.gate, name=name, mode=section.mode, group=section.group)
+    service = Service(line.bus, gate=line.gate, name=name, mode=section.mode, group=section.group, share=section.share)
     try:
         await service.__aenter__()
     except InvalidCommand as error:

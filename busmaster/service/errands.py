@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Collection, Hashable, Mapping
 from typing import Any, Protocol, cast
 
+from busmaster.arbiter.clients import LineClient
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Journey, Node
 from busmaster.bus.points import Point
@@ -34,6 +35,11 @@ class Line(Protocol):
     @property
     def gate(self) -> Gate: ...
 
+    @property
+    def share(self) -> float:
+        """What weighs the line time of each program: the owner's own share is 1."""
+        ...
+
     def broadcast_of(self, group: PollGroup, /) -> Broadcast:
         """Return what tells the cycles of a poll group."""
         ...
@@ -57,6 +63,10 @@ class Asker(Protocol):
         """Return a node of the line. Raises InvalidCommand."""
         ...
 
+    def client_of(self, sequence: int | None, node: Node, /) -> LineClient:
+        """Return whose turn a request takes: the program's, or that of its sequence. Raises InvalidCommand."""
+        ...
+
     def stops_before(self, node: Node, /) -> int:
         """Return the stops of a node from which this client counts."""
         ...
@@ -74,6 +84,7 @@ class Errand:
         *,
         line: Line,
         peer: Peer,
+        client: LineClient,
         stops_seen: int | None,
         stop: bool,
         asked: float,
@@ -85,6 +96,7 @@ class Errand:
         self._options = options
         self._line = line
         self._peer = peer
+        self._client = client
         self._stops_seen = stops_seen
         self._stop = stop
         self._asked = asked
@@ -109,6 +121,7 @@ class Errand:
             given,
             line=line,
             peer=asker.peer,
+            client=asker.client_of(params.get("sequence"), node),
             stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
             stop=params.get("stop") is True and _check_stop(node, command),
             asked=min(now, seconds(params.get("asked", now), "asked")),
@@ -163,6 +176,7 @@ class Errand:
             touches=self._touches,
             stops_seen=self._stops_seen,
             stop=self._stop,
+            client=self._client,
             **self._left(),
         )
 

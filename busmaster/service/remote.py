@@ -6,15 +6,17 @@ import asyncio
 import sys
 import time
 from collections.abc import AsyncIterator, Hashable, Iterable, Mapping
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, TypeVar, Unpack
 
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.bus.alarms import BusEvent
+from busmaster.bus.exclusive import checked_hold
 from busmaster.bus.limits import Limit
 from busmaster.bus.points import Point
-from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, RequestOptions
+from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, Requester, RequestOptions
 from busmaster.bus.samples import Sample
 from busmaster.bus.snapshots import Snapshot, Stream
 from busmaster.contract.exchange import Command
@@ -25,6 +27,7 @@ from busmaster.errors import BusClosed, InvalidCommand
 from busmaster.planning.merging import Merge
 from busmaster.service.link import Asked, Link
 from busmaster.service.messages import said_timings, value_of
+from busmaster.service.sequences import HeldRemoteNode, Room
 from busmaster.service.telling import (
     event_of,
     point_of,
@@ -113,16 +116,51 @@ class RemoteNode:
         If the connection is lost meanwhile, a write raises WriteUnconfirmed, or NotStarted where it was not handed over
         yet, and a read LineDown. Cancelling it cancels it there.
         """
+        return await self.ask(command, None, touches=touches, stops_seen=stops_seen, stop=stop, **options)
+
+    async def ask(
+        self,
+        command: Command[T],
+        sequence: int | None,
+        /,
+        *,
+        touches: Command[Any] | None,
+        stops_seen: int | None,
+        stop: bool,
+        **options: Unpack[CommandOptions],
+    ) -> T:
+        """Do what `request` does, within a sequence of this program, if it is given the number of one."""
         chosen = RequestOptions.of(options, self.label) if options else ORDINARY
         if chosen.verify:
             raise InvalidCommand(f"{self.label}: verify is for what writes a value through a handle")
         if chosen.safe:
             raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
-        params = self._said(command, options, touches, stops_seen, stop)
         link = self._bus.opened(self, str(command))
-        asked = link.ask("request", params, writes=command.writes, node=self, command=str(command))
-        value: T = value_of(await link.answer(asked, chosen.finish_within))
-        return value
+        # What is of a sequence waits for nothing else of this program, which waits for the sequence.
+        at_once = sequence is not None or chosen.priority is Priority.URGENT
+        async with self._bus.room.taken(chosen, self, str(command), at_once) as waited:
+            left: Mapping[str, Any] = {**options, **_shortened(chosen, waited)} if waited else options
+            params = self._said(command, left, touches, stops_seen, stop)
+            if sequence is not None:
+                params["sequence"] = sequence
+            asked = link.ask("request", params, writes=command.writes, node=self, command=str(command))
+            value: T = value_of(await link.answer(asked, left.get("finish_within")))
+            return value
+
+    @asynccontextmanager
+    async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[Requester]:
+        """Return, for `async with`, this node for one sequence of requests: see `Requester.exclusive`.
+
+        The line is held no longer than the connection lasts.
+        """
+        longest = checked_hold(max_hold, self.label)
+        sequence, link = self._bus.new_sequence(), self._bus.link
+        named = {"sequence": sequence, "protocol": self.profile.name, "address": self.address}
+        link.tell("hold", {**named, "max_hold": longest})
+        try:
+            yield HeldRemoteNode(self, self, sequence)
+        finally:
+            link.tell("release", {"sequence": sequence})
 
     def _said(
         self,
@@ -150,6 +188,12 @@ class RemoteNode:
 
 
 LEFT_OUT = ("verify", "safe")
+
+
+def _shortened(options: RequestOptions, by: float) -> dict[str, float]:
+    """Return what is left of the times of a request that has waited for so long."""
+    times = {"start_within": options.start_within, "finish_within": options.finish_within}
+    return {name: max(0.0, limit - by) for name, limit in times.items() if limit is not None}
 
 
 class RemoteGroup:
@@ -240,6 +284,9 @@ class RemoteBus:
         """Those of them of which the owner knows."""
         self._groups: dict[int, RemoteGroup] = {}
         self._count = 0
+        self._sequences = 0
+        self.room = Room(self.now)
+        """For what is asked: so much of it is under way at a time."""
         self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
 
@@ -270,6 +317,11 @@ class RemoteBus:
         if self._link is None:
             raise BusClosed("the bus is not open")
         return self._link
+
+    def new_sequence(self) -> int:
+        """Return the number of one more sequence of requests."""
+        self._sequences += 1
+        return self._sequences
 
     def opened(self, node: RemoteNode, command: str) -> Link:
         """Return the connection for a request. Raises BusClosed, naming it, before the bus is entered."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE
 from busmaster.arbiter.health import NodeRecord
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
@@ -56,8 +57,9 @@ class Service:
 
     `path` is the socket's; without it, it is NAME.sock in this user's runtime folder, where `name` is that of the
     line, by default its port's. Every write passes `gate`: without one, its own, which keeps a record in the log
-    "busmaster.audit". `mode` and `group`, a number, are the socket's. Entering raises InvalidCommand where the socket
-    is served by another process, which it names, or cannot be made.
+    "busmaster.audit". `mode` and `group`, a number, are the socket's. Each program takes turns with the others and with
+    this one; `share`, 0.1 to 10, weighs its line time: with 0.5, half as much as this one has, as long as both wait.
+    Entering raises InvalidCommand where the socket is served by another process, which it names, or cannot be made.
     """
 
     def __init__(
@@ -69,8 +71,12 @@ class Service:
         path: Path | str | None = None,
         mode: int = 0o600,
         group: int | None = None,
+        share: float = 1.0,
     ) -> None:
+        if isinstance(share, bool) or not LEAST_SHARE <= share <= MOST_SHARE:
+            raise InvalidCommand(f"a program's share is a number from {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share!r}")
         self.bus = bus
+        self.share = share
         self.gate = gate or Gate(bus)
         self.name = name or line_name(bus.endpoint.name)
         self.refused = 0

@@ -1,0 +1,95 @@
+"""What a program asks of a line that it does not own: so many requests at a time, some of them in a sequence."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any, Protocol, TypeVar, Unpack
+
+from busmaster.bus.exclusive import HeldNode
+from busmaster.bus.requester import CommandOptions, Requester, RequestOptions
+from busmaster.contract.exchange import Command
+from busmaster.errors import NotStarted
+from busmaster.service.messages import MOST_UNDER_WAY
+
+T = TypeVar("T")
+
+
+class Room:
+    """Lets so many requests of a program be under way; the others wait here, in their order, as long as they may."""
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._free = asyncio.Semaphore(MOST_UNDER_WAY)
+        self._now = now
+
+    @asynccontextmanager
+    async def taken(
+        self, options: RequestOptions, node: Requester, command: str, at_once: bool
+    ) -> AsyncIterator[float]:
+        """Wait for room, unless it is to go `at_once`, and yield how many seconds that took.
+
+        Raises NotStarted if the time of the request is over before.
+        """
+        if at_once:
+            yield 0.0
+            return
+        waited = 0.0
+        if self._free.locked():
+            began = self._now()
+            limits = [limit for limit in (options.start_within, options.finish_within) if limit is not None]
+            try:
+                async with asyncio.timeout(min(limits, default=None)):
+                    await self._free.acquire()
+            except TimeoutError:
+                what = f"{MOST_UNDER_WAY} requests of this program are not answered yet, and its time was over"
+                raise NotStarted(what, node=node, command=command) from None
+            waited = self._now() - began
+        else:
+            await self._free.acquire()
+        try:
+            yield waited
+        finally:
+            self._free.release()
+
+
+class AsksInSequence(Protocol):
+    """A node of a line that another program owns."""
+
+    async def ask(
+        self,
+        command: Command[T],
+        sequence: int,
+        /,
+        *,
+        touches: Command[Any] | None,
+        stops_seen: int | None,
+        stop: bool,
+        **options: Unpack[CommandOptions],
+    ) -> T:
+        """Run one command within a sequence."""
+        ...
+
+
+class HeldRemoteNode(HeldNode):
+    """A node of a line that another program owns, within one sequence."""
+
+    def __init__(self, node: Requester, asks: AsksInSequence, sequence: int) -> None:
+        super().__init__(node)
+        self._asks = asks
+        self._sequence = sequence
+
+    async def request(
+        self,
+        command: Command[T],
+        /,
+        *,
+        touches: Command[Any] | None = None,
+        stops_seen: int | None = None,
+        stop: bool = False,
+        **options: Unpack[CommandOptions],
+    ) -> T:
+        """Run one command within the sequence, see `HeldNode.request`."""
+        return await self._asks.ask(
+            command, self._sequence, touches=touches, stops_seen=stops_seen, stop=stop, **options
+        )
