@@ -133,7 +133,8 @@ def plan(
     """Reckon what becomes of these poll groups on this line.
 
     `others` may be asked beside them: the worst case reckons with those, and with every node's probe. `could_merge`
-    are merges to be weighed that no group opts in to. `sharing` says who else has the line. Raises InvalidCommand for a period or phase that cannot be.
+    are merges to be weighed that no group opts in to. `sharing` says who else has the line. Raises InvalidCommand for a
+    period or phase that cannot be.
     """
     return at_once(
         plan_steps(
