@@ -293,6 +293,7 @@ class Dispatcher:
             left = backlog.end_hold(hold, now)
             self.failing.add(left, HoldEnded(f"the {hold.longest:g} s for which the line was held for it are over"))
             self.fail_more(now)
+            self.writes.wake(hold.node, hold.client)
 
     # everything at once
 

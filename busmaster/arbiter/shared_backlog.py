@@ -59,17 +59,19 @@ class SharedBacklog(Backlog):
         self.note_time(now)
         urgent = self._turns[URGENT]
         self._urgent_yields = urgent.live > 0 and len(self) > urgent.live and urgent.shortest_run() >= URGENT_RUN
-        transaction = super().pop(now) if self.hold is None else self._pop_within(self.hold)
+        transaction = super().pop(now) if self.hold is None else self._pop_within(self.hold, now)
         while transaction is not None and (write := self._write_before(transaction)) is not None:
             self.restore(transaction)
             self.promote(write, transaction.priority)
             transaction = super().pop(now)
         return self._taken(transaction, now)
 
-    def _pop_within(self, hold: Hold) -> Transaction | None:
+    def _pop_within(self, hold: Hold, now: float) -> Transaction | None:
         urgent, *lower = self._turns
         if urgent.live and not self._urgent_yields:
             return urgent.pop()
+        if now >= self._deadlines.hold:  # it ends next
+            return None
         of_hold = (turns.pop_of(hold) for turns in lower)
         return next((transaction for transaction in of_hold if transaction is not None), None)
 
@@ -179,7 +181,6 @@ class SharedBacklog(Backlog):
         for turns in self._turns:
             turns.forget(hold)
         hold.holds, hold.over = False, True
-        self._writes.wake(hold.node, hold.client)
         return left
 
     def _left(self, hold: Hold) -> Iterator[Transaction]:

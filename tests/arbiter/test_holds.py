@@ -217,6 +217,20 @@ def test_r6_a_caller_of_a_sequence_may_go() -> None:
     assert other.error is None
 
 
+def test_r8_what_waits_of_a_sequence_that_is_left_before_it_began_ends_once() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    other = bench.ask(table.there)
+    waiting = [bench.ask(table.node, command, client=hold) for command in (WRITE, hcp2.Read(1), WRITE)]
+    table.release(hold)
+    bench.served(other)
+    assert table.is_silent()
+    for transaction in waiting:
+        assert bench.ended(transaction) == 1
+        assert isinstance(transaction.error, HoldEnded)
+    assert bench.served(bench.ask(table.node, WRITE)).error is None
+
+
 def test_a_sequence_that_never_sent_anything_held_nothing() -> None:
     table = Table()
     hold = table.hold()

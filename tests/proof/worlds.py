@@ -86,6 +86,22 @@ def lines() -> Iterator[Setup]:
     yield replace(_line("hcp2", IDLE), depth=2)
 
 
+def shared() -> Iterator[Setup]:
+    """Lines that programs share, and hold for sequences of requests."""
+    one = replace(_line(), clients=1, depth=2)
+    yield one
+    for feature in (LOST, NAKS, CANCELS, URGENT, LOSS, FLIPS):
+        yield replace(one, adversary=(feature,))
+    yield replace(one, retries=1, adversary=(LOST,), commands=(WRITE,))
+    held = replace(_line(), longest_hold=0.3)
+    yield held
+    for feature in (LOST, NAKS, CANCELS, URGENT, LOSS, FLIPS):
+        yield replace(held, adversary=(feature,))
+    yield replace(held, clients=1, commands=(WRITE,))
+    yield replace(held, retries=1, adversary=(LOST,), commands=(READ,))
+    yield replace(held, depth=1, adversary=(CANCELS,), commands=(WRITE,))
+
+
 def packets() -> Iterator[Setup]:
     """MSC: packets damaged, said again, and the host's ACK lost."""
     yield replace(_line("msc"), damage=DAMAGE)
@@ -121,6 +137,7 @@ def in_step() -> Iterator[Setup]:
 GROUPS = {
     "quick": quick,
     "lines": lines,
+    "shared": shared,
     "packets": packets,
     "pairs": pairs,
     "msc pairs": msc_pairs,
