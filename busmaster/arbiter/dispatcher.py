@@ -16,7 +16,7 @@ from busmaster.arbiter.backlog import Backlog
 from busmaster.arbiter.clients import Hold
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.endings import make_error, name_error, too_late
+from busmaster.arbiter.endings import hold_ended, make_error, name_error, too_late
 from busmaster.arbiter.events import Event, Overdue, Polled, Sampled
 from busmaster.arbiter.expiries import Expiries
 from busmaster.arbiter.failing_transactions import FailingTransactions, take_out
@@ -47,7 +47,6 @@ from busmaster.errors import (
     BacklogFull,
     BusError,
     GarbledReply,
-    HoldEnded,
     NodeDown,
     NoReply,
     Refused,
@@ -290,9 +289,8 @@ class Dispatcher:
         backlog = self.share()
         hold = hold or backlog.hold
         if hold is not None:
-            left = backlog.end_hold(hold, now)
-            self.failing.add(left, HoldEnded(f"the {hold.longest:g} s for which the line was held for it are over"))
-            self.fail_more(now)
+            for transaction in backlog.end_hold(hold, now):
+                self._end(transaction, now, hold_ended(transaction, hold))
             self.writes.wake(hold.node, hold.client)
 
     # everything at once

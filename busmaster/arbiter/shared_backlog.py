@@ -9,7 +9,7 @@ from busmaster.arbiter.backlog import SHARE, Backlog, new_queues
 from busmaster.arbiter.clients import OWN, Hold, LineClient, turn_of
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo
-from busmaster.arbiter.transaction import COMMAND, PARKED, QUEUED, URGENT, Priority, Transaction
+from busmaster.arbiter.transaction import COMMAND, FAILING, QUEUED, URGENT, Priority, Transaction
 from busmaster.arbiter.turns import Turns
 from busmaster.arbiter.writes import Writes
 
@@ -140,13 +140,10 @@ class SharedBacklog(Backlog):
             turns, client = self._payer
             turns.charge(client, now - self._since)
         last = self._last
-        if (
-            last is not None
-            and last.attempts > self._attempts
-            and isinstance(last.client, Hold)
-            and not last.client.over
-        ):
-            self._hold_for(last.client, last.priority)
+        if last is not None and last.attempts > self._attempts:
+            hold = last.client
+            if isinstance(hold, Hold) and not (hold.holds or hold.over):
+                self._hold_for(hold, last.priority)
         self._since = now
 
     def _hold_for(self, hold: Hold, priority: Priority) -> None:
@@ -169,7 +166,9 @@ class SharedBacklog(Backlog):
         left = list(self._left(hold))
         for transaction in left:
             if transaction.phase is QUEUED:
-                self.discard(transaction, PARKED)
+                self.discard(transaction, FAILING)
+            else:
+                transaction.phase = FAILING
         if hold.holds:
             self.hold = None
             self._deadlines.hold = inf

@@ -121,6 +121,22 @@ def test_a_sequence_ends_when_its_time_is_over_and_what_it_asks_then_is_not_sent
     bench.served(other)
 
 
+def test_a_sequence_that_goes_on_asking_ends_all_the_same() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    began = bench.now
+    other = bench.ask(table.there, hcp2.Read(30), priority=BACKGROUND)
+    while not other.attempts:
+        if hold.over:
+            bench.until_sent()
+            break
+        read = bench.ask(table.node, hcp2.Read(1 + bench.checks), client=hold)
+        bench.served(read)
+        bench.wait(0.03)
+    bench.served(other)
+    assert other.started - began <= LONGEST + 0.2
+
+
 def test_what_waits_of_a_sequence_whose_time_is_over_ends_truthfully() -> None:
     table = Table()
     bench, hold = table.bench, table.hold(longest=0.1)
