@@ -38,6 +38,8 @@ LONGEST = 1800.0
 """Virtual seconds after which the faults heal, however few transactions there were."""
 RECOVERY = 240.0
 """Likewise in which everything must go well again (R11: probes are up to 36 s apart, and paid for)."""
+SOON = 1e-6
+"""Seconds: the line does what is due before."""
 PAUSE = 0.05
 """Seconds after which a client whose request failed at once asks again."""
 PERIODS = (0.1, 0.25, 0.5, 1.0)
@@ -447,7 +449,7 @@ class Hunt:
     def _check_nothing_is_open(self) -> None:
         """R13: whatever waited has failed, so many at once."""
         if self.world.arbiter.failing:
-            self.world.at(self.world.now, self._check_nothing_is_open)
+            self.world.at(self.world.now + SOON, self._check_nothing_is_open)
         elif self.open:
             self.judge.problem(f"R13: {len(self.open)} requests are still open on a port that is gone")
 
