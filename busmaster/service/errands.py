@@ -17,7 +17,9 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
 from busmaster.gate.gate import FRESH, Gate, Wish
+from busmaster.gate.permission import Permission
 from busmaster.service.peers import Peer
+from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast
 from busmaster.service.telling import protocol_of
 
@@ -40,6 +42,9 @@ class Line(Protocol):
         """What weighs the line time of each program: the owner's own share is 1."""
         ...
 
+    @property
+    def safe_wishes(self) -> SafeWishes: ...
+
     def broadcast_of(self, group: PollGroup, /) -> Broadcast:
         """Return what tells the cycles of a poll group."""
         ...
@@ -58,6 +63,9 @@ class Asker(Protocol):
 
     @property
     def peer(self) -> Peer: ...
+
+    @property
+    def permission(self) -> Permission: ...
 
     def node(self, name: str, address: int, /) -> Node:
         """Return a node of the line. Raises InvalidCommand."""
@@ -83,7 +91,7 @@ class Errand:
         options: CommandOptions,
         *,
         line: Line,
-        peer: Peer,
+        asker: Asker,
         client: LineClient,
         stops_seen: int | None,
         stop: bool,
@@ -95,7 +103,7 @@ class Errand:
         self._touches = touches
         self._options = options
         self._line = line
-        self._peer = peer
+        self._asker = asker
         self._client = client
         self._stops_seen = stops_seen
         self._stop = stop
@@ -120,7 +128,7 @@ class Errand:
             None if touches is None else protocol.read_back(touches),
             given,
             line=line,
-            peer=asker.peer,
+            asker=asker,
             client=asker.client_of(params.get("sequence"), node),
             stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
             stop=params.get("stop") is True and _check_stop(node, command),
@@ -130,6 +138,17 @@ class Errand:
     @property
     def text(self) -> str:
         return str(self.command)
+
+    def check(self) -> None:
+        """Raise InvalidCommand for a write that would be refused now: a record is kept of that."""
+        wish = self._wish()
+        try:
+            if self.command.writes and (refusal := self._line.gate.refusal(wish)):
+                raise InvalidCommand(f"{self.node.label}: {refusal}")
+            self.node.check(self.command, stop=self._stop)
+        except InvalidCommand as error:
+            self._line.gate.refuse(wish, str(error))
+            raise
 
     async def run(self) -> Any:
         """Run it and return its value. Raises BusError or InvalidCommand; every write passes the gate."""
@@ -200,7 +219,15 @@ class Errand:
             if point is not None:
                 value = _value(point, changes, value)
         point = point or Point(self.node, self.text, command)
-        return Wish(door=DOOR, by=str(self._peer), name=point.key, point=point, value=value)
+        return Wish(
+            door=DOOR,
+            by=str(self._asker.peer),
+            name=point.key,
+            point=point,
+            value=value,
+            command=command,
+            permission=self._asker.permission,
+        )
 
 
 def _check_stop(node: Node, command: Command[Any]) -> bool:

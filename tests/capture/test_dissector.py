@@ -345,7 +345,7 @@ def test_a_character_with_bit_7_set_acknowledges_where_that_bit_is_parity_and_no
         "dc104": "02 55 02 FF FF 55",
         "mentor": "04 31 31 34 34 02 30 31 31 37 2B 30 34 37 36 35 03 3F",
     }
-    packets = []
+    packets: list[Packet] = []
     for protocol, request in asked.items():
         packets += [packet(len(packets), protocol, HOST, request), packet(len(packets) + 1, protocol, NODE, "86")]
     rows = dissect(tmp_path, packets, "busmaster.ack", EXPERT)

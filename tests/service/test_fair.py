@@ -181,10 +181,10 @@ def test_a_sequence_ends_with_its_program(tmp_path: Path) -> None:
             assert isinstance(hold, Hold)
             waits = asyncio.ensure_future(Hcp2Controller(remote, 6).read(1))
             await until(lambda: len(asked) == 2)
-            assert not hold.over
+            assert not held_no_longer(hold)
             other.link._connection.transport.abort()  # type: ignore[union-attr]
             await waits
-            assert hold.over
+            assert held_no_longer(hold)
             with pytest.raises(BusError):
                 await held.read(1)
 
