@@ -60,7 +60,7 @@ OPEN: dict[str, set[str]] = {
             "schedule",
             "state",
         ),
-        *("tap", "transaction", "unasked"),
+        *("tap", "transaction", "turns", "unasked"),
     },
     "bus": {
         *("alarms", "bus", "exclusive", "handle", "limits", "meaning", "node", "points", "polling", "requester"),

@@ -6,7 +6,7 @@ import asyncio
 import sys
 import time
 from collections.abc import AsyncIterator, Hashable, Iterable, Mapping
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, TypeVar, Unpack
@@ -28,7 +28,7 @@ from busmaster.planning.merging import Merge
 from busmaster.service.link import TCP, Asked, Link
 from busmaster.service.messages import MOST_CHECKED, said_timings, value_of
 from busmaster.service.safe import outcomes_of
-from busmaster.service.sequences import HeldRemoteNode, Room
+from busmaster.service.sequences import Room, held_remotely, shortened
 from busmaster.service.telling import (
     event_of,
     point_of,
@@ -146,7 +146,7 @@ class RemoteNode:
         # What is of a sequence waits for nothing else of this program, which waits for the sequence.
         at_once = sequence is not None or chosen.priority is Priority.URGENT
         async with self._bus.room.taken(chosen, self, str(command), at_once) as waited:
-            left: Mapping[str, Any] = {**options, **_shortened(chosen, waited)} if waited else options
+            left: Mapping[str, Any] = {**options, **shortened(chosen, waited)} if waited else options
             params = self._said(command, left, touches, stops_seen, stop)
             if sequence is not None:
                 params["sequence"] = sequence
@@ -154,20 +154,12 @@ class RemoteNode:
             value: T = value_of(await link.answer(asked, left.get("finish_within")))
             return value
 
-    @asynccontextmanager
-    async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[Requester]:
+    def exclusive(self, *, max_hold: float = 0.5) -> AbstractAsyncContextManager[Requester]:
         """Return, for `async with`, this node for one sequence of requests: see `Requester.exclusive`.
 
         The line is held no longer than the connection lasts.
         """
-        longest = checked_hold(max_hold, self.label)
-        sequence, link = self._bus.new_sequence(), self._bus.link
-        named = {"sequence": sequence, "protocol": self.profile.name, "address": self.address}
-        link.tell("hold", {**named, "max_hold": longest})
-        try:
-            yield HeldRemoteNode(self, self, sequence)
-        finally:
-            link.tell("release", {"sequence": sequence})
+        return held_remotely(self, self._bus, checked_hold(max_hold, self.label))
 
     def _said(
         self,
@@ -200,12 +192,6 @@ class RemoteNode:
 
 
 LEFT_OUT = ("verify", "safe")
-
-
-def _shortened(options: RequestOptions, by: float) -> dict[str, float]:
-    """Return what is left of the times of a request that has waited for so long."""
-    times = {"start_within": options.start_within, "finish_within": options.finish_within}
-    return {name: max(0.0, limit - by) for name, limit in times.items() if limit is not None}
 
 
 class RemoteGroup:

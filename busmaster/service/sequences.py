@@ -11,6 +11,7 @@ from busmaster.bus.exclusive import HeldNode
 from busmaster.bus.requester import CommandOptions, Requester, RequestOptions
 from busmaster.contract.exchange import Command
 from busmaster.errors import NotStarted
+from busmaster.service.link import Link
 from busmaster.service.messages import MOST_UNDER_WAY
 
 T = TypeVar("T")
@@ -53,7 +54,13 @@ class Room:
             self._free.release()
 
 
-class AsksInSequence(Protocol):
+def shortened(options: RequestOptions, by: float) -> dict[str, float]:
+    """Return what is left of the times of a request that has waited for so many seconds."""
+    times = {"start_within": options.start_within, "finish_within": options.finish_within}
+    return {name: max(0.0, limit - by) for name, limit in times.items() if limit is not None}
+
+
+class AsksInSequence(Requester, Protocol):
     """A node of a line that another program owns."""
 
     async def ask(
@@ -71,11 +78,34 @@ class AsksInSequence(Protocol):
         ...
 
 
-class HeldRemoteNode(HeldNode):
+class HoldsLine(Protocol):
+    """A line that another program owns."""
+
+    @property
+    def link(self) -> Link: ...
+
+    def new_sequence(self) -> int:
+        """Return the number of one more sequence."""
+        ...
+
+
+@asynccontextmanager
+async def held_remotely(node: AsksInSequence, bus: HoldsLine, longest: float) -> AsyncIterator[Requester]:
+    """Have the owner of a line hold it for one sequence, `longest` seconds at most, and yield the node for it."""
+    sequence, link = bus.new_sequence(), bus.link
+    named = {"sequence": sequence, "protocol": node.profile.name, "address": node.address}
+    link.tell("hold", {**named, "max_hold": longest})
+    try:
+        yield _HeldRemoteNode(node, sequence)
+    finally:
+        link.tell("release", {"sequence": sequence})
+
+
+class _HeldRemoteNode(HeldNode):
     """A node of a line that another program owns, within one sequence."""
 
-    def __init__(self, node: Requester, asks: AsksInSequence, sequence: int) -> None:
-        super().__init__(node)
+    def __init__(self, asks: AsksInSequence, sequence: int) -> None:
+        super().__init__(asks)
         self._asks = asks
         self._sequence = sequence
 
