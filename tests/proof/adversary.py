@@ -9,7 +9,7 @@ from busmaster.arbiter.state import OFFLINE
 from tests.proof import setups
 from tests.proof.instants import Instant
 from tests.proof.msc_world import MscWorld
-from tests.proof.shipped import AnyTime, Asker, Decided
+from tests.proof.shipped import AnyTime, Asker, Decided, Ranks
 from tests.proof.wire import SCRIPT, STRAY, Owed, Time
 from tests.proof.world import Action, World
 
@@ -131,6 +131,7 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
     Decided.by_answer[0] = AnyTime.chosen[0] = False
     Asker.ask[0] = world.ask_one
     Asker.saturated[0] = world.is_saturated
+    Ranks.of = world.ranks
     AnyTime.at[0] = cast("float", later)
     world.now = now
     world.said = b""

@@ -150,13 +150,14 @@ def past_stragglers(view: View) -> None:
 
 def past_requests(view: View) -> None:
     """Of a request's times only `started` is read, on the wire: where something is owed, or exchanges have a limit.
-    `deadline` orders polls and probes alone, `queued` counts where there is a `start_by`. Of attempts, whether there
-    were any."""
+    `deadline` orders polls and probes alone, `queued` counts where there is a `start_by`, and its order where a
+    sequence may wait for a write that was asked before. Of attempts, whether there were any."""
     world = view.world
     owed = world.setup.in_step and bool(world.arbiter._in_step.debts)
     limited = world.kind.profile.exchange_limit is not None or owed
+    ranks = _ranks_of_queued(view) if world.setup.longest_hold else {}
     for transaction in transactions(world):
-        transaction.queued = 0.0
+        transaction.queued = ranks.get(transaction, 0.0)
         transaction.first_byte = transaction.last_byte = transaction.ended_at = transaction.refused_until = -inf
         transaction.exchanges_ahead = 0
         transaction.settling_ahead = 0.0
@@ -167,6 +168,14 @@ def past_requests(view: View) -> None:
             transaction.deadline = inf
         if not (limited and transaction is world.arbiter._wire.transaction) and not world.frozen:
             transaction.started = -inf
+
+
+def _ranks_of_queued(view: View) -> dict[Transaction, Time]:
+    """In what order they were asked; times, where that is not known."""
+    waiting = list(dict.fromkeys(transactions(view.world)))
+    if not all(_ordered(view, a.queued, b.queued) for a in waiting for b in waiting):
+        return {one: one.queued for one in waiting}
+    return {one: past(sum(not view.before(one.queued, other.queued) for other in waiting), 0) for one in waiting}
 
 
 def past_nodes(view: View) -> None:

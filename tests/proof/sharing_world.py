@@ -27,7 +27,6 @@ class SharingWorld(World):
 
     @property
     def ranks(self) -> dict[LineClient, int]:
-        """The order in which clients are told."""
         every = [OWN, *self.clients, self.sequence]
         return {client: place for place, client in enumerate(every) if client is not None}
 

@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 
 from busmaster.arbiter import alike, health, in_step
 from busmaster.arbiter.choice import Choice, Chosen
+from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import DOWN, SUSPECT, UP, NodeRecord
 from busmaster.arbiter.shared_backlog import URGENT_RUN
@@ -176,6 +177,7 @@ def set_aside(setup: Setup) -> Iterator[None]:
         put(Choice, "next", _any_of_all)
         put(UnaskedBytes, "babbling", _may_be_noisy if setup.may(NOISE) else _is_never_noisy)
         AnyStep.holds[0] = setup.may(HOLDS)
+    put(Turns, "_waiting", _in_their_order)
     put(Turns, "_chosen", _anybodys)
     put(Turns, "charge", _counts_nothing)
     put(Turns, "count_run", _counts_nothing)
@@ -266,6 +268,17 @@ def _any_of_all(self: Choice, now: float, last_byte: float) -> Chosen | float | 
             dispatcher.backlog.restore(transaction)
             return other
     return first
+
+
+class Ranks:
+    """The order in which those who wait are told: turns that were had make none."""
+
+    of: ClassVar[dict[LineClient, int]] = {}
+
+
+def _in_their_order(turns: Turns) -> list[Any]:
+    waiting = [turn for turn in turns._turns.values() if turn.queue.live]
+    return sorted(waiting, key=lambda turn: Ranks.of.get(turn.client, 0))
 
 
 def _anybodys(turns: Turns) -> Any:

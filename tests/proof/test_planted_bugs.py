@@ -17,7 +17,6 @@ from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.output import Output
 from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.transaction import Transaction
-from busmaster.arbiter.writes import Writes
 from busmaster.contract.exchange import FrameError
 from busmaster.wire import readers
 from tests.planted import (
@@ -52,7 +51,6 @@ LINE = Setup(commands=(READ, WRITE))
 MSC = Setup(kind="msc", commands=(READ,), lapse=2.5)
 LATE = replace(LINE, receive_latency=0.016)
 SEQUENCES = replace(LINE, commands=(READ,), longest_hold=0.3)
-SHARED = replace(LINE, commands=(WRITE,), clients=1, depth=2, retries=1, adversary=(NAKS,))
 TURNS = replace(LINE, commands=(READ, WRITE_THERE), second_timing=True)
 
 
@@ -231,7 +229,13 @@ def without_sequences(patch: Any) -> None:
 
 
 def with_a_sequence_that_never_ends(patch: Any) -> None:
-    patch.setattr(Dispatcher, "end_hold", lambda dispatcher, now, hold=None: None)
+    right = SharedBacklog._hold_for
+
+    def hold_for(backlog: SharedBacklog, *arguments: Any) -> None:
+        right(backlog, *arguments)
+        backlog._deadlines.hold = inf
+
+    patch.setattr(SharedBacklog, "_hold_for", hold_for)
 
 
 def with_what_a_sequence_leaves_behind(patch: Any) -> None:
@@ -244,10 +248,6 @@ def with_what_a_sequence_leaves_behind(patch: Any) -> None:
             backlog.end_hold(hold, now)
 
     patch.setattr(Dispatcher, "end_hold", end_hold)
-
-
-def without_an_order_of_each_program(patch: Any) -> None:
-    patch.setattr(Writes, "is_first", lambda writes, write: True)
 
 
 @pytest.mark.parametrize(
@@ -280,7 +280,6 @@ def without_an_order_of_each_program(patch: Any) -> None:
         (without_sequences, SEQUENCES, "R9"),
         (with_a_sequence_that_never_ends, SEQUENCES, "progress"),
         (with_what_a_sequence_leaves_behind, SEQUENCES, "R8"),
-        (without_an_order_of_each_program, SHARED, "R7"),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )

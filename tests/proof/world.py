@@ -133,6 +133,11 @@ class World:
         self.live.append(ticket)
         return Transaction(self.nodes[node], command, tag=ticket, client=client)
 
+    @property
+    def ranks(self) -> dict[LineClient, int]:
+        """The order in which those who take turns are told."""
+        return {}
+
     def whose(self) -> LineClient | None:
         """Who asks: here the program that owns the line alone."""
         return None
