@@ -79,7 +79,7 @@ OPEN: dict[str, set[str]] = {
     "outputs": {"base", "cells", "distributor", "settings", "values"},
     "planning": {"", "merging"},
     "registry": {""},
-    "service": {"folder", "remote", "service", "tcp"},
+    "service": {"folder", "remote", "remote_group", "service", "tcp"},
     "transport": {
         *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "serial_port", "tcp"),
     },

@@ -19,7 +19,7 @@ from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import SLICE
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Tap
-from busmaster.arbiter.transaction import Phase, Priority
+from busmaster.arbiter.transaction import Priority
 from busmaster.bus.alarms import AlarmChanged, Alarms, BusEvent
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
@@ -263,6 +263,11 @@ class Bus:
         return self._line.on_stop
 
     @property
+    def on_touched(self) -> list[Callable[[NodeRecord, float], None]]:
+        """Return those who are told, at once, of which node a write is over, and when it ended."""
+        return self._line.on_touched
+
+    @property
     def groups(self) -> tuple[PollGroup, ...]:
         return tuple(self._groups.values())
 
@@ -389,10 +394,8 @@ class Bus:
             background=probed + max(low, backlog.waiting(Priority.BACKGROUND)),
             sharing=self._line.sharing,
         )
-        queues = self._arbiter.dispatcher.writes.queues.values()
-        parked = sum(write.phase is Phase.PARKED and write.client is None for queue in queues for write in queue)
         longest = max((poll.patience for poll in polls if poll.results), default=1.0)
-        return bound.wait(priority, ahead=backlog.waiting_of(priority, None) + parked, patience=longest)
+        return bound.wait(priority, ahead=self._line.ahead(priority), patience=longest)
 
     @property
     def alarms(self) -> Mapping[Point[Any], AlarmChanged | None]:

@@ -267,9 +267,7 @@ class Node:
     ) -> T:
         """Do what `request` does, for a client of the line or within a sequence, and say by `journey`, also once this
         was cancelled, whether it was ever sent. Raises HoldEnded if the sequence is over."""
-        within = _HeldNode(self, client) if isinstance(client, Hold) else None
-        if within is not None and within.hold.over:
-            raise hold_ended(self, within.hold.longest, command)
+        within = self._within(client, command)
         chosen, limiter = self._options(options), self.shared.limiter
         if limiter is None or not command.writes:
             return (await self._timed(command, chosen, touches, stops_seen, journey, client))[0]
@@ -285,6 +283,14 @@ class Node:
         finally:
             self.shared.release(hold)
 
+    def _within(self, client: LineClient | None, command: Command[Any]) -> Requester | None:
+        """Return the node for the sequence that a request is of, if it is of one. Raises HoldEnded if that is over."""
+        if not isinstance(client, Hold):
+            return None
+        if client.over:
+            raise hold_ended(self, client.longest, command)
+        return _HeldNode(self, client)
+
     def hold(self, max_hold: float, client: LineClient | None = None) -> Hold:
         """Return what the requests of one sequence, of a client of the line, name as their client.
 
@@ -292,6 +298,29 @@ class Node:
         """
         self.shared.check_loop()
         return self.shared.arbiter.exclusive(self.record, client, checked_hold(max_hold, self.label))
+
+    def begin_reading(
+        self,
+        command: Command[T],
+        journey: Journey,
+        *,
+        stops_seen: int | None = None,
+        client: LineClient | None = None,
+        **options: Unpack[CommandOptions],
+    ) -> asyncio.Future[T]:
+        """Begin a request of what writes nothing, and return its future: who cancels that calls `give_up` too.
+
+        Raises what `request` raises before anything is sent, and HoldEnded as `followed_request`.
+        """
+        self._within(client, command)
+        chosen = self._options(options) if options else ORDINARY
+        journey.transaction, future = self._start(command, chosen, stops_seen=stops_seen, client=client)
+        return future
+
+    def give_up(self, journey: Journey) -> None:
+        """Cancel what nobody waits for any more."""
+        if journey.transaction is not None:
+            self._give_up(journey.transaction)
 
     async def _timed(
         self,

@@ -12,7 +12,7 @@ from typing import Any
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.transaction import Poll, Transaction
+from busmaster.arbiter.transaction import Phase, Poll, Priority, Transaction
 from busmaster.bus.alarms import Alarms
 from busmaster.bus.answers import Answer, composed
 from busmaster.bus.limiter import Limiter
@@ -51,6 +51,8 @@ class SharedLine:
         self.loop_runs: Callable[[], bool] = lambda: False
         self.on_stop: list[Callable[[NodeRecord], None]] = []
         """Told, at once, when a node is told to stop."""
+        self.on_touched: list[Callable[[NodeRecord, float], None]] = []
+        """Told, at once, of which node a write is over, and when it ended."""
         self.latest_of: dict[str, Snapshot] = {}
         """The latest snapshot of each poll group, by the group's name."""
         self.answers_of: dict[str, list[Answer]] = {}
@@ -175,6 +177,13 @@ class SharedLine:
         """Return who shares the line, for the bounds of what a request waits."""
         return Sharing(self.clients, self.arbiter.longest_hold)
 
+    def ahead(self, priority: Priority) -> int:
+        """Return how many requests of this program wait already that go before another of this class."""
+        dispatcher = self.arbiter.dispatcher
+        queues = dispatcher.writes.queues.values()
+        parked = sum(write.phase is Phase.PARKED and write.client is None for queue in queues for write in queue)
+        return dispatcher.backlog.waiting_of(priority, None) + parked
+
     def release(self, hold: Hold) -> None:
         """Hold the line no longer for a sequence of requests."""
         self.arbiter.release(hold, self.now())
@@ -195,6 +204,8 @@ class SharedLine:
             # what has another name, or is read in another run, may share a place with it
             for place in write.command.changes(write.node.profile):
                 self._touched[write.touches[0], place] = when
+        for told in self.on_touched:
+            told(write.node, when)
 
     def written_since(self, node: NodeRecord, started: float) -> bool:
         """Return whether a write to this node, or to a point of it, has ended since then."""

@@ -24,34 +24,27 @@ class Room:
         self._free = asyncio.Semaphore(MOST_UNDER_WAY)
         self._now = now
 
-    @asynccontextmanager
-    async def taken(
-        self, options: RequestOptions, node: Requester, command: str, at_once: bool
-    ) -> AsyncIterator[float]:
-        """Wait for room, unless it is to go `at_once`, and yield how many seconds that took.
+    async def take(self, options: RequestOptions, node: Requester, command: Command[Any]) -> float:
+        """Wait for room, which is to be given back, and return how many seconds that took.
 
         Raises NotStarted if the time of the request is over before.
         """
-        if at_once:
-            yield 0.0
-            return
-        waited = 0.0
-        if self._free.locked():
-            began = self._now()
-            limits = [limit for limit in (options.start_within, options.finish_within) if limit is not None]
-            try:
-                async with asyncio.timeout(min(limits, default=None)):
-                    await self._free.acquire()
-            except TimeoutError:
-                what = f"{MOST_UNDER_WAY} requests of this program are not answered yet, and its time was over"
-                raise NotStarted(what, node=node, command=command) from None
-            waited = self._now() - began
-        else:
+        if not self._free.locked():
             await self._free.acquire()
+            return 0.0
+        began = self._now()
+        limits = [limit for limit in (options.start_within, options.finish_within) if limit is not None]
         try:
-            yield waited
-        finally:
-            self._free.release()
+            async with asyncio.timeout(min(limits, default=None)):
+                await self._free.acquire()
+        except TimeoutError:
+            what = f"{MOST_UNDER_WAY} requests of this program are not answered yet, and its time was over"
+            raise NotStarted(what, node=node, command=str(command)) from None
+        return self._now() - began
+
+    def give_back(self) -> None:
+        """Make room for another."""
+        self._free.release()
 
 
 def shortened(options: RequestOptions, by: float) -> dict[str, float]:
