@@ -182,13 +182,14 @@ def test_a_poll_group_of_a_thousand_points_comes_in_messages_that_hold_up_nobody
         handles = [Hcp2Controller(remote, 5 + number % 2) for number in range(10)]
         points = [handles[n % 10].point(f"{n % 99 + 1}") for n in range(198)]
         scaled = [replace(point, item=f"{point.item} {n}") for n in range(6) for point in points]
-        group = await remote.poll_group("many", period=5, points=scaled[: messages.MOST_POINTS])
-        snapshot = await anext(aiter(group))
+        cycles = (await remote.poll_group("many", period=60, points=scaled[: messages.MOST_POINTS])).subscribe()
+        line.bus.groups[0].demand()
+        snapshot = await anext(cycles)
         assert len(snapshot) == messages.MOST_POINTS
         assert all(sample.value == 0 for sample in snapshot.samples.values())
         assert max(lengths) < messages.LONGEST_REQUEST / 2
         with pytest.raises(InvalidCommand, match="1000 points at most"):
-            await remote.poll_group("more", period=5, points=scaled[: messages.MOST_POINTS + 1])
+            await remote.poll_group("more", period=60, points=scaled[: messages.MOST_POINTS + 1])
 
     on_a_served_line(tmp_path, story)
 

@@ -270,8 +270,9 @@ def test_a_program_of_a_machine_with_another_clock_reads_and_writes_by_the_owner
         async with connect(address, token=SECRETS["hmi"]) as remote:
             point = Hcp2Controller(remote, 5).point("1")
             await point.write(3, start_within=PATIENCE, finish_within=PATIENCE)
-            group = await remote.poll_group("mine", period=60, points=[point], phase=0)
-            await anext(aiter(group))
+            cycles = (await remote.poll_group("mine", period=60, points=[point])).subscribe()
+            line.bus.groups[0].demand()
+            await anext(cycles)
             assert abs(remote.now() - line.bus.now()) < PATIENCE
             assert await point.read(max_age=PATIENCE) == 3
 
