@@ -190,7 +190,7 @@ class RemoteBus:
         """What the owner says of the line: its name, settings and process."""
         self._link: Link | None = None
         self._ahead = 0.0
-        """Seconds by which the clock of the owner's machine is ahead of this one's, less what its hello took to come."""
+        """Seconds by which the clock of the owner's machine is ahead of this one, less what its hello took to come."""
         self._nodes: dict[tuple[str, int], RemoteNode] = {}
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
