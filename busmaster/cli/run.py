@@ -102,7 +102,7 @@ class Running:
         """Run the line until it is told to end, send its safe state, and return the exit status."""
         entered = False
         self.line.outputs.tell = self._tell_of_output
-        service = service_of(self.line, wanted=self._view.silent)  # now: it keeps what happens as the line is opened
+        service = service_of(self.line)  # now: it keeps what happens as the line is opened
         try:
             async with self.line:
                 entered = True

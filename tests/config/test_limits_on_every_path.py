@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from busmaster.arbiter.clients import LineClient
 from busmaster.bus.node import Node
 from busmaster.bus.requester import Priority
 from busmaster.cli.write import pass_on, prepare
@@ -179,6 +180,9 @@ class Person:
 
     def node(self, name: str, address: int, /) -> Node:
         raise AssertionError("a person names points")
+
+    def client_of(self, sequence: int | None, node: Node, /) -> LineClient:
+        return node.shared.add_client(1.0)
 
     def stops_before(self, node: Node, /) -> int:
         return 0
