@@ -126,6 +126,10 @@ class InStep:
         """Return whether an answer beginning with one of these keys, of this node if given, could be one owed."""
         return any(debt.of(node, now) and _could_be(debt, answers) for debt in self.debts)
 
+    def owes_else(self, asked: float) -> bool:
+        """Return whether anything is owed but to the request that was out at `asked`."""
+        return any(debt.asked != asked for debt in self.debts)
+
     def over(self, answers: Sequence[bytes]) -> float:
         """Return when all that is owed and could look so is later than its node's lateness allows."""
         return max((debt.over for debt in self.debts if _could_be(debt, answers)), default=-inf)

@@ -127,7 +127,7 @@ class AnyStep:
     def perhaps(self, *arguments: Any) -> bool:
         return bool(choose(2))
 
-    clashes = doubts = perhaps
+    clashes = doubts = owes_else = perhaps
 
     def is_doubtful(self, *arguments: Any) -> bool:
         return self.holds[0] and bool(choose(2))

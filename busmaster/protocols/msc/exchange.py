@@ -258,8 +258,9 @@ class PacketExchange(Generic[T]):
 class StalePacketListener:
     """Reads what arrives while nothing is asked: a packet whose ACK was lost. It is ACKed and dropped, a bad one too.
 
-    Otherwise the controller would send it again, up to five times, into the exchanges of others. Ready for the next
-    packet whenever one has ended.
+    Otherwise the controller would send it again, up to five times, into the exchanges of others. The ACK before it may
+    come with it, if both are late. One ACK is for all packets that came together. Ready for the next packet whenever
+    one has ended.
     """
 
     __slots__ = ("_buffer",)
@@ -268,15 +269,22 @@ class StalePacketListener:
         self._buffer = b""
 
     def feed(self, data: bytes, /) -> Need | Done[None]:
-        buffer = self._buffer + data
+        heard = buffer = self._buffer + data
         self._buffer = b""
-        if not buffer:
+        if not heard:
             return MORE
-        size = packet_size(buffer)
-        if size and len(buffer) >= size and is_sound(buffer[:size]):
-            return Done(None, send=ACK, rest=buffer[size:])
-        if buffer[0] != STX[0] or len(buffer) > LONGEST_PACKET:
-            raise FrameError(f"{len(buffer)} unasked bytes, the first of them {buffer[0]:02x}")
+        send = b""
+        while True:
+            buffer = buffer.lstrip(ACK)
+            size = packet_size(buffer) if buffer else None
+            if not size or len(buffer) < size or not is_sound(buffer[:size]):
+                break
+            buffer = buffer[size:]
+            send = ACK
+        if send and not buffer:
+            return Done(None, send=send)
+        if buffer[:1] != STX or len(buffer) > LONGEST_PACKET:
+            raise FrameError(f"{len(heard)} unasked bytes, the first of them {heard[0]:02x}", send=send)
         self._buffer = buffer
         return MORE
 
