@@ -99,7 +99,7 @@ class Trust:
         # Where the reader would have said something in between, this is not all that comes.
         if ending is None or not ending.delivered or ending.rest or read.said or any(len(key) == 1 for key in answers):
             return False
-        return not self._in_step.owes_else(asked) and not self._in_step.is_doubtful(answers, now)
+        return not (self._in_step.clashes(answers, now, node, but=asked) or self._in_step.is_doubtful(answers, now))
 
     def hear(
         self, wire: OnWire, run: bytes, unasked: UnaskedBytes, now: float, ours: bool = False

@@ -124,10 +124,10 @@ class AnyStep:
 
     owe = lapse = forgive = answered = said = said_twice = heard = nothing
 
-    def perhaps(self, *arguments: Any) -> bool:
+    def perhaps(self, *arguments: Any, **named: Any) -> bool:
         return bool(choose(2))
 
-    clashes = doubts = owes_else = perhaps
+    clashes = doubts = perhaps
 
     def is_doubtful(self, *arguments: Any) -> bool:
         return self.holds[0] and bool(choose(2))
