@@ -88,9 +88,12 @@ class Trust:
         self._unheard = (transaction.command, transaction.node, leg.end) if unheard else None
 
     def is_late_reply(self, run: bytes, now: float) -> bool:
-        """Return whether these bytes are all of the reply to what was asked last, and nothing else, though they are late:
-        what ends an exchange for certain within the window. One reply is all that a request causes (R3). A lone byte
-        may be noise, and is none."""
+        """Return whether these bytes are all of the late reply to what was asked last, and nothing else.
+
+        Then nothing more of it can come, since a request causes one reply (R3). What proves that is what ends an
+        exchange for certain within its window: the reader takes it, nothing is behind it, and nothing that is owed or
+        doubted could be it. A lone byte may be noise, and proves nothing.
+        """
         if self._unheard is None:
             return False
         command, node, asked = self._unheard

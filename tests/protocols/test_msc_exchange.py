@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import pytest
 
 from busmaster.contract.exchange import MORE, Done, Expect, FrameError, Refused
@@ -319,7 +321,31 @@ def test_a_stale_packet_is_acked_and_dropped_in_any_chunks() -> None:
     for _ in range(2):
         assert listener.feed(b"") is MORE
         assert all(listener.feed(bytes((byte,))) is MORE for byte in STALE[:-1])
-        assert listener.feed(STALE[-1:] + b"\x02") == Done(None, send=ACK, rest=b"\x02")
+        assert listener.feed(STALE[-1:]) == Done(None, send=ACK)
+
+
+@pytest.mark.parametrize("chunk", [1, 2, 7, 100])
+@pytest.mark.parametrize("before", [ACK, ACK + ACK, STALE, ACK + STALE, STALE + ACK])
+def test_an_ack_or_a_packet_in_front_does_not_hide_a_stale_packet(before: bytes, chunk: int) -> None:
+    listener = StalePacketListener()
+    heard = before + REPLY
+    said = []
+    for start in range(0, len(heard), chunk):
+        with suppress(FrameError):
+            said.append(listener.feed(heard[start : start + chunk]))
+    assert said[-1] == Done(None, send=ACK)
+
+
+def test_the_ack_of_a_stale_packet_is_not_said_into_the_next_one() -> None:
+    listener = StalePacketListener()
+    assert listener.feed(STALE + REPLY[:5]) is MORE
+    assert listener.feed(REPLY[5:]) == Done(None, send=ACK), "one for both"
+
+
+def test_a_stale_packet_with_noise_behind_it_is_acked_all_the_same() -> None:
+    with pytest.raises(FrameError, match="unasked") as error:
+        StalePacketListener().feed(STALE + b"\xff")
+    assert error.value.send == ACK
 
 
 def test_a_damaged_stale_packet_is_acked_when_the_line_pauses() -> None:
