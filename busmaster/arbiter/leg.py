@@ -103,7 +103,6 @@ class Leg:
         self.longest = longest
         self.begun = False
         self.pause = 0.0
-        self._follows = None
         out = self.out
         # no calls of `max`: this is done for every request
         self.out = self.end = end = (out if out > now else now) + said * self.byte_time

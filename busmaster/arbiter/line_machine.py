@@ -85,9 +85,7 @@ class LineMachine:
         self._trust = Trust(self._in_step)
         # the line
         self._unasked = UnaskedBytes(self.events, self._counters)
-        self._up_at = -inf
-        self._quarantine = -inf
-        self._silent_at = -inf
+        self._up_at = self._quarantine = self._silent_at = -inf
 
     # inputs
 
@@ -143,11 +141,11 @@ class LineMachine:
 
     def transmitted(self, now: float) -> None:
         """Note that the port took what `poll_transmit` gave only now: whoever held the process up meanwhile."""
-        wire = self._wire
-        said_at = wire.output.said_at
+        wire, output = self._wire, self._wire.output
+        said_at = output.said_at
         late = now - said_at
         if late > 0:
-            wire.output.said_at = now
+            output.said_at = now
             leg = self._leg  # as leg.shift does: this is done for every request
             leg.end += late
             leg.out += late
@@ -212,7 +210,8 @@ class LineMachine:
         if now < self._quarantine:
             self._settle(now)
             return True
-        chosen = self._choice.next(now, self._unasked.last_byte)
+        unasked = self._unasked
+        chosen = self._choice.next(now, unasked.last_byte)
         if chosen is None:
             return False
         if type(chosen) is not tuple:
@@ -224,8 +223,8 @@ class LineMachine:
         if self.state is not EXCHANGE:
             self._enter(EXCHANGE, now)
         self._wire.begin(transaction, exchange, now)
-        if self._unasked.unanswered_one is not None:
-            self._unasked.looked(now, self._deadlines.line)
+        if unasked.unanswered_one is not None:
+            unasked.looked(now, self._deadlines.line)
         return True
 
     def _begin_reply(self, data: bytes, now: float) -> bytes:
@@ -294,14 +293,15 @@ class LineMachine:
                 if verdict is not None:
                     self._deadlines.line = verdict
                     return
-            if leg.end > leg.begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
-                leg.end = leg.out = leg.begun_at
-            transaction.node.note_reply(exchange.answers, transaction.command, leg.begun_at - leg.end)
+            begun_at = leg.begun_at
+            if leg.end > begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
+                leg.end = leg.out = begun_at
+            transaction.node.note_reply(exchange.answers, transaction.command, begun_at - leg.end)
             if transaction.node.learning is not None:
                 wire.learn(now)
         if step.send:
             wire.say(step.send, now)
-        wire.transaction = wire.exchange = self._trust.held = None
+        wire.transaction = wire.exchange = None  # and nothing is held: what was has been weighed again
         self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, step.value, now)
         if rest:
