@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Hashable, Mapping
+from collections.abc import Callable, Collection, Hashable, Mapping
 from typing import Any, Protocol, cast
 
 from busmaster.bus.bus import Bus
@@ -16,7 +16,9 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
 from busmaster.gate.gate import FRESH, Gate, Wish
+from busmaster.gate.permission import Permission
 from busmaster.service.peers import Peer
+from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast
 from busmaster.service.telling import protocol_of
 
@@ -33,6 +35,9 @@ class Line(Protocol):
 
     @property
     def gate(self) -> Gate: ...
+
+    @property
+    def safe_wishes(self) -> SafeWishes: ...
 
     def broadcast_of(self, group: PollGroup, /) -> Broadcast:
         """Return what tells the cycles of a poll group."""
@@ -52,6 +57,9 @@ class Asker(Protocol):
 
     @property
     def peer(self) -> Peer: ...
+
+    @property
+    def permission(self) -> Permission: ...
 
     def node(self, name: str, address: int, /) -> Node:
         """Return a node of the line. Raises InvalidCommand."""
@@ -73,7 +81,7 @@ class Errand:
         options: CommandOptions,
         *,
         line: Line,
-        peer: Peer,
+        asker: Asker,
         stops_seen: int | None,
         stop: bool,
         asked: float,
@@ -84,11 +92,12 @@ class Errand:
         self._touches = touches
         self._options = options
         self._line = line
-        self._peer = peer
+        self._asker = asker
         self._stops_seen = stops_seen
         self._stop = stop
         self._asked = asked
         self._begun = False
+        self.future: asyncio.Future[Any]
 
     @classmethod
     def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
@@ -98,9 +107,10 @@ class Errand:
         command = protocol.read_back(params["command"])
         touches = params.get("touches")
         given = cast("CommandOptions", dict(params.get("options", {})))
-        if not set(given) <= OPTIONS:
-            raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
-        RequestOptions.of(given, node.label)  # checked here, before it may wait
+        if given:
+            if not set(given) <= OPTIONS:
+                raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
+            RequestOptions.of(given, node.label)  # checked here, before it may wait
         now, stops_seen = line.bus.now(), params.get("stops_seen")
         return cls(
             node,
@@ -108,7 +118,7 @@ class Errand:
             None if touches is None else protocol.read_back(touches),
             given,
             line=line,
-            peer=asker.peer,
+            asker=asker,
             stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
             stop=params.get("stop") is True and _check_stop(node, command),
             asked=min(now, seconds(params.get("asked", now), "asked")),
@@ -118,11 +128,39 @@ class Errand:
     def text(self) -> str:
         return str(self.command)
 
-    async def run(self) -> Any:
-        """Run it and return its value. Raises BusError or InvalidCommand; every write passes the gate."""
+    def check(self) -> None:
+        """Raise InvalidCommand for a write that would be refused now: a record is kept of that."""
+        wish = self._wish()
+        try:
+            if self.command.writes and (refusal := self._line.gate.refusal(wish)):
+                raise InvalidCommand(f"{self.node.label}: {refusal}")
+            self.node.check(self.command, stop=self._stop)
+        except InvalidCommand as error:
+            self._line.gate.refuse(wish, str(error))
+            raise
+
+    def begin(self, done: Callable[[asyncio.Future[Any]], object]) -> None:
+        """Have it done, and then call `done` with the future that has its value, BusError or InvalidCommand.
+
+        Raises them too, where nothing could be begun. Every write passes the gate.
+        """
+        if self.command.writes:
+            self.future = asyncio.ensure_future(self._write())
+        else:
+            self.future = self.node.begin_reading(
+                self.command, self.journey, stops_seen=self._stops_seen, **self._left()
+            )
+        self.future.add_done_callback(done)
+
+    def cancel(self) -> None:
+        """Give it up: what is on the wire runs out unheard."""
+        if not self.future.done():
+            self.future.cancel()
+            if not self.command.writes:
+                self.node.give_up(self.journey)
+
+    async def _write(self) -> Any:
         self._begun = True
-        if not self.command.writes:
-            return await self._request()
         wish = self._wish()
         passage = self._line.gate.begin(wish)
         try:
@@ -130,7 +168,14 @@ class Errand:
                 raise InvalidCommand(f"{self.node.label}: {refusal}")
             if (age := self._line.bus.now() - self._asked) > FRESH:
                 raise NotStarted(f"it came {age:.1f} s after it was asked for", node=self.node, command=self.text)
-            value = await self._request()
+            value = await self.node.followed_request(
+                self.command,
+                self.journey,
+                touches=self._touches,
+                stops_seen=self._stops_seen,
+                stop=self._stop,
+                **self._left(),
+            )
         except BaseException as error:
             passage.end(self._truth(error))
             raise
@@ -156,19 +201,11 @@ class Errand:
             return WriteUnconfirmed("its program gave up before it was answered")
         return NotStarted("its program gave up before it was sent")
 
-    async def _request(self) -> Any:
-        return await self.node.followed_request(
-            self.command,
-            self.journey,
-            touches=self._touches,
-            stops_seen=self._stops_seen,
-            stop=self._stop,
-            **self._left(),
-        )
-
     def _left(self) -> CommandOptions:
         """Return the options, less the time that the request took to come here."""
         options: dict[str, Any] = dict(self._options)
+        if not options:
+            return {}
         age = self._line.bus.now() - self._asked
         for name in ("start_within", "finish_within"):
             limit = options.get(name)
@@ -186,7 +223,15 @@ class Errand:
             if point is not None:
                 value = _value(point, changes, value)
         point = point or Point(self.node, self.text, command)
-        return Wish(door=DOOR, by=str(self._peer), name=point.key, point=point, value=value)
+        return Wish(
+            door=DOOR,
+            by=str(self._asker.peer),
+            name=point.key,
+            point=point,
+            value=value,
+            command=command,
+            permission=self._asker.permission,
+        )
 
 
 def _check_stop(node: Node, command: Command[Any]) -> bool:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import AsyncIterator, Hashable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
+from math import inf
 from types import TracebackType
 from typing import Any, TypeVar, Unpack
 
@@ -16,34 +18,39 @@ from busmaster.bus.limits import Limit
 from busmaster.bus.points import Point
 from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, RequestOptions
 from busmaster.bus.samples import Sample
-from busmaster.bus.snapshots import Snapshot, Stream
+from busmaster.bus.snapshots import Stream
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
-from busmaster.errors import BusClosed, InvalidCommand
+from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.planning.merging import Merge
-from busmaster.service.link import Asked, Link
-from busmaster.service.messages import said_timings, value_of
+from busmaster.service.link import TCP, Link
+from busmaster.service.messages import MOST_CHECKED, said_timings, value_of
+from busmaster.service.remote_group import RemoteGroup
+from busmaster.service.safe import outcomes_of
 from busmaster.service.telling import (
     event_of,
-    point_of,
     protocol_of,
     said_points,
-    snapshot_of,
     statistics_of,
 )
 
 T = TypeVar("T")
 EVENT_BUFFER = 256
+POINTS_IN_A_MESSAGE = 50
+LEFT_OUT = ("verify", "safe")
+"""Options that are of no use on another's line: where they are said, they are false."""
 
 
-def connect(address: str) -> RemoteBus:
-    """Return the bus that another program of this machine owns, for `async with`, which connects.
+def connect(address: str, *, token: str | None = None) -> RemoteBus:
+    """Return the bus that another program owns, for `async with`, which connects.
 
-    `address` is `unix:PATH`, or the name of a line or of its port, as `busmaster status` lists them.
+    `address` is `unix:PATH`, or the name of a line or of its port, as `busmaster status` lists them; or
+    `tcp://HOST:PORT`, where a `token` that the line's owner knows may be needed. The token goes over the network as it
+    is. Raises InvalidCommand for a token anywhere else: there the kernel says who comes.
     """
-    return RemoteBus(address)
+    return RemoteBus(address, token=token)
 
 
 class RemoteNode:
@@ -80,12 +87,13 @@ class RemoteNode:
         self._bus.link.tell("stop", {"protocol": self.profile.name, "address": self.address})
 
     def now(self) -> float:
-        """Return the time of the line's clock, in seconds: that of the machine, which is the same for all programs."""
+        """Return the time of the line's clock, in seconds: that of its owner's machine."""
         return self._bus.now()
 
-    def latest(self, point: Hashable, /) -> Sample[Any] | None:
-        """Return None: only the line knows of every write that makes a sample stale."""
-        return None
+    def latest(self, point: Any, /) -> Sample[Any] | None:
+        """Return the youngest good sample of a point in this program's poll groups, unless a write, by whatever
+        program, has made it stale: any write to the node does."""
+        return self._bus.latest(point)
 
     def merge_reads(self, merge: Merge, /) -> None:
         """Have the profile propose `merge`. What is merged on the line is its owner's affair."""
@@ -96,7 +104,11 @@ class RemoteNode:
         raise InvalidCommand(f"{self.label}: limits are held by the program that owns the line: set {limit.name} there")
 
     def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
-        """Do nothing: the line checks each write as it comes. Of several writes, those before a bad one are written."""
+        """Have the line check these writes when the bus is entered: entering raises InvalidCommand for a bad one.
+
+        Later it does nothing: the line checks each write as it comes. Of several, those before a bad one are written.
+        """
+        self._bus.prepare(self, commands, stop is True)
 
     async def request(
         self,
@@ -119,8 +131,8 @@ class RemoteNode:
         if chosen.safe:
             raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
         params = self._said(command, options, touches, stops_seen, stop)
-        link = self._bus.opened(self, str(command))
-        asked = link.ask("request", params, writes=command.writes, node=self, command=str(command))
+        link = self._bus.opened(self, command)
+        asked = link.ask("request", params, writes=command.writes, node=self, command=command)
         value: T = value_of(await link.answer(asked, chosen.finish_within))
         return value
 
@@ -133,10 +145,10 @@ class RemoteNode:
         stop: bool,
     ) -> dict[str, Any]:
         params: dict[str, Any] = {
-            "protocol": self.profile.name,
-            "address": self.address,
+            "protocol": self._profile.name,
+            "address": self._address,
             "command": self._protocol.write_down(command),
-            "asked": self.now(),
+            "asked": self._bus.now(),
         }
         if touches is not None:
             params["touches"] = self._protocol.write_down(touches)
@@ -144,78 +156,15 @@ class RemoteNode:
             params["stops_seen"] = stops_seen
         if stop:
             params["stop"] = True
-        if given := {name: value for name, value in options.items() if value is not None and name not in LEFT_OUT}:
-            params["options"] = given
+        if options:
+            given = {name: value for name, value in options.items() if value is not None}
+            params["options"] = {name: given[name] for name in given if name not in LEFT_OUT}
         return params
 
-
-LEFT_OUT = ("verify", "safe")
-
-
-class RemoteGroup:
-    """A poll group of the line. Iterate it, or look at `latest`; close it when it is not read any more."""
-
-    def __init__(self, bus: RemoteBus, name: str, number: int, points: tuple[Point[Any], ...]) -> None:
-        self.name = name
-        self.period = 0.0
-        self.latest: Snapshot | None = None
-        """That of its last cycle."""
-        self.dropped = 0
-        """Cycles that this program was too slow for, counted by the line's owner."""
-        self._bus = bus
-        self._number = number
-        self._own = points
-        self._points = points
-        self._set = -1
-        self._consumers: list[Stream[Snapshot]] = []
-        self._over = False
-
-    @property
-    def points(self) -> tuple[Point[Any], ...]:
-        return self._points
-
-    def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
-        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
-        if self._over:
-            raise BusClosed(f"poll group {self.name!r} is closed")
-        return Stream(self._consumers, buffer)
-
-    async def __aiter__(self) -> AsyncIterator[Snapshot]:
-        consumer = self.subscribe()
-        try:
-            async for snapshot in consumer:
-                yield snapshot
-        finally:
-            consumer.close()
-
-    def close(self) -> None:
-        """Read it no more; one that this program made ends."""
-        if not self._over:
-            self._bus.end_stream(self._number)
-
-    def hear(self, method: str, params: Mapping[str, Any]) -> None:
-        """Take what the line's owner says of it."""
-        body = params["body"]
-        for consumer in self._consumers:
-            consumer.dropped += params["dropped"] - self.dropped
-        self.dropped = params["dropped"]
-        if method == "points":
-            self._set = body["set"]
-            # By its own points, a program gets the values that they decode.
-            if not self._own:
-                self._points = tuple(point_of(said, self._bus.find) for said in body["points"])
-        elif method == "snapshot" and body["set"] == self._set:
-            self.latest = snapshot_of(body, self.name, self._points)
-            for consumer in self._consumers:
-                consumer.put(self.latest)
-        elif method == "ended":
-            self._bus.end_stream(self._number)
-
-    def end(self) -> None:
-        """End those who read it, after what they hold."""
-        self._over = True
-        for consumer in list(self._consumers):
-            consumer.close()
+    def said_check(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
+        """Return writes of this node as the line is asked whether it would take them."""
+        said = [self._protocol.write_down(command) for command in commands]
+        return {"protocol": self.profile.name, "address": self.address, "commands": said, "stop": stop}
 
 
 class RemoteBus:
@@ -224,38 +173,59 @@ class RemoteBus:
     Handles take it as they take a Bus: `MicroFlexDrive(remote, 7)`. What is safe lives with the line: a stop of any
     program counts for all, limits and the record of writes are the owner's. A node that the owner does not have is
     asked as this program says, and leaves the line with it. Entering raises LineDown if nobody serves the line, and
-    InvalidCommand for a name that nobody's line has. A lost connection is not made again: enter a new RemoteBus.
+    InvalidCommand for a name that nobody's line has, and for a write that was prepared before and that the line would
+    not take. A lost connection is not made again: enter a new RemoteBus.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, *, token: str | None = None) -> None:
+        if token is not None and not address.startswith(TCP):
+            raise InvalidCommand(f"{address} takes no token: it is for tcp://HOST:PORT")
+        if token is not None and not (token.isascii() and token.isprintable() and token.split() == [token]):
+            raise InvalidCommand("a token is of letters, digits and signs, without spaces")
         self.address = address
+        self._token = token
         self.line = ""
         """The name of the line's port, once it is entered."""
         self.about: Mapping[str, Any] = {}
         """What the owner says of the line: its name, settings and process."""
         self._link: Link | None = None
+        self._ahead = 0.0
+        """Seconds by which the clock of the owner's machine is ahead of this one, less what its hello took to come."""
         self._nodes: dict[tuple[str, int], RemoteNode] = {}
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
         """Those of them of which the owner knows."""
         self._groups: dict[int, RemoteGroup] = {}
         self._count = 0
+        self._touched: dict[tuple[str, int], float] = {}
+        """When the last write to a node ended."""
         self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
+        self._prepared: list[tuple[RemoteNode, tuple[Command[Any], ...], bool]] = []
+        """Writes that are to be checked before the first of them is sent."""
 
     async def __aenter__(self) -> RemoteBus:
         if self._link is not None:
             raise InvalidCommand(f"the bus of {self.address} was entered already: enter it once, and share it")
-        link = Link(self.address, self._hear, self._lost)
+        link = Link(self.address, self._token, self._hear, self._lost)
         self._link = link
         said = await link.open(sys.argv[0])
         self.about, self.line = said, said["line"]
+        if self.address.startswith(TCP):  # another machine, perhaps: its clock began at another moment
+            self._ahead = said["now"] - time.monotonic()
         for known in said["nodes"]:
             node = self._nodes.get((known["protocol"], known["address"]))
             if node is not None:
                 node.label = known["label"]
         for node in self._named:
             self._name(node)
+        try:
+            for node, commands, stop in self._prepared:
+                for first in range(0, len(commands), MOST_CHECKED):
+                    await self._ask("check", node.said_check(commands[first : first + MOST_CHECKED], stop))
+        except BaseException:
+            await link.close()
+            raise
         return self
 
     async def __aexit__(
@@ -271,15 +241,20 @@ class RemoteBus:
             raise BusClosed("the bus is not open")
         return self._link
 
-    def opened(self, node: RemoteNode, command: str) -> Link:
+    def opened(self, node: RemoteNode, command: Command[Any]) -> Link:
         """Return the connection for a request. Raises BusClosed, naming it, before the bus is entered."""
         if self._link is None:
-            raise BusClosed("the bus is not open", node=node, command=command)
+            raise BusClosed("the bus is not open", node=node, command=str(command))
         return self._link
 
+    def prepare(self, node: RemoteNode, commands: tuple[Command[Any], ...], stop: bool) -> None:
+        """Have these writes checked when the bus is entered, if it is not yet."""
+        if self._link is None:
+            self._prepared.append((node, commands, stop))
+
     def now(self) -> float:
-        """Return the time of the line's clock, in seconds: that of the machine, which is the same for all programs."""
-        return time.monotonic()
+        """Return the time of the line's clock, in seconds: that of its owner's machine."""
+        return time.monotonic() + self._ahead
 
     # nodes
 
@@ -355,10 +330,27 @@ class RemoteBus:
         priority: Priority = Priority.POLL,
     ) -> RemoteGroup:
         """Have `points` read every `period` seconds, as `Bus.poll_group`; it ends with this program."""
-        wanted = tuple(points)
-        params: dict[str, Any] = {"name": name, "period": period, "points": said_points(wanted)}
-        params |= {"phase": phase, "priority": priority}
-        return await self._follow("poll", name, wanted, params)
+        params = {"name": name, "period": period, "phase": phase, "priority": priority}
+        return await self._follow("poll", name, tuple(points), params)
+
+    def latest(self, point: Point[T]) -> Sample[T] | None:
+        """Return the youngest good sample of a point in a poll group of this program, unless a write to its node, by
+        whatever program, has ended since it was read."""
+        node, profile = point.node, point.node.profile
+        addresses = (node.address,) if profile.broadcast is None else (node.address, profile.broadcast)
+        touched = [self._touched.get((profile.name, address), -inf) for address in addresses]
+        snapshots = [group.latest for group in self._groups.values() if group.own and group.latest is not None]
+        samples = [snapshot.samples[point] for snapshot in snapshots if point in snapshot.samples]
+        good = (one for one in samples if one.error is None and one.started is not None and one.started > max(touched))
+        return max(good, key=lambda one: one.finished, default=None)
+
+    async def enter_safe_state(self, values: Mapping[str, float]) -> dict[str, BusError | None]:
+        """Have the line's owner send its safe state, and return by point why it was not confirmed, None if it was.
+
+        `values` is what the caller takes that to be, by the names of the file's points. Raises InvalidCommand, and
+        nothing is sent, if it is something else, or this program may not write all of it.
+        """
+        return outcomes_of(await self._ask("safe", {"writes": dict(values)}, writes=True))
 
     async def groups(self) -> tuple[str, ...]:
         """Return the names of the line's poll groups."""
@@ -381,8 +373,8 @@ class RemoteBus:
 
     # inside
 
-    async def _ask(self, method: str, params: Mapping[str, Any]) -> Any:
-        asked = self.link.ask(method, params)
+    async def _ask(self, method: str, params: Mapping[str, Any], *, writes: bool = False) -> Any:
+        asked = self.link.ask(method, params, writes=writes)
         return await self.link.answer(asked)
 
     async def _follow(
@@ -390,10 +382,16 @@ class RemoteBus:
     ) -> RemoteGroup:
         self._count += 1
         number = self._count
-        group = self._groups[number] = RemoteGroup(self, name, number, points)
-        asked: Asked = self.link.ask(method, {**params, "stream": number})
+        group = RemoteGroup(name, points, find=self.find, end=partial(self.end_stream, number))
+        self._groups[number] = group
+        said = said_points(points)
         try:
-            group.period = (await self.link.answer(asked))["period"]
+            while len(said) > POINTS_IN_A_MESSAGE:
+                await self._ask("gather", {"stream": number, "points": said[:POINTS_IN_A_MESSAGE]})
+                del said[:POINTS_IN_A_MESSAGE]
+            if said:
+                params = {**params, "points": said}
+            group.period = (await self._ask(method, {**params, "stream": number}))["period"]
         except BaseException:
             self.end_stream(number)
             raise
@@ -404,6 +402,8 @@ class RemoteBus:
             node = self._nodes.get((params["protocol"], params["address"]))
             if node is not None:
                 node.stops = params["stops"]
+        elif method == "touched":
+            self._touched[params["protocol"], params["address"]] = params["when"]
         elif method == "event":
             event = event_of(params["body"], self.find)
             for stream in self._events:
@@ -415,5 +415,6 @@ class RemoteBus:
     def _lost(self) -> None:
         for group in list(self._groups.values()):
             group.end()
+        self._groups.clear()  # what is written from now on is not heard of any more
         for stream in list(self._events):
             stream.close()
