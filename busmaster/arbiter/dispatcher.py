@@ -100,11 +100,10 @@ class Dispatcher:
             return True
         changed = transaction.writes  # it may have superseded others, which is to be told
         queue = self.backlog.queues[transaction.priority]
-        waiting = queue.live
-        if changed:
-            if transaction.priority is URGENT:  # even if it fails below: no enable may follow it
-                self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
-            waiting = max(queue.live, len(self.writes.queues[node]))  # those that are parked are in no class
+        if changed and transaction.priority is URGENT:  # even if it fails below: no enable may follow it
+            self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
+        # writes that are parked are in no class
+        waiting = max(queue.live, len(self.writes.queues[node])) if changed else queue.live
         if waiting >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return True
