@@ -364,6 +364,27 @@ def test_what_is_no_stale_packet_is_not_answered(unasked: bytes) -> None:
     assert listener.feed(STALE) == Done(None, send=ACK)
 
 
+def test_the_end_of_a_packet_that_was_asked_for_again_is_passed_over_and_not_asked_for_twice() -> None:
+    """A noise byte before the checksum pushes its last byte out; a unit says its packet once for each NAK."""
+    exchange = acked()
+    pushed = REPLY[:-2] + b"\x23" + REPLY[-2:]
+    assert says(exchange.feed(pushed[: len(REPLY)])) == NAK
+    assert exchange.feed(pushed[len(REPLY) :]) is MORE
+    assert says(exchange.expired(True)) == b""
+    assert exchange.feed(REPLY) == Done(1234, send=ACK)
+
+
+def test_what_never_becomes_a_packet_is_passed_over_a_few_times_and_no_more() -> None:
+    exchange = acked()
+    assert says(exchange.feed(BAD)) == NAK
+    for _ in range(4):
+        exchange.feed(b"\x55")
+        assert says(exchange.expired(True)) == b""
+    exchange.feed(b"\x55")
+    with pytest.raises(FrameError, match="no packet"):
+        exchange.expired(True)
+
+
 def test_a_bad_unit_byte_with_the_right_length_is_no_exemption_from_settling() -> None:
     heard = REPLY[:1] + b"\x03" + REPLY[2:]
     exchange = acked()
