@@ -19,8 +19,9 @@ from busmaster.service import messages
 from busmaster.service.client import Client
 from busmaster.service.folder import Owner, ServedSocket
 from busmaster.service.outbox import Outbox
-from busmaster.service.visit import READ_AT_ONCE, Visit
-from tests.service.lines import ABSENT, Served, SlowWay, on_a_line, on_a_served_line, raw, until
+from busmaster.service.visit import READ_AT_ONCE, Reception, Visit
+from tests.patience import PATIENCE
+from tests.service.lines import ABSENT, Served, SlowWay, on_a_line, on_a_served_line, raw, served, until
 
 
 def test_news_that_were_dropped_take_no_memory() -> None:
@@ -182,13 +183,14 @@ def test_a_poll_group_of_a_thousand_points_comes_in_messages_that_hold_up_nobody
         handles = [Hcp2Controller(remote, 5 + number % 2) for number in range(10)]
         points = [handles[n % 10].point(f"{n % 99 + 1}") for n in range(198)]
         scaled = [replace(point, item=f"{point.item} {n}") for n in range(6) for point in points]
-        group = await remote.poll_group("many", period=5, points=scaled[: messages.MOST_POINTS])
-        snapshot = await anext(aiter(group))
+        cycles = (await remote.poll_group("many", period=60, points=scaled[: messages.MOST_POINTS])).subscribe()
+        line.bus.groups[0].demand()
+        snapshot = await anext(cycles)
         assert len(snapshot) == messages.MOST_POINTS
         assert all(sample.value == 0 for sample in snapshot.samples.values())
         assert max(lengths) < messages.LONGEST_REQUEST / 2
         with pytest.raises(InvalidCommand, match="1000 points at most"):
-            await remote.poll_group("more", period=5, points=scaled[: messages.MOST_POINTS + 1])
+            await remote.poll_group("more", period=60, points=scaled[: messages.MOST_POINTS + 1])
 
     on_a_served_line(tmp_path, story)
 
@@ -225,3 +227,49 @@ def test_one_that_says_nothing_for_ten_seconds_is_let_go(tmp_path: Path, monkeyp
         await until(lambda: not line.service.strangers)
 
     on_a_line(tmp_path, story)
+
+
+def test_one_message_of_each_program_is_taken_before_the_second_of_any() -> None:
+    class Queue:
+        """Some messages of one program."""
+
+        def __init__(self, name: str, count: int) -> None:
+            self.name = name
+            self.count = count
+
+        def take(self) -> None:
+            taken.append((self.name, turn))
+            self.count -= 1
+            if self.count:
+                reception.ask(self)  # type: ignore[arg-type]  # all of a visit that it asks for
+
+    taken: list[tuple[str, int]] = []
+    turn, reception = 0, Reception()
+
+    async def run() -> None:
+        nonlocal turn
+        for name, count in (("first", 1), ("much", 4), ("some", 2), ("one", 1)):
+            reception.ask(Queue(name, count))  # type: ignore[arg-type]
+        for turn in range(1, 9):  # noqa: B007  it is looked at in `take`
+            await asyncio.sleep(0)
+
+    asyncio.run(run())
+    assert [name for name, _ in taken] == ["first", "much", "some", "one", "much", "some", "much", "much"]
+    assert len({turn for _, turn in taken}) == len(taken)
+
+
+def test_it_runs_on_uvloop_too(tmp_path: Path) -> None:
+    uvloop = pytest.importorskip("uvloop")
+
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE), served(tmp_path) as line, connect(line.address) as remote:
+            controller = Hcp2Controller(remote, 5)
+            await controller.write(1, 1.5)
+            assert await asyncio.gather(*(controller.read(number) for number in (1, 2))) == [1.5, 0]
+            async with raw(line) as client:
+                await client.connection.send("[" * (messages.LONGEST_REQUEST + 100))
+                with pytest.raises(ConnectionClosed, match="1009"):
+                    await client.hear()
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        runner.run(run())

@@ -412,8 +412,10 @@ def test_a_sample_of_a_program_serves_until_a_write_by_whatever_program_has_made
     async def story(line: Served, remote: RemoteBus) -> None:
         mine, theirs = Hcp2Controller(remote, 5).point("1"), Hcp2Controller(line.bus, 5).point("1")
         assert await mine.read(max_age=60) == 0
-        group = await remote.poll_group("mine", period=60, points=[mine], phase=0)
-        snapshot = await anext(aiter(group))
+        group = await remote.poll_group("mine", period=60, points=[mine])
+        cycles = group.subscribe()
+        line.bus.groups[0].demand()
+        snapshot = await anext(cycles)
         exchanges = line.bus.statistics().exchanges
         assert mine.node.latest(mine) is snapshot[mine]
         assert await mine.read(max_age=60) == 0
