@@ -36,6 +36,8 @@ class Choice:
         self._in_step = in_step
         self._alike = Alike(wire)
         self._gone_before = 0
+        self._held_since = -inf
+        """When the first went before the one that is held back."""
         self._last_byte = -inf
 
     def next(self, now: float, last_byte: float) -> Chosen | float | None:
@@ -154,21 +156,25 @@ class Choice:
 
     def _while_awaited(self, first: Chosen, now: float, answers: Sequence[bytes] | None = None) -> Chosen | None:
         """Return what goes while an owed answer (that could look so) may still be on time, though the line went on: a
-        check of the node that owes it, which shows that it is not to come; else another. Returns None once two were in
-        vain."""
-        if self._gone_before >= MOST_BEFORE - 1:
+        check of the node that owes it, which shows that it is not to come; else another. After two, only checks, which
+        are short where times are learned, and only for a lateness: with the wait that is left that is no longer than
+        MOST_BEFORE exchanges can last. Then returns None."""
+        if not self._gone_before:
+            self._held_since = now
+        two_gone = self._gone_before >= MOST_BEFORE - 1
+        urgent, timings = first[0].priority is URGENT, first[0].node.timings
+        if two_gone and (urgent or now >= self._held_since + timings.read.lateness):
             return None
 
         def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
             return self._in_step.clashes(answers, now, node)
 
         owing = dict.fromkeys(self._in_step.owing(answers, now))
-        other = (
-            self._of_these(owing, now, clashes)
-            or self._ask_check(owing, now, clashes)
-            or self._another(first, now, clashes)
-        )
-        self._gone_before += other is not None
+        other = self._of_these(owing, now, clashes) or self._ask_check(owing, now, clashes)
+        if other is None and not two_gone:
+            other = self._another(first, now, clashes)
+        if other is not None and not two_gone:
+            self._gone_before += 1
         return other
 
     def _of_these(self, nodes: Container[NodeRecord], now: float, unfit: Unfit) -> Chosen | None:
