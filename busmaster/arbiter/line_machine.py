@@ -6,8 +6,7 @@ One half-duplex line, many nodes, anonymous replies: at most one exchange is on 
 one can come when the next begins (R3), unless its window was learned (R15). It is told the time and sends nothing: its
 owner pumps `poll_transmit`, then `poll_event`, and arms a timer for `poll_timeout`. Calls too early change nothing.
 
-The line is in one of five states; `_line_due` is when the state ends by itself.
-from busmaster.arbiter.mark import Mark
+The line is in one of five states; `_deadlines.line` is when the state ends by itself.
 
 =========  =====================  =======================  ==========================  ====================
 state      data received          its deadline             line_up / line_down         submit, poll due
