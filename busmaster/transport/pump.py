@@ -174,7 +174,7 @@ class Pump(asyncio.Protocol):
         self._transport = cast("asyncio.Transport", transport)
         self._port = open_port(self._transport)
         self._may_hold = self._may_hold or self._port.flow_controlled
-        self._paused = False
+        self._paused = self._all_has_left = False
         self._held_since = inf
         self.arbiter.line_up(self.clock(), paced=self._paced(transport))
         self.turn()
@@ -232,7 +232,8 @@ class Pump(asyncio.Protocol):
             self._armed = due
             self._alarm.set(due)
         if self.arbiter.state is LineState.HOLDOFF and self._port is not None and not self._all_has_left:
-            # As when the hold is over, but now nobody waits for the answer. However short a time it was under way.
+            # It would be asked when the hold is over, when the next request waits for that. `inf`: nothing may be under
+            # way either, however short a time ago it was said, or it is asked again then.
             self._all_has_left = self._port.unsent(inf) == 0
 
     def _on_time(self) -> None:
