@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 from busmaster.arbiter.alike import Alike
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import UP, NodeRecord
-from busmaster.arbiter.in_step import InStep
+from busmaster.arbiter.in_step import MOST_UNHEARD, InStep
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.transaction import URGENT, Transaction
 from busmaster.contract.exchange import Command, Exchange
@@ -136,8 +136,9 @@ class Choice:
             other = self._another(first, now, clashes, of)
         if other is None:
             ends = in_step.ends(answers, now)
-            if ends < inf:
-                return ends
+            if ends < inf:  # what its own node owes has to be asked for then, too
+                own = in_step.clashes(answers, ends, first[0].node)
+                return (self._ask_itself(first, now) if own else None) or ends
             asked, silent = self._whom_to_ask(now)
             worth_it = first[0].writes or not first[0].attempts
             if worth_it and not (owing or asked):  # all are silent: a check of its own node costs no more than it would
@@ -201,7 +202,10 @@ class Choice:
         """Return a check of a node that owes what it is to be asked for: its answer would not be believed. Returns None
         for a node that is likely to be dead."""
         node = first[0].node
-        if node.silent or self._gone_before >= MOST_BEFORE:  # a death would cost the living an exchange
+        # A death would cost the living an exchange. Where times are learned that is a short one.
+        brief = node.learning is not None and not node.failures
+        dead = node.unheard > MOST_UNHEARD if brief else node.silent
+        if dead or self._gone_before >= MOST_BEFORE:
             return None
         self._gone_before += 1
         return self._ask_check([node], now, lambda answers, node: self._in_step.clashes(answers, now, node))

@@ -266,6 +266,23 @@ def test_r15_all_that_owe_are_asked_before_a_write_waits_for_a_lateness() -> Non
     assert write.started - held_at == pytest.approx(3 * (REQUEST + TOOK))
 
 
+def test_r15_who_has_lost_two_replies_is_asked_for_a_check_before_an_answer_that_would_not_be_believed() -> None:
+    bench = Bench()
+    node, other = trained(bench, 1), trained(bench, 2)
+    lost = [bench.ask(node, hcp2.Read(element)) for element in (1, 3)]
+    for number in range(40):  # until the lateness of both is over, and the other has answered since
+        bench.ask(other, hcp2.Read(20 + number))
+    to_node = []
+    while not all(bench.ended(read) for read in lost):
+        bench.until_sent()
+        request = bench.sent()
+        if request[3:8] == request_of(1)[3:8]:
+            to_node.append(request)
+        if request[3:8] != request_of(1)[3:8] or len(to_node) > 2:
+            bench.answer(after=REQUEST + TOOK)
+    assert to_node == [request_of(1), request_of(3), request_of(10), request_of(1), request_of(3)]
+
+
 def test_r9_what_goes_before_a_write_takes_no_longer_than_three_exchanges_that_nobody_answers() -> None:
     bench = Bench()
     other = trained(bench, 9)
