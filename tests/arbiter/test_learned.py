@@ -283,6 +283,21 @@ def test_r15_who_has_lost_two_replies_is_asked_for_a_check_before_an_answer_that
     assert to_node == [request_of(1), request_of(3), request_of(10), request_of(1), request_of(3)]
 
 
+def test_r15_a_node_that_was_heard_late_is_asked_for_a_check_before_its_last_attempt() -> None:
+    bench = Bench()
+    node = trained(bench)
+    read = bench.ask(node, retries=1)
+    for request in (request_of(element) for element in (1, 10, 11, 2, 3)):
+        bench.until_sent()
+        assert bench.sent() == request
+    bench.hear(reply_of(10, 5), after=0.020)
+    bench.until_sent()
+    assert bench.sent() != request_of(1), "its answer could be the first attempt's"
+    bench.answer(after=REQUEST + TOOK)
+    bench.served(read, after=REQUEST + TOOK)
+    assert (read.error, read.attempts) == (None, 2)
+
+
 def test_r9_what_goes_before_a_write_takes_no_longer_than_three_exchanges_that_nobody_answers() -> None:
     bench = Bench()
     other = trained(bench, 9)
