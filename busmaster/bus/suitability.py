@@ -30,9 +30,11 @@ def check_settings(profile: Profile, endpoint: Endpoint) -> None:
     settings = endpoint.settings
     if settings is None or not isinstance(endpoint, SerialPort | TcpPort):
         return
-    if isinstance(endpoint, SerialPort) and settings.framing != profile.line.framing:
+    framings = dict.fromkeys(line.framing for line in (profile.line, *profile.other_lines))
+    if isinstance(endpoint, SerialPort) and settings.framing not in framings:
+        usual = " or ".join(framings)
         warnings.warn(
-            f"{profile.name} is meant for {profile.line.framing}, but {endpoint.name} is {settings.framing}",
+            f"{profile.name} is meant for {usual}, but {endpoint.name} is {settings.framing}",
             stacklevel=4,
         )
     if wrong := profile.wrong_rate(settings.baudrate):

@@ -27,6 +27,7 @@ COMMANDS = (
     "write",
     "poll",
     "scan",
+    "discover",
     "emulate",
     "run",
     "serve",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from busmaster.contract.exchange import Command, Listener
@@ -41,6 +41,10 @@ class LineSettings:
     def framing(self) -> str:
         return f"{self.bytesize}{self.parity}{self.stopbits:g}"
 
+    def at(self, *baudrates: int) -> tuple[LineSettings, ...]:
+        """Return the same framing at other rates."""
+        return tuple(replace(self, baudrate=baudrate) for baudrate in baudrates)
+
 
 @dataclass(frozen=True, slots=True)
 class Batch:
@@ -63,7 +67,8 @@ class Profile:
     another request's, one of those is asked that cannot be (R15); a node that refuses one is asked another.
     `exchange_limit` bounds one exchange as a whole, in seconds (MSC: past it a bad packet is ACKed away); its
     exchanges are `Abandonable`. `shares_line_with` are the other protocols whose nodes may be on the same line.
-    `fixed_rate`: its devices have the baud rate of `line` and no other.
+    `fixed_rate`: its devices have the baud rate of `line` and no other. `other_lines`: further settings that its
+    devices are met with, the likeliest first, for whoever looks for one on an unknown line.
     """
 
     name: str
@@ -80,6 +85,7 @@ class Profile:
     noise_tolerant: bool = False
     shares_line_with: frozenset[str] = frozenset()
     fixed_rate: bool = False
+    other_lines: Sequence[LineSettings] = ()
     exchange_limit: float | None = None
     listen: Callable[[], Listener] | None = field(default=None, compare=False)
     # Compared apart: a second handle that leaves it open asks for the same node (Node.check_shared).

@@ -2,7 +2,9 @@
 -- frames say is left to Wireshark's own dissector.
 --
 -- Copy it into the folder that Help > About Wireshark > Folders calls "Personal Lua Plugins", or run
--- tshark -X lua_script:busmaster.lua -r line.pcapng. Every packet is one frame on the line behind a header (version,
+-- tshark -X lua_script:busmaster.lua -r line.pcapng. The folder profile/ beside it has columns for the times of replies
+-- and colours for what went wrong: copied as profiles/busmaster into the "Personal configuration" folder, it is chosen
+-- by Edit > Configuration Profiles or -C busmaster. Every packet is one frame on the line behind a header (version,
 -- protocol, direction, outcome, node; since version 2 the request and the attempt at it, by number), on the private
 -- link type 157. A protocol that has no number there is called as the packet's interface is described. Frames are read
 -- by position: any byte, a control character too, may be a checksum.
@@ -19,6 +21,7 @@ local OUTCOMES = {
 }
 local NO_REPLY, UNASKED, DOUBTED = 2, 5, 6
 local SHORT_COMMANDS = { [NAK] = "again", [ACK] = "next", [BS] = "previous" }
+local ACKNOWLEDGED = { ACK = true, NAK = true, EOT = true }
 local ACKNOWLEDGEMENTS = { [ACK] = "ACK", [NAK] = "NAK", [EOT] = "EOT" }
 
 local line = Proto("busmaster", "Serial line of drives")
@@ -49,6 +52,7 @@ local f = {
   status = ProtoField.string("busmaster.checksum.status", "Checksum status"),
   request_in = ProtoField.framenum("busmaster.request_in", "Request in", base.NONE, frametype.REQUEST),
   time = ProtoField.double("busmaster.time", "Seconds since the request"),
+  late = ProtoField.bool("busmaster.late", "Came after its request was given up"),
 }
 line.fields = f
 
@@ -60,6 +64,7 @@ local e = {
   silent = ProtoExpert.new("busmaster.silent", "No reply", expert.group.SEQUENCE, expert.severity.WARN),
   echo = ProtoExpert.new("busmaster.echo", "Not what was asked", expert.group.SEQUENCE, expert.severity.WARN),
   unasked = ProtoExpert.new("busmaster.unasked", "Nobody asked for this", expert.group.SEQUENCE, expert.severity.NOTE),
+  late = ProtoExpert.new("busmaster.late.note", "A late reply", expert.group.SEQUENCE, expert.severity.WARN),
   unused = ProtoExpert.new("busmaster.unused", "Not taken for an answer", expert.group.SEQUENCE, expert.severity.WARN),
 }
 line.experts = e
@@ -216,8 +221,9 @@ local function telegram(p, frame, start, check, mask)
   return true
 end
 
-local function acknowledgement(p, frame)
-  local text = ACKNOWLEDGEMENTS[frame(0, 1):uint() % 128]
+-- `mask`: where bit 7 of a character may carry parity. Elsewhere it is a bit as any other, and 0x86 is no ACK.
+local function acknowledgement(p, frame, mask)
+  local text = ACKNOWLEDGEMENTS[frame(0, 1):uint() % (mask or 256)]
   if frame:len() ~= 1 or not text then return false end
   local item = p.tree:add(f.acknowledgement, frame(0, 1), text)
   if text == "NAK" then item:add_proto_expert_info(e.refused) end
@@ -293,7 +299,7 @@ end
 local function mentor(p, frame)
   local size, first = frame:len(), frame(0, 1):uint() % 128
   if p.direction == FROM_NODE then
-    if size == 1 then return acknowledgement(p, frame) end
+    if size == 1 then return acknowledgement(p, frame, 128) end
     p.kind = "value"
     return size >= 7 and first == STX and add_parameter(p, frame(1, 4)) and mentor_data(p, frame, 5, 1)
   end
@@ -450,43 +456,75 @@ end
 -- The conversation: which request a reply answers --------------------------------------------------------------------
 
 local READERS = { comms, comms, comms, msc, mentor, dc104, modbus, mentor }
-local asked, links = nil, {}
+-- The request that waits for an answer; the last one that was given up; and by packet, found as the packets are read in
+-- order the first time, the request that it answers and the one that it is too late for.
+local asked, given_up, links, late = nil, nil, {}, {}
 
 function line.init()
-  asked, links = nil, {}
+  asked, given_up, links, late = nil, nil, {}, {}
 end
 
--- Filled in the first time a packet is seen, in order; looked up ever after. Where the master said to which exchange a
--- packet belongs, only a request of the same one is its request.
-local function link(p, pinfo)
-  if not pinfo.visited then
-    if p.exchange and asked and asked.exchange ~= p.exchange then asked = nil end
-    if p.direction == FROM_NODE then
-      links[pinfo.number] = asked
-    elseif p.kind == "short" then
-      links[pinfo.number] = asked
-      local menu, number = (asked and asked.item or ""):match("^(%d+)%.(%d+)$")
-      local step = ({ again = 0, next = 1, previous = -1 })[p.say]
-      local item = menu and string.format("%s.%02d", menu, number + step)
-      if asked then
-        asked = { number = pinfo.number, time = pinfo.rel_ts, item = item, what = item, node = asked.node, kind = "read" }
-        asked.exchange = p.exchange
-      end
-    elseif p.direction == FROM_HOST and p.kind and p.kind ~= "ACK" and p.kind ~= "NAK" then
-      asked = { number = pinfo.number, time = pinfo.rel_ts, item = p.item, what = p.what, node = p.node, kind = p.kind }
-      asked.exchange = p.exchange
-    elseif p.direction == FROM_HOST then
-      links[pinfo.number] = asked
-    end
+local function request_of(p, pinfo)
+  return {
+    number = pinfo.number, time = pinfo.rel_ts, item = p.item, what = p.what, node = p.node, kind = p.kind,
+    exchange = p.exchange, reader = READERS[p.protocol],
+  }
+end
+
+-- A short command asks for the parameter of the request before it, or for the one beside that.
+local function short_request(p, pinfo)
+  local request = request_of(p, pinfo)
+  local menu, number = (asked.item or ""):match("^(%d+)%.(%d+)$")
+  local step = ({ again = 0, next = 1, previous = -1 })[p.say]
+  request.item = menu and string.format("%s.%02d", menu, number + step)
+  request.what, request.node, request.kind = request.item, asked.node, "read"
+  return request
+end
+
+-- Where the master said to which exchange a packet belongs, only a request of the same one is its request; and only a
+-- request of the same kind of frames can be: several protocols may share a line.
+local function link(p, pinfo, outcome)
+  if pinfo.visited then return links[pinfo.number] end
+  if asked and (asked.reader ~= READERS[p.protocol] or (p.exchange and asked.exchange ~= p.exchange)) then asked = nil end
+  local asks = p.direction == FROM_HOST and p.kind and p.kind ~= "short" and not ACKNOWLEDGED[p.kind]
+  if p.direction ~= 0 and not asks then links[pinfo.number] = asked end
+  if asks then asked = request_of(p, pinfo) end
+  if asked and p.kind == "short" then asked = short_request(p, pinfo) end
+  if outcome == NO_REPLY then
+    given_up = asked
+  elseif p.direction == FROM_NODE and given_up and asked and given_up.node == asked.node then
+    given_up = nil -- a node answers in order: it has said what it owed
   end
   return links[pinfo.number]
+end
+
+-- Bytes that nobody asked for may be the answer to the last request that was given up, if they could answer it.
+local function lateness(p, pinfo)
+  if pinfo.visited then return late[pinfo.number] end
+  local answers = p.kind == "value" or ACKNOWLEDGED[p.kind or ""]
+  if given_up and answers and given_up.reader == READERS[p.protocol] and (p.item or given_up.item) == given_up.item then
+    late[pinfo.number], given_up = given_up, nil
+  end
+  return late[pinfo.number]
+end
+
+local function seconds_since(request, pinfo)
+  return math.floor((pinfo.rel_ts - request.time) * 1e6 + 0.5) / 1e6
+end
+
+local function add_lateness(p, pinfo, request)
+  p.node = p.node or request.node
+  p.tree:add(f.request_in, request.number):set_generated()
+  p.tree:add(f.time, seconds_since(request, pinfo)):set_generated()
+  p.tree:add(f.late, true):set_generated()
+  p.tree:add_proto_expert_info(e.late, "A late reply to the request in packet " .. request.number)
 end
 
 local function add_link(p, pinfo, request)
   p.node = p.node or request.node
   p.tree:add(f.request_in, request.number):set_generated()
   if p.direction ~= FROM_NODE then return end
-  p.tree:add(f.time, math.floor((pinfo.rel_ts - request.time) * 1e6 + 0.5) / 1e6):set_generated()
+  p.tree:add(f.time, seconds_since(request, pinfo)):set_generated()
   if p.kind ~= "value" then return end
   if p.item and request.item and p.item ~= request.item then
     p.tree:add_proto_expert_info(e.echo, "Not what was asked: " .. (request.what or request.item))
@@ -546,8 +584,13 @@ function line.dissector(tvb, pinfo, root)
   if not whole then p.kind, p.say = nil, nil end
   local in_frame = p.node
   if not in_frame and tvb(4, 2):uint() ~= NO_NODE then p.node = tvb(4, 2):uint() end
-  local request = outcome ~= UNASKED and link(p, pinfo)
-  if request then add_link(p, pinfo, request) end
+  if outcome == UNASKED then
+    local request = direction == FROM_NODE and lateness(p, pinfo)
+    if request then add_lateness(p, pinfo, request) end
+  else
+    local request = link(p, pinfo, outcome)
+    if request then add_link(p, pinfo, request) end
+  end
   if p.node and not in_frame then tree:add(f.node, tvb(4, 2), p.node):set_generated() end
   if p.leg then tree:add(f.leg, p.leg):set_generated() end
   if protocol == MODBUS and size > 0 then

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import anyio.to_thread
 
@@ -215,9 +216,8 @@ async def ask_all(patient: Patient, prober: Prober) -> list[Record]:
 
 async def try_settings(patient: Patient, wire: Wire, prober: Prober, tell: Tell) -> None:
     """Try, as nobody answers, whether somebody would at another rate or framing. The port is left as it was."""
-    assert wire.transport is not None
-    device, settings = wire.transport.get_extra_info("serial"), patient.endpoint.settings
-    if device is None or settings is None:
+    settings = patient.endpoint.settings
+    if not wire.tunable or settings is None:
         return
     if not wire.paced:
         tell(Finding("settings", True, "a pseudo-terminal has no baud rate: no other was tried"))
@@ -228,41 +228,29 @@ async def try_settings(patient: Patient, wire: Wire, prober: Prober, tell: Tell)
     try:
         with patient.progress("trying rates", len(candidates)) as bar:
             for candidate in candidates:
-                found = await answers_at(candidate, device, prober, asked, patience)
+                found = await answers_at(candidate, wire, prober, asked, patience)
                 bar.advance()
                 if found is not None:
                     break
     finally:
-        with anyio.CancelScope(shield=True):
-            await anyio.to_thread.run_sync(configure, device, settings)
+        with anyio.CancelScope(shield=True), contextlib.suppress(LineDown):
+            await wire.tune(settings)
     tell(diagnosis.other_rate(found, candidate, patient.crowd(asked), len(candidates)))
 
 
 async def answers_at(
-    settings: LineSettings, device: Any, prober: Prober, asked: Sequence[int], patience: float
+    settings: LineSettings, wire: Wire, prober: Prober, asked: Sequence[int], patience: float
 ) -> int | None:
     """Return the first node that answers with these settings; None too where the port does not take them."""
     try:
-        await anyio.to_thread.run_sync(configure, device, settings)
-    except (OSError, ValueError):
+        await wire.tune(settings)
+    except LineDown:
         return None
     prober.byte_time = settings.byte_time
     for address in asked:
         if (await prober.ask(address, patience=patience)).outcome is Outcome.ANSWERED:
             return address
     return None
-
-
-def configure(device: Any, settings: LineSettings) -> None:
-    """Give an open port other settings. Blocks. Raises OSError or ValueError for what the port does not take."""
-    device.apply_settings(
-        {
-            "baudrate": settings.baudrate,
-            "bytesize": settings.bytesize,
-            "parity": settings.parity,
-            "stopbits": settings.stopbits,
-        }
-    )
 
 
 def other_settings(settings: LineSettings) -> list[LineSettings]:

@@ -22,7 +22,7 @@ from busmaster.arbiter.tap import Attempt, Tap, Verdict
 from busmaster.arbiter.unasked import QUIET
 from busmaster.contract.driver import Driver
 from busmaster.contract.exchange import Command, Exchange, FrameError
-from busmaster.contract.profile import Profile
+from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import LineDown, Refused, cause_text
 from busmaster.outputs.values import value_text
@@ -85,6 +85,15 @@ class Wire(asyncio.Protocol):
         if self._tap is not None:
             self._tap.transmitted(now, data, self.attempt)
         return now
+
+    @property
+    def tunable(self) -> bool:
+        """Whether the port can be set to other rates: a device server's cannot, from here."""
+        return hasattr(self.transport, "tune")
+
+    async def tune(self, settings: LineSettings) -> None:
+        """Set the open port to another rate and framing. Raises LineDown where it does not take them."""
+        await self.transport.tune(settings)  # type: ignore[union-attr]  # of a tunable one, which is open
 
     def attempted(self, attempt: Attempt) -> None:
         """Tell the tap that this is over."""
@@ -149,7 +158,8 @@ class Probe:
     """One request and what was heard of it, without an echo.
 
     `start`: seconds from the request's end on the wire to the first byte, None if there was none. `text` is the command
-    and its value or refusal, or what was wrong. `again`: bytes that came after the reply, to which nobody was entitled.
+    and its value or refusal, or what was wrong. `raw` is all that came, and `again` what of it came after the reply, to
+    which nobody was entitled.
     """
 
     outcome: Outcome
@@ -157,6 +167,7 @@ class Probe:
     text: str = ""
     raw: bytes = b""
     again: bytes = b""
+    refused: bool = False
 
 
 class Prober:
@@ -262,7 +273,9 @@ class _Hearing:
             return Probe(Outcome.GARBLED, self.start, result, self._raw + rest)
         text = value_text(result) if verdict is Verdict.OK else result
         left_over = b"" if self.driver.ending is None else self.driver.ending.rest
-        return Probe(Outcome.ANSWERED, self.start, f"{self._command}: {text}", self._raw, left_over + rest)
+        told = f"{self._command}: {text}"
+        raw = self._raw + rest
+        return Probe(Outcome.ANSWERED, self.start, told, raw, left_over + rest, verdict is Verdict.REFUSED)
 
     def _hear(self, now: float, data: bytes) -> None:
         if self.start is None:

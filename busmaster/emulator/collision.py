@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.chance import Chance
 from busmaster.emulator.device import Device
+from busmaster.emulator.misheard import IDLE, START, parity_bit
 
-IDLE = 1
-START = 0
 ROUNDING = 1e-6
 """Of a bit: times are floats."""
 
@@ -85,6 +84,5 @@ class Collision:
 
     def _encode(self, byte: int) -> list[int]:
         data = [byte >> place & 1 for place in range(self._bytesize)]
-        ones = sum(data) & 1
-        parity = {"N": [], "E": [ones], "O": [1 - ones], "M": [1], "S": [0]}[self._parity]
+        parity = [] if self._parity == "N" else [parity_bit(data, self._parity)]
         return [START, *data, *parity, *[IDLE] * self._stop_bits]

@@ -30,6 +30,7 @@ from busmaster.emulator.collision import Collision
 from busmaster.emulator.device import NEVER, Device
 from busmaster.emulator.disturbance import Said, distort, flipped
 from busmaster.emulator.faults import Faults
+from busmaster.emulator.misheard import misheard
 
 PIECE = 0.005
 """Seconds of a frame that a port hands over at once."""
@@ -100,6 +101,9 @@ class Line:
 
         Needless if the host asks at each of its deadlines.
         """
+        self.host: LineSettings | None = None
+        """How the host's port is set, where that is not as the line is: then neither hears the other rightly. Devices
+        pass over bytes with a wrong parity or stop bit; the host's port hands them over."""
         self._piece = max(1, int(PIECE / self.tau)) if self.tau else 0
         self.collisions = 0
         """Talks that started while another was on the wire."""
@@ -176,6 +180,8 @@ class Line:
         """Have the host say `data`, behind what it is still sending."""
         self._advance(now)
         start = now if now > self._sent_by else self._sent_by
+        if self.host is not None:
+            data = self._as_devices_hear(data, start)
         self._sent_by = start + len(data) * self.tau
         self._say(None, start, data)
 
@@ -305,8 +311,17 @@ class Line:
 
     # What the host hears of it
 
+    def _as_devices_hear(self, data: bytes, start: float) -> bytes:
+        """Return what is left for the devices of what a host says whose port is set otherwise, and echo it to that."""
+        assert self.host is not None
+        if self.echo is not None:
+            self._arrive(data, start + (len(data) * self.host.byte_time if self.tau else 0.0) + self.echo.delay)
+        return bytes(byte for byte, whole in misheard(data, self.host, self.settings) if whole)
+
     def _heard_at_once(self, talk: Talk) -> bool:
-        """Return whether the host hears it as it comes."""
+        """Return whether the host hears it as it comes; what is misheard is reckoned as a whole."""
+        if self.host is not None:
+            return False
         return talk.talker is not None or (self.echo is not None and not self.echo.delay and not self.echo.corrupt)
 
     def _count(self, talk: Talk, now: float) -> int:
@@ -329,8 +344,11 @@ class Line:
         if talk.collision is not None:
             self._arrive(self._host_hears(talk.collision, NEVER)[talk.given :], talk.end)
         elif talk.talker is not None:
-            self._arrive(talk.data[talk.given :], talk.end)
-        elif self.echo is not None:
+            data = talk.data[talk.given :]
+            if self.host is not None:
+                data = bytes(byte for byte, _ in misheard(data, self.settings, self.host))
+            self._arrive(data, talk.end)
+        elif self.echo is not None and self.host is None:
             data = talk.data[talk.given :]
             if self.echo.corrupt and self.chance.random() < self.echo.corrupt:
                 data = flipped(data, self.chance, 1)

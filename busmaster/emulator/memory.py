@@ -92,6 +92,10 @@ class MemoryTransport(asyncio.Transport):
         """Return how many bytes are held."""
         return len(self._held or b"")
 
+    async def tune(self, settings: LineSettings) -> None:
+        """Set the port to another rate and framing: what is not as the line is neither hears it nor is heard."""
+        self._line.host = None if settings == self._line.settings else settings
+
     def hold(self) -> None:
         """Hold back what is written from now on, as if flow control stopped the port."""
         if self._held is None:

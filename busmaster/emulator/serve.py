@@ -20,6 +20,7 @@ from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
+from busmaster.emulator import port_settings
 from busmaster.emulator.device import NEVER
 from busmaster.emulator.line import Line
 
@@ -143,8 +144,8 @@ class LineServer(ABC):
 class PtyServer(LineServer):
     """A line on a pseudo-terminal. `path` is `link` if given, else the terminal's own.
 
-    The terminal is raw and is held open, so that clients may come and go. Raises FileExistsError if `link` is there
-    and is no symbolic link.
+    The terminal is raw and is held open, so that clients may come and go. It is set to the line's rate; a client that
+    sets another hears, and is heard, as by a UART. Raises FileExistsError if `link` is there and is no symbolic link.
     """
 
     def __init__(self, line: Line, link: str | os.PathLike[str] | None = None) -> None:
@@ -154,6 +155,8 @@ class PtyServer(LineServer):
         self.path = self._device
         try:
             tty.setraw(self._slave)
+            port_settings.set_rate(self._slave, line.settings.baudrate)
+            self._terminal = port_settings.words(self._master)
             os.set_blocking(self._master, False)
             if self._link is not None:
                 if os.path.islink(self._link):
@@ -170,6 +173,10 @@ class PtyServer(LineServer):
         return [self._master]
 
     def _read(self, source: int) -> bytes:
+        terminal = port_settings.words(self._master)
+        if terminal != self._terminal:  # whoever says this has set it
+            self._terminal = terminal
+            self.line.host = port_settings.differing(terminal, self.line.settings)
         try:
             return os.read(source, CHUNK)
         except BlockingIOError:

@@ -105,6 +105,8 @@ class NodeKind:
     make_device: DeviceMaker
     items: str
     """What an ITEM of such a node looks like, for the command line's help; its words are wrapped there."""
+    probe_item: str = ""
+    """The ITEM that the profile's probe reads."""
     documented: tuple[Item, ...] = ()
     """What the protocol's document says of items, one by one."""
     options: tuple[Option, ...] = ()

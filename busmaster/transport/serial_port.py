@@ -183,6 +183,14 @@ class PortTransport(_SerialTransport):
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._port.name}{' closing' if self._closing else ''}>"
 
+    async def tune(self, settings: LineSettings) -> None:
+        """Set the open port to another rate and framing. Raises LineDown where it does not take them.
+
+        Of a pseudo-terminal, that takes no framing, the rate is set, and whether odd parity is meant.
+        """
+        change = functools.partial(_tune, self._port, self._serial, settings)
+        await asyncio.wrap_future(in_own_thread(change, f"tune {self._port.path}"))
+
     def _read_ready(self) -> None:
         """Read from the descriptor: pyserial's read asks select(), which fails above descriptor 1023."""
         try:
@@ -347,6 +355,18 @@ def _equip(port: SerialPort, device: serial.Serial) -> None:
                 f"the driver of {port.path} has no low-latency flag",
                 hint="leave low_latency out; `busmaster doctor` tells what the adapter does",
             ) from None
+
+
+def _tune(port: SerialPort, device: serial.Serial, settings: LineSettings) -> None:
+    wanted: dict[str, object] = {"baudrate": settings.baudrate, "stopbits": settings.stopbits}
+    if is_pty(device.fileno()):
+        wanted["parity"] = "O" if settings.parity == "O" else "N"
+    else:
+        wanted |= {"bytesize": settings.bytesize, "parity": settings.parity}
+    try:
+        device.apply_settings(wanted)
+    except (OSError, ValueError, termios.error):
+        raise LineDown(f"{port.path} does not take {settings.baudrate} baud, {settings.framing}") from None
 
 
 def _refusal(port: SerialPort, error: Exception) -> LineDown:

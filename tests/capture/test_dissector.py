@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import random
+import re
 import shutil
 import struct
 import subprocess
@@ -33,10 +35,7 @@ EXPERT = "_ws.expert.message"
 def dissect(folder: Path, packets: list[Packet], *fields: str) -> list[list[str]]:
     """The fields of each packet, as tshark prints them."""
     path = folder / "line.pcapng"
-    with path.open("wb") as file:
-        writer = PcapngWriter(file, port="COM1")
-        for packet in packets:
-            writer.write(packet)
+    write_capture(path, packets)
     names = [argument for field in fields for argument in ("-e", field)]
     command = ["tshark", "-X", f"lua_script:{DISSECTOR}", "-r", str(path), "-T", "fields", "-E", "separator=\t", *names]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=PATIENCE)
@@ -44,6 +43,13 @@ def dissect(folder: Path, packets: list[Packet], *fields: str) -> list[list[str]
     rows = [line.split("\t") for line in done.stdout.splitlines()]
     assert len(rows) == len(packets)
     return rows
+
+
+def write_capture(path: Path, packets: list[Packet]) -> None:
+    with path.open("wb") as file:
+        writer = PcapngWriter(file, port="COM1")
+        for packet in packets:
+            writer.write(packet)
 
 
 def packet(at: int, protocol: str, sender: Direction, frame: str, node: int | None = None) -> Packet:
@@ -330,3 +336,79 @@ def test_no_bytes_however_garbled_upset_it(tmp_path: Path) -> None:
         packets.append(Packet(START, spoken, sender, bytes(garbled), draw.choice([None, 1]), outcome))
     rows = dissect(tmp_path, packets, EXPERT)
     assert not [message for (message,) in rows if "Lua" in message]
+
+
+def test_a_character_with_bit_7_set_acknowledges_where_that_bit_is_parity_and_nowhere_else(tmp_path: Path) -> None:
+    asked = {
+        "hcp2": "07 30 31 02 44 45 35 03 34",
+        "msc": "02 01 00 08 00 00 53 46 4C 41 47 2C 00 05 01 A7",
+        "dc104": "02 55 02 FF FF 55",
+        "mentor": "04 31 31 34 34 02 30 31 31 37 2B 30 34 37 36 35 03 3F",
+    }
+    packets: list[Packet] = []
+    for protocol, request in asked.items():
+        packets += [packet(len(packets), protocol, HOST, request), packet(len(packets) + 1, protocol, NODE, "86")]
+    rows = dissect(tmp_path, packets, "busmaster.ack", EXPERT)
+    assert [acknowledged for acknowledged, _ in rows[1::2]] == ["", "", "", "ACK"]
+    assert ["cut short" in told for _, told in rows[1::2]] == [True, True, True, False]
+
+
+def test_a_short_command_behind_another_protocols_request_is_tied_to_nothing(tmp_path: Path) -> None:
+    packets = [
+        packet(0, "hcp2", HOST, "07 30 32 02 30 31 05 04"),
+        packet(1, "mentor", HOST, "06"),
+        packet(2, "mentor", NODE, "02 30 31 31 38 2B 30 30 30 30 30 03 30"),
+    ]
+    rows = dissect(tmp_path, packets, "_ws.col.Info", "busmaster.request_in", EXPERT)
+    assert rows[1:] == [["next", "", ""], ["01.18 = +00000", "", ""]]
+
+
+def test_what_comes_after_its_request_was_given_up_is_called_late(tmp_path: Path) -> None:
+    request, reply = "07 30 32 02 30 31 05 04", "02 30 31 35 03 37"
+    packets = [
+        packet(0, "hcp2", HOST, request),
+        replace(packet(100, "hcp2", NODE, "", 2), outcome=Outcome.NO_REPLY),
+        replace(packet(120, "hcp2", NODE, "02 30 32 35 03 34"), outcome=Outcome.UNASKED),
+        replace(packet(130, "hcp2", NODE, reply), outcome=Outcome.UNASKED),
+        replace(packet(140, "hcp2", NODE, reply), outcome=Outcome.UNASKED),
+        packet(200, "hcp2", HOST, request),
+        packet(205, "hcp2", NODE, reply),
+    ]
+    rows = dissect(tmp_path, packets, "busmaster.late", "busmaster.time", "busmaster.request_in", EXPERT)
+    assert rows[3][:3] == ["1", "0.13", "1"]
+    assert "A late reply to the request in packet 1" in rows[3][3]
+    assert [row[:3] for row in (rows[2], rows[4])] == [["", "", ""]] * 2
+    assert rows[6][:3] == ["", "0.005", "6"]
+
+
+def test_the_profile_shows_times_of_replies_and_colours_what_went_wrong(tmp_path: Path) -> None:
+    packets = [
+        packet(0, "hcp2", HOST, "07 30 32 02 30 31 05 04"),
+        packet(3, "hcp2", NODE, "02 30 31 35 03 37"),
+        packet(4, "hcp2", HOST, "07 30 32 02 30 31 05 04"),
+        replace(packet(104, "hcp2", NODE, "", 2), outcome=Outcome.NO_REPLY),
+        replace(packet(130, "hcp2", NODE, "02 30 31 35 03 37"), outcome=Outcome.UNASKED),
+        replace(packet(200, "hcp2", HOST, "07 30 32 02 30 31 05 04"), transaction=1, attempt=2),
+        replace(packet(203, "hcp2", NODE, "02 30 31 35 03 38"), outcome=Outcome.GARBLED, transaction=1, attempt=2),
+        replace(packet(210, "hcp2", NODE, "15"), outcome=Outcome.UNASKED),
+    ]
+    write_capture(tmp_path / "line.pcapng", packets)
+    shutil.copytree(DISSECTOR.parent / "profile", tmp_path / "profiles" / "busmaster")
+    command = ["tshark", "-C", "busmaster", "-X", f"lua_script:{DISSECTOR}", "-r", str(tmp_path / "line.pcapng")]
+    environment = {**os.environ, "WIRESHARK_CONFIG_DIR": str(tmp_path)}
+
+    def told(*options: str) -> list[str]:
+        done = subprocess.run(
+            [*command, *options], capture_output=True, text=True, check=True, timeout=PATIENCE, env=environment
+        )
+        assert not re.search("Lua|olor|column|preference", done.stderr), done.stderr
+        return done.stdout.splitlines()
+
+    lines = told()
+    assert "0.003" in lines[1]
+    assert "0.126" in lines[4]
+    rules = told("-T", "fields", "-e", "frame.coloring_rule.name", "-e", "frame.number", "--color")
+    names = [re.sub("\x1b\\[[0-9;]*[mK]", "", line).partition("\t")[0] for line in rules]
+    assert names == [
+        "", "", "", "No reply", "Late reply", "Another attempt", "Garbled, or a bad checksum", "Refused",
+    ]  # fmt: skip

@@ -254,8 +254,9 @@ def flood(server: socket.socket) -> None:
 
 def test_where_nobody_answers_that_is_one_finding() -> None:
     findings = examined(line_of("hcp2", [hcp2(5)]), (6, 7))
-    assert findings.wrong == {"nodes"}
+    assert findings.wrong == {"nodes", "settings"}
     assert findings.on("nodes").what == "no answer from nodes 6, 7 at 57600 8N1"
+    assert findings.on("settings").what == "nodes 6, 7: no answer with 20 other settings either"
 
 
 def test_what_learned_windows_would_come_to_is_said() -> None:
@@ -402,30 +403,19 @@ def test_wrong_usage_is_status_2_and_nothing_is_examined(
 # Other settings
 
 
-class Deaf(PtyServer):
-    """A line that hears only while the port is set to its own rate."""
-
-    def __init__(self, line: Line, rate: int) -> None:
-        self.rate = rate
-        super().__init__(line)
-
-    def setting(self) -> int:
-        port = os.open(self.path, os.O_RDWR | os.O_NOCTTY)
-        try:
-            return int(termios.tcgetattr(port)[5])
-        finally:
-            os.close(port)
-
-    def _read(self, source: int) -> bytes:
-        data = super()._read(source)
-        return data if self.setting() == self.rate else b""
+def rate_of(path: str) -> int:
+    port = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        return int(termios.tcgetattr(port)[5])
+    finally:
+        os.close(port)
 
 
 @pytest.mark.usefixtures("hasty")
 def test_a_wrong_rate_is_found_and_the_port_is_left_as_it_was(busmaster: Command) -> None:
-    with Deaf(line_of("hcp2", [hcp2(1)], paced=False), termios.B9600) as server:
+    with serve_pty(Line(LineSettings(9600), [hcp2(1)], paced=False)) as server:
         done = doctor_of_a_paced(server, busmaster)
-        assert server.setting() == termios.B57600
+        assert rate_of(server.path) == termios.B57600
     assert done.status == 1
     assert "no answer from node 1 at 57600 8N1" in done.out
     assert "node 1 answers at 9600 8N1\n" in done.out

@@ -8,9 +8,12 @@ from typing import Any
 
 import pytest
 
+from busmaster.bus.bus import Bus
 from busmaster.contract.exchange import Done
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
+from busmaster.emulator.line import Line
+from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.ct_ansi import codec as ct_ansi
 from busmaster.protocols.dc104 import codec as dc104
@@ -20,6 +23,8 @@ from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.exchange import packet
+from busmaster.registry import NodeKind, kinds
+from busmaster.testing.virtual_time import run_in_virtual_time
 from busmaster.wire.readers import ACK
 
 MINT = ReplyTiming(0.05, 0.1, 0.15, 0.02)
@@ -214,3 +219,20 @@ def test_a_program_status_has_two_bytes_or_more() -> None:
         exchange.feed(ACK)
         step = exchange.feed(packet(1, b"RQSTAT," + bytes(size)))
         assert isinstance(step, Done) == (size >= 2), size
+
+
+@pytest.mark.parametrize("kind", kinds().values(), ids=lambda kind: kind.name)
+def test_the_item_of_the_probe_is_what_the_probe_reads(kind: NodeKind) -> None:
+    async def read() -> None:
+        async with Bus(MemoryPort(Line(kind.profile.line, []))) as bus:
+            handle: Any = kind.handle
+            assert handle(bus, kind.profile.addresses[-1]).point(kind.probe_item).command == kind.profile.probe
+
+    run_in_virtual_time(read())
+
+
+@pytest.mark.parametrize("kind", kinds().values(), ids=lambda kind: kind.name)
+def test_further_settings_of_a_line_are_further_ones_each_named_once(kind: NodeKind) -> None:
+    every = [kind.profile.line, *kind.profile.other_lines]
+    assert len(set(every)) == len(every)
+    assert not (kind.profile.fixed_rate and kind.profile.other_lines)

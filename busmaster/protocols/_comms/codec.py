@@ -19,6 +19,7 @@ from busmaster.wire.numbers import LONGEST_LIST, LONGEST_NUMBER, format_list, fo
 from busmaster.wire.readers import NAK, AcknowledgeReader, TelegramReader, telegram_sizes
 
 LINE = LineSettings(57600)
+OTHER_LINES = LINE.at(9600, 19200, 38400, 115200)
 CHECKED = (1, 2, 3, 4, 5, 6, 7, 99)
 """Elements that every controller has, the cheap reads that tell one answer from another (R15)."""
 # read to the letter, the 50 ms and 100 ms more make the lateness

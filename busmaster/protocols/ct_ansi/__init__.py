@@ -18,6 +18,7 @@ PROTOCOL = Protocol(
             CtAnsiDrive,
             device_of("busmaster.protocols.ct_ansi.device"),
             items="1.21 (menu and parameter), 1.21:8 (8 parameters from there on)",
+            probe_item="1.17",
             documented=(ANY,),
             read_options=(CHAIN,),
             width=lambda item: 0 if is_decimal(item.partition(":")[2]) else 32,

@@ -125,13 +125,15 @@ def is_sendable(value: SupportsFloat) -> bool:
         return False
 
 
+LINE = LineSettings(9600, bytesize=7, parity="E")
 PROFILE = Profile(
     name="ct-ansi",
     title="CT-ANSI",
     # a second digit of 0 means a group, and nobody answers
     addresses=tuple(address for address in range(11, 100) if address % 10),
     broadcast=0,
-    line=LineSettings(9600, bytesize=7, parity="E"),
+    line=LINE,
+    other_lines=LINE.at(4800, 19200, 2400, 38400),
     timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.15, lateness=0.3, byte_gap=0.05)),
     probe=Read(1, 17),
     checks=tuple(Read(1, number) for number in range(17, 22)),

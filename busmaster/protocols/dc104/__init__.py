@@ -19,6 +19,7 @@ PROTOCOL = Protocol(
             Dc104Drive,
             device_of("busmaster.protocols.dc104.device"),
             items="a parameter, 1 to 255",
+            probe_item="1",
             documented=(Item("1-255", "1-255", "a parameter, 0 to 65535", access="read/write"),),
             options=(MAXIMUM, ALLOW_ZERO),
             emulated=(

@@ -17,6 +17,7 @@ PROTOCOL = Protocol(
             HcpController,
             device_of("busmaster.protocols.hcp.device"),
             items="a comms element, 1 to 99",
+            probe_item="1",
             documented=COMMS,
             emulated=EMULATED,
             capture_id=1,

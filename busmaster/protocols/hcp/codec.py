@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import ClassVar
 
 from busmaster.contract.profile import Profile
-from busmaster.protocols._comms.codec import CHECKED, LINE, TIMINGS, ReadElement, WriteElements
+from busmaster.protocols._comms.codec import CHECKED, LINE, OTHER_LINES, TIMINGS, ReadElement, WriteElements
 from busmaster.wire.checks import xor
 from busmaster.wire.readers import ENQ, EOT, ETX, STX
 
@@ -57,5 +57,6 @@ PROFILE = Profile(
     timings=TIMINGS,
     probe=Read(1),
     checks=tuple(Read(element) for element in CHECKED),
+    other_lines=OTHER_LINES,
     shares_line_with=frozenset({"hcp2"}),  # a telegram of the one means nothing to the other
 )

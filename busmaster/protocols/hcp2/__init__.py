@@ -18,6 +18,7 @@ PROTOCOL = Protocol(
             Hcp2Controller,
             device_of("busmaster.protocols.hcp2.device"),
             items=comms_array.FORM,
+            probe_item="1",
             documented=comms_array.ITEMS,
             emulated=EMULATED,
             capture_id=2,
@@ -27,6 +28,7 @@ PROTOCOL = Protocol(
             MicroFlexDrive,
             device_of("busmaster.protocols.hcp2.microflex_device"),
             items=f"an element, or its name: {' '.join(MicroFlexDrive.elements)}",
+            probe_item="1",
             documented=microflex.ITEMS,
             emulated=(
                 Option("current_control", "flag"),

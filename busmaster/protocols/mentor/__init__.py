@@ -39,6 +39,7 @@ PROTOCOL = Protocol(
             device_of("busmaster.protocols.mentor.device"),
             items="1.17 (menu and parameter), 15.60:wide, 1.17:hires, 1.17:20 (20 parameters from there on), or a "
             f"name: {' '.join(NAMED)}",
+            probe_item="1.17",
             documented=ITEMS,
             options=(Option("chained", "flag"),),
             read_options=(CHAIN,),

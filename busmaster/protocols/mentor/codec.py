@@ -332,12 +332,14 @@ def reset(address: int) -> bytes:
     return EOT + b"%d%d%d%d" % (tens, tens, units, units)
 
 
+LINE = LineSettings(9600, bytesize=7, parity="E")  # ten bits a character, as 8N1 has
 PROFILE = Profile(
     name="mentor",
     title="Mentor II",
     addresses=range(1, 100),
     broadcast=0,
-    line=LineSettings(9600, bytesize=7, parity="E"),  # ten bits a character, as 8N1 has
+    line=LINE,
+    other_lines=LINE.at(4800, 19200, 2400, 38400),  # beyond 9600 with an option module
     timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.15, lateness=0.3, byte_gap=0.05)),
     probe=Read(1, 17),
     # a reply names its parameter, which tells these apart (R15)

@@ -18,6 +18,7 @@ PROTOCOL = Protocol(
             items="holding:100, input:100, coil:5, discrete:5 (addresses as sent, 0 to 65535); holding:100:10 (ten "
             "from there on); holding:100:float32 (int16 uint16 int32 uint32 float32 float64, most significant word "
             "first; :swapped behind it for the other order)",
+            probe_item="holding:0",
             documented=(
                 Item("coil:0-65535", "0-65535", "a bit, read by function 1, written by 5 and 15", access="read/write"),
                 Item("discrete:0-65535", "0-65535", "an input bit, read by function 2", access="read"),

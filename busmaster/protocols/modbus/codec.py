@@ -323,11 +323,19 @@ def _span(table: str, first: int, count: int) -> str:
     return f"{table} {first}" if count == 1 else f"{table} {first}-{first + count - 1}"
 
 
+LINE, NO_PARITY = LineSettings(19200, parity="E"), LineSettings(19200)
 PROFILE = Profile(
     name="modbus",
     title="Modbus RTU",
     addresses=range(1, 248),
-    line=LineSettings(19200, parity="E"),  # the standard's default; 8N1 is common
+    line=LINE,  # the standard's default
+    other_lines=(
+        *NO_PARITY.at(9600, 19200),  # common, though the standard wants a second stop bit then
+        *LINE.at(9600),
+        *NO_PARITY.at(38400, 115200, 57600),
+        *LINE.at(38400, 115200, 57600),
+        *LineSettings(19200, parity="O").at(19200, 9600),
+    ),
     timings=Timings.uniform(ReplyTiming(nominal=0.05, window=0.2, lateness=0.4, byte_gap=0.02, turnaround=SILENCE)),
     probe=ReadRegisters(0),  # a unit without it refuses, which is an answer too (R11)
     # unit, function and length are all that tells answers apart, so the lengths differ (R15)

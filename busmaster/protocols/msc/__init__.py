@@ -21,6 +21,7 @@ PROTOCOL = Protocol(
             MscController,
             device_of("busmaster.protocols.msc.device"),
             items="2008 (a data address), 2008:32 (32 values from there on), flag:5, flags, status",
+            probe_item="status",
             documented=ITEMS,
             options=(
                 Option("symbols", "addresses", common=False, reader=read_listing),

@@ -1,0 +1,137 @@
+"""`busmaster discover`: which rate, framing, protocol and nodes an unknown cable has."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+
+from busmaster.arbiter.tap import Tap
+from busmaster.cli.arguments import nodes_option
+from busmaster.cli.capturing import capture_option, capturing
+from busmaster.cli.ending import until_ended
+from busmaster.cli.output import emit_all, note
+from busmaster.cli.parsing import parsed
+from busmaster.contract.profile import LineSettings
+from busmaster.discovery.search import Discovery, Search
+from busmaster.discovery.steps import LISTENING, Step, seconds, steps, untuned_steps
+from busmaster.discovery.writing import lasting, line_text, summary
+from busmaster.doctor.diagnosis import speed
+from busmaster.doctor.probing import opened
+from busmaster.errors import InvalidCommand
+from busmaster.registry import Protocol, find, kinds, protocols
+from busmaster.transport.endpoints import endpoint
+from busmaster.transport.serial_port import SerialPort
+from busmaster.transport.tcp import TcpPort
+
+FAILED = 1
+SERVED = ("unix:", "tcp:")
+USUAL = LineSettings(9600)
+"""What a port is opened with until something is tried."""
+
+
+@dataclass(frozen=True, slots=True)
+class Errand:
+    """What is to be done: on which port, and what is tried."""
+
+    port: SerialPort | TcpPort
+    tried: Sequence[Step]
+
+
+@click.command(short_help="Find out what is on an unknown cable.")
+@click.argument("port")
+@click.option("--yes", is_flag=True, help="Send without asking first.")
+@click.option("-o", "--output", metavar="LINE.toml", help="Write what was found there; to standard output by default.")
+@click.option(
+    "--protocol",
+    "names",
+    multiple=True,
+    type=click.Choice(list(kinds())),
+    metavar="P",
+    help="Try this protocol alone (or these: may be given again); all by default.",
+)
+@nodes_option
+@capture_option
+def command(
+    port: str, yes: bool, output: str | None, names: tuple[str, ...], nodes: tuple[int, ...] | None, capture: str | None
+) -> int:
+    """Find out at which rate, in which framing and which protocols the nodes on PORT speak; write a LINE.toml for them.
+
+    It says what it will try and how long that takes, and asks before it does. It listens first, and sends nothing where
+    somebody else talks. Nothing but reads is sent. Nodes 1 to 8 are asked unless --nodes names others; a baud rate in
+    PORT (`?baudrate=9600`) is the only one that is tried, and with a framing (`&bytesize=7&parity=E`) that too.
+    """
+    errand = Errand(*parsed(lambda text: what_to_try(text, names, nodes), port))
+    if output is not None and Path(output).exists():
+        raise click.UsageError(f"{output} is there already, and not overwritten: choose another name")
+    tell_plan(errand)
+    if not yes and not sys.stdin.isatty():
+        raise click.UsageError("nobody can be asked here, so nothing was sent: say --yes")
+    if not yes and not click.confirm("Send these reads, if nobody else talks there?", err=True):
+        note("nothing was sent")
+        return FAILED
+    with capturing(capture, port=errand.port.name, protocol="", echo=errand.port.echo) as recorder:
+        discovery = until_ended(discover, errand, recorder)
+    if discovery is None:
+        return FAILED
+    text = line_text(lasting(errand.port), discovery)
+    note(f"found {summary(discovery)}")
+    if output is None:
+        emit_all(text.splitlines())
+    else:
+        Path(output).write_text(text)
+        note(f"written to {output}: `busmaster run {output}` polls it")
+    return 0
+
+
+def what_to_try(
+    port: str, names: Sequence[str], nodes: Sequence[int] | None
+) -> tuple[SerialPort | TcpPort, Sequence[Step]]:
+    """Return the port, and what is tried there. Raises InvalidCommand."""
+    if port.startswith(SERVED):
+        raise InvalidCommand(f"{port} is a line that a program owns and knows: discover needs the port itself")
+    wanted: Sequence[Protocol] = list(dict.fromkeys(find(name).protocol for name in names)) or protocols()
+    where = endpoint(port, defaults=USUAL)
+    if isinstance(where, TcpPort):
+        return where, untuned_steps(wanted, nodes)
+    options = port.partition("?")[2]
+    framing = any(f"{key}=" in options for key in ("bytesize", "parity", "stopbits"))
+    allowed = (where.settings if framing else where.baudrate) if "baudrate=" in options else None
+    return where, steps(wanted, nodes, allowed)
+
+
+def tell_plan(errand: Errand) -> None:
+    """Say what will be tried, and for how long."""
+    tried = errand.tried
+    settings = list(dict.fromkeys(step.settings for step in tried))
+    titles = dict.fromkeys(step.protocol.profile.title for step in tried)
+    requests = sum(len(step.addresses) for step in tried)
+    match settings:
+        case [None]:
+            at = "at the server's own rate"
+        case [LineSettings() as only]:
+            at = f"at {speed(only)}"
+        case _:
+            at = f"at {len(settings)} settings of the line"
+    reads = "1 read" if requests == 1 else f"{requests} reads"
+    note(f"{errand.port.name}: listen for {LISTENING:g} s; then {reads}, {at}, in {', '.join(titles)}")
+    note(f"that takes {seconds(tried):.0f} s at most where nobody answers; nothing is written to any node")
+
+
+async def discover(errand: Errand, tap: Tap | None) -> Discovery | None:
+    """Listen, and look. Returns None where nothing was found or nothing was sent, having said why."""
+    from busmaster.cli.progress import Bar  # it takes a fifth of the time of --help
+
+    async with opened(errand.port, tap) as wire:
+        search = Search(wire, errand.port, note, Bar)
+        if talk := await search.listen(errand.tried):
+            note(f"{talk}; nothing was sent. `busmaster monitor` shows it; end the other master to look for nodes")
+            return None
+        discovery = await search.look(errand.tried)
+    if not discovery.found:
+        note("nobody answered: check power, wires A and B (swap them), termination; name nodes beyond 1-8 with --nodes")
+        return None
+    return discovery

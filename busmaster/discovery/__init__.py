@@ -1,0 +1,1 @@
+"""What is on a cable of which nothing is known: its rate, framing and protocols, and the nodes."""

@@ -1,0 +1,177 @@
+"""Looking for nodes on an unknown line: listen first, send nothing where somebody talks, and nothing but reads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from busmaster.arbiter.unasked import QUIET
+from busmaster.contract.profile import LineSettings
+from busmaster.discovery.steps import LISTENING, Step
+from busmaster.doctor.diagnosis import garbage, speed, spoken
+from busmaster.doctor.examination import OPENING, Course, unseen
+from busmaster.doctor.probing import Outcome, Probe, Prober, Wire
+from busmaster.errors import LineDown
+from busmaster.registry import Protocol
+from busmaster.transport.endpoints import Endpoint
+
+RECOGNISING = 1.0
+"""Seconds in which talk is listened to with each of the settings."""
+RECOGNISED = 2
+"""Whole frames by which a protocol is known."""
+CONFIRMED = 2
+"""How often a node must answer again to be taken for one: at wrong settings, noise may look like an answer."""
+MEASURED = 10
+"""How often a node is asked for its reply time."""
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A node that answers. `starts`: seconds until its replies began, in order; `text`: what it said."""
+
+    protocol: Protocol
+    address: int
+    starts: tuple[float, ...]
+    text: str
+    refuses: bool
+    """It answers, and refuses what was asked: it lives, but has no such item."""
+
+    @property
+    def label(self) -> str:
+        return self.protocol.profile.label(self.address)
+
+
+@dataclass(slots=True)
+class Discovery:
+    """What came of a search. `settings` are those of the line, None where nobody knows them; `echo`: it echoes."""
+
+    settings: LineSettings | None = None
+    echo: bool = False
+    found: list[Found] = field(default_factory=list)
+    talk: str = ""
+    """Who talks there already, in words; then nothing was sent."""
+
+
+class Search:
+    """Looks for nodes on an open port. `tell` is called with what is noticed on the way, in words."""
+
+    def __init__(self, wire: Wire, endpoint: Endpoint, tell: Tell, progress: Course = unseen) -> None:
+        self._wire = wire
+        self._endpoint = endpoint
+        self._tell = tell
+        self._progress = progress
+        self._echo = endpoint.echo
+        self._silent: set[tuple[LineSettings | None, bytes]] = set()
+        """Requests that nobody answered, and how the line was set: some protocols have the same ones."""
+
+    async def listen(self, tried: Sequence[Step]) -> str:
+        """Return who talks there, in words, and nothing if nobody does. Nothing is sent. Raises LineDown."""
+        wire = self._wire
+        assert wire.port is not None
+        await wire.hear_all(OPENING)
+        wire.port.reset()
+        heard = await wire.hear_all(LISTENING)
+        if not heard:
+            return ""
+        settings = list(dict.fromkeys(step.settings for step in tried))
+        with self._progress("listening", len(settings)) as bar:
+            for one in settings:
+                if one is None or await self._tuned(one):
+                    heard = await wire.hear_all(RECOGNISING, quiet=RECOGNISING) or heard
+                    for step in tried:
+                        known = spoken(heard, step.protocol.kinds[0].name) if step.settings == one else []
+                        if len(known) >= RECOGNISED:
+                            return f"somebody talks {step.protocol.profile.title} already{_at(one)}: {known[0]}"
+                bar.advance()
+        return f"somebody talks already, in a way that is not known here: {garbage(heard)}"
+
+    async def look(self, tried: Sequence[Step]) -> Discovery:
+        """Try one step after the other; where nodes are found, only what may share a line with them is tried on.
+
+        Raises LineDown.
+        """
+        discovery = Discovery()
+        left = list(tried)
+        with self._progress("asking", sum(len(step.addresses) for step in tried)) as bar:
+            while left:
+                step = left.pop(0)
+                found = []
+                if step.settings is None or await self._tuned(step.settings):
+                    found = await self._ask_all(step, bar.advance)
+                if found:
+                    discovery.settings, discovery.found = step.settings, discovery.found + found
+                    left = [other for other in left if self._goes_with(other, step)]
+        discovery.echo = self._echo
+        return discovery
+
+    @staticmethod
+    def _goes_with(other: Step, found: Step) -> bool:
+        return other.settings == found.settings and other.protocol.profile.may_share_with(found.protocol.profile)
+
+    async def _tuned(self, settings: LineSettings) -> bool:
+        """Set the port so, and return whether it takes that. What was on its way before is heard and forgotten."""
+        try:
+            await self._wire.tune(settings)
+        except LineDown as error:
+            if self._wire.closed.is_set():
+                raise
+            self._tell(f"left out: {error.what}")
+            return False
+        await self._wire.hear_all(QUIET)
+        return True
+
+    def _prober(self, step: Step) -> Prober:
+        profile = step.protocol.profile
+        return Prober(self._wire, profile, profile.timings, (step.settings or profile.line).byte_time, echo=self._echo)
+
+    async def _ask_all(self, step: Step, advance: Callable[[], None]) -> list[Found]:
+        found: dict[int, Found] = {}
+        before: int | None = None
+        for address in step.addresses:
+            request = step.protocol.profile.probe.open(address, step.protocol.profile.timings).request
+            if (step.settings, request) not in self._silent:
+                probe = await self._ask(step, address, request)
+                if probe.outcome is Outcome.SILENT:
+                    self._silent.add((step.settings, request))
+                else:
+                    # A late answer is heard behind the next request: it may be that of the node before.
+                    for one in (before, address):
+                        if one is not None and one not in found and (node := await self._confirmed(step, one)):
+                            found[one] = node
+                    if not found and probe.outcome is Outcome.GARBLED:
+                        self._tell(f"{self._place(step, address)}: {probe.text}: {garbage(probe.raw)}")
+            before = address
+            advance()
+        return list(found.values())
+
+    async def _ask(self, step: Step, address: int, request: bytes) -> Probe:
+        """Ask a node once. An adapter that echoes is found out by the first request that comes back."""
+        profile = step.protocol.profile
+        probe = await self._prober(step).ask(address, patience=profile.timings.read.window)
+        # an echo may look like an answer: that of a Mentor II begins with EOT
+        if not self._echo and probe.raw.startswith(request):
+            self._echo = True
+            self._tell("the adapter hears what it sends")
+            probe = await self._prober(step).ask(address, patience=profile.timings.read.window)
+        return probe
+
+    async def _confirmed(self, step: Step, address: int) -> Found | None:
+        """Ask a node again and again; None unless it answers each time, with nobody else to answer for it."""
+        prober = self._prober(step)
+        await self._wire.hear_all(step.protocol.profile.timings.read.lateness)  # an answer of before is over then
+        probes = [await prober.ask(address, alone=True) for _ in range(CONFIRMED)]
+        if any(probe.outcome is not Outcome.ANSWERED for probe in probes):
+            return None
+        probes += [await prober.ask(address, alone=number == MEASURED - 1) for number in range(MEASURED)]
+        starts = sorted(max(0.0, probe.start) for probe in probes if probe.start is not None)
+        refuses = all(probe.refused for probe in probes)
+        return Found(step.protocol, address, tuple(starts), probes[0].text, refuses)
+
+    def _place(self, step: Step, address: int) -> str:
+        return f"{step.protocol.profile.title}, {step.protocol.profile.label(address)}{_at(step.settings)}"
+
+
+def _at(settings: LineSettings | None) -> str:
+    return "" if settings is None else f" at {speed(settings)}"
