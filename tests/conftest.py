@@ -23,6 +23,10 @@ settings.load_profile("ci" if os.environ.get("CI") else "busmaster")
 
 # A shell that starts a job in the background has it ignore these, and so would every command that the tests start and
 # end by Ctrl-C. What a process handles is back at its default in those that it starts.
-for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+for number, handler in (
+    (signal.SIGINT, signal.default_int_handler),
+    (signal.SIGQUIT, signal.SIG_DFL),
+    (signal.SIGHUP, signal.SIG_DFL),
+):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, handler)

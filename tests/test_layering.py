@@ -18,6 +18,7 @@ ALL = {entry.stem for entry in PACKAGE.iterdir() if entry.suffix in ("", ".py") 
 
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
+    "files": set(),
     "contract": {"contract", "errors"},
     "wire": {"wire"} | BASE,
     "arbiter": {"arbiter"} | BASE,
@@ -30,8 +31,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "registry": {"registry", "bus.handle", "emulator.device", "emulator.traceable", "capture.decode"} | BASE,
     "gate": {"gate", "bus", "arbiter"} | BASE,
     "service": {"service", "gate", "registry", "bus", "arbiter", "planning"} | BASE,
-    "outputs": {"outputs", "gate", "bus", "arbiter"} | BASE,
-    "capture": {"capture", "wire", "registry", "arbiter.tap"} | BASE,
+    "outputs": {"outputs", "gate", "bus", "arbiter", "files"} | BASE,
+    "capture": {"capture", "wire", "registry", "arbiter.tap", "files"} | BASE,
     "doctor": {"doctor", "registry", "capture", "transport", "arbiter", "outputs.values"} | BASE,
     "discovery": {"discovery", "doctor", "registry", "config", "transport", "arbiter"} | BASE,
     "config": ALL - {"capture", "testing", "cli", "protocols", "discovery"},
@@ -72,11 +73,12 @@ OPEN: dict[str, set[str]] = {
     "doctor": {"adapters", "diagnosis", "examination", "probing", "uart"},
     "emulator": {"chance", "device", "faults", "line", "memory", "motion", "serve", "traceable"},
     "errors": {""},
-    "gate": {"gate", "payload", "record"},
+    "files": {""},
+    "gate": {"gate", "payload", "permission", "record"},
     "outputs": {"base", "cells", "distributor", "settings", "values"},
     "planning": {"", "merging"},
     "registry": {""},
-    "service": {"folder", "remote", "service"},
+    "service": {"folder", "remote", "service", "tcp"},
     "transport": {
         *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "serial_port", "tcp"),
     },

@@ -26,8 +26,11 @@ MOST_DIGITS = 15
 """Behind them a float says nothing."""
 SHARE = 0.01
 """Of what lies between low and high: the hysteresis where none is given."""
-OF_QUANTITIES = ("precision", "low", "high", "hysteresis")
-"""What numbers that have names cannot have."""
+OF_QUANTITIES = {
+    "precision": "",
+    **dict.fromkeys(("low", "high", "hysteresis"), "; for each of its changes, and these alone, write deadband = 0"),
+}
+"""What numbers that have names cannot have, and what to write in place of it."""
 
 
 class Named(int):
@@ -93,9 +96,9 @@ class Meaning:
     def _faults_of_names(self) -> Iterator[tuple[str, str]]:
         if self.bits and self.labels:
             yield "labels", "a number has bits or labels, not both: bits are of words"
-        for name in OF_QUANTITIES if self.bits or self.labels else ():
+        for name, instead in OF_QUANTITIES.items() if self.bits or self.labels else ():
             if getattr(self, name) is not None:
-                yield name, f"is for quantities, and this number has {'bits' if self.bits else 'labels'}"
+                yield name, f"is for quantities, and this number has {'bits' if self.bits else 'labels'}{instead}"
         if (self.bits or self.labels) and self.deadband:
             yield "deadband", "of a number with names is 0: every change is told"
         holders: dict[int, str] = {}

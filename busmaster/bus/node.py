@@ -125,6 +125,13 @@ class Node:
         """Return the youngest good sample of a point in any poll group, unless a write has made it stale."""
         return self.shared.latest(point)
 
+    def held(self, point: Any, /) -> Any:
+        """Return what a point of it would have read last, by whatever name it was polled, alone or with others.
+
+        None where that is not known, or may have been written since.
+        """
+        return self.shared.held(self.record, point)
+
     def planned(self) -> PlannedNode:
         """Return the node as the planner sees it, with its reply time as measured so far."""
         record = self.record
@@ -168,8 +175,8 @@ class Node:
         if isinstance(timings, Learned):
             timings = timings.of(profile.timings)
         wanted = {
-            "other timings": timings not in (None, self._asked),
-            "other retries": retries not in (None, self.record.retries),
+            f"other timings{_windows(timings, self._asked)}": timings not in (None, self._asked),
+            f"other retries ({retries}, not {self.record.retries})": retries not in (None, self.record.retries),
             "another profile": profile != own or profile.merge not in (None, own.merge),
         }
         for what, differs in wanted.items():
@@ -373,3 +380,14 @@ class Node:
         learning = record.learning
         learned = () if learning is None else learning.times(record.timings)
         return replace(record.counters.snapshot(record.lateness), learned=learned)
+
+
+def _windows(asked: Timings | Learned | None, own: Timings | Learned) -> str:
+    """Return how two reply windows differ, for messages; "" where they do not."""
+    if asked is None or (one := _window(asked)) == (other := _window(own)):
+        return ""
+    return f" (a reply window of {one}, not {other})"
+
+
+def _window(timings: Timings | Learned) -> str:
+    return "what is learned" if isinstance(timings, Learned) else f"{timings.read.window * 1000:g} ms"

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.schedule import line_time, set_members
 from busmaster.arbiter.transaction import Poll, Priority, Transaction
+from busmaster.bus.answers import Answer
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.samples import Quality, Sample
@@ -154,6 +155,7 @@ class PollGroup:
             self._on_close(self)
             self._line.alarms.forget(self._watched)
             self._line.latest_of.pop(self.name, None)
+            self._line.answers_of.pop(self.name, None)
             self._line.remove_poll(self._poll)
         for consumer in list(self._consumers):
             consumer.close()
@@ -228,6 +230,11 @@ class PollGroup:
         wall = poll.finished + self._wall_offset
         snapshot = Snapshot(self.name, poll.cycles, poll.due, started, poll.finished, poll.missed, wall, self._samples)
         self.latest = self._line.latest_of[self.name] = snapshot
+        self._line.answers_of[self.name] = [
+            Answer(done.tag.node, done.tag.served.command, done.tag.points, done.value, done.started)
+            for done in poll.results
+            if done.error is None
+        ]
         for consumer in self._consumers:
             consumer.put(snapshot)
         self._line.alarms.look(self._watched, self._samples)

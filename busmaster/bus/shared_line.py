@@ -13,13 +13,15 @@ from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.bus.alarms import Alarms
+from busmaster.bus.answers import Answer, composed
 from busmaster.bus.limiter import Limiter
 from busmaster.bus.logbook import Logbook
 from busmaster.bus.points import Point
 from busmaster.bus.requester import Requester
 from busmaster.bus.samples import Sample
 from busmaster.bus.snapshots import Snapshot
-from busmaster.errors import BusClosed, InvalidCommand
+from busmaster.contract.places import Changing, Placed
+from busmaster.errors import BusClosed, GarbledReply, InvalidCommand
 from busmaster.transport.pump import Pump
 
 CLOCK_WAS_SET = 0.005
@@ -38,8 +40,8 @@ class SharedLine:
         self.limiter: Limiter | None = None
         """None while nothing is limited."""
         self.closed = False
-        self.only_safe = False
-        """Whether no write is accepted any more but those of the safe state."""
+        self.only_safe = 0
+        """How many have said that no write is to be accepted but those of the safe state."""
         self.thread = 0
         """In which its loop runs; 0 while the bus is not open."""
         self.loop_runs: Callable[[], bool] = lambda: False
@@ -47,12 +49,18 @@ class SharedLine:
         """Told, at once, when a node is told to stop."""
         self.latest_of: dict[str, Snapshot] = {}
         """The latest snapshot of each poll group, by the group's name."""
+        self.answers_of: dict[str, list[Answer]] = {}
+        """What its last cycle brought, by the group's name."""
         self.last_touched = -inf
         """When the last write to anything ended."""
         self._all_touched = -inf
         self._touched: dict[object, float] = {}
         self._written: dict[NodeRecord, float] = {}
         self._wall_offset = inf
+
+    def take_writes_again(self) -> None:
+        """Accept every write again, unless somebody else has said otherwise."""
+        self.only_safe -= 1
 
     @property
     def running(self) -> bool:
@@ -114,6 +122,23 @@ class SharedLine:
                 youngest = sample
         return youngest
 
+    def held(self, node: NodeRecord, point: Point[Any]) -> Any:
+        """Return what a point would have read last, by what was read under whatever name, alone or with others.
+
+        None where that is not known, or may have been written since.
+        """
+        answers = [answer for cycle in self.answers_of.values() for answer in cycle if answer.node is point.node]
+        answers.sort(key=lambda answer: answer.started)
+        found = [raw for one in answers if not self.is_stale(point, one.started) for raw in one.found(point.command)]
+        # stale is what a write changed by its name: a part of it may have another
+        if not found:
+            untouched = (one for one in answers if not self.written_since(node, one.started))
+            found = composed(point.command, untouched, node.profile)
+        try:
+            return point.value_of(found[-1]) if found else None
+        except GarbledReply:
+            return None
+
     # nodes
 
     def note_stop(self, record: NodeRecord) -> None:
@@ -142,6 +167,10 @@ class SharedLine:
         self._touched[write.touches] = self._written[write.node] = self.last_touched = when
         if write.node.address == write.node.profile.broadcast:
             self._all_touched = when
+        if isinstance(write.touches, tuple) and isinstance(write.command, Changing):
+            # what has another name, or is read in another run, may share a place with it
+            for place in write.command.changes(write.node.profile):
+                self._touched[write.touches[0], place] = when
 
     def written_since(self, node: NodeRecord, started: float) -> bool:
         """Return whether a write to this node, or to a point of it, has ended since then."""
@@ -151,7 +180,10 @@ class SharedLine:
         """Return whether a write to the point's quantity, or to all of its node, has ended since its read began."""
         touched = self._touched
         # Of the quantity: points of other names and scales read it too. A read that starts as the write ends is fresh.
-        return max(touched.get(point.quantity, -inf), touched.get(point.node, -inf), self._all_touched) > started
+        if max(touched.get(point.quantity, -inf), touched.get(point.node, -inf), self._all_touched) > started:
+            return True
+        places = point.command.places if isinstance(point.command, Placed) else ()
+        return any(touched.get((point.node, place), -inf) > started for place in places)
 
     # misuse
 

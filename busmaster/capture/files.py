@@ -6,6 +6,8 @@ import io
 import os
 from collections import deque
 
+from busmaster.files import open_file
+
 SIZE = 100_000_000
 """Bytes after which the next file is begun: a busy line at 57600 baud writes some two gigabytes a day."""
 COUNT = 10
@@ -15,9 +17,9 @@ COUNT = 10
 class CaptureFiles:
     """Writes to `path`; where that is taken, and when `size` bytes are in it, to `path` with -2, -3 and so on.
 
-    With more than `count` files of its own it removes its oldest. A device or a pipe is written to as it is. What could
-    not be written is kept, so that writing goes on where it stopped once the disk has room. Raises OSError if no file
-    can be made.
+    A new file is for its owner and group. With more than `count` files of its own it removes its oldest. A device or a
+    pipe is written to as it is. What could not be written is kept, so that writing goes on where it stopped once the
+    disk has room. Raises OSError if no file can be made.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, size: int = SIZE, count: int = COUNT) -> None:
@@ -30,7 +32,7 @@ class CaptureFiles:
         self._number = 1
         self._own: deque[str] = deque()
         self._is_plain = not os.path.exists(self.path) or os.path.isfile(self.path)
-        self._file = self._new() if self._is_plain else io.FileIO(self.path, "wb")
+        self._file = self._new() if self._is_plain else io.FileIO(os.open(self.path, os.O_WRONLY), "wb")
 
     @property
     def full(self) -> bool:
@@ -78,7 +80,8 @@ class CaptureFiles:
         while True:
             self.path = self._name()
             try:
-                file = io.FileIO(self.path, "xb")  # exclusive: what is there is never overwritten
+                # exclusive: what is there is never overwritten
+                file = io.FileIO(open_file(self.path, os.O_WRONLY | os.O_EXCL), "wb")
             except FileExistsError:
                 self._number += 1
                 continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,13 +23,13 @@ from busmaster.discovery.writing import lasting, line_text, summary
 from busmaster.doctor.diagnosis import speed
 from busmaster.doctor.probing import opened
 from busmaster.errors import InvalidCommand
+from busmaster.files import open_file
 from busmaster.registry import Protocol, find, kinds, protocols
-from busmaster.transport.endpoints import endpoint
+from busmaster.transport.endpoints import endpoint, is_served
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
 FAILED = 1
-SERVED = ("unix:", "tcp:")
 USUAL = LineSettings(9600)
 """What a port is opened with until something is tried."""
 
@@ -82,7 +83,8 @@ def command(
     if output is None:
         emit_all(text.splitlines())
     else:
-        Path(output).write_text(text)
+        with open(open_file(output, os.O_WRONLY | os.O_EXCL), "w", encoding="utf-8") as file:
+            file.write(text)
         note(f"written to {output}: `busmaster run {output}` polls it")
     return 0
 
@@ -91,7 +93,7 @@ def what_to_try(
     port: str, names: Sequence[str], nodes: Sequence[int] | None
 ) -> tuple[SerialPort | TcpPort, Sequence[Step]]:
     """Return the port, and what is tried there. Raises InvalidCommand."""
-    if port.startswith(SERVED):
+    if is_served(port):
         raise InvalidCommand(f"{port} is a line that a program owns and knows: discover needs the port itself")
     wanted: Sequence[Protocol] = list(dict.fromkeys(find(name).protocol for name in names)) or protocols()
     where = endpoint(port, defaults=USUAL)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import click
 
-from busmaster.cli.arguments import Connection, nodes_option, nodes_to_ask
+from busmaster.cli.arguments import Connection, json_option, nodes_option, nodes_to_ask
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
-from busmaster.cli.output import emit_all, note
+from busmaster.cli.output import emit_all, json_line, note
 from busmaster.cli.parsing import Whole, option_type, parse_window, parsed
 from busmaster.cli.protocols import protocol_option
 from busmaster.contract.learning import documented
@@ -33,6 +33,7 @@ USUAL = LineSettings(9600)
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
 @click.option("--echo", is_flag=True, help="The adapter hears what it sends (two-wire).")
 @click.option("--timeout", type=option_type(parse_window), metavar="MS", help="The reply window, in milliseconds.")
+@json_option
 @capture_option
 def command(
     port: str,
@@ -41,6 +42,7 @@ def command(
     baud: int | None,
     echo: bool,
     timeout: float | None,
+    as_json: bool,
     capture: str | None,
 ) -> int:
     """Examine PORT and, with --protocol, the nodes on it. Whatever is not in order comes with what to do.
@@ -54,7 +56,7 @@ def command(
     def tell(finding: Finding) -> None:
         nonlocal wrong
         wrong += not finding.ok
-        emit_all(lines_of(finding))
+        emit_all([json_line(**asdict(finding))] if as_json else lines_of(finding))
 
     name = patient.endpoint.name
     with capturing(capture, port=name, protocol=protocol or "", echo=patient.endpoint.echo) as recorder:

@@ -1,4 +1,4 @@
-"""How a command ends that is told to: Ctrl-C or SIGTERM unwind it, so that ports, links and files are given back."""
+"""How a command ends that is told to: a signal unwinds it, so that ports, links and files are given back."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ import anyio
 import click
 
 T = TypeVar("T")
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU)
+"""Those that somebody sends, and that would end the process where it stands. Not SIGABRT, by which a supervisor ends
+one that hangs: it would hang on."""
 PATIENCE = 2.0
 
 
@@ -39,7 +41,7 @@ class Ending:
     def __enter__(self) -> Ending:
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
-                # a shell starts what runs in its background deaf to Ctrl-C, and so it is to stay
+                # a shell starts what runs in its background deaf to Ctrl-C and Ctrl-\, and so it is to stay
                 if signal.getsignal(number) is not signal.SIG_IGN:
                     self._before[number] = signal.signal(number, self._heard)
         return self

@@ -10,7 +10,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from typing import TextIO
 
 from busmaster.cli.terminal import printable
-from busmaster.outputs.values import json_line, json_value, number_text, value_text, word_text
+from busmaster.outputs.values import json_line, json_value, name_fields, number_text, value_text, word_text
 
 __all__ = [
     "Level",
@@ -20,6 +20,7 @@ __all__ = [
     "emit_all",
     "json_line",
     "json_value",
+    "name_fields",
     "note",
     "number_text",
     "value_text",

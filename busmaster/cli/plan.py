@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import click
@@ -19,6 +20,8 @@ from busmaster.transport.endpoints import Endpoint
 from busmaster.transport.serial_port import SerialPort
 
 SHOWN = (Priority.URGENT, Priority.COMMAND, Priority.POLL)
+SOME = 8
+"""Names that are listed."""
 HEAD = ("GROUP", "PERIOD", "VALUES", "EXCHANGES", "LINE", "CYCLE", "LONGEST", "MISSED")
 
 
@@ -33,15 +36,16 @@ def command(path: str, as_json: bool) -> int:
     """
     line = ConfiguredLine(load(path), outputs=False)
     plan = line.plan()
+    assumed = [name for name, node in line.file.nodes.items() if node.reply_time is None]
     if as_json:
-        emit(json_line(**fields(plan)))
+        emit(json_line(**fields(plan), assumed_reply_times=assumed))
     else:
-        emit_all(page(f"{line.file.title}: {port_text(line.bus.endpoint, plan.line)}", plan))
+        emit_all(page(f"{line.file.title}: {port_text(line.bus.endpoint, plan.line)}", plan, assumed))
     return OK if plan.fits else FAILED
 
 
-def page(head: str, plan: Plan) -> list[str]:
-    """Return what a person wants to know: a table of the groups, the waits, and what would fit."""
+def page(head: str, plan: Plan, assumed: Sequence[str]) -> list[str]:
+    """Return what a person wants to know: a table of the groups, the waits, what would fit, and what is `assumed`."""
     table = columns([HEAD, *(row(group) for group in plan.groups)], right=range(1, len(HEAD)))
     verdict = "it fits" if plan.fits and not plan.advice else "it fits, barely" if plan.fits else "it does not fit"
     share = f"the schedule asks for {plan.utilisation:.0%} of the line"
@@ -51,8 +55,19 @@ def page(head: str, plan: Plan) -> list[str]:
         *(table if plan.groups else ["no poll groups"]),
         *((f"{verdict}:", *plan.advice) if plan.advice else (f"{verdict}: {share}",)),
         f"a command waits {time_text(plan.typical_wait)} on a healthy line; at the very worst: {', '.join(waits)}",
+        *assumed_text(assumed),
         *([losses_text(plan.losses)] if plan.groups else []),
     ]
+
+
+def assumed_text(nodes: Sequence[str]) -> Iterator[str]:
+    """Yield a line that says whose reply times nobody has said, if there are such nodes."""
+    if nodes:
+        some = ", ".join(nodes[:SOME]) + (f" and {len(nodes) - SOME} more" if len(nodes) > SOME else "")
+        yield (
+            f"reply times are assumed, half of the nominal one, for {some}: `busmaster doctor` measures them, and "
+            "`reply_time` says them"
+        )
 
 
 def losses_text(losses: Losses) -> str:

@@ -12,7 +12,7 @@ from busmaster.cli.app import OK, WRONG_USAGE
 from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import Level, columns, emit, note
 from busmaster.config import LineFile
-from busmaster.config.points_table import COLUMNS, ITEM, NODE, ORIGIN, POINT, points_csv, rows, said_text
+from busmaster.config.points_table import COLUMNS, ITEM, LIMITED_BY, NODE, ORIGIN, POINT, points_csv, rows, said_text
 from busmaster.config.points_taking import BadRows, taken, write_beside
 
 
@@ -28,6 +28,9 @@ from busmaster.config.points_taking import BadRows, taken, write_beside
 )
 def command(path: str, as_csv: bool, table: str | None) -> int:
     """Show the points of LINE.toml, one a line: what the file says of each, and the template or table it comes from.
+
+    Limits hold for the quantity, by whatever name: the column limited_by has the points whose limits hold for this one
+    too. It is told, not taken, as the column origin is.
 
     With --csv as CSV, for a spreadsheet. With --from what such a CSV says is written into LINE.toml, and each change is
     printed; comments and order stay. Rows add and change points, and none is taken away. Nothing is written unless all
@@ -50,7 +53,8 @@ def command(path: str, as_csv: bool, table: str | None) -> int:
 def page(file: LineFile) -> Iterator[str]:
     """Yield the lines of a table, with the columns of which something is said anywhere."""
     texts = [
-        {NODE: row.node, POINT: row.point, ITEM: row.point, ORIGIN: row.origin}
+        {NODE: row.node, POINT: row.point, ITEM: row.point}
+        | {LIMITED_BY: ", ".join(row.limited_by), ORIGIN: row.origin}
         | {key: said_text(row.said, key) for key in row.said}
         for row in rows(file)
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,8 +11,10 @@ import click
 from busmaster.bus.handle import Handle
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.cli.ending import until_ended
-from busmaster.cli.output import emit, emit_all, json_line, json_value, value_text
+from busmaster.cli.output import emit, emit_all, json_line, json_value, name_fields, value_text
 from busmaster.cli.protocols import ItemCommand, Offer, read_options, take_options
+from busmaster.cli.reaching import reach
+from busmaster.outputs.values import utc
 
 
 class ItemsReadCommand(ItemCommand):
@@ -36,14 +39,15 @@ async def read(
     connection: Connection, address: int, items: tuple[str, ...], how: dict[str, Any], as_json: bool
 ) -> None:
     """Read the items of one node and print each; all are checked before the first is asked for."""
-    bus = connection.reach()
+    bus = reach(connection)
     handle = connection.open_handle(bus, address)
     points = [handle.point(item) for item in items]
     async with bus:
         for item, point in zip(items, points, strict=True):
             value = await handle.read_item(item, **how)
             if as_json:
-                emit(json_line(node=connection.node_number(address), item=item, value=json_value(value)))
+                fields = {"value": json_value(value), **name_fields(value), "time": utc(time.time())}
+                emit(json_line(node=connection.node_number(address), item=item, **fields))
             else:
                 emit_all(plain_lines(handle, item, value, point.meaning.precision))
 

@@ -5,36 +5,47 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from datetime import datetime
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import click
 
 from busmaster.capture.pcapng import CaptureError, CutOff, Packet, read_packets
 from busmaster.capture.replay import Replayed, replay
-from busmaster.cli.output import emit, note
+from busmaster.cli.arguments import json_option
+from busmaster.cli.output import emit, json_line, note
+from busmaster.outputs.values import utc
 
 CHANGED = 1
+COUNTED = ("same", "changed", "unjudged")
 
 
 @click.command(short_help="Run a recorded exchange list against the decoders.")
 @click.argument("capture", type=click.Path(exists=True, dir_okay=False))
-def command(capture: str) -> int:
+@json_option
+def command(capture: str, as_json: bool) -> int:
     """Read again what a capture has recorded, and say what comes out otherwise than it was recorded.
 
     A line for each exchange that has changed, then how many there were. The exit status is 1 if any has. What no
     reader was asked about is not judged: bytes that the port called damaged, say, or an exchange that was cut off.
     A file that is cut off, as its recorder was killed, is read up to there, and that is said on standard error.
+    With --json every exchange is an object, changed or not, and so are the counts behind them.
     """
     counts: Counter[str] = Counter()
     try:
         with open(capture, "rb") as file:
             for one in replay(whole_packets(file)):
                 counts["changed" if one.changed else "same" if one.judged else "unjudged"] += 1
-                if one.changed:
+                if as_json:
+                    emit(json_line(**fields(one)))
+                elif one.changed:
                     emit(changed_text(one))
     except CaptureError as error:
         raise click.UsageError(f"{capture}: {error}") from None
-    emit(summary_text(counts))
+    emit(
+        json_line(exchanges=counts.total(), **{name: counts[name] for name in COUNTED})
+        if as_json
+        else summary_text(counts)
+    )
     return CHANGED if counts["changed"] else 0
 
 
@@ -47,6 +58,20 @@ def whole_packets(file: BinaryIO) -> Iterator[Packet]:
             yield packet
     except CutOff as error:
         note(f"{file.name}: {error}, behind packet {packets}: what is before is replayed")
+
+
+def fields(one: Replayed) -> dict[str, Any]:
+    """Return an exchange as a JSON object: what was recorded, and what comes out now."""
+    return {
+        "packet": one.packet,
+        "time": utc(one.micros / 1e6),
+        "node": one.node,
+        "command": one.command,
+        "recorded": str(one.recorded),
+        "now": str(one.now),
+        "judged": one.judged,
+        "changed": one.changed,
+    }
 
 
 def changed_text(one: Replayed) -> str:

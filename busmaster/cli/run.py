@@ -10,13 +10,14 @@ import click
 
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import View, viewed
+from busmaster.cli.audit_log import AuditLog
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import Ending, until_ended
 from busmaster.cli.hangups import Hangups
 from busmaster.cli.lines import file_argument, load, other_port, port_option
 from busmaster.cli.output import Level, note, number_text
 from busmaster.cli.safe import tell_unsafe
-from busmaster.cli.serving import served
+from busmaster.cli.serving import secrets_of, served
 from busmaster.cli.systemd import ServiceManager
 from busmaster.cli.watching import Watch, follow
 from busmaster.config import ConfiguredLine, LineFile
@@ -35,14 +36,15 @@ FAREWELL = 2.0
 @capture_option
 @viewed
 def command(path: str, port: str | None, capture: str | None, view: View) -> int:
-    """Poll the groups of LINE.toml until Ctrl-C or SIGTERM, and feed the outputs that it enables.
+    """Poll the groups of LINE.toml until a signal ends it, and feed the outputs that it enables.
 
     On a terminal a live table; else, or with --plain, a line a value; with --json a line a cycle. A summary on
-    standard error ends it: of groups, of nodes, and of what each output has written and dropped. An output that is
-    slow or down never holds up the line. A port that is missing is waited for. SIGHUP has the file read again.
+    standard error ends it: of groups, of nodes, and of what each output has written and dropped. There each write from
+    outside is told too, with what became of it. An output that is slow or down never holds up the line. A port that is
+    missing is waited for. SIGHUP has the file read again.
 
     When it ends, however it ends, the writes of the file's [safe] are sent first. The exit status is 1 if one was not
-    confirmed; else 0 after SIGTERM, 130 after Ctrl-C.
+    confirmed; else 0 after SIGTERM, 130 after Ctrl-C, and 128 and its number after another signal.
     """
     with Hangups() as hangups:  # first of all: SIGHUP ends a process that does not hear it
         return run(path, port, capture, view, hangups)
@@ -60,8 +62,10 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
     context.call_on_close(lambda: sys.setswitchinterval(usual))
     sys.setswitchinterval(SWITCH_INTERVAL)
     with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
+        line = ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only)
+        line.gate.take_secrets(secrets_of(file))
         running = Running(
-            ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only),
+            line,
             path,
             view,
             hangups,
@@ -70,13 +74,11 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
         if ending is not None:
             ending.patience = running.line.safe_state.within + FAREWELL
         try:
-            status = until_ended(running.run)
-        except KeyboardInterrupt:
-            if running.left_safely:
-                raise
-            return FAILED
-        except SystemExit as ended:
-            if ended.code != 128 + signal.SIGTERM:
+            with AuditLog(running.watch.may_print):
+                status = until_ended(running.run)
+        except (KeyboardInterrupt, SystemExit) as ended:
+            stopped = isinstance(ended, SystemExit) and ended.code == 128 + signal.SIGTERM
+            if running.left_safely and not stopped:
                 raise
             status = OK  # how a service is stopped is no failure of it
         return status if running.left_safely else FAILED
@@ -93,7 +95,7 @@ class Running:
         self._view = view
         self._hangups = hangups
         self._ending = ending
-        self._watch = Watch(line.bus, line.file.title, view, gate=line.gate, steady=True)
+        self.watch = Watch(line.bus, line.file.title, view, gate=line.gate, steady=True)
         self._manager = ServiceManager()
 
     async def run(self) -> int:
@@ -115,7 +117,7 @@ class Running:
 
     async def _poll(self) -> int:
         for group in self.line.groups.values():
-            self._watch.add(group)
+            self.watch.add(group)
         self._say_what_is_polled()
         self._manager.ready()
 
@@ -129,7 +131,7 @@ class Running:
             finally:
                 await self._leave()  # at once: what is shown may take its time to end
 
-        return await follow(self._watch, beside)
+        return await follow(self.watch, beside)
 
     def _say_what_is_polled(self) -> None:
         if not self.line.groups:
@@ -148,30 +150,31 @@ class Running:
         self._manager.reloading()
         self.line.bus.accept_device()
         try:
-            file = await anyio.to_thread.run_sync(self._checked_file)
+            file, secrets = await anyio.to_thread.run_sync(self._checked_file)
             await self.line.take(file)
+            self.line.gate.take_secrets(secrets)
         except (InvalidCommand, OSError) as error:
             note(f"the file was read again, and nothing of it taken: {error}", Level.ERROR)
         else:
-            self._watch.title = file.title
-            self._watch.replace_groups(self.line.groups.values())
+            self.watch.title = file.title
+            self.watch.replace_groups(self.line.groups.values())
             note(f"{self._path} was read again", Level.NOTICE)
             self._say_what_is_polled()
         self._manager.ready()
 
-    def _checked_file(self) -> LineFile:
-        """Load the file and check it.
+    def _checked_file(self) -> tuple[LineFile, dict[str, bytes]]:
+        """Load the file and its tokens, and check them.
 
         Raises OSError, and InvalidCommand, naming line and key, for what is wrong with the file.
         """
         file = load(self._path)
         # made for its complaints alone: `take` wants a file of which a line can be made
         ConfiguredLine(file, port=self.line.bus.endpoint)
-        return file
+        return file, secrets_of(file)
 
     def _tell_of_output(self, text: str) -> None:
         down = any(counts.error for counts in self.line.outputs.statistics())
-        self._watch.announce(text, Level.WARNING if down else Level.NOTICE)
+        self.watch.announce(text, Level.WARNING if down else Level.NOTICE)
 
     def _why(self) -> str:
         """Return what ends the run."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Coroutine, Iterable, Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from statistics import fmean
-from typing import Any
+from typing import Any, Protocol
 
 import anyio
 from anyio.abc import TaskGroup
@@ -161,8 +161,12 @@ class Watch:
     def announce(self, text: str, level: Level = Level.NOTICE) -> None:
         """Add to the last events; print a line on standard error, unless the screen that shows them is there."""
         self.tell(text)
-        if not (shown_on_screen(self.view) and sys.stderr.isatty()):  # a line there would tear the picture
+        if self.may_print():
             note(text, level)
+
+    def may_print(self) -> bool:
+        """Tell whether a line may be printed on standard error: it must not tear the picture that is drawn there."""
+        return not (shown_on_screen(self.view) and sys.stderr.isatty())
 
     def picture(self) -> Frame:
         """Return the frame for the screen. Cheap: it is taken on the loop that owns the line."""
@@ -313,12 +317,22 @@ def short_unit(unit: str) -> str:
     return unit.partition(" of ")[0]
 
 
-def json_cycle(watch: Watch, snapshot: Snapshot) -> str:
+class Clock(Protocol):
+    """What printed times begin at."""
+
+    start: float
+
+    def since(self, time: float, /) -> float:
+        """Return a time of the bus in seconds since the start."""
+        ...
+
+
+def json_cycle(watch: Clock, snapshot: Snapshot) -> str:
     """Return a cycle as one JSON object."""
     return json_line(**cycle_fields(snapshot, watch.since))
 
 
-def plain_cycle(watch: Watch, snapshot: Snapshot) -> Iterator[str]:
+def plain_cycle(watch: Clock, snapshot: Snapshot) -> Iterator[str]:
     """Yield a line a sample: seconds since the start, node and item, the value, or what went wrong."""
     for point, sample in snapshot.samples.items():
         value = error_text(sample.error) if sample.error else value_text(sample.value, point.meaning.precision)

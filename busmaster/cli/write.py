@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import click
 
 from busmaster.bus.handle import Send
+from busmaster.bus.points import Point
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.cli.capturing import capturing
 from busmaster.cli.ending import until_ended
@@ -15,10 +17,12 @@ from busmaster.cli.lines import is_line_file, keep, load
 from busmaster.cli.output import emit, json_line, note
 from busmaster.cli.parsing import parse_assignment, parsed
 from busmaster.cli.protocols import ItemCommand
+from busmaster.cli.reaching import owner_of, reach, tell_owner
 from busmaster.config import ConfiguredLine
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Wish
 from busmaster.gate.record import WriteRecord
+from busmaster.service.remote import connect
 
 Pairs = Sequence[tuple[str, tuple[float, ...]]]
 """What is written, in its order: items, or points of a file, and their values."""
@@ -39,20 +43,27 @@ def command(
     fails ends it, with those before it written.
 
     With a LINE.toml, ITEM is a point of it, as NODE/ITEM, and its value is in the point's unit. The file's limits
-    hold, and its outputs keep a record of each write, or of why it was refused.
+    hold, and its outputs keep a record of each write, or of why it was refused. Where another busmaster owns the line,
+    its limits hold, and its outputs keep the record.
     """
     pairs = [parsed(parse_assignment, text) for text in assignments]
     if not is_line_file(connection.port):
         until_ended(write, connection, connection.one_address(node), pairs, verify, as_json)
         return
     file = load(connection.port)
+    if (owner := owner_of(file.port)) is not None:
+        if connection.capture is not None:
+            raise click.UsageError(f"{owner.port} is a line of another program: record it there, not by --capture")
+        tell_owner(owner)
+        until_ended(write_points_through, ConfiguredLine(file, outputs=False), owner.address, pairs, verify, as_json)
+        return
     with capturing(connection.capture, port=file.port.name, echo=file.port.echo) as recorder:
         until_ended(write_points, ConfiguredLine(file, outputs=False, tap=recorder), pairs, verify, as_json)
 
 
 async def write(connection: Connection, address: int, pairs: Pairs, verify: bool, as_json: bool) -> None:
     """Write the pairs to one node, one after another, and print each; all are checked before the first is sent."""
-    bus = connection.reach()
+    bus = reach(connection)
     handle = connection.open_handle(bus, address)
     prepared = [(item, handle.prepare_write(item, values, verify=verify)) for item, values in pairs]
     async with bus:
@@ -68,7 +79,7 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
     records: list[WriteRecord] = []
     line.gate.record = records.append
     try:
-        prepared = [(wish_of(line, name, values), prepare(line, name, values, verify)) for name, values in pairs]
+        prepared = [prepare(line, name, values, verify) for name, values in pairs]
         async with line.bus:
             for wish, send in prepared:
                 await pass_on(line, wish, send)
@@ -77,22 +88,37 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
         await keep(audit, records)
 
 
+async def write_points_through(line: ConfiguredLine, address: str, pairs: Pairs, verify: bool, as_json: bool) -> None:
+    """Write the pairs to points of a line that another program owns, which holds its limits and keeps the record."""
+    remote = connect(address)
+    prepared = [(name, line.prepare_write(name, values, bus=remote, verify=verify)) for name, values in pairs]
+    async with remote:
+        for name, send in prepared:
+            await send()
+            emit(json_line(point=name, ok=True) if as_json else f"{name} ok")
+
+
 async def pass_on(line: ConfiguredLine, wish: Wish, send: Send) -> None:
     """Write one point, of which a record is kept."""
     with line.gate.begin(wish):
         await send()
 
 
-def wish_of(line: ConfiguredLine, name: str, values: Sequence[float]) -> Wish:
-    """Return what a person wants to have written. Raises InvalidCommand for what is no point of the line."""
+def wish_of(name: str, values: Sequence[float], point: Point[Any] | None = None) -> Wish:
+    """Return what a person wants to have written; without a point, to what is none of the line."""
     value = values[0] if len(values) == 1 else tuple(values)
-    return Wish(door="command line", by="busmaster write", name=name, point=line.point(name), value=value)
+    return Wish(door="command line", by="busmaster write", name=name, point=point, value=value)
 
 
-def prepare(line: ConfiguredLine, name: str, values: Sequence[float], verify: bool) -> Send:
-    """Return what writes a point. Raises InvalidCommand, of which a record is kept, for what may not be written."""
+def prepare(line: ConfiguredLine, name: str, values: Sequence[float], verify: bool) -> tuple[Wish, Send]:
+    """Return what a person wants, and what writes it.
+
+    Raises InvalidCommand, of which a record is kept, for what may not be written, and for no point of the line.
+    """
+    wish = wish_of(name, values)
     try:
-        return line.prepare_write(name, values, verify=verify)
+        wish = wish_of(name, values, line.point(name))
+        return wish, line.prepare_write(name, values, verify=verify)
     except InvalidCommand as error:
-        line.gate.refuse(wish_of(line, name, values), str(error))
+        line.gate.refuse(wish, str(error))
         raise

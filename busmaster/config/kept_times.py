@@ -21,6 +21,7 @@ import anyio
 from busmaster.arbiter.learned import LearnedTimes
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
+from busmaster.files import open_file
 
 VERSION = 1
 """Of the file's form. Another one is started anew."""
@@ -140,7 +141,7 @@ class KeptTimes:
             return  # too little is known yet: what an earlier run has kept stays
         fresh = f"{path}.new"
         try:
-            with open(os.open(fresh, os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o640), "w", encoding="utf-8") as file:
+            with open(open_file(fresh, os.O_TRUNC | os.O_WRONLY), "w", encoding="utf-8") as file:
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())

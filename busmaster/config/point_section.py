@@ -132,7 +132,7 @@ def _misfits(section: PointSection, point: Point[Any], kind: NodeKind) -> Iterat
         if sort == "text" and key != "heartbeat" and (key != "deadband" or meaning.deadband):
             yield key, f"cannot be said of {section.item}, which is a text"
         if sort in NO_QUANTITIES and key in OF_QUANTITIES:
-            yield key, f"cannot be said of {section.item}, which is a {sort} and no quantity"
+            yield key, f"cannot be said of {section.item}, which is a {sort} and no quantity{OF_QUANTITIES[key]}"
     if sort in NO_QUANTITIES and meaning.deadband:
         yield "deadband", f"of a {sort} is 0: every change is told"
     for key in ("bits", "labels"):
@@ -185,6 +185,8 @@ SORTS: Mapping[type, str] = {
     int: "whole",
     float: "float",
     str: "text",
+    bytes: "text",
     tuple: "run",
+    list: "run",
 }
 """In this order: a bit is an int too, and so may be a word."""

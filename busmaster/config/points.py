@@ -152,4 +152,11 @@ def _after(decode: Callable[[Any], Any] | None, scaled: Callable[[Any], Any]) ->
 
 
 def _before(unscaled: Callable[[Any], Any], encode: Callable[[Any], Command[None]]) -> Callable[[Any], Command[None]]:
-    return lambda value: encode(unscaled(value))
+    def scaled(value: Any) -> Command[None]:
+        number = unscaled(value)
+        try:
+            return encode(number)
+        except InvalidCommand as error:  # it tells of a number that nobody has written
+            raise InvalidCommand(f"{value!r} cannot be sent: on the line, {error}") from None
+
+    return scaled

@@ -22,9 +22,10 @@ from busmaster.transport.holders import PROC, holders, owning_group, serves
 SLOW_LATENCY_TIMER = 2
 """Milliseconds; above that, an FTDI adapter's batching shows in every reply."""
 
-FLAGS = 4
+FLAGS, BAUD_BASE = 4, 7
 ASYNC_LOW_LATENCY = 1 << 13
-"""Of struct serial_struct (linux/serial.h, linux/tty_flags.h): where its flags are, and the one that we look for."""
+"""Of struct serial_struct (linux/serial.h, linux/tty_flags.h): where its flags are and the rate that a UART divides by
+whole numbers, and the flag that we look for."""
 TIOCGRS485 = 0x542E
 SER_RS485_ENABLED = 1
 """Of linux/serial.h: the flags are the first word of struct serial_rs485."""
@@ -68,6 +69,17 @@ def low_latency(descriptor: int) -> bool | None:
     except OSError:
         return None
     return bool(settings[FLAGS] & ASYNC_LOW_LATENCY)
+
+
+def made_rate(descriptor: int, baudrate: int) -> float | None:
+    """Return the rate that the UART of an open port makes for `baudrate`; None where its driver does not tell."""
+    settings = array.array("i", [0] * 32)
+    try:
+        fcntl.ioctl(descriptor, termios.TIOCGSERIAL, settings)
+    except OSError:
+        return None
+    base = settings[BAUD_BASE]
+    return base / max(1, round(base / baudrate)) if base > 0 else None
 
 
 def rs485_mode(descriptor: int) -> bool | None:
@@ -129,6 +141,9 @@ def _holders(path: str, proc: Path) -> Finding:
     # Whoever emulates the line on a pseudo-terminal has it open as well, and is no second master.
     found = [str(holder) for holder in holders(path, proc=proc) if not serves(proc / str(holder.pid), device)]
     if not found:
+        if os.geteuid():
+            advice = "those of other users are seen by root alone: `sudo busmaster doctor`"
+            return Finding("holders", True, "no other program of yours has it open", advice)
         return Finding("holders", True, "no other program has it open")
     return Finding(
         "holders",
@@ -153,7 +168,8 @@ def _latency_timer(path: str) -> Iterator[Finding]:
         yield Finding("latency", True, what)
     else:
         file = _device(path) / "latency_timer"
-        yield Finding("latency", False, what, f"open it with low_latency=True, or write 1 to {file}")
+        advice = f"add ?low_latency=1 to the port (low_latency=True in Python), or write 1 to {file} as root"
+        yield Finding("latency", False, what, advice)
 
 
 def _device(path: str) -> Path:

@@ -34,6 +34,8 @@ PROBES = 24
 """How often a node that lives is asked again."""
 SILENT_PROBES = 3
 """How often one that was named is asked before it is said to be silent."""
+TOLERANCE = 0.02
+"""By how much the two ends of a line may differ in their rates: together less than half a bit in ten."""
 STRANGERS = 4
 """How many nodes are asked at each setting that is tried."""
 RATES = (9600, 19200, 38400, 57600, 115200, 4800, 2400)
@@ -128,7 +130,18 @@ def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
     yield Finding("open", True, f"it opens at {diagnosis.speed(where.settings)}", advice)
     device = wire.transport.get_extra_info("serial")
     if device is not None:
+        yield from rate(device.fileno(), where.settings.baudrate)
         yield from driver(device.fileno())
+
+
+def rate(descriptor: int, baudrate: int) -> Iterator[Finding]:
+    """Say whether the UART can make the baud rate, where its driver tells."""
+    made = adapters.made_rate(descriptor, baudrate)
+    if made is not None and abs(made / baudrate - 1) > TOLERANCE:
+        what = f"its UART makes {made:.0f} baud of {baudrate}, {made / baudrate - 1:+.1%}"
+        yield Finding(
+            "rate", False, what, "use a rate that it can make, or another adapter: both ends may differ by 2%"
+        )
 
 
 def driver(descriptor: int) -> Iterator[Finding]:
@@ -150,7 +163,8 @@ def driver(descriptor: int) -> Iterator[Finding]:
                 "rs485",
                 True,
                 "the driver's RS-485 mode is off",
-                "if nothing is answered and this is a bare transceiver that needs RTS, add ?rs485=1",
+                "if nothing is answered and this is a bare transceiver that needs RTS, add ?rs485=1 (rs485=True in "
+                "Python); a driver may know the mode and still refuse it",
             )
 
 

@@ -24,28 +24,47 @@ class Payload(NamedTuple):
     expires: float | None = None
 
 
+class NoCommand(InvalidCommand):
+    """A text is no command. `id` is the one that it has all the same, "" for none."""
+
+    def __init__(self, fault: str, mark: str) -> None:
+        self.id = mark
+        super().__init__(fault)
+
+
 def read_payload(payload: object) -> Payload:
-    """Read `12.5`, `[1, 2]`, or `{"value": 12.5, "id": "a1", "expires": 1767225600}`. Raises InvalidCommand."""
+    """Read `12.5`, `[1, 2]`, or `{"value": 12.5, "id": "a1", "expires": 1767225600}`. Raises NoCommand."""
     raw = payload if isinstance(payload, bytes | bytearray) else str(payload).encode()
     if len(raw) > LONGEST:
-        raise InvalidCommand(f"{len(raw)} bytes are no command: it has {LONGEST} at most")
+        raise NoCommand(f"{len(raw)} bytes are no command: it has {LONGEST} at most", "")
     text = bytes(raw).decode(errors="replace")
     try:
         said = json.loads(text, parse_constant=lambda name: name)
     except (ValueError, RecursionError):
         said = None
+    mark = said.get("id", "") if isinstance(said, dict) else ""
+    shown = str(mark)
+    if not isinstance(mark, str | int) or isinstance(mark, bool) or len(shown) > LONGEST_ID or not shown.isprintable():
+        raise NoCommand(f"an id is a text of {LONGEST_ID} characters at most on one line, or a whole number", "")
+    try:
+        value, expires = _read(said, text)
+    except InvalidCommand as error:
+        raise NoCommand(str(error), shown) from None
+    return Payload(value, shown, expires)
+
+
+def _read(said: Any, text: str) -> tuple[Any, float | None]:
+    """Return the value, and until when it is meant."""
     if not isinstance(said, dict):
-        return Payload(_numbers(said, text))
+        return _numbers(said, text), None
     if not set(said) <= {"value", "id", "expires"} or "value" not in said:
         raise InvalidCommand(f'{text[:40]!r} is not {{"value": ..., "id": ..., "expires": ...}}')
-    mark, expires = said.get("id", ""), said.get("expires")
-    if not isinstance(mark, str | int) or isinstance(mark, bool) or len(str(mark)) > LONGEST_ID:
-        raise InvalidCommand(f"an id is a text of {LONGEST_ID} characters at most, or a whole number")
+    expires = said.get("expires")
     if expires is not None and not _is_number(expires):
         raise InvalidCommand("expires is a time in seconds since 1970")
     if expires is not None and expires > LATEST:
         raise InvalidCommand("expires is a time in seconds since 1970, not in milliseconds")
-    return Payload(_numbers(said["value"], text), str(mark), expires)
+    return _numbers(said["value"], text), expires
 
 
 def _numbers(value: Any, text: str) -> Any:

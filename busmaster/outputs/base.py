@@ -183,6 +183,9 @@ class Output(ABC):
 
     # off the loop
 
+    def close_door(self) -> None:  # noqa: B027  nothing to do where there is no door
+        """Take in nothing from outside any more, and answer what has come. Most take in nothing at all."""
+
     def close(self, within: float) -> None:
         """Let it write what waits, for so many seconds; what is left, and not on disk, is dropped.
 

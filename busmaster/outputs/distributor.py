@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -117,8 +117,7 @@ class Distributor:
         for news in self._news.values():
             news.forget()  # what is made or opened anew knows nothing yet
         with anyio.CancelScope(shield=True):
-            # Closing waits for a thread, and perhaps for a disk: never on the loop that owns the line.
-            await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in leaving.values()))
+            await close_all(leaving.values())
         for kind, output in fresh.items():
             if kind in leaving:
                 output.succeed(leaving.pop(kind))
@@ -144,7 +143,7 @@ class Distributor:
             if self._watching is not None:
                 self._watching.cancel()
                 await asyncio.gather(self._watching, return_exceptions=True)
-            await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in self._outputs))
+            await close_all(self._outputs)
         self._feeding.clear()
         self._watching = None
 
@@ -220,6 +219,13 @@ class Distributor:
                 return MetricsOutput(kind, settings, self._bus, self._say, self.statistics)
             case _:
                 raise AssertionError(settings)
+
+
+async def close_all(outputs: Collection[Output]) -> None:
+    """Close them, their doors first: what was answered there is on record in all of them."""
+    # Closing waits for a thread, and perhaps for a disk: never on the loop that owns the line.
+    await asyncio.gather(*(asyncio.to_thread(output.close_door) for output in outputs))
+    await asyncio.gather(*(asyncio.to_thread(output.close, FAREWELL) for output in outputs))
 
 
 def label_of(event: BusEvent) -> str:

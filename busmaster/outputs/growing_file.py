@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable
 
-FOLDER_MODE = 0o750
+from busmaster.files import FOLDER_MODE, MODE, open_file
 
 
 class GrowingFile:
@@ -25,7 +25,7 @@ class GrowingFile:
         self,
         pattern: str,
         *,
-        mode: int = 0o640,
+        mode: int = MODE,
         sync_every: float = 10.0,
         head: bytes = b"",
         tell: Callable[[str], None] = lambda _: None,
@@ -79,7 +79,7 @@ class GrowingFile:
         # No other folder is made: one that is missing was refused at the start, as it may be mistyped.
         if folder and "%" in os.path.dirname(self._pattern):
             os.makedirs(folder, FOLDER_MODE, exist_ok=True)
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, self._mode)
+        descriptor = open_file(path, os.O_WRONLY | os.O_APPEND, self._mode)
         if ends_in_a_half_line(path):
             os.write(descriptor, b"\n")  # else the first new line would be taken for the rest of the half one
             self._tell(f"{path} ended in the middle of a line, which was closed off")

@@ -29,14 +29,16 @@ import socket
 import ssl
 import struct
 import termios
+import threading
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import anyio
+from anyio.abc import TaskStatus
 
 from busmaster.arbiter.state import LineState
 from busmaster.bus.bus import Bus
@@ -67,8 +69,13 @@ TIMEOUT = 5.0
 """Seconds in which a broker must answer."""
 KEEP_ALIVE = 15
 ALARMS = "alarms/"
+COMMANDS = "set/#"
 UNSUPPORTED_VERSION = 132
 """What a broker says that knows MQTT 3.1.1 alone, or what the client makes of what that says."""
+LAST_ANSWERS = 2.0
+"""Seconds in which the commands that have come are answered, when no more are to be taken in."""
+MARGIN = 1.0
+"""Seconds, beyond those, for a thread that does not get on: who does not answer then never will."""
 HURRY = 2.0
 """Seconds from the wish to end until what could not be sent goes to disk."""
 
@@ -105,6 +112,9 @@ class MqttOutput(SpillingOutput):
         self._in_charge = in_charge
         self._commands = {topic_part(key): point for key, point in (commands or {}).items()}
         self._arriving: Commands
+        self._leaving = threading.Event()
+        self._door_is_closed = threading.Event()
+        self._door_is_closed.set()
         self._owner: asyncio.AbstractEventLoop | None = None
         self._held: list[Item] = []
         self._published: dict[str, str | None] = {}
@@ -117,6 +127,10 @@ class MqttOutput(SpillingOutput):
     def start(self) -> None:
         self._owner = asyncio.get_running_loop()
         super().start()
+
+    def close_door(self) -> None:
+        self._leaving.set()
+        self._door_is_closed.wait(LAST_ANSWERS + MARGIN)
 
     # on the thread
 
@@ -165,13 +179,10 @@ class MqttOutput(SpillingOutput):
         async with self._connection() as client, anyio.create_task_group() as tasks:
             self._published.clear()
             self._alarms = None
+            tasks.start_soon(self._listen, client)
+            await tasks.start(self._serve, client)
             await self._send(client, self._status("online"))
             self.up()
-            if self._commands:
-                await client.subscribe(self._topic("set/#"), qos=1)
-            tasks.start_soon(self._listen, client)
-            answer = partial(self._answer, client)
-            tasks.start_soon(self._arriving.serve, self._write, self._keep, answer, partial(unread, client))
             stopped = False
             while not stopped:
                 stopped = self._stop.is_set()  # looked at first, so that a last round sends what waits
@@ -192,8 +203,10 @@ class MqttOutput(SpillingOutput):
 
         broker = f"{self._settings.host}:{self._settings.port}"
         async with AsyncExitStack() as stack:
+            unconnected = self._client()
+            stack.callback(self._arriving.tell_unanswered)  # at the very end
             try:
-                client = await stack.enter_async_context(self._client())
+                client = await stack.enter_async_context(unconnected)
             except aiomqtt.MqttCodeError as error:
                 if getattr(error.rc, "value", error.rc) == UNSUPPORTED_VERSION:
                     raise ConnectionError(f"{broker} does not speak MQTT 5, which this output needs") from None
@@ -310,6 +323,31 @@ class MqttOutput(SpillingOutput):
         except aiomqtt.MqttError:
             raise ConnectionError(f"{self._settings.host}:{self._settings.port} ended the connection") from None
 
+    async def _serve(self, client: Client, *, task_status: TaskStatus[None]) -> None:
+        """Take in commands until the door is to be closed; it has started when they are listened to."""
+        self._door_is_closed.clear()  # before the look: whoever wants it closed looks in the other order
+        try:
+            if self._commands and not self._leaving.is_set():
+                await client.subscribe(self._topic(COMMANDS), qos=1)
+            task_status.started()
+            if self._commands and not self._leaving.is_set():
+                await self._obey(client)
+        finally:
+            self._arriving.close(self._keep)
+            self._door_is_closed.set()
+
+    async def _obey(self, client: Client) -> None:
+        """Have commands written and answered. None is answered any more when this returns."""
+        answer = partial(self._answer, client)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(self._arriving.serve, self._write, self._keep, answer, partial(unread, client))
+            while not self._leaving.is_set():  # noqa: ASYNC110  # another thread sets it
+                await anyio.sleep(TICK)
+            with anyio.move_on_after(LAST_ANSWERS):
+                await client.unsubscribe(self._topic(COMMANDS))
+                await self._arriving.answered()
+            tasks.cancel_scope.cancel()
+
     async def _write(self, wish: Wish) -> WriteRecord:
         """Write it on the loop that owns the line."""
         assert self._owner is not None
@@ -318,7 +356,8 @@ class MqttOutput(SpillingOutput):
     def _keep(self, wish: Wish, error: str) -> None:
         """Put on record, on that loop too, what was refused."""
         assert self._owner is not None
-        self._owner.call_soon_threadsafe(self._gate.refuse, wish, error)
+        with suppress(RuntimeError):  # that loop has ended
+            self._owner.call_soon_threadsafe(self._gate.refuse, wish, error)
 
     async def _answer(self, client: Client, answer: Answer) -> None:
         topic = self._topic("result", answer.name) if answer.name else self._topic("result")

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import anyio
@@ -13,7 +15,7 @@ import anyio
 from busmaster.bus.points import Point
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import MOST_AT_ONCE, Gate, Wish
-from busmaster.gate.payload import LONGEST, read_payload
+from busmaster.gate.payload import LONGEST, NoCommand, read_payload
 from busmaster.gate.record import WriteRecord
 
 if TYPE_CHECKING:
@@ -32,6 +34,10 @@ TOLD_EVERY = 10.0
 LONGEST_NAME = 256
 """Characters of a point's name; a longer one is answered without it."""
 EXPIRY = "MessageExpiryInterval"
+PROPERTIES = "UserProperty"
+SENDER = "by"
+"""The user property in which a sender may say who it is: no broker tells a subscriber, and nobody checks it."""
+LONGEST_SENDER = 100
 
 
 class Answer(NamedTuple):
@@ -71,7 +77,7 @@ class Commands:
         self.unanswered = 0
         self.queued: deque[Wish] = deque()
         self._tell = tell
-        self._prefix = prefix
+        self._asked = f"{prefix}/set/"
         self._gate = gate
         self._points = points
         self._now = now
@@ -82,29 +88,43 @@ class Commands:
         self._looks: deque[tuple[float, int]] = deque()
         """Later looks, each with what will have been read when all is that lay there then."""
         self._answers: deque[tuple[Wish, Answer]] = deque()
+        self._answering = 0
+        """Commands that are neither waiting nor answered yet."""
+        self._told = 0
+        self._closed = False
         self._something = asyncio.Event()
 
     def arrive(self, message: Message) -> None:
         """Take in one message. Never waits, never raises."""
-        self._bytes_read += LEAST + len(str(message.topic)) + len(message.payload)
-        name = str(message.topic).removeprefix(f"{self._prefix}/set/")
+        topic = str(message.topic)
+        self._bytes_read += LEAST + len(topic) + len(message.payload)
+        if self._closed:
+            self._count_alone()
+            return
+        name = topic.removeprefix(self._asked)
+        point = self._points.get(name)
+        if point is None and len(self._answers) >= MOST_WAITING:
+            self._count_alone()  # before anything is made of it: what is in a flood is to cost nothing
+            return
         shown = name if len(name) <= LONGEST_NAME else ""
         wish = Wish(
             door="mqtt",
-            by=str(message.topic)[:LONGEST_NAME],
+            by=_sender(topic[:LONGEST_NAME], message),
             name=shown or name[:40],
-            point=self._points.get(name),
+            point=point,
             value=bytes(message.payload[:LONGEST]).decode(errors="replace"),
             arrived=self._looked,
         )
         try:
             wish = self._read(wish, message)  # first: whatever becomes of it, its value and its id are told
-            if wish.point is None:
+            if point is None:
                 raise InvalidCommand(self._gate.refusal(wish))
             if message.retain:
                 raise InvalidCommand("a retained command is not obeyed: nobody knows how old it is")
             if len(self.queued) >= MOST_WAITING:
                 raise InvalidCommand(f"{MOST_WAITING} commands are waiting already")
+        except NoCommand as error:
+            self._refuse(replace(wish, id=error.id), shown, str(error))
         except InvalidCommand as error:
             self._refuse(wish, shown, str(error))
         else:
@@ -117,23 +137,18 @@ class Commands:
         interval = getattr(message.properties, EXPIRY, None)
         if interval is not None:
             ends.append(time.time() - (self._now() - self._looked) + interval)
-        return Wish(
-            door=wish.door,
-            by=wish.by,
-            name=wish.name,
-            point=wish.point,
-            value=said.value,
-            arrived=wish.arrived,
-            expires=min(ends, default=None),
-            id=said.id,
-        )
+        return replace(wish, value=said.value, expires=min(ends, default=None), id=said.id)
 
     def _refuse(self, wish: Wish, name: str, error: str) -> None:
-        self.refused += 1
         if len(self._answers) < MOST_WAITING:
+            self.refused += 1
             self._answers.append((wish, Answer(name, False, error, wish.id)))
         else:
-            self.unanswered += 1
+            self._count_alone()
+
+    def _count_alone(self) -> None:
+        self.refused += 1
+        self.unanswered += 1
 
     async def serve(
         self, write: Write, keep: Callable[[Wish, str], object], say: Say, unread: Callable[[], int]
@@ -145,7 +160,7 @@ class Commands:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(self._keep_looking, unread)
             tasks.start_soon(self._answer_refusals, keep, say)
-            tasks.start_soon(self._tell_unanswered)
+            tasks.start_soon(self._keep_telling)
             for _ in range(MOST_AT_ONCE):
                 tasks.start_soon(self._obey, write, say)
 
@@ -169,8 +184,9 @@ class Commands:
         while True:
             if self.queued:
                 wish = self.queued.popleft()
-                record = await write(wish)
-                await say(Answer(wish.name, record.ok, record.error, wish.id))
+                with self._one_more():
+                    record = await write(wish)
+                    await say(Answer(wish.name, record.ok, record.error, wish.id))
             else:
                 await self._wait()
 
@@ -178,23 +194,56 @@ class Commands:
         while True:
             if self._answers:
                 wish, answer = self._answers.popleft()
-                keep(wish, answer.error)
-                await say(answer)
+                with self._one_more():
+                    keep(wish, answer.error)
+                    await say(answer)
                 await anyio.sleep(BREATH)
             else:
                 await self._wait()
 
-    async def _tell_unanswered(self) -> None:
-        told = 0
+    @contextmanager
+    def _one_more(self) -> Iterator[None]:
+        self._answering += 1
+        try:
+            yield
+        finally:
+            self._answering -= 1
+
+    async def answered(self) -> None:
+        """Return when all that has come is answered."""
+        while self.queued or self._answers or self._answering:  # noqa: ASYNC110  many have a hand in it
+            await anyio.sleep(LOOK)
+
+    def close(self, keep: Callable[[Wish, str], object]) -> None:
+        """Take in nothing any more. `keep` is told of what was not answered; what still comes is counted alone."""
+        self._closed = True
+        for wish, answer in self._answers:
+            keep(wish, answer.error)
+        for wish in self.queued:
+            keep(wish, "the connection to the broker ended before it was its turn: nothing was sent")
+        self.queued.clear()
+        self._answers.clear()
+
+    async def _keep_telling(self) -> None:
         while True:
             await anyio.sleep(TOLD_EVERY)
-            if self.unanswered > told:
-                self._tell(f"{self.unanswered - told} refused commands were neither answered nor put on record")
-                told = self.unanswered
+            self.tell_unanswered()
+
+    def tell_unanswered(self) -> None:
+        """Tell how many refusals were counted alone, if there are any that were not told."""
+        if self.unanswered > self._told:
+            self._tell(f"{self.unanswered - self._told} refused commands were neither answered nor put on record")
+            self._told = self.unanswered
 
     async def _wait(self) -> None:
         self._something.clear()
         await self._something.wait()
+
+
+def _sender(topic: str, message: Message) -> str:
+    """Return by whom a command is: all that is known is its topic, and what its sender says of itself."""
+    said = dict(getattr(message.properties, PROPERTIES, ())).get(SENDER, "")[:LONGEST_SENDER]
+    return f"{topic}, says {said!r}" if said else topic
 
 
 class Inbox(asyncio.Queue["Message"]):

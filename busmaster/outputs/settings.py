@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from math import inf
 from typing import Annotated, Literal
 
 from busmaster.contract.arguments import Between
 from busmaster.errors import InvalidCommand
+from busmaster.files import MODE
 
 BUFFER = 50_000
 """Values that may wait, some 500 bytes each: ten minutes of 80 a second."""
+DATE_FIELD = re.compile("%(-?.?)", re.DOTALL)
+DATE_FIELDS = frozenset("YCyGgmbBhdejaAuwUWVHIklMSspPFTRrXzZ")
+"""What may stand behind a % in the path of a file, or behind %-: what makes slashes or ends of lines is none of it."""
 MOST_BUFFERED = 1_000_000
 MOST_SPILLED = 100_000_000
 
@@ -31,37 +36,41 @@ class Settings:
 class SpillingSettings(Settings):
     """`spill` is a file for what waits while the output is down, which then survives a restart: `spill_values` at most.
 
-    It is best on another disk than what it stands in for.
+    It is best on another disk than what it stands in for. `mode` is what new files may be used for and by whom,
+    narrowed by the process's umask.
     """
 
+    mode: int = MODE
     spill: str | None = None
     spill_values: Annotated[int, Between(1, MOST_SPILLED)] = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileSettings(SpillingSettings):
-    """`path` may hold fields of a date (%Y/line-%m-%d.csv): a new file begins when the name changes.
+    """`path` may hold fields of a date (%Y/line-%m-%d.csv): a new file begins when the name changes; %% is a %.
 
-    `mode` is what a new file may be used for and by whom, narrowed by the process's umask. `sync_every`: after so many
-    seconds at most what was written survives a loss of power too; 0 for after each batch.
+    `sync_every`: after so many seconds at most what was written survives a loss of power too; 0 for after each batch.
     """
 
     path: str
-    mode: int = 0o640
     sync_every: Annotated[float, Between(0)] = 10.0
+
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)  # super() does not work in a class with slots
+        for field in DATE_FIELD.findall(self.path):
+            if field != "%" and field.removeprefix("-") not in DATE_FIELDS:
+                raise InvalidCommand(
+                    f"{self.path}: %{field} is no field of a date: use those of strftime (%Y %m %d %H), and %% for a %"
+                )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SqliteSettings(SpillingSettings):
-    """What is older than `keep_days` is deleted, and the oldest of more than `keep_mb` megabytes; None keeps all.
-
-    `mode` is that of a new file, narrowed by the process's umask.
-    """
+    """What is older than `keep_days` is deleted, and the oldest of more than `keep_mb` megabytes; None keeps all."""
 
     path: str
     keep_days: float | None = None
     keep_mb: float | None = None
-    mode: int = 0o640
 
     def __post_init__(self) -> None:
         for name in ("keep_days", "keep_mb"):

@@ -27,6 +27,7 @@ class SpillingOutput(Output):
 
     def __init__(self, kind: str, settings: SpillingSettings, say: Callable[[str], None] = lambda _: None) -> None:
         super().__init__(kind, settings, say)
+        self._mode = settings.mode
         self._spill = settings.spill
         self._most_spilled = settings.spill_values
         self._spool: Spool | None = None
@@ -64,7 +65,11 @@ class SpillingOutput(Output):
             return
         try:
             self._spool = Spool(
-                self._spill, self._most_spilled, self.kind, lambda text: self._say(f"{self.kind}: {text}")
+                self._spill,
+                self._most_spilled,
+                self.kind,
+                lambda text: self._say(f"{self.kind}: {text}"),
+                mode=self._mode,
             )
         except InvalidCommand as error:
             if os.path.isfile(self._spill) and os.path.getsize(self._spill):

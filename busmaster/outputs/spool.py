@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from busmaster.errors import InvalidCommand
+from busmaster.files import MODE, open_file
 
 PIECE = 1_000
 """Records that are forgotten at once."""
@@ -31,12 +32,20 @@ class Spool:
     else. `say` is told when a file was there that is damaged: it is moved aside, not deleted.
     """
 
-    def __init__(self, path: str, most: int, kind: str, say: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(
+        self,
+        path: str,
+        most: int,
+        kind: str,
+        say: Callable[[str], None] = lambda _: None,
+        *,
+        mode: int = MODE,
+    ) -> None:
         self.path = path
         self._most = most
         try:
             try:
-                self._database = _opened(path, kind)
+                self._database = _opened(path, kind, mode)
             # Not damaged, but held by another process, say: to move it aside would take it from there.
             except sqlite3.OperationalError:
                 raise
@@ -46,7 +55,7 @@ class Spool:
                     if os.path.exists(path + part):
                         os.replace(path + part, aside + part)
                 say(f"{path}: {error}: it is kept as {aside}, and begun anew")
-                self._database = _opened(path, kind)
+                self._database = _opened(path, kind, mode)
             self.values: int = self._database.execute("select coalesce(sum(count), 0) from waiting").fetchone()[0]
         except sqlite3.OperationalError as error:
             hint = "; does another process use it?" if "locked" in str(error) else ""
@@ -94,8 +103,8 @@ class Spool:
         return gone
 
 
-def _opened(path: str, kind: str) -> sqlite3.Connection:
-    os.close(os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o640))
+def _opened(path: str, kind: str, mode: int) -> sqlite3.Connection:
+    os.close(open_file(path, os.O_RDWR, mode))  # SQLite would make it with a mode of its own
     database = sqlite3.connect(path, timeout=0.0)  # nothing to wait for: who has it keeps it
     try:
         _check_kind(path, database, kind)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from busmaster.bus.meaning import Named
 from busmaster.errors import InvalidCommand
+from busmaster.files import open_file
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Happening, Item, check_folder
 from busmaster.outputs.batches import BatchOutput
@@ -91,7 +92,6 @@ class SqliteOutput(BatchOutput[Rows]):
         super().__init__(kind, settings, say)
         check_folder(settings.path)
         self._path = settings.path
-        self._mode = settings.mode
         self._tell: Callable[[str], None] = lambda text: say(f"{kind}: {text}")
         self._retention = Retention(settings.keep_days, settings.keep_mb, self._tell)
         self._database: sqlite3.Connection | None = None
@@ -174,7 +174,7 @@ class SqliteOutput(BatchOutput[Rows]):
     def _open(self) -> sqlite3.Connection:
         if self._database is None:
             # SQLite would make the file with a mode of its own.
-            self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, self._mode)
+            self._file = open_file(self._path, os.O_RDWR, self._mode)
             database = self._database = sqlite3.connect(self._path, timeout=BUSY)
             [version] = database.execute("pragma user_version").fetchone()
             [tables] = database.execute("select count(*) from sqlite_master").fetchone()

@@ -42,15 +42,17 @@ def rounded_text(value: float, precision: int) -> str:
 
 def word_text(word: enum.Flag) -> str:
     """Return the number and the names of the bits that are set: `65 PROGRAM_RUNNING|AUTO_START_ENABLED`."""
-    number: int = word.value
-    names, rest = [], number
+    return f"{word.value} {'|'.join(set_bits(word))}".rstrip()
+
+
+def set_bits(word: enum.Flag) -> list[str]:
+    """Return the names of the bits that are set, and those that have no name as one number in hex."""
+    names, rest = [], word.value
     for member in type(word):
-        if number & member.value == member.value:
+        if word.value & member.value == member.value:
             names.append(str(member.name))
             rest &= ~member.value
-    if rest:
-        names.append(hex(rest))
-    return f"{number} {'|'.join(names)}" if names else str(number)
+    return [*names, hex(rest)] if rest else names
 
 
 def value_text(value: Any, precision: int | None = None) -> str:
@@ -133,13 +135,26 @@ def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[
 
 
 def sample_fields(sample: Sample[Any]) -> dict[str, Any]:
-    """Return a value, or what went wrong, and whether it is late; the label of a number that has one."""
+    """Return a value, or what went wrong, and whether it is late; and what the value is called, where it is."""
     fields = {
         "value": json_value(sample.value),
         "error": None if sample.error is None else sample.error.what,
         "late": sample.quality is Quality.LATE,
     }
-    return {**fields, "label": sample.value.label} if isinstance(sample.value, Named) else fields
+    return {**fields, **name_fields(sample.value)}
+
+
+def name_fields(value: Any) -> dict[str, Any]:
+    """Return what a number is called: the `label` of one that has one, of a word the `names` of the set bits."""
+    match value:
+        case Named():
+            return {"label": value.label}
+        case enum.Flag():
+            return {"names": set_bits(value)}
+        case enum.Enum():
+            return {"label": value.name}
+        case _:
+            return {}
 
 
 def write_fields(record: WriteRecord) -> dict[str, Any]:

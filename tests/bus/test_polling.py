@@ -21,8 +21,10 @@ from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.mentor.device import EmulatedMentor
 from busmaster.protocols.mentor.handle import MentorDrive as MentorHandle
+from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.protocols.msc.handle import MscController
+from busmaster.registry import make_device
 from tests.stories import cycles, on_a_bus
 
 # consumers
@@ -226,6 +228,22 @@ def test_a_write_that_was_never_sent_makes_nothing_stale() -> None:
         assert bus.latest(point) is not None
 
     on_a_bus(story)
+
+
+def test_a_write_makes_stale_what_shares_a_place_with_it_under_another_name() -> None:
+    async def story(bus: Bus) -> None:
+        unit = ModbusUnit(bus, 17)
+        whole, half, other = (unit.point(item) for item in ("holding:10:uint32", "holding:11", "holding:12"))
+        group = bus.poll_group("g", period=5.0, points=[whole, half, other])
+        await cycles(group, 1)
+        await half.write(7)
+        assert [bus.latest(point) is not None for point in (whole, half, other)] == [False, False, True]
+        group.demand()
+        await cycles(group, 1)
+        await whole.write(8)
+        assert [bus.latest(point) is not None for point in (whole, half, other)] == [False, False, True]
+
+    on_a_bus(story, make_device("modbus", 17), settings=ModbusUnit.profile.line)
 
 
 def test_a_broadcast_makes_every_drive_stale() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import random
@@ -11,7 +12,9 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -50,6 +53,13 @@ def busmaster(capfd: pytest.CaptureFixture[str]) -> Iterator[Command]:
     yield run
     logging.getLogger().handlers[:] = handlers
     warnings.showwarning = show
+
+
+def without_time(line: str) -> dict[str, Any]:
+    """A line of JSON, but for the time that it carries, which is one of today's in UTC."""
+    fields: dict[str, Any] = json.loads(line)
+    assert abs(datetime.now(UTC) - datetime.fromisoformat(fields.pop("time"))).days == 0
+    return fields
 
 
 def serve(protocol: str, *addresses: int) -> TcpServer:

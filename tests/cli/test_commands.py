@@ -15,7 +15,7 @@ from busmaster.emulator.serve import TcpServer
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from busmaster.registry import kinds
-from tests.cli.conftest import Command, ended_once, serve
+from tests.cli.conftest import Command, ended_once, serve, without_time
 
 HCP2 = ("--protocol", "hcp2")
 
@@ -36,7 +36,7 @@ def test_several_items_are_a_line_each_and_json_an_object_a_line(busmaster: Comm
         "axis0.idle 1",
     ]
     read = busmaster("read", controllers.path, *HCP2, "--node", "2", "10", "12", "--json")
-    assert list(map(json.loads, read.lines)) == [
+    assert list(map(without_time, read.lines)) == [
         {"node": 2, "item": "10", "value": 12.5},
         {"node": 2, "item": "12", "value": 1234},
     ]
@@ -234,4 +234,9 @@ def test_words_are_printed_with_the_names_of_their_bits(busmaster: Command) -> N
         refused = busmaster("write", server.path, *microflex, "speed_reference=10,20")
         assert (refused.status, refused.out) == (2, "")
         read = busmaster("read", server.path, *microflex, "status_word", "--json")
-        assert json.loads(read.out) == {"node": 7, "item": "status_word", "value": 192}
+        assert without_time(read.out) == {
+            "node": 7,
+            "item": "status_word",
+            "value": 192,
+            "names": ["HARDWARE_ENABLE", "ENABLED"],
+        }

@@ -7,6 +7,7 @@ number, and is deaf while it is another than its own.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import random
 import socket
@@ -314,6 +315,15 @@ def test_a_pty_is_examined_and_the_status_is_0_if_all_is_well(busmaster: Command
     assert [line.split()[1] for line in done.lines if line[:4].strip()] == [
         *("port", "permission", "holders", "open", "driver", "rs485", "silence", "echo", "node", "windows", "learning")
     ]
+
+
+@pytest.mark.usefixtures("hasty")
+def test_json_has_an_object_for_each_finding(busmaster: Command) -> None:
+    with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
+        done = busmaster("doctor", server.path, *HCP2, "--nodes", "1", "--timeout", "1000", "--json")
+    findings = [json.loads(line) for line in done.lines]
+    assert {tuple(finding) for finding in findings} == {("topic", "ok", "what", "advice")}
+    assert findings[0] == {"topic": "port", "ok": True, "what": f"{server.path} exists", "advice": ""}
 
 
 @pytest.mark.usefixtures("hasty")

@@ -13,7 +13,7 @@ import anyio
 import pytest
 
 from busmaster.cli.emulate import serve_for
-from busmaster.cli.ending import Ending
+from busmaster.cli.ending import SIGNALS, Ending
 from busmaster.emulator.serve import TcpServer
 from tests.cli.conftest import ENVIRONMENT, ROOT, Command, started
 from tests.patience import PATIENCE
@@ -23,7 +23,8 @@ POLL = ("--protocol", "hcp2", "--nodes", "1", "--items", "1", "--period", "0.02"
 
 @pytest.fixture
 def ending() -> Iterator[Ending]:
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    # All of them: one that was heard leaves them ignored, and so they would be in what a later test starts.
+    before = {number: signal.getsignal(number) for number in SIGNALS}
     with Ending() as ending:
         yield ending
     for number, handler in before.items():

@@ -18,9 +18,10 @@ import pytest
 from busmaster.bus.requester import Priority
 from busmaster.config import open_line
 from busmaster.emulator.line import Line
-from busmaster.emulator.serve import TcpServer
+from busmaster.emulator.serve import TcpServer, serve_pty
 from busmaster.errors import Superseded, WriteUnconfirmed
 from busmaster.protocols._comms.mint import EmulatedMint
+from busmaster.registry import find, make_device
 from tests.cli.conftest import ENVIRONMENT, ROOT, Command, serve, started
 from tests.cli.test_processes import Terminal
 from tests.patience import PATIENCE
@@ -80,7 +81,10 @@ def polls(process: subprocess.Popen[str]) -> None:
     assert process.stdout.readline()
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+LEAVING = [(signal.SIGTERM, 0), (signal.SIGINT, 130), (signal.SIGQUIT, 131), (signal.SIGUSR1, 128 + signal.SIGUSR1)]
+
+
+@pytest.mark.parametrize(("number", "status"), LEAVING)
 def test_a_run_that_is_told_to_end_leaves_the_drive_in_its_safe_state(
     path: Path, winder: TcpServer, number: signal.Signals, status: int
 ) -> None:
@@ -92,13 +96,33 @@ def test_a_run_that_is_told_to_end_leaves_the_drive_in_its_safe_state(
     assert (process.returncode, force(winder)) == (status, 15)
     assert "safe state: when this ends, winder/force = 1.5 within 1 s" in err
     assert "the safe state is confirmed: winder/force" in err
+    assert "busmaster: audit: winder/force = 1.5" in err
+    assert f"by safe {number.name}" in err
 
 
-def test_a_safe_write_that_is_not_confirmed_is_named_and_the_status_is_1(path: Path, winder: TcpServer) -> None:
+def test_what_a_shell_made_deaf_to_the_terminal_goes_on(path: Path) -> None:
+    with subprocess.Popen(
+        ["sh", "-c", 'trap "" INT QUIT; exec "$0" -m busmaster run "$1" --plain', sys.executable, str(path)],
+        cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        polls(process)
+        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGQUIT)
+        process.send_signal(signal.SIGHUP)
+        told(process, "was read again")
+        process.terminate()
+        process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGQUIT])
+def test_a_safe_write_that_is_not_confirmed_is_named_and_the_status_is_1(
+    path: Path, winder: TcpServer, number: signal.Signals
+) -> None:
     with started("run", str(path), "--plain") as process:
         polls(process)
         winder.call(lambda line, now: line.cut(now, line.device(1)))
-        process.terminate()
+        process.send_signal(number)
         _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1
     assert "the safe state of winder/force is not confirmed: " in err
@@ -131,6 +155,40 @@ def test_what_cannot_be_a_safe_write_is_refused_when_the_file_is_read(
     outcome = busmaster("run", str(path), "--seconds", "0.1")
     assert outcome.status == 2
     assert error in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("port", "reason"),
+    [
+        ("FOLDER/away", "FOLDER/away does not exist"),
+        ("FOLDER/line.toml", "FOLDER/line.toml is no serial port"),
+        ("socket://127.0.0.1:FREE", "127.0.0.1:FREE refused the connection"),
+    ],
+)
+def test_safe_says_why_the_port_is_refused_and_names_each_point(
+    busmaster: Command, path: Path, port: str, reason: str
+) -> None:
+    free = str(free_port())
+    path.write_text(path.read_text().replace("within = 1.0", "within = 0.2"))
+    port, reason = (text.replace("FOLDER", str(path.parent)).replace("FREE", free) for text in (port, reason))
+    outcome = busmaster("safe", str(path), "--port", port)
+    first, *rest = outcome.err.splitlines()
+    assert (outcome.status, outcome.out) == (1, "")
+    assert first.startswith(f"busmaster: cannot connect: {reason}")
+    assert [line.partition(" is not")[0] for line in rest] == ["busmaster: the safe state of winder/force"]
+
+
+def test_safe_says_who_has_the_port(busmaster: Command, path: Path) -> None:
+    with serve_pty(Line(find("hcp2").profile.line, [make_device("hcp2", 1)], paced=False)) as served:
+        path.write_text((TEXT + SAFE).replace("PORT", served.path).replace("within = 1.0", "within = 0.2"))
+        with started("run", str(path), "--plain") as process:
+            polls(process)
+            outcome = busmaster("safe", str(path))
+            process.terminate()
+            process.communicate(timeout=PATIENCE)
+    assert outcome.status == 1
+    assert f"{served.path} is in use by " in outcome.err
+    assert "the safe state of winder/force is not confirmed: " in outcome.err
 
 
 def test_safe_without_a_safe_state_is_wrong_usage(busmaster: Command, path: Path) -> None:

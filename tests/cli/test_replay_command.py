@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,18 @@ def test_what_has_changed_is_a_line_each(tmp_path: Path, capsys: pytest.CaptureF
     assert first.startswith("packet 3, ")
     assert first.endswith("node 255: read element 105: was refused, is ok: 4096.0")
     assert last == "2 exchanges: 1 the same, 1 changed"
+
+
+def test_json_has_every_exchange_with_its_time_and_the_counts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["replay", capture(tmp_path, Outcome.OK, Outcome.REFUSED), "--json"]) == 1
+    same, changed, counts = map(json.loads, capsys.readouterr().out.splitlines())
+    assert same["time"] == "1970-01-01T00:00:00.000Z"
+    assert (same["packet"], same["node"], same["command"]) == (1, 255, "read element 105")
+    assert (same["judged"], same["changed"]) == (True, False)
+    assert (changed["recorded"], changed["now"], changed["changed"]) == ("refused", "ok: 4096.0", True)
+    assert counts == {"exchanges": 2, "same": 1, "changed": 1, "unjudged": 0}
 
 
 def test_a_file_that_is_no_capture_is_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

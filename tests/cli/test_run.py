@@ -155,6 +155,7 @@ def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     assert outcome.lines[0].startswith("Slitter: 127.0.0.1:")
     assert [row.split()[0] for row in outcome.lines[1:4]] == ["GROUP", "fast", "slow"]
     assert outcome.lines[4].startswith("it fits: the schedule asks for ")
+    assert outcome.lines[-2].startswith("reply times are assumed, half of the nominal one, for ")
     assert outcome.lines[-1].startswith("with 1% of all frames lost it asks for ")
     assert 'with timing = "learned" (a window of 52 ms) for ' in outcome.lines[-1]
 

@@ -72,6 +72,8 @@ def test_a_point_is_written_by_its_name_in_its_unit_and_that_is_on_record(
         ("winder/force=2,3", "does not take 2 values"),
         ("winder/force=inf", "finite number"),
         ("winder/force=1e308", "1e+308 is too large"),
+        ("winder/farce=2", "no such item 'farce'"),
+        ("rewinder/force=2", "no such point 'rewinder/force'"),
     ],
 )
 def test_what_is_refused_is_on_record_and_nothing_is_sent(

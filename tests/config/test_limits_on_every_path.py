@@ -16,7 +16,7 @@ from busmaster.bus.requester import Priority
 from busmaster.cli.arguments import View
 from busmaster.cli.messages import Action
 from busmaster.cli.watching import Watch
-from busmaster.cli.write import pass_on, prepare, wish_of
+from busmaster.cli.write import pass_on, prepare
 from busmaster.config import ConfiguredLine, emulated_line
 from busmaster.config.sections import read
 from busmaster.config.source import Source
@@ -184,7 +184,7 @@ def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
 def by_command_line(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
         key = f"drive/{name or plant.kind.item}"
-        await pass_on(plant.line, wish_of(plant.line, key, (value,)), prepare(plant.line, key, (value,), False))
+        await pass_on(plant.line, *prepare(plant.line, key, (value,), False))
 
     return write
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from math import inf
 from typing import Any
@@ -12,7 +13,7 @@ from busmaster.bus.alarms import AlarmChanged
 from busmaster.bus.meaning import Meaning, Named
 from busmaster.bus.points import Point
 from busmaster.config import ConfiguredLine, FileError, LineFile, emulated_line
-from busmaster.config.point_section import POINT_KEYS, check_suits
+from busmaster.config.point_section import POINT_KEYS, check_suits, sort_of
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.emulator.memory import MemoryPort
@@ -170,7 +171,11 @@ def test_a_mistyped_key_is_named_with_its_line_and_the_one_that_was_meant(key: s
         ("modbus", 'item = "holding:1:float32", bits = { A = 1 }', "bits: are of whole numbers, and holding:1:float32"),
         ("modbus", 'item = "holding:1:4", minimum = 1', "minimum: cannot be said of holding:1:4, a run of values"),
         ("modbus", 'item = "coil:1", bits = { A = 1 }', "bits: A is bit 1, and the highest of coil:1 is bit 0"),
-        ("modbus", 'item = "coil:1", high = 0.5', "high: cannot be said of coil:1, which is a bit and no quantity"),
+        (
+            "modbus",
+            'item = "coil:1", high = 0.5',
+            "high: cannot be said of coil:1, which is a bit and no quantity; for each of its changes, and these",
+        ),
         ("modbus", 'item = "coil:1", deadband = 0.5', "deadband: of a bit is 0: every change is told"),
         ("modbus", 'item = "coil:1", labels = { 2 = "x" }', "labels: coil:1 is never 2: it has 1 bit"),
         ("msc", 'item = "flags", bits = { A = 256 }', "bits: A is bit 256, and the highest of flags is bit 255"),
@@ -189,7 +194,11 @@ def test_a_mistyped_key_is_named_with_its_line_and_the_one_that_was_meant(key: s
         ("hcp2", 'item = "10", labels = { 0 = "" }', "labels: the label of 0 is a text on one line, not ''"),
         ("hcp2", 'item = "axis0.position", labels = { 0 = "x" }', "labels: are of whole numbers, and axis0.position"),
         ("mentor", 'item = "1.17", decimals = 1, labels = { 0 = "x" }', "labels: are of whole numbers, and 1.17 has"),
-        ("hcp2", 'item = "10", labels = { 0 = "x" }, low = 1', "low: is for quantities, and this number has labels"),
+        (
+            "hcp2",
+            'item = "10", labels = { 0 = "x" }, low = 1',
+            "low: is for quantities, and this number has labels; for each of its changes, and these alone, write",
+        ),
         ("hcp2", 'item = "10", deadband = -1', "deadband: is 0 or more, not -1"),
         ("hcp2", 'item = "10", deadband = "1"', "deadband: must be a number, not '1'"),
         ("hcp2", 'item = "10", heartbeat = 0', "heartbeat: is more than 0 seconds, not 0; leave it out for none"),
@@ -214,6 +223,12 @@ def test_a_text_has_nothing_of_a_number(said: str) -> None:
     text: Point[Any] = replace(parse("hcp2", "").nodes["w"].point("10"), decode=str)
     with pytest.raises(FileError, match="cannot be said of 10, which is a text"):
         check_suits(section, text, find("hcp2"))
+
+
+@pytest.mark.parametrize(("decode", "sort"), [(str, "text"), (lambda value: b"\0", "text"), (lambda value: [1], "run")])
+def test_what_is_no_number_is_known_before_it_is_read(decode: Callable[[Any], Any], sort: str) -> None:
+    point: Point[Any] = replace(parse("hcp2", "").nodes["w"].point("10"), decode=decode)
+    assert sort_of(point, find("hcp2")) == sort
 
 
 def test_a_text_may_be_told_by_exception() -> None:
@@ -245,6 +260,8 @@ def test_a_bit_that_was_not_named_is_guessed() -> None:
     [
         ("modbus", '"holding:1:4"', 'metrics]\ngroups = "axes"', "metrics.groups: cannot take w/a: it is a run, and"),
         ("msc", '"flags"', 'metrics]\ngroups = "axes"', "metrics.groups: cannot take w/a: it is a set, and a gauge"),
+        ("msc", '"2008:32"', 'metrics]\ngroups = "axes"', "metrics.groups: cannot take w/a: it is a run, and a gauge"),
+        ("hcp2", '"10"', 'csv]\npath = "%Q-line.csv"', "csv: %Q-line.csv: %Q is no field of a date: use those of strf"),
         ("hcp2", '"10"', 'mqtt]\nprefix = "a\\u0001"', "mqtt.prefix: a topic has neither"),
     ],
 )

@@ -52,6 +52,30 @@ def file(points: str, rest: str = GROUP) -> LineFile:
     return read(Source("line.toml", HEAD + points + rest))
 
 
+def test_a_point_is_told_with_the_points_whose_limits_hold_for_it_and_they_are_not_taken_for_its_own() -> None:
+    held = file(
+        """
+[nodes.w.points]
+force = { item = "10", factor = 0.1, maximum = 50 }
+pull = { item = "10", minimum = 3, maximum = 400 }
+raw = { item = "10" }
+other = { item = "11" }
+""",
+        "",
+    )
+    assert [(row.point, row.limited_by) for row in rows(held)] == [
+        ("force", ("pull",)),
+        ("pull", ("force",)),
+        ("raw", ("force", "pull")),
+        ("other", ()),
+    ]
+    data = points_csv(held)
+    assert b'"force, pull"' in data
+    assert taken(held, "points.csv", data).changes == ()
+    more = taken(held, "points.csv", data + data.splitlines()[3].replace(b"raw", b"newer") + b"\n")
+    assert [str(change) for change in more.changes] == ['w/newer is new: { item = "10" }']
+
+
 def take(held: LineFile, *lines: str) -> Taking:
     return taken(held, "points.csv", "\n".join(lines).encode())
 

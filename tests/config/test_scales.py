@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from busmaster.config import ConfiguredLine
 from busmaster.config.names import expanded
 from busmaster.config.points import Scale
+from busmaster.config.sections import read
+from busmaster.config.source import Source
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.msc.status import ProgramStatus
 
@@ -45,6 +50,21 @@ def test_of_a_run_every_value_is_scaled_and_words_and_flags_are_left_alone() -> 
     assert read(ProgramStatus(65)) is ProgramStatus(65)
     assert read(frozenset({1})) == frozenset({1})
     assert Scale.of(0.1, whole=True).write([0.1, 0.2]) == (1, 2)
+
+
+def test_what_cannot_be_written_is_told_as_it_was_said_and_not_only_as_it_is_on_the_line() -> None:
+    text = """
+        port = "/dev/ttyUSB0"
+        [nodes.winder]
+        protocol = "modbus"
+        address = 17
+        points.force = { item = "holding:10", factor = 0.1, unit = "N" }
+    """
+    point = ConfiguredLine(read(Source("line.toml", text)), outputs=False).point("winder/force")
+    assert point.encode is not None
+    for value in ([1, 2], 10_000):
+        with pytest.raises(InvalidCommand, match=rf"^{re.escape(repr(value))} cannot be sent: on the line, "):
+            point.encode(value)
 
 
 def test_a_factor_of_zero_is_refused_and_what_is_not_finite_is_left_for_the_protocol_to_refuse() -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from busmaster.doctor.adapters import Finding, inspect, latency_timer, low_latency, rs485_mode
+from busmaster.doctor.adapters import Finding, inspect, latency_timer, low_latency, made_rate, rs485_mode
+from busmaster.doctor.examination import rate
 from busmaster.transport import identity
 from busmaster.transport.holders import Holder, holders, lock_owner, owning_group
 from tests.transport.fakes import PtyMaster, plugged
@@ -157,6 +158,28 @@ def test_a_pty_has_no_low_latency_flag_and_a_driver_tells_its_own(
     for flag in (0, 1 << 13):
         monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings, flag=flag: settings.__setitem__(4, flag))
         assert low_latency(pty_master.fd) is bool(flag)
+
+
+def test_a_rate_that_a_uart_cannot_make_is_told_where_its_driver_tells_what_it_divides(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert made_rate(pty_master.fd, 57600) is None
+    assert list(rate(pty_master.fd, 57600)) == []
+    monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings: settings.__setitem__(7, 115200))
+    assert list(rate(pty_master.fd, 38400)) == []
+    [finding] = rate(pty_master.fd, 76800)
+    assert not finding.ok
+    assert finding.what == "its UART makes 57600 baud of 76800, -25.0%"
+
+
+def test_who_is_not_root_is_told_that_other_users_programs_cannot_be_seen(
+    pty_master: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    [finding] = [one for one in inspect(pty_master.path) if one.topic == "holders"]
+    assert finding.ok
+    assert finding.what == "no other program of yours has it open"
+    assert "root" in finding.advice
 
 
 # -- a name that lasts -----------------------------------------------------------------------------------------------

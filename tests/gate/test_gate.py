@@ -28,6 +28,7 @@ from busmaster.errors import (
 from busmaster.gate.gate import MOST_AT_ONCE, Gate, Wish, outcome_of
 from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.protocols.hcp2.handle import Hcp2Controller
+from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 
@@ -100,6 +101,39 @@ def test_what_is_refused_unread_is_on_record_as_it_came_with_the_value_before_it
         assert {record.before for record in records} == {5}
 
     at_a_gate(story)
+
+
+@pytest.mark.parametrize(
+    ("polled", "written", "before"),
+    [
+        (["holding:10"], "holding:10", 11),
+        (["holding:10"], "holding:10:int16", 11),  # another name of the same quantity
+        (["holding:10:3"], "holding:12", 13),  # one of a block
+        (["holding:10", "holding:11"], "holding:10:2", (11, 12)),  # a block of what is polled one by one
+        (["holding:10", "holding:12"], "holding:10:3", None),  # a part of it is not known
+        (["input:10"], "holding:10", None),
+    ],
+)
+def test_the_value_before_is_known_by_whatever_name_it_was_polled(
+    polled: list[str], written: str, before: object
+) -> None:
+    async def run() -> None:
+        async with Bus(MemoryPort(Line(ModbusUnit.profile.line, [make_device("modbus", 5)]))) as bus:
+            gate, records, unit = Gate(bus), list[WriteRecord](), ModbusUnit(bus, 5)
+            gate.record = records.append
+            await unit.write("holding:10", 11, 12, 13)
+            group = bus.poll_group("all", period=1, points=[unit.point(item) for item in polled])
+            await anext(aiter(group))
+            point = unit.point(written)
+            value = (1,) * len(before) if isinstance(before, tuple) else (1, 2, 3) if written == "holding:10:3" else 1
+            for _ in range(2):
+                await gate.write(Wish(door="mqtt", by="a test", name=point.key, point=point, value=value))
+            assert [(record.ok, record.before) for record in records] == [(True, before), (True, None)]
+            await anext(aiter(group))
+            gate.refuse(Wish(door="mqtt", by="a test", name=point.key, point=point, value=value), "a test")
+            assert records[-1].before == (value if before is not None else None)
+
+    run_in_virtual_time(run())
 
 
 @pytest.mark.parametrize(

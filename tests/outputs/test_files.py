@@ -14,7 +14,7 @@ import pytest
 from busmaster.errors import InvalidCommand, NoReply
 from busmaster.outputs.base import Happening
 from busmaster.outputs.files import COLUMNS, CsvOutput, JsonlOutput
-from busmaster.outputs.settings import FileSettings
+from busmaster.outputs.settings import DATE_FIELDS, FileSettings
 from busmaster.protocols.msc.status import ProgramStatus
 from tests.outputs.cycles import cycle
 from tests.patience import PATIENCE
@@ -41,6 +41,33 @@ def test_csv_has_a_line_a_value_under_a_head_and_grows(tmp_path: Path) -> None:
     moment = datetime.fromisoformat(rows[0]["time"])
     assert moment.tzinfo == UTC
     assert before - 1 < moment.timestamp() < time.time() + 1
+
+
+@pytest.mark.parametrize(
+    ("path", "field"),
+    [
+        ("%Q-line.csv", "%Q"),
+        ("line-%f.csv", "%f"),
+        ("line-%D.csv", "%D"),
+        ("line-%-%.csv", "%-%"),
+        ("line-%\n.csv", "%\n"),
+        ("line.csv%", "%"),
+    ],
+)
+def test_what_is_no_field_of_a_date_is_refused(path: str, field: str) -> None:
+    with pytest.raises(InvalidCommand) as refused:
+        FileSettings(path=path)
+    assert str(refused.value).startswith(f"{path}: {field} is no field of a date")
+
+
+def test_each_field_that_is_taken_is_one_of_this_machines_dates() -> None:
+    """What strftime does not know it leaves as it is, and would be part of a file's name."""
+    for field in sorted(DATE_FIELDS):
+        for text in (f"%{field}", f"%-{field}"):
+            name = time.strftime(FileSettings(path=text).path)
+            assert "%" not in name
+            assert "/" not in name
+    assert time.strftime(FileSettings(path="100%%-%Y").path).startswith("100%-2")
 
 
 def test_json_lines_are_cycles_and_events(tmp_path: Path) -> None:

@@ -17,14 +17,13 @@ from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand, NoReply
-from busmaster.gate import gate
-from busmaster.gate.payload import Payload, read_payload
+from busmaster.gate.payload import NoCommand, Payload, read_payload
 from busmaster.outputs.base import Happening
 from busmaster.outputs.mqtt import MqttOutput
 from busmaster.outputs.settings import MqttSettings
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
-from tests.outputs.brokers import Broker, needs_mosquitto, running
+from tests.outputs.brokers import Broker, needs_mosquitto
 from tests.outputs.cycles import BUS, cycle, until
 from tests.patience import PATIENCE
 from tests.ports import free_port
@@ -36,17 +35,6 @@ Heard = tuple[str, Any, bool]
 """Topic, payload, and whether it was retained."""
 
 pytestmark = needs_mosquitto
-
-
-@pytest.fixture(autouse=True)
-def commands_stay_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gate, "FRESH", PATIENCE)
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    with running(tmp_path) as found:
-        yield found
 
 
 class Seen(MqttOutput):
@@ -333,6 +321,27 @@ def test_anything_else_is_refused(payload: bytes | None) -> None:
 def test_a_number_that_is_too_large_is_not_said_to_be_none() -> None:
     with pytest.raises(InvalidCommand, match=r"^'\[1, 1e308\]' is beyond 1e\+15"):
         read_payload(b"[1, 1e308]")
+
+
+@pytest.mark.parametrize(
+    ("payload", "mark"),
+    [
+        (b'{"id": "a", "value": "NaN"}', "a"),
+        (b'{"id": 7, "value": NaN}', "7"),
+        (b'{"id": 7}', "7"),
+        (b'{"id": 7, "value": 1, "x": 2}', "7"),
+        (b'{"id": 7, "value": 1e308}', "7"),
+        (b'{"id": 7, "value": 1, "expires": "soon"}', "7"),
+        (b'{"id": [7], "value": 1}', ""),
+        (b'{"id": "\\ud800", "value": 1}', ""),
+        (b'{"id": "a\\nb", "value": 1}', ""),
+        (b'"id"', ""),
+    ],
+)
+def test_what_is_no_command_keeps_the_id_that_it_has(payload: bytes, mark: str) -> None:
+    with pytest.raises(NoCommand) as caught:
+        read_payload(payload)
+    assert caught.value.id == mark
 
 
 def test_an_end_in_milliseconds_is_refused_since_it_would_never_come() -> None:

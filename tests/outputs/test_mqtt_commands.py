@@ -5,10 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
@@ -17,8 +16,7 @@ from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BusError
-from busmaster.gate import gate
-from busmaster.gate.gate import Gate
+from busmaster.gate.gate import MOST_AT_ONCE, Gate, Wish
 from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.outputs import mqtt_commands
 from busmaster.outputs.mqtt import MqttOutput
@@ -26,7 +24,7 @@ from busmaster.outputs.mqtt_commands import LEAST, MOST_WAITING, Commands
 from busmaster.outputs.settings import MqttSettings
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
-from tests.outputs.brokers import Broker, needs_mosquitto, running
+from tests.outputs.brokers import Broker, needs_mosquitto
 from tests.patience import PATIENCE
 
 if TYPE_CHECKING:
@@ -35,15 +33,10 @@ if TYPE_CHECKING:
 pytestmark = needs_mosquitto
 
 
-@pytest.fixture(autouse=True)
-def commands_stay_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gate, "FRESH", PATIENCE)
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    with running(tmp_path) as found:
-        yield found
+async def until(fact: Callable[[], object]) -> None:
+    """Wait for a fact of this loop: it turns until it is one."""
+    while not fact():  # noqa: ASYNC110  nobody tells it
+        await asyncio.sleep(0)
 
 
 class Plant:
@@ -105,6 +98,7 @@ async def plant(broker: Broker, *topics: str, read_only: bool = False) -> AsyncI
 
 @pytest.mark.asyncio
 async def test_a_write_is_answered_with_its_id_and_kept_whole(broker: Broker) -> None:
+    began = time.time() - 0.001  # times are rounded
     async with plant(broker, "line/result/#", "line/audit") as there:
         await there.send('{"value": 12.5, "id": "a1"}')
         found = dict(await there.answers(2))
@@ -113,8 +107,8 @@ async def test_a_write_is_answered_with_its_id_and_kept_whole(broker: Broker) ->
     audit = found["line/audit"]
     assert (audit["door"], audit["by"], audit["point"], audit["value"]) == ("mqtt", "line/set/5/1", "5/1", 12.5)
     assert (audit["outcome"], audit["error"], audit["id"]) == ("written", None, "a1")
-    assert 0 < audit["took"] < 10
-    assert abs(audit["time"] - time.time()) < 60
+    assert audit["took"] > 0
+    assert began <= audit["time"] <= time.time()
     assert audit["process"] > 0
     assert audit["user"]
 
@@ -194,6 +188,27 @@ async def test_a_command_to_what_the_file_does_not_allow_is_told_with_its_value_
 
 
 @pytest.mark.asyncio
+async def test_a_malformed_command_is_answered_with_its_id_and_on_record_under_it(broker: Broker) -> None:
+    async with plant(broker) as there:
+        for payload, mark in (('{"value": [1, 2], "id": 7}', "7"), ('{"id": "a", "value": "NaN"}', "a")):
+            assert (await there.ask(payload))["id"] == mark
+    assert [(record.ok, record.id) for record in there.records] == [(False, "7"), (False, "a")]
+
+
+@pytest.mark.asyncio
+async def test_by_whom_a_command_is_says_its_topic_and_what_its_sender_says_of_itself(broker: Broker) -> None:
+    from paho.mqtt.packettypes import PacketTypes
+    from paho.mqtt.properties import Properties
+
+    properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]  # paho has no types
+    properties.UserProperty = [("shift", "2"), ("by", "recipes")]
+    async with plant(broker) as there:
+        await there.ask("1", properties=properties)
+        await there.ask("1")
+    assert [record.by for record in there.records] == ["line/set/5/1, says 'recipes'", "line/set/5/1"]
+
+
+@pytest.mark.asyncio
 async def test_refused_commands_do_not_starve_those_that_are_allowed(
     broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -225,6 +240,29 @@ async def test_read_only_means_mqtt_too(broker: Broker) -> None:
     async with plant(broker, read_only=True) as there:
         assert "read-only" in (await there.ask("7"))["error"]
         assert await there.controller.read(1) == 0
+
+
+@pytest.mark.asyncio
+async def test_while_the_line_is_left_commands_are_refused_and_recorded(broker: Broker) -> None:
+    async with plant(broker) as there:
+        there.gate.leaving = True
+        assert "the line is being left" in (await there.ask('{"value": 7, "id": "late"}'))["error"]
+        assert [(record.id, record.outcome) for record in there.records] == [("late", Outcome.REFUSED)]
+        assert await there.controller.read(1) == 0
+
+
+@pytest.mark.asyncio
+async def test_behind_a_closed_door_nothing_is_carried_out_answered_or_recorded(broker: Broker) -> None:
+    async with plant(broker) as there:
+        assert (await there.ask("7"))["ok"]
+        await asyncio.to_thread(there.output.close_door)
+        await there.send("8")
+        assert there.output._arriving.unanswered == 0  # the broker keeps it: nobody listens
+        there.output._arriving.arrive(cast("Message", Arrived(b"9")))  # what it had sent before that
+        await asyncio.to_thread(there.output.close, PATIENCE)
+        assert [record.value for record in there.records] == [7]
+        assert there.output._arriving.unanswered == 1
+        assert await there.controller.read(1) == 7
 
 
 @pytest.mark.asyncio
@@ -298,3 +336,47 @@ async def test_refusals_that_were_counted_alone_are_told(monkeypatch: pytest.Mon
     finally:
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)
+
+
+@pytest.mark.asyncio
+async def test_what_waits_when_the_connection_ends_is_on_record_each_once() -> None:
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    commands = Commands("line", Gate(bus), {"5/1": Hcp2Controller(bus, 5).point("1")}, lambda: 0.0)
+    kept: list[tuple[Any, str]] = []
+    under_way: list[Wish] = []
+    for number in range(MOST_AT_ONCE + 2):
+        commands.arrive(cast("Message", Arrived(str(number).encode())))
+    for refused in (b"on", b"off"):
+        commands.arrive(cast("Message", Arrived(refused)))
+
+    async def write(wish: Wish) -> WriteRecord:
+        under_way.append(wish)
+        return await asyncio.Future()
+
+    async def say(_: object) -> None:
+        await asyncio.Future()
+
+    def keep(wish: Wish, why: str) -> None:
+        kept.append((wish.value, why))
+
+    serving = asyncio.ensure_future(commands.serve(write, keep, say, lambda: 0))
+    await until(lambda: len(under_way) == MOST_AT_ONCE and len(kept) == 1)
+    serving.cancel()
+    await asyncio.gather(serving, return_exceptions=True)
+    commands.close(keep)
+    assert [value for value, _ in kept] == ["on", "off", MOST_AT_ONCE, MOST_AT_ONCE + 1]
+    assert "before it was its turn" in kept[-1][1]
+
+
+def test_of_a_flood_that_nobody_is_told_of_nothing_is_read() -> None:
+    bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
+    commands = Commands("line", Gate(bus), {}, lambda: 0.0)
+    for _ in range(MOST_WAITING):
+        commands.arrive(cast("Message", Arrived(b"1")))
+
+    class Unread(bytes):
+        def __getitem__(self, _: object) -> Any:
+            raise AssertionError("it was read")
+
+    commands.arrive(cast("Message", Arrived(Unread(b"1"))))
+    assert (commands.refused, commands.unanswered) == (MOST_WAITING + 1, 1)

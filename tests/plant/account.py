@@ -14,7 +14,10 @@ from tests.plant.programs import Program
 
 SUMMARY = re.compile(r"busmaster: (\w+): \d+ (?:written|answered), (\d+) dropped")
 CYCLES = re.compile(r"busmaster: (\w+): (\d+) cycles, (\d+) missed")
+AUDIT = "busmaster: audit: "
+"""What the record of a write begins with."""
 USUAL = (
+    AUDIT,
     *("no safe state", "safe state: when", "the safe state is confirmed", " requests, ", " cycles, "),
     *(" written, ", " answered, ", "uart: "),
 )

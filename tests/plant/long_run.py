@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from tests.plant import faults_of_broker, faults_of_commands, faults_of_files, faults_of_line, faults_of_run
 from tests.plant import faults_of_scrapes as scrapes
-from tests.plant.account import Counts, counts_of
+from tests.plant.account import AUDIT, Counts, counts_of
 from tests.plant.brokers import PREFIX
 from tests.plant.holdings import Holding, json_lines, of_stdout
 from tests.plant.plant import HOLDERS, SETPOINT, Plant, Site, tail_of
@@ -208,7 +208,7 @@ def settle(plant: Plant, found: LongRun, starts: list[float], notes: list[tuple[
     lines = plant.run.printed()
     polled = of_stdout(lines, PERIODS)
     found.samples, found.held, found.counted = polled.samples, plant.holdings(), counts_of(plant.run)
-    found.told = plant.run.told
+    found.told = [line for line in plant.run.told if not line.startswith(AUDIT)]
     missed, unread = by_minute(lines, starts)
     found.minutes = [
         Minute(fault, missed[number], unread[number], back, note) for number, (fault, back, note) in enumerate(notes)

@@ -18,6 +18,10 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, Service, connect
 from busmaster.emulator.line import Line
 from busmaster.errors import BacklogFull, InvalidCommand
+from busmaster.gate.gate import Gate
+from busmaster.gate.record import WriteRecord
+from busmaster.protocols.modbus.handle import ModbusUnit
+from busmaster.registry import make_device
 from busmaster.service import messages
 from busmaster.service.folder import Owner, ServedSocket, find_owner, line_name, owners, runtime_folder, socket_path
 from busmaster.service.outbox import Outbox
@@ -57,6 +61,24 @@ def test_a_write_is_on_record_with_who_wrote_what_and_what_it_was_before(tmp_pat
         assert record.ok
 
     on_a_served_line(tmp_path, story)
+
+
+def test_the_owner_knows_the_value_before_of_each_place_that_a_program_changes(tmp_path: Path) -> None:
+    async def run() -> None:
+        line = Line(ModbusUnit.profile.line, [make_device("modbus", 5)], paced=False)
+        async with asyncio.timeout(PATIENCE), Bus(MemoryPort(line)) as bus:
+            gate, records, unit = Gate(bus), list[WriteRecord](), ModbusUnit(bus, 5)
+            gate.record = records.append
+            await unit.write("holding:10", 11, 12, 13)
+            group = bus.poll_group("all", period=0.02, points=[unit.point("holding:10:3")])
+            path = tmp_path / "line.sock"
+            async with Service(bus, gate=gate, path=path) as service, connect(service.address) as remote:
+                for item, values in (("holding:11", (1,)), ("holding:10", (2, 3))):
+                    await anext(aiter(group))
+                    await ModbusUnit(remote, 5).write(item, *values)
+            assert [record.before for record in records] == [12, (11, 1)]
+
+    asyncio.run(run())
 
 
 def test_a_read_only_line_lets_no_program_write(tmp_path: Path) -> None:

@@ -131,8 +131,8 @@ class MentorDrive(ParameterHandle):
         super().__init__(bus, address, decimals=decimals, timings=timings, retries=retries, profile=profile)
         if address and (address < 10 or address % 10 == 0):
             warnings.warn(
-                f"mentor: address {address} means a group to later Control Techniques products: "
-                "if some share the line, use 11 to 99 without the tens",
+                "mentor: addresses below 10, and the tens, mean groups to later Control Techniques products: if some "
+                "share the line, use 11 to 99 without the tens",  # in the same words for each: it is shown once
                 stacklevel=2,
             )
 

@@ -1,0 +1,80 @@
+"""Files that are made: by one function, for their owner and group."""
+
+from __future__ import annotations
+
+import ast
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from busmaster.capture.files import CaptureFiles
+from busmaster.files import open_file
+from busmaster.outputs.growing_file import GrowingFile
+from busmaster.outputs.spool import Spool
+
+PACKAGE = Path(__file__).parent.parent / "busmaster"
+FOR_ALL_TO_READ = {"service/folder.py"}
+"""Say who owns a line, to whoever wants to know."""
+
+
+@pytest.fixture
+def umask() -> Iterator[None]:
+    before = os.umask(0o002)
+    yield
+    os.umask(before)
+
+
+def mode_of(path: Path) -> str:
+    return oct(stat.S_IMODE(path.stat().st_mode))
+
+
+@pytest.mark.usefixtures("umask")
+def test_files_are_for_their_owner_and_group(tmp_path: Path) -> None:
+    capture = CaptureFiles(tmp_path / "line.pcapng")
+    capture.begin_next()
+    capture.close()
+    GrowingFile(str(tmp_path / "line.csv")).append(b"1\n")
+    Spool(str(tmp_path / "spool"), 10, "csv").close()
+    Spool(str(tmp_path / "secret"), 10, "csv", mode=0o600).close()
+    found = {path.name: mode_of(path) for path in tmp_path.iterdir()}
+    assert found.pop("secret") == "0o600"
+    assert found == dict.fromkeys(("line.pcapng", "line-2.pcapng", "line.csv", "spool"), "0o640")
+
+
+def test_the_umask_narrows_the_mode(tmp_path: Path) -> None:
+    before = os.umask(0o077)
+    try:
+        os.close(open_file(str(tmp_path / "new"), os.O_WRONLY))
+    finally:
+        os.umask(before)
+    assert mode_of(tmp_path / "new") == "0o600"
+
+
+def makes_files(source: str) -> list[int]:
+    """The lines that make a file in another way than by `open_file`."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Attribute) and node.attr in ("O_CREAT", "write_text", "write_bytes", "touch", "mknod"):
+            found.append(node.lineno)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("open", "io.open", "io.FileIO", "os.fdopen"):
+            [first, *rest] = node.args
+            by_name = not (isinstance(first, ast.Call) or ast.unparse(first) in ("os.devnull", "descriptor"))
+            modes = [*rest[:1], *(keyword.value for keyword in node.keywords if keyword.arg == "mode")]
+            if by_name and any(set(ast.unparse(mode).strip("\"'")) & set("wax") for mode in modes):
+                found.append(node.lineno)
+    return found
+
+
+def test_the_check_sees_each_way_of_making_a_file() -> None:
+    assert makes_files('open(path, "w")\nopen(path, mode="ab")\nio.FileIO(path, "xb")\nos.open(path, os.O_CREAT)') == [
+        *(1, 2, 3, 4)
+    ]
+    assert makes_files('open(path)\nopen(path, "r+b")\nopen(open_file(path, flags), "w")') == []
+
+
+def test_no_file_is_made_in_another_way() -> None:
+    found = {str(path.relative_to(PACKAGE)): makes_files(path.read_text()) for path in PACKAGE.rglob("*.py")}
+    assert {name for name, lines in found.items() if lines} == {"files.py"} | FOR_ALL_TO_READ
