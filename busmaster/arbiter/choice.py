@@ -286,10 +286,10 @@ def _is_decisive(chosen: Chosen) -> bool:
 
 
 def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:
-    """Yield cheap reads of a node: those that it has answered, then those of its protocol that it has not refused."""
+    """Yield cheap reads of a node: those that it has answered, then those of its protocol that it does not refuse."""
     yield from node.answered.values()
     for command in node.profile.checks:
-        if command not in node.refused:
+        if not node.refuses(command):
             yield command
 
 
