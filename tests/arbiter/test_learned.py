@@ -298,6 +298,21 @@ def test_r15_a_node_that_was_heard_late_is_asked_for_a_check_before_its_last_att
     assert (read.error, read.attempts) == (None, 2)
 
 
+def test_r15_a_late_reply_pays_nothing_while_somebody_else_owes_one_that_it_could_be() -> None:
+    """A drive that answers with another element than it was asked for: the check of its reply is right."""
+    bench = Bench()
+    node, other = trained(bench, 1), trained(bench, 2)
+    read = bench.ask(node)
+    bench.ask(other, hcp2.Read(3))
+    for request in (request_of(1), request_of(3, 2)):
+        bench.until_sent()
+        assert bench.sent() == request
+    bench.hear(reply_of(1, 77), after=REQUEST + TOOK)  # the other's, for another element
+    bench.until_sent()
+    assert bench.sent() != request_of(1), "what it was asked for first may still come"
+    assert read.value is None
+
+
 def test_r9_what_goes_before_a_write_takes_no_longer_than_three_exchanges_that_nobody_answers() -> None:
     bench = Bench()
     other = trained(bench, 9)
@@ -359,7 +374,7 @@ def test_a_straggler_brings_the_documents_times_back_until_enough_replies_have_c
     assert learning(node).returns == 1
     assert not trusted(node)
     bench.until_ready()
-    for _ in range(TRUSTED_AGAIN_AFTER - 1):  # one reply has come since
+    for _ in range(TRUSTED_AGAIN_AFTER - 2):  # two replies have come since: a check's, and its own
         assert not trusted(node)
         bench.served(bench.ask(node, hcp2.Read(12)), after=REQUEST + TOOK)
     assert trusted(node)
