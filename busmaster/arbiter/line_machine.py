@@ -183,12 +183,7 @@ class LineMachine:
         """Do what is due. If `unread`, bytes have come that were not handed over: the line's silence is not known."""
         deadlines = self._deadlines
         if now >= deadlines.earliest_other:
-            if now >= deadlines.failing:
-                self.dispatcher.fail_more(now)
-            if now >= deadlines.schedule:
-                self.dispatcher.release_polls(now)
-            if now >= deadlines.expiry and not unread:
-                self.dispatcher.expire(now)
+            self.dispatcher.handle_timeout(now, unread)
             if now >= deadlines.health:
                 self._enter(self.state, now)
                 self.dispatcher.probe(now, self.state is READY)

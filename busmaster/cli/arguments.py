@@ -17,7 +17,7 @@ from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.lines import is_line_file
 from busmaster.cli.parsing import Whole, option_type, parse_nodes, parse_seconds, parse_window, parsed
 from busmaster.cli.protocols import handle_options, protocol_option, take_options
-from busmaster.contract.learning import Learned
+from busmaster.contract.learning import Learned, documented
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings
 from busmaster.registry import find
@@ -61,6 +61,11 @@ class Connection:
         if self.timeout is None or isinstance(self.timeout, Learned):
             return self.timeout
         return self.profile.timings.with_window(self.timeout)
+
+    @property
+    def lateness(self) -> float:
+        """The seconds after which nothing comes any more, as the options say, else the protocol."""
+        return (documented(self.timings) or self.profile.timings).read.lateness
 
     def endpoint(self) -> SerialPort | TcpPort:
         """Return the endpoint that PORT names. Raises InvalidCommand for a PORT that is none."""

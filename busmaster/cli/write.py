@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,13 +16,14 @@ from busmaster.cli.capturing import capturing
 from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import is_line_file, keep, load
 from busmaster.cli.output import emit, json_line, note
-from busmaster.cli.parsing import parse_assignment, parsed
+from busmaster.cli.parsing import Whole, parse_assignment, parsed
 from busmaster.cli.protocols import ItemCommand
 from busmaster.cli.reaching import owner_of, reach, tell_owner
 from busmaster.config import ConfiguredLine
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Wish
 from busmaster.gate.record import WriteRecord
+from busmaster.registry import find
 from busmaster.service.remote import connect
 
 Pairs = Sequence[tuple[str, tuple[float, ...]]]
@@ -33,9 +35,20 @@ Pairs = Sequence[tuple[str, tuple[float, ...]]]
 @node_option
 @click.argument("assignments", nargs=-1, required=True, metavar="ITEM=VALUE[,VALUE...]...")
 @click.option("--verify", is_flag=True, help="Read back and compare.")
+@click.option(
+    "--decimals",
+    type=Whole(min=0),
+    metavar="N",
+    help="mentor, ct-ansi: so many of a value's digits are behind its point, as in 1.17=-47.6 with 1.",
+)
 @json_option
 def command(
-    connection: Connection, node: int | None, assignments: tuple[str, ...], verify: bool, as_json: bool
+    connection: Connection,
+    node: int | None,
+    assignments: tuple[str, ...],
+    verify: bool,
+    decimals: int | None,
+    as_json: bool,
 ) -> None:
     """Write to one node on PORT, in the order given, and print `ITEM ok` for each.
 
@@ -48,7 +61,9 @@ def command(
     """
     pairs = [parsed(parse_assignment, text) for text in assignments]
     if not is_line_file(connection.port):
-        until_ended(write, connection, connection.one_address(node), pairs, verify, as_json)
+        if decimals is not None and not find(connection.protocol).takes_decimals:
+            raise click.UsageError(f"{connection.protocol} carries the point of a number itself: leave --decimals out")
+        until_ended(write, connection, connection.one_address(node), pairs, verify, as_json, decimals)
         return
     file = load(connection.port)
     if (owner := owner_of(file.port)) is not None:
@@ -61,10 +76,16 @@ def command(
         until_ended(write_points, ConfiguredLine(file, outputs=False, tap=recorder), pairs, verify, as_json)
 
 
-async def write(connection: Connection, address: int, pairs: Pairs, verify: bool, as_json: bool) -> None:
+async def write(
+    connection: Connection, address: int, pairs: Pairs, verify: bool, as_json: bool, decimals: int | None
+) -> None:
     """Write the pairs to one node, one after another, and print each; all are checked before the first is sent."""
     bus = reach(connection)
     handle = connection.open_handle(bus, address)
+    if decimals is not None:
+        items = (name for item, values in pairs for name in handle.run_items(item.partition(":")[0], len(values)))
+        with_decimals = {**connection.options, "decimals": dict.fromkeys(items, decimals)}
+        handle = replace(connection, options=with_decimals).open_handle(bus, address)
     prepared = [(item, handle.prepare_write(item, values, verify=verify)) for item, values in pairs]
     async with bus:
         for item, sends in prepared:
