@@ -30,7 +30,13 @@ async def served(line: ConfiguredLine, *, tell: bool) -> AsyncIterator[None]:
         return
     name = line_name(os.path.basename(line.file.path).removesuffix(".toml"))
     service = Service(
-        line.bus, gate=line.gate, name=name, mode=section.mode, group=section.group, listen=section.listen
+        line.bus,
+        gate=line.gate,
+        name=name,
+        mode=section.mode,
+        group=section.group,
+        share=section.share,
+        listen=section.listen,
     )
     try:
         await service.__aenter__()

@@ -8,6 +8,7 @@ from collections.abc import Hashable, Mapping
 from functools import partial
 from typing import Any
 
+from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.node import Node
@@ -21,6 +22,7 @@ from busmaster.service.errands import Errand, Line
 from busmaster.service.failures import said_error
 from busmaster.service.messages import (
     MOST_CHECKED,
+    MOST_HOLDS,
     MOST_NODES,
     MOST_POINTS,
     MOST_REQUESTS,
@@ -57,6 +59,10 @@ class Client:
         self._errands: dict[int, Errand] = {}
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
+        self._turn = line.bus.shared.add_client(line.share)
+        """What its requests take turns by, with those of the others."""
+        self._holds: dict[int, Hold] = {}
+        """Its sequences that nobody comes between, by the number that it gave them."""
         self._gathered: dict[int, list[Point[Any]]] = {}
         """Points for poll groups that it will make, by the streams of those."""
         self._log = logging.getLogger("busmaster.service")
@@ -138,6 +144,10 @@ class Client:
                     errand.cancel()
             case "end":
                 self._end_stream(params.get("stream", -1))
+            case "hold":
+                self._hold(params)
+            case "release":
+                self._release(params.get("sequence", -1))
             case "stop":
                 node = self._nodes.get((str(params.get("protocol")), params.get("address", -1)))
                 if node is not None and self.permission.reaches(node):
@@ -264,6 +274,33 @@ class Client:
         else:
             self._say({"id": number, "error": said_error(error)})
 
+    # sequences
+
+    def client_of(self, sequence: int | None, node: Node) -> LineClient:
+        """Return whose turn a request takes. Raises InvalidCommand for a sequence that this client does not have."""
+        if sequence is None:
+            return self._turn
+        hold = self._holds.get(sequence)
+        if hold is None or hold.node is not node.record:
+            raise InvalidCommand(f"{node.label}: no sequence {sequence} was begun for it, of {MOST_HOLDS} at most")
+        return hold
+
+    def _hold(self, params: Mapping[str, Any]) -> None:
+        """Begin a sequence; the requests of one that cannot be begun are refused."""
+        number = params.get("sequence")
+        if isinstance(number, int) and number not in self._holds and len(self._holds) < MOST_HOLDS:
+            try:
+                node = self.node(params["protocol"], params["address"])
+                if self.permission.reaches(node):  # who may only read keeps nobody waiting so
+                    self._holds[number] = node.hold(seconds(params["max_hold"], "max_hold"), self._turn)
+            except (InvalidCommand, KeyError):
+                self._log.debug("%s cannot hold the line so: %s", self.peer, params)
+
+    def _release(self, sequence: int) -> None:
+        hold = self._holds.pop(sequence, None)
+        if hold is not None:
+            self._line.bus.shared.release(hold)
+
     # streams
 
     def _follow(self, params: Mapping[str, Any], source: Broadcast) -> dict[str, Any]:
@@ -337,6 +374,9 @@ class Client:
             errand.cancel()
         while self._errands:
             await asyncio.wait([errand.future for errand in self.errands])
+        for sequence in list(self._holds):
+            self._release(sequence)
+        self._line.bus.shared.remove_client(self._turn)
         for node in self._nodes.values():
             self._line.bus.give_back(node)
         self._nodes.clear()

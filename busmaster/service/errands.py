@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Callable, Collection, Hashable, Mapping
 from typing import Any, Protocol, cast
 
+from busmaster.arbiter.clients import LineClient
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Journey, Node
 from busmaster.bus.points import Point
@@ -37,6 +38,11 @@ class Line(Protocol):
     def gate(self) -> Gate: ...
 
     @property
+    def share(self) -> float:
+        """What weighs the line time of each program: the owner's own share is 1."""
+        ...
+
+    @property
     def safe_wishes(self) -> SafeWishes: ...
 
     def broadcast_of(self, group: PollGroup, /) -> Broadcast:
@@ -65,6 +71,10 @@ class Asker(Protocol):
         """Return a node of the line. Raises InvalidCommand."""
         ...
 
+    def client_of(self, sequence: int | None, node: Node, /) -> LineClient:
+        """Return whose turn a request takes: the program's, or that of its sequence. Raises InvalidCommand."""
+        ...
+
     def stops_before(self, node: Node, /) -> int:
         """Return the stops of a node from which this client counts."""
         ...
@@ -82,6 +92,7 @@ class Errand:
         *,
         line: Line,
         asker: Asker,
+        client: LineClient,
         stops_seen: int | None,
         stop: bool,
         asked: float,
@@ -93,6 +104,7 @@ class Errand:
         self._options = options
         self._line = line
         self._asker = asker
+        self._client = client
         self._stops_seen = stops_seen
         self._stop = stop
         self._asked = asked
@@ -119,6 +131,7 @@ class Errand:
             given,
             line=line,
             asker=asker,
+            client=asker.client_of(params.get("sequence"), node),
             stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
             stop=params.get("stop") is True and _check_stop(node, command),
             asked=min(now, seconds(params.get("asked", now), "asked")),
@@ -148,7 +161,7 @@ class Errand:
             self.future = asyncio.ensure_future(self._write())
         else:
             self.future = self.node.begin_reading(
-                self.command, self.journey, stops_seen=self._stops_seen, **self._left()
+                self.command, self.journey, stops_seen=self._stops_seen, client=self._client, **self._left()
             )
         self.future.add_done_callback(done)
 
@@ -174,6 +187,7 @@ class Errand:
                 touches=self._touches,
                 stops_seen=self._stops_seen,
                 stop=self._stop,
+                client=self._client,
                 **self._left(),
             )
         except BaseException as error:

@@ -24,6 +24,11 @@ MOST_REQUESTS = 256
 """Requests of one client that have not been answered."""
 MOST_URGENT = 16
 """Urgent ones that are taken beyond those."""
+MOST_UNDER_WAY = MOST_REQUESTS // 2
+"""Requests of one client, none of them urgent, that it has said and that are not answered: the others wait there. As
+many again may have been given up by it, and be known to the owner still."""
+MOST_HOLDS = 32
+"""Sequences of one client that are not over."""
 MOST_UNREAD = 256
 """Messages of streams that one client has not read: beyond it the oldest is dropped, and counted."""
 MOST_WAITING = MOST_UNREAD + 2 * MOST_REQUESTS

@@ -6,6 +6,7 @@ import asyncio
 import sys
 import time
 from collections.abc import Iterable, Mapping
+from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
 from functools import partial
 from math import inf
@@ -14,9 +15,10 @@ from typing import Any, TypeVar, Unpack
 
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.bus.alarms import BusEvent
+from busmaster.bus.exclusive import checked_hold
 from busmaster.bus.limits import Limit
 from busmaster.bus.points import Point
-from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, RequestOptions
+from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, Requester, RequestOptions
 from busmaster.bus.samples import Sample
 from busmaster.bus.snapshots import Stream
 from busmaster.contract.exchange import Command
@@ -29,6 +31,7 @@ from busmaster.service.link import TCP, Link
 from busmaster.service.messages import MOST_CHECKED, said_timings, value_of
 from busmaster.service.remote_group import RemoteGroup
 from busmaster.service.safe import outcomes_of
+from busmaster.service.sequences import Room, held_remotely, shortened
 from busmaster.service.telling import (
     event_of,
     protocol_of,
@@ -125,16 +128,47 @@ class RemoteNode:
         If the connection is lost meanwhile, a write raises WriteUnconfirmed, or NotStarted where it was not handed over
         yet, and a read LineDown. Cancelling it cancels it there.
         """
+        return await self.ask(command, None, touches=touches, stops_seen=stops_seen, stop=stop, **options)
+
+    async def ask(
+        self,
+        command: Command[T],
+        sequence: int | None,
+        /,
+        *,
+        touches: Command[Any] | None,
+        stops_seen: int | None,
+        stop: bool,
+        **options: Unpack[CommandOptions],
+    ) -> T:
+        """Do what `request` does, within a sequence of this program, if it is given the number of one."""
         chosen = RequestOptions.of(options, self.label) if options else ORDINARY
         if chosen.verify:
             raise InvalidCommand(f"{self.label}: verify is for what writes a value through a handle")
         if chosen.safe:
             raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
-        params = self._said(command, options, touches, stops_seen, stop)
-        link = self._bus.opened(self, command)
-        asked = link.ask("request", params, writes=command.writes, node=self, command=command)
-        value: T = value_of(await link.answer(asked, chosen.finish_within))
-        return value
+        link, room = self._bus.opened(self, command), self._bus.room
+        # What is of a sequence waits for nothing else of this program, which waits for the sequence.
+        waits = sequence is None and chosen.priority is not Priority.URGENT
+        waited = await room.take(chosen, self, command) if waits else 0.0
+        try:
+            left: Mapping[str, Any] = {**options, **shortened(chosen, waited)} if waited else options
+            params = self._said(command, left, touches, stops_seen, stop)
+            if sequence is not None:
+                params["sequence"] = sequence
+            asked = link.ask("request", params, writes=command.writes, node=self, command=command)
+            value: T = value_of(await link.answer(asked, left.get("finish_within")))
+            return value
+        finally:
+            if waits:
+                room.give_back()
+
+    def exclusive(self, *, max_hold: float = 0.5) -> AbstractAsyncContextManager[Requester]:
+        """Return, for `async with`, this node for one sequence of requests: see `Requester.exclusive`.
+
+        The line is held no longer than the connection lasts.
+        """
+        return held_remotely(self, self._bus, checked_hold(max_hold, self.label))
 
     def _said(
         self,
@@ -197,6 +231,9 @@ class RemoteBus:
         """Those of them of which the owner knows."""
         self._groups: dict[int, RemoteGroup] = {}
         self._count = 0
+        self._sequences = 0
+        self.room = Room(self.now)
+        """For what is asked: so much of it is under way at a time."""
         self._touched: dict[tuple[str, int], float] = {}
         """When the last write to a node ended."""
         self._events: list[Stream[BusEvent]] = []
@@ -240,6 +277,11 @@ class RemoteBus:
         if self._link is None:
             raise BusClosed("the bus is not open")
         return self._link
+
+    def new_sequence(self) -> int:
+        """Return the number of one more sequence of requests."""
+        self._sequences += 1
+        return self._sequences
 
     def opened(self, node: RemoteNode, command: Command[Any]) -> Link:
         """Return the connection for a request. Raises BusClosed, naming it, before the bus is entered."""

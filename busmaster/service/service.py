@@ -13,12 +13,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE
 from busmaster.arbiter.health import NodeRecord
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.contract.places import Placed
+from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
 from busmaster.registry import protocols
 from busmaster.service.client import Client
@@ -58,8 +60,9 @@ class Service:
     line, by default its port's. Every write passes `gate`, which says who may do what: without one, its own, which
     keeps a record in the log "busmaster.audit", and lets this user write and others read. `mode` and `group`, a number,
     are the socket's. `listen` is a host and a port where programs may come by TCP too: off this machine only where the
-    gate knows tokens. Entering raises InvalidCommand where the socket is served by another process, which it names,
-    or cannot be made.
+    gate knows tokens. Each program takes turns with the others and with this one; `share`, 0.1 to 10, weighs its line
+    time: with 0.5, half as much as this one has, as long as both wait. Entering raises InvalidCommand where the socket
+    is served by another process, which it names, or cannot be made.
     """
 
     def __init__(
@@ -71,9 +74,13 @@ class Service:
         path: Path | str | None = None,
         mode: int = 0o600,
         group: int | None = None,
+        share: float = 1.0,
         listen: HostPort | None = None,
     ) -> None:
+        if isinstance(share, bool) or not LEAST_SHARE <= share <= MOST_SHARE:
+            raise InvalidCommand(f"a program's share is a number from {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share!r}")
         self.bus = bus
+        self.share = share
         self.gate = gate or Gate(bus)
         if listen is not None:
             check_listening(listen, tokens=bool(self.gate.access.secrets))

@@ -240,6 +240,7 @@ def test_the_section_of_the_service_is_checked_with_its_line(busmaster: Command,
         ('group = "no-such-group"', "there is no group 'no-such-group' on this machine"),
         ('mode = "rw"', "a mode is octal"),
         ("port = 5020", "port"),
+        ("share = 0.01", "must be 0.1 to 10, not 0.01"),
     ):
         file.write_text(f"{text}[service]\n{said}\n")
         ran = busmaster("plan", str(file))
