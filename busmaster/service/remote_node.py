@@ -5,32 +5,56 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeVar, Unpack
+from typing import Any, Protocol, TypeVar, Unpack
 
 from busmaster.bus.exclusive import checked_hold
 from busmaster.bus.limits import Limit
+from busmaster.bus.points import Point
 from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, Requester, RequestOptions
 from busmaster.bus.samples import Sample
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand
 from busmaster.planning.merging import Merge
+from busmaster.service.link import Link
 from busmaster.service.messages import value_of
-from busmaster.service.sequences import held_remotely, shortened
+from busmaster.service.sequences import HoldsLine, Room, held_remotely, shortened
 from busmaster.service.telling import protocol_of
-
-if TYPE_CHECKING:
-    from busmaster.service.remote import RemoteBus
 
 T = TypeVar("T")
 LEFT_OUT = ("verify", "safe")
 """Options that are of no use on another's line: where they are said, they are false."""
 
 
+class Home(HoldsLine, Protocol):
+    """The line of a remote node."""
+
+    @property
+    def address(self) -> str: ...
+
+    @property
+    def line(self) -> str: ...
+
+    @property
+    def room(self) -> Room: ...
+
+    def opened(self, node: RemoteNode, command: Command[Any], /) -> Link:
+        """Return the connection for a request. Raises BusClosed, naming it, before the line is entered."""
+        ...
+
+    def prepare(self, node: RemoteNode, commands: tuple[Command[Any], ...], stop: bool, /) -> None:
+        """Have these writes checked when the line is entered, if it is not yet."""
+        ...
+
+    def now(self) -> float: ...
+
+    def latest(self, point: Point[T], /) -> Sample[T] | None: ...
+
+
 class RemoteNode:
     """One node of a line that another program owns. Handles and points work on it as on a node of this process."""
 
-    def __init__(self, bus: RemoteBus, profile: Profile, address: int) -> None:
+    def __init__(self, bus: Home, profile: Profile, address: int) -> None:
         self.stops = 0
         """How often it was told to stop, by whatever program, since this one named it."""
         self.label = profile.label(address)
