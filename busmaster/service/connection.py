@@ -125,7 +125,8 @@ class Connection(asyncio.BufferedProtocol):
 
     def resume(self) -> None:
         """Read on."""
-        self.transport.resume_reading()
+        if self._transport is not None:
+            self._transport.resume_reading()
 
     async def closed(self) -> None:
         """Return when the connection is over."""
