@@ -120,14 +120,14 @@ class Running:
         self._manager.ready()
 
         async def beside() -> None:
-            try:
-                async with anyio.create_task_group() as tasks:
-                    tasks.start_soon(self._manager.show_life, self.line.bus)
-                    while True:
-                        await self._hangups.next()
-                        await self._read_again()
-            finally:
-                await self._leave()  # at once: what is shown may take its time to end
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(self._manager.show_life, self.line.bus)
+                tasks.start_soon(self._hear_hangups)
+                try:
+                    await anyio.sleep_forever()
+                finally:
+                    # at once: what is shown may take its time to end, and so may an output that a new file replaces
+                    await self._leave()
 
         return await follow(self.watch, beside)
 
@@ -139,6 +139,11 @@ class Running:
             note(f"safe state: when this ends, {', '.join(writes)} within {self.line.safe_state.within:g} s")
         else:
             note("no safe state: when this ends, nodes keep what was written to them last (see [safe])")
+
+    async def _hear_hangups(self) -> None:
+        while True:
+            await self._hangups.next()
+            await self._read_again()
 
     async def _read_again(self) -> None:
         """Go on as the file says now, and with whatever device has the port's name.
