@@ -14,7 +14,7 @@ from busmaster.cli.audit_log import AuditLog
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import Ending, until_ended
 from busmaster.cli.hangups import Hangups
-from busmaster.cli.lines import file_argument, load, other_port, port_option
+from busmaster.cli.lines import check_no_owner, file_argument, load, other_port, port_option
 from busmaster.cli.output import Level, note, number_text
 from busmaster.cli.safe import tell_unsafe
 from busmaster.cli.serving import served
@@ -55,6 +55,7 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
     file = load(path)
     endpoint = other_port(file, port)
     where = endpoint or file.port
+    check_no_owner(where.name)
     protocols = {node.protocol for node in file.nodes.values()}
     only = protocols.pop() if len(protocols) == 1 else ""
     usual = sys.getswitchinterval()

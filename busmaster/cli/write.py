@@ -13,7 +13,7 @@ from busmaster.bus.points import Point
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.cli.capturing import capturing
 from busmaster.cli.ending import until_ended
-from busmaster.cli.lines import is_line_file, keep, load
+from busmaster.cli.lines import check_no_owner, is_line_file, keep, load
 from busmaster.cli.output import emit, json_line, note
 from busmaster.cli.parsing import parse_assignment, parsed
 from busmaster.cli.protocols import ItemCommand
@@ -48,6 +48,7 @@ def command(
         until_ended(write, connection, connection.one_address(node), pairs, verify, as_json)
         return
     file = load(connection.port)
+    check_no_owner(file.port.name, "write by node and item")
     with capturing(connection.capture, port=file.port.name, echo=file.port.echo) as recorder:
         until_ended(write_points, ConfiguredLine(file, outputs=False, tap=recorder), pairs, verify, as_json)
 

@@ -64,9 +64,10 @@ def test_the_safe_state_is_sent_while_a_file_that_is_read_again_still_waits_for_
             await replacing.wait()
             tasks.cancel_scope.cancel()
             try:
-                return await comes_true(lambda: winder.call(held) == 1.5)
+                came = await comes_true(lambda: winder.call(held) == 1.5)
             finally:
                 replaced.set()
+        return came
 
     with serve("hcp2", 1) as winder:
         path.write_text(TEXT.replace("PORT", winder.path))
