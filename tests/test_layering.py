@@ -74,11 +74,11 @@ OPEN: dict[str, set[str]] = {
     "emulator": {"chance", "device", "faults", "line", "memory", "motion", "serve", "traceable"},
     "errors": {""},
     "files": {""},
-    "gate": {"gate", "payload", "record"},
+    "gate": {"gate", "payload", "permission", "record"},
     "outputs": {"base", "cells", "distributor", "settings", "values"},
     "planning": {"", "merging"},
     "registry": {""},
-    "service": {"folder", "remote", "service"},
+    "service": {"folder", "remote", "service", "tcp"},
     "transport": {
         *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "serial_port", "tcp"),
     },

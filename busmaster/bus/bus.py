@@ -174,16 +174,17 @@ class Bus:
         if self._connection is not None:
             self._connection.accept_device()
 
-    def take_only_safe_writes(self) -> None:
+    def take_only_safe_writes(self) -> Callable[[], None]:
         """End every write that waits as Superseded, and accept none from now on but those that say `safe=True`.
 
-        A write that is on the wire runs out, and is not repeated. Reads and polls go on. There is no way back: the line
-        is about to be left.
+        A write that is on the wire runs out, and is not repeated. Reads and polls go on. What is returned,
+        called once, takes writes again: not on a line that is about to be left.
         """
         self.check_loop()
-        self._line.only_safe = True
+        self._line.only_safe += 1
         self._arbiter.supersede_writes(self.now())
         self.pump.turn()
+        return self._line.take_writes_again
 
     # nodes and groups
 

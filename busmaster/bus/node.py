@@ -175,8 +175,8 @@ class Node:
         if isinstance(timings, Learned):
             timings = timings.of(profile.timings)
         wanted = {
-            "other timings": timings not in (None, self._asked),
-            "other retries": retries not in (None, self.record.retries),
+            f"other timings{_windows(timings, self._asked)}": timings not in (None, self._asked),
+            f"other retries ({retries}, not {self.record.retries})": retries not in (None, self.record.retries),
             "another profile": profile != own or profile.merge not in (None, own.merge),
         }
         for what, differs in wanted.items():
@@ -380,3 +380,14 @@ class Node:
         learning = record.learning
         learned = () if learning is None else learning.times(record.timings)
         return replace(record.counters.snapshot(record.lateness), learned=learned)
+
+
+def _windows(asked: Timings | Learned | None, own: Timings | Learned) -> str:
+    """Return how two reply windows differ, for messages; "" where they do not."""
+    if asked is None or (one := _window(asked)) == (other := _window(own)):
+        return ""
+    return f" (a reply window of {one}, not {other})"
+
+
+def _window(timings: Timings | Learned) -> str:
+    return "what is learned" if isinstance(timings, Learned) else f"{timings.read.window * 1000:g} ms"

@@ -40,8 +40,8 @@ class SharedLine:
         self.limiter: Limiter | None = None
         """None while nothing is limited."""
         self.closed = False
-        self.only_safe = False
-        """Whether no write is accepted any more but those of the safe state."""
+        self.only_safe = 0
+        """How many have said that no write is to be accepted but those of the safe state."""
         self.thread = 0
         """In which its loop runs; 0 while the bus is not open."""
         self.loop_runs: Callable[[], bool] = lambda: False
@@ -57,6 +57,10 @@ class SharedLine:
         self._touched: dict[object, float] = {}
         self._written: dict[NodeRecord, float] = {}
         self._wall_offset = inf
+
+    def take_writes_again(self) -> None:
+        """Accept every write again, unless somebody else has said otherwise."""
+        self.only_safe -= 1
 
     @property
     def running(self) -> bool:

@@ -6,7 +6,6 @@ import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
-from urllib.parse import parse_qs
 
 import click
 from click.core import ParameterSource
@@ -16,15 +15,12 @@ from busmaster.bus.handle import Handle
 from busmaster.bus.requester import NodeSource
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.lines import is_line_file
-from busmaster.cli.output import note
 from busmaster.cli.parsing import Whole, option_type, parse_nodes, parse_seconds, parse_window, parsed
 from busmaster.cli.protocols import handle_options, protocol_option, take_options
-from busmaster.contract.learning import Learned
+from busmaster.contract.learning import Learned, documented
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import Timings
 from busmaster.registry import find
-from busmaster.service.folder import Owner, owner_of
-from busmaster.service.remote import RemoteBus, connect
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -66,6 +62,11 @@ class Connection:
             return self.timeout
         return self.profile.timings.with_window(self.timeout)
 
+    @property
+    def lateness(self) -> float:
+        """The seconds after which nothing comes any more, as the options say, else the protocol."""
+        return (documented(self.timings) or self.profile.timings).read.lateness
+
     def endpoint(self) -> SerialPort | TcpPort:
         """Return the endpoint that PORT names. Raises InvalidCommand for a PORT that is none."""
         found = endpoint(self.port, defaults=self.line)
@@ -80,35 +81,6 @@ class Connection:
         recording = capturing(self.capture, port=where.name, protocol=self.protocol, echo=where.echo)
         # left with the command, when no loop runs any more: leaving waits for the disk
         return Bus(where, tap=click.get_current_context().with_resource(recording))
-
-    def reach(self) -> Bus | RemoteBus:
-        """Return the bus on PORT, or, where another program owns that line, the one that it serves.
-
-        Says so on standard error. Raises UsageError for options that differ from the owner's.
-        """
-        owner = owner_of(self.port if self.port.startswith("unix:") else self.endpoint().name)
-        if owner is None:
-            return connect(self.port) if self.port.startswith("unix:") else self.open_bus()
-        if self.capture is not None:
-            raise click.UsageError(f"process {owner.pid} owns {owner.port}: record the line there, not by --capture")
-        self._check_settings(owner)
-        note(f"{owner.port} is owned by process {owner.pid}: asking through {owner.address}")
-        return connect(owner.address)
-
-    def _check_settings(self, owner: Owner) -> None:
-        """Raise UsageError for settings of the line that were said, and are not the owner's."""
-        said = set(parse_qs(self.port.partition("?")[2]))
-        wanted = None if self.port.startswith("unix:") else self.endpoint().settings
-        baud = wanted.baudrate if wanted is not None and "baudrate" in said else self.baud
-        framing = wanted.framing if wanted is not None and said & {"bytesize", "parity", "stopbits"} else None
-        differs = [
-            *([f"{baud} baud"] if owner.baudrate and baud not in (None, owner.baudrate) else []),
-            *([framing] if owner.framing and framing not in (None, owner.framing) else []),
-            *(["with an echo"] if self.echo and not owner.echo else []),
-        ]
-        if differs:
-            has = f"{owner.baudrate} {owner.framing}" + (" with an echo" if owner.echo else "")
-            raise click.UsageError(f"process {owner.pid} owns {owner.port} at {has}, not {', '.join(differs)}")
 
     def open_handle(self, bus: NodeSource, address: int) -> Handle:
         """Return a handle on the bus, which need not be open. Raises InvalidCommand."""

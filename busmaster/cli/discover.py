@@ -25,12 +25,11 @@ from busmaster.doctor.probing import opened
 from busmaster.errors import InvalidCommand
 from busmaster.files import open_file
 from busmaster.registry import Protocol, find, kinds, protocols
-from busmaster.transport.endpoints import endpoint
+from busmaster.transport.endpoints import endpoint, is_served
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
 FAILED = 1
-SERVED = ("unix:", "tcp:")
 USUAL = LineSettings(9600)
 """What a port is opened with until something is tried."""
 
@@ -94,7 +93,7 @@ def what_to_try(
     port: str, names: Sequence[str], nodes: Sequence[int] | None
 ) -> tuple[SerialPort | TcpPort, Sequence[Step]]:
     """Return the port, and what is tried there. Raises InvalidCommand."""
-    if port.startswith(SERVED):
+    if is_served(port):
         raise InvalidCommand(f"{port} is a line that a program owns and knows: discover needs the port itself")
     wanted: Sequence[Protocol] = list(dict.fromkeys(find(name).protocol for name in names)) or protocols()
     where = endpoint(port, defaults=USUAL)

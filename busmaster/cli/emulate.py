@@ -13,9 +13,10 @@ import click
 from busmaster.cli.arguments import line_settings, nodes_option, seconds_option, single_nodes
 from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import emit
-from busmaster.cli.parsing import Whole, option_type, parse_host_port, parsed
+from busmaster.cli.parsing import Whole, option_type, parsed
 from busmaster.cli.protocols import protocol_option
 from busmaster.config import ConfiguredLine, LineFile, emulated_line
+from busmaster.contract.arguments import host_and_port
 from busmaster.contract.profile import Profile
 from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import NAMES, Faults
@@ -38,7 +39,7 @@ LOOK_FOR_SIGNALS = 0.2
 @click.option(
     "--pty", is_flag=False, flag_value="", metavar="[LINK]", help="A pseudo-terminal (the default), and a link to it."
 )
-@click.option("--tcp", type=option_type(parse_host_port), metavar="HOST:PORT", help="A TCP port; 0 picks a free one.")
+@click.option("--tcp", type=option_type(host_and_port), metavar="HOST:PORT", help="A TCP port; 0 picks a free one.")
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
 @click.option("--paced", is_flag=True, help="Bytes take their time on the wire.")
 @click.option(

@@ -11,10 +11,8 @@ import click
 
 from busmaster.cli.output import Level, note
 from busmaster.config import LineFile, line_settings, load
-from busmaster.errors import LineDown
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.distributor import Distributor
-from busmaster.service.folder import find_owner
 from busmaster.transport.endpoints import endpoint
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -47,18 +45,6 @@ def other_port(file: LineFile, port: str | None) -> SerialPort | TcpPort | None:
     return None if port is None else endpoint(port, defaults=line_settings(file))
 
 
-def check_no_owner(port: str, instead: str = "") -> None:
-    """Raise LineDown where another program owns the line at this port: a serial server would let two masters in.
-
-    `instead` says what to do through that program.
-    """
-    owner = find_owner(port)
-    if owner is not None:
-        through = f", or {instead} through {owner.address}" if instead else ""
-        hint = f"end that first{through}: two masters on one line garble each other"
-        raise LineDown(f"{port} is owned by process {owner.pid}", hint=hint)
-
-
 def is_line_file(port: str) -> bool:
     """Tell whether PORT is a LINE.toml that is there."""
     return port.endswith(".toml") and os.path.isfile(port)
@@ -80,4 +66,4 @@ async def keep(audit: Distributor, records: Iterable[WriteRecord]) -> None:
             note(f"{counts.kind} could not keep the record of what was written{why}", Level.WARNING)
 
 
-__all__ = ["check_no_owner", "file_argument", "is_line_file", "keep", "load", "other_port", "port_option"]
+__all__ = ["file_argument", "is_line_file", "keep", "load", "other_port", "port_option"]

@@ -15,7 +15,6 @@ from busmaster.registry import kinds
 S = TypeVar("S")
 T = TypeVar("T")
 
-HIGHEST_PORT = 65535
 LONGEST_WINDOW = 60.0
 """Seconds. Lateness moves with it, and a line is first listened to for that long."""
 
@@ -105,14 +104,6 @@ def parse_value(text: str) -> float:
         return float(text)
     except ValueError:
         raise InvalidCommand(f"{text!r} is no number") from None
-
-
-def parse_host_port(text: str) -> tuple[str, int]:
-    """Return the host and the port of `HOST:PORT`. Raises InvalidCommand."""
-    host, colon, port = text.rpartition(":")
-    if not colon or not host or not is_decimal(port) or int(port) > HIGHEST_PORT:
-        raise InvalidCommand(f"a TCP address is written HOST:PORT, like 127.0.0.1:5020, not {text!r}")
-    return host.strip("[]"), int(port)
 
 
 def parsed(parse: Callable[[S], T], value: S) -> T:

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
+from statistics import fmean
+from typing import Any
+
+import anyio
 import click
 
+from busmaster.bus.points import Point
+from busmaster.bus.snapshots import Snapshot
+from busmaster.cli.app import OK
 from busmaster.cli.arguments import Connection, View, connected, nodes_option, viewed
 from busmaster.cli.ending import until_ended
+from busmaster.cli.output import emit_all, note
 from busmaster.cli.parsing import option_type, parse_items, parse_seconds
 from busmaster.cli.protocols import ItemCommand
-from busmaster.cli.watching import Watch, follow
+from busmaster.cli.reaching import reach
+from busmaster.cli.watching import Watch, follow, json_cycle, p99_of, plain_cycle, wants_screen
+from busmaster.service.remote import RemoteBus, RemoteGroup
+
+KEPT = 1_001
+"""Cycles of which the summary tells the periods."""
 
 
 @click.command(short_help="Read values of several nodes once a period.", cls=ItemCommand)
@@ -34,10 +50,61 @@ async def poll(
     connection: Connection, addresses: tuple[int, ...], items: tuple[str, ...], period: float, view: View
 ) -> int:
     """Poll the items of all addresses every `period` seconds until the view ends, and return the exit status."""
-    bus = connection.open_bus()
+    bus = reach(connection)
     handles = [connection.open_handle(bus, address) for address in addresses]
     points = [handle.point(item) for handle in handles for item in items]
+    if isinstance(bus, RemoteBus):
+        return await poll_served(bus, points, period, view)
     async with bus:
         watch = Watch(bus, "busmaster poll", view)
         watch.add(bus.poll_group("poll", period=period, points=points))
         return await follow(watch)
+
+
+class Cycles:
+    """The cycles of a group of a served line: printed, and counted for the summary."""
+
+    def __init__(self, remote: RemoteBus, view: View) -> None:
+        self.start = remote.now()
+        self._view = view
+        self._last: Snapshot | None = None
+        self._started: deque[float] = deque(maxlen=KEPT)
+
+    def since(self, time: float) -> float:
+        """Return a time of the line in seconds since the start."""
+        return round(time - self.start, 6)
+
+    async def show(self, group: RemoteGroup) -> None:
+        """Print every cycle, in a thread: a reader that is slow loses cycles of its own."""
+        async for snapshot in group:
+            self._last = snapshot
+            if snapshot.started is not None:
+                self._started.append(snapshot.started)
+            lines = [json_cycle(self, snapshot)] if self._view.as_json else list(plain_cycle(self, snapshot))
+            await anyio.to_thread.run_sync(emit_all, lines, abandon_on_cancel=True)
+
+    def summarise(self) -> None:
+        """Print the summary on standard error; of nodes, and of how busy the line is, its owner tells."""
+        if self._last is None:
+            note("nothing was polled")
+            return
+        text = f"poll: {self._last.cycle} cycles, {self._last.missed} missed"
+        periods = [later - earlier for earlier, later in pairwise(self._started)]
+        if periods:
+            text += f", period {fmean(periods) * 1000:.2f} ms mean, {(p99_of(periods) or 0.0) * 1000:.2f} ms p99"
+        note(text)
+
+
+async def poll_served(remote: RemoteBus, points: Sequence[Point[Any]], period: float, view: View) -> int:
+    """Have the program that owns the line poll, and print what it reads, until the view ends. Raises LineDown."""
+    if wants_screen(view):
+        note("the live view of a line that another program owns is busmaster top; plain lines instead")
+    cycles = Cycles(remote, view)
+    try:
+        async with remote:
+            with anyio.move_on_after(view.seconds):
+                await cycles.show(await remote.poll_group("poll", period=period, points=points))
+                await remote.groups()  # it ended without us: this says why
+    finally:
+        cycles.summarise()
+    return OK

@@ -11,8 +11,11 @@ import click
 from busmaster.bus.handle import Handle
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.cli.ending import until_ended
+from busmaster.cli.late import late_nodes
 from busmaster.cli.output import emit, emit_all, json_line, json_value, name_fields, value_text
 from busmaster.cli.protocols import ItemCommand, Offer, read_options, take_options
+from busmaster.cli.reaching import reach
+from busmaster.errors import NoReply
 from busmaster.outputs.values import utc
 
 
@@ -38,12 +41,16 @@ async def read(
     connection: Connection, address: int, items: tuple[str, ...], how: dict[str, Any], as_json: bool
 ) -> None:
     """Read the items of one node and print each; all are checked before the first is asked for."""
-    bus = connection.reach()
+    bus = reach(connection)
     handle = connection.open_handle(bus, address)
     points = [handle.point(item) for item in items]
-    async with bus:
+    async with bus, late_nodes(bus) as late:
         for item, point in zip(items, points, strict=True):
-            value = await handle.read_item(item, **how)
+            try:
+                value = await handle.read_item(item, **how)
+            except NoReply as error:
+                await late.explain(error, connection.lateness)
+                raise
             if as_json:
                 fields = {"value": json_value(value), **name_fields(value), "time": utc(time.time())}
                 emit(json_line(node=connection.node_number(address), item=item, **fields))

@@ -14,10 +14,11 @@ from busmaster.cli.audit_log import AuditLog
 from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import Ending, until_ended
 from busmaster.cli.hangups import Hangups
-from busmaster.cli.lines import check_no_owner, file_argument, load, other_port, port_option
+from busmaster.cli.lines import file_argument, load, other_port, port_option
 from busmaster.cli.output import Level, note, number_text
+from busmaster.cli.reaching import check_no_owner
 from busmaster.cli.safe import tell_unsafe
-from busmaster.cli.serving import served
+from busmaster.cli.serving import secrets_of, served
 from busmaster.cli.systemd import ServiceManager
 from busmaster.cli.watching import Watch, follow
 from busmaster.config import ConfiguredLine, LineFile
@@ -55,7 +56,7 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
     file = load(path)
     endpoint = other_port(file, port)
     where = endpoint or file.port
-    check_no_owner(where.name)
+    check_no_owner(where)
     protocols = {node.protocol for node in file.nodes.values()}
     only = protocols.pop() if len(protocols) == 1 else ""
     usual = sys.getswitchinterval()
@@ -63,8 +64,10 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
     context.call_on_close(lambda: sys.setswitchinterval(usual))
     sys.setswitchinterval(SWITCH_INTERVAL)
     with capturing(capture, port=where.name, protocol=only, echo=where.echo) as recorder:
+        line = ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only)
+        line.gate.take_secrets(secrets_of(file))
         running = Running(
-            ConfiguredLine(file, port=endpoint, tap=recorder, wait_for_port=True, read_only=view.read_only),
+            line,
             path,
             view,
             hangups,
@@ -154,8 +157,9 @@ class Running:
         self._manager.reloading()
         self.line.bus.accept_device()
         try:
-            file = await anyio.to_thread.run_sync(self._checked_file)
+            file, secrets = await anyio.to_thread.run_sync(self._checked_file)
             await self.line.take(file)
+            self.line.gate.take_secrets(secrets)
         except (InvalidCommand, OSError) as error:
             note(f"the file was read again, and nothing of it taken: {error}", Level.ERROR)
         else:
@@ -165,15 +169,15 @@ class Running:
             self._say_what_is_polled()
         self._manager.ready()
 
-    def _checked_file(self) -> LineFile:
-        """Load the file and check it.
+    def _checked_file(self) -> tuple[LineFile, dict[str, bytes]]:
+        """Load the file and its tokens, and check them.
 
         Raises OSError, and InvalidCommand, naming line and key, for what is wrong with the file.
         """
         file = load(self._path)
         # made for its complaints alone: `take` wants a file of which a line can be made
         ConfiguredLine(file, port=self.line.bus.endpoint)
-        return file
+        return file, secrets_of(file)
 
     def _tell_of_output(self, text: str) -> None:
         down = any(counts.error for counts in self.line.outputs.statistics())

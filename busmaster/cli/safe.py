@@ -14,10 +14,12 @@ from busmaster.cli.app import FAILED, OK
 from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import file_argument, keep, load, other_port, port_option
 from busmaster.cli.output import Level, emit, note
+from busmaster.cli.reaching import owner_of, tell_owner
 from busmaster.config import ConfiguredLine
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.values import event_text
+from busmaster.service.remote import RemoteBus, connect
 
 
 @click.command(short_help="Send the safe state of a file, and verify it.")
@@ -29,12 +31,24 @@ def command(path: str, port: str | None) -> int:
     Nothing is polled. The outputs keep a record of the writes, once those are over. What was not confirmed in the
     file's time is named on standard error, and the exit status is 1. A port that cannot be opened is waited for in that
     time, and named with the reason.
+
+    Where another busmaster owns the line, that sends them, if its file says the same; the line goes on afterwards.
     """
     file = load(path)
     line = ConfiguredLine(file, port=other_port(file, port), outputs=False, wait_for_port=True)
     if not line.safe_state:
         raise click.UsageError(f"{path} has no safe state: its writes stand in [safe]")
+    owner = owner_of(line.bus.endpoint)
+    if owner is not None:
+        tell_owner(owner)
+        return until_ended(leave_through, connect(owner.address), line.safe_state.values)
     return until_ended(leave, line)
+
+
+async def leave_through(remote: RemoteBus, values: Mapping[str, float]) -> int:
+    """Have the program that owns the line send its safe state, which is to be this one, and return the exit status."""
+    async with remote:
+        return tell_outcomes(await remote.enter_safe_state(values))
 
 
 async def leave(line: ConfiguredLine) -> int:
@@ -45,10 +59,7 @@ async def leave(line: ConfiguredLine) -> int:
         tasks.start_soon(tell_of_port, line.bus.events())
         async with line.bus:
             outcomes = await line.safe_state.enter(line.gate, "busmaster safe")
-    for name, error in outcomes.items():
-        if error is None:
-            emit(f"{name} ok")
-    status = tell_unsafe(outcomes)
+    status = tell_outcomes(outcomes)
     # only now: no output, be it broken, is in the way of a stop
     try:
         await keep(line.audit(note), records)
@@ -62,6 +73,14 @@ async def tell_of_port(events: Stream[BusEvent]) -> None:
     async for event in events:
         if isinstance(event, PortFailed):
             note(event_text(event), Level.ERROR)
+
+
+def tell_outcomes(outcomes: Mapping[str, BusError | None]) -> int:
+    """Print each point that was confirmed, name each that was not, and return the exit status."""
+    for name, error in outcomes.items():
+        if error is None:
+            emit(f"{name} ok")
+    return tell_unsafe(outcomes)
 
 
 def tell_unsafe(outcomes: Mapping[str, BusError | None]) -> int:

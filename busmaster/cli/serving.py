@@ -8,10 +8,15 @@ from contextlib import asynccontextmanager
 from importlib.util import find_spec
 
 from busmaster.cli.output import Level, note
-from busmaster.config import ConfiguredLine
+from busmaster.config import ConfiguredLine, LineFile
 from busmaster.errors import InvalidCommand
 from busmaster.service.folder import line_name
 from busmaster.service.service import Service
+
+
+def secrets_of(file: LineFile) -> dict[str, bytes]:
+    """Return the digests of the tokens with which programs may come to a line. Raises FileError, as their file does."""
+    return file.service.secrets() if file.service.enabled else {}
 
 
 @asynccontextmanager
@@ -26,7 +31,9 @@ async def served(line: ConfiguredLine, *, tell: bool) -> AsyncIterator[None]:
         yield
         return
     name = line_name(os.path.basename(line.file.path).removesuffix(".toml"))
-    service = Service(line.bus, gate=line.gate, name=name, mode=section.mode, group=section.group)
+    service = Service(
+        line.bus, gate=line.gate, name=name, mode=section.mode, group=section.group, listen=section.listen
+    )
     try:
         await service.__aenter__()
     except InvalidCommand as error:
@@ -35,7 +42,8 @@ async def served(line: ConfiguredLine, *, tell: bool) -> AsyncIterator[None]:
         return
     try:
         if tell:
-            note(f"{line.file.title} is served at {service.address}", Level.NOTICE)
+            by_tcp = "" if service.tcp_address is None else f" and {service.tcp_address}"
+            note(f"{line.file.title} is served at {service.address}{by_tcp}", Level.NOTICE)
         yield
     finally:
         await service.__aexit__(None, None, None)

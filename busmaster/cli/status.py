@@ -17,13 +17,15 @@ from busmaster.service.remote import connect
 
 ANSWER_WITHIN = 2.0
 """Seconds in which a program that owns a line has to say how it is."""
+NOT_FOR_US = "not for this user"
 
 
 @click.command(short_help="List this user's lines that run.")
 @json_option
 def command(as_json: bool) -> int:
-    """List the lines that programs of this user serve: name, port, process, programs that use it, how busy it is, and
-    how many of its nodes are up. The exit status is 1 if one does not answer.
+    """List the lines that programs of this user serve, and those of the system in /run/busmaster: name, port, process,
+    programs that use it, how busy it is, and how many of its nodes are up. The exit status is 1 if one does not answer;
+    one that is not for this user is listed as such.
     """
     return until_ended(status, as_json)
 
@@ -37,22 +39,25 @@ async def status(as_json: bool) -> int:
         note("no line of this user is served: start busmaster run LINE.toml")
     else:
         emit(*columns([("NAME", "PORT", "PROCESS", "PROGRAMS", "BUSY", "NODES UP"), *map(cells, lines)], {2, 3, 4, 5}))
-    return FAILED if any(line["error"] for line in lines) else OK
+    return FAILED if any(line["error"] not in (None, NOT_FOR_US) for line in lines) else OK
 
 
 async def ask(owner: Owner) -> dict[str, Any]:
     """Return how a line is, or why its owner does not say so."""
     line: dict[str, Any] = {"name": owner.name, "port": owner.port, "address": owner.address, "process": owner.pid}
-    line |= {"programs": None, "utilisation": None, "up": None, "nodes": None, "error": None}
+    line |= {"tcp": None, "programs": None, "utilisation": None, "up": None, "nodes": None, "error": None}
     try:
         async with asyncio.timeout(ANSWER_WITHIN), connect(owner.address) as remote:
-            nodes = remote.about["nodes"]
+            nodes, line["tcp"] = remote.about["nodes"], remote.about["tcp"]
             line["programs"] = remote.about["clients"] - 1  # without this one
             line["up"] = sum(node["health"] == "up" for node in nodes)
             line["nodes"] = len(nodes)
             line["utilisation"] = (await remote.statistics()).utilisation
     except (BusError, TimeoutError) as error:
-        line["error"] = error.what if isinstance(error, BusError) else "it does not answer"
+        if isinstance(error.__cause__, PermissionError):
+            line["error"] = NOT_FOR_US
+        else:
+            line["error"] = error.what if isinstance(error, BusError) else "it does not answer"
     return line
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Coroutine, Iterable, Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from statistics import fmean
-from typing import Any
+from typing import Any, Protocol
 
 import anyio
 from anyio.abc import TaskGroup
@@ -317,12 +317,22 @@ def short_unit(unit: str) -> str:
     return unit.partition(" of ")[0]
 
 
-def json_cycle(watch: Watch, snapshot: Snapshot) -> str:
+class Clock(Protocol):
+    """What printed times begin at."""
+
+    start: float
+
+    def since(self, time: float, /) -> float:
+        """Return a time of the bus in seconds since the start."""
+        ...
+
+
+def json_cycle(watch: Clock, snapshot: Snapshot) -> str:
     """Return a cycle as one JSON object."""
     return json_line(**cycle_fields(snapshot, watch.since))
 
 
-def plain_cycle(watch: Watch, snapshot: Snapshot) -> Iterator[str]:
+def plain_cycle(watch: Clock, snapshot: Snapshot) -> Iterator[str]:
     """Yield a line a sample: seconds since the start, node and item, the value, or what went wrong."""
     for point, sample in snapshot.samples.items():
         value = error_text(sample.error) if sample.error else value_text(sample.value, point.meaning.precision)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,14 +14,17 @@ from busmaster.bus.points import Point
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.cli.capturing import capturing
 from busmaster.cli.ending import until_ended
-from busmaster.cli.lines import check_no_owner, is_line_file, keep, load
+from busmaster.cli.lines import is_line_file, keep, load
 from busmaster.cli.output import emit, json_line, note
-from busmaster.cli.parsing import parse_assignment, parsed
+from busmaster.cli.parsing import Whole, parse_assignment, parsed
 from busmaster.cli.protocols import ItemCommand
+from busmaster.cli.reaching import owner_of, reach, tell_owner
 from busmaster.config import ConfiguredLine
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Wish
 from busmaster.gate.record import WriteRecord
+from busmaster.registry import find
+from busmaster.service.remote import connect
 
 Pairs = Sequence[tuple[str, tuple[float, ...]]]
 """What is written, in its order: items, or points of a file, and their values."""
@@ -31,9 +35,20 @@ Pairs = Sequence[tuple[str, tuple[float, ...]]]
 @node_option
 @click.argument("assignments", nargs=-1, required=True, metavar="ITEM=VALUE[,VALUE...]...")
 @click.option("--verify", is_flag=True, help="Read back and compare.")
+@click.option(
+    "--decimals",
+    type=Whole(min=0),
+    metavar="N",
+    help="mentor, ct-ansi: so many of a value's digits are behind its point, as in 1.17=-47.6 with 1.",
+)
 @json_option
 def command(
-    connection: Connection, node: int | None, assignments: tuple[str, ...], verify: bool, as_json: bool
+    connection: Connection,
+    node: int | None,
+    assignments: tuple[str, ...],
+    verify: bool,
+    decimals: int | None,
+    as_json: bool,
 ) -> None:
     """Write to one node on PORT, in the order given, and print `ITEM ok` for each.
 
@@ -41,22 +56,36 @@ def command(
     fails ends it, with those before it written.
 
     With a LINE.toml, ITEM is a point of it, as NODE/ITEM, and its value is in the point's unit. The file's limits
-    hold, and its outputs keep a record of each write, or of why it was refused.
+    hold, and its outputs keep a record of each write, or of why it was refused. Where another busmaster owns the line,
+    its limits hold, and its outputs keep the record.
     """
     pairs = [parsed(parse_assignment, text) for text in assignments]
     if not is_line_file(connection.port):
-        until_ended(write, connection, connection.one_address(node), pairs, verify, as_json)
+        if decimals is not None and not find(connection.protocol).takes_decimals:
+            raise click.UsageError(f"{connection.protocol} carries the point of a number itself: leave --decimals out")
+        until_ended(write, connection, connection.one_address(node), pairs, verify, as_json, decimals)
         return
     file = load(connection.port)
-    check_no_owner(file.port.name, "write by node and item")
+    if (owner := owner_of(file.port)) is not None:
+        if connection.capture is not None:
+            raise click.UsageError(f"{owner.port} is a line of another program: record it there, not by --capture")
+        tell_owner(owner)
+        until_ended(write_points_through, ConfiguredLine(file, outputs=False), owner.address, pairs, verify, as_json)
+        return
     with capturing(connection.capture, port=file.port.name, echo=file.port.echo) as recorder:
         until_ended(write_points, ConfiguredLine(file, outputs=False, tap=recorder), pairs, verify, as_json)
 
 
-async def write(connection: Connection, address: int, pairs: Pairs, verify: bool, as_json: bool) -> None:
+async def write(
+    connection: Connection, address: int, pairs: Pairs, verify: bool, as_json: bool, decimals: int | None
+) -> None:
     """Write the pairs to one node, one after another, and print each; all are checked before the first is sent."""
-    bus = connection.reach()
+    bus = reach(connection)
     handle = connection.open_handle(bus, address)
+    if decimals is not None:
+        items = (name for item, values in pairs for name in handle.run_items(item.partition(":")[0], len(values)))
+        with_decimals = {**connection.options, "decimals": dict.fromkeys(items, decimals)}
+        handle = replace(connection, options=with_decimals).open_handle(bus, address)
     prepared = [(item, handle.prepare_write(item, values, verify=verify)) for item, values in pairs]
     async with bus:
         for item, sends in prepared:
@@ -78,6 +107,16 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
                 emit(json_line(point=wish.name, ok=True) if as_json else f"{wish.name} ok")
     finally:
         await keep(audit, records)
+
+
+async def write_points_through(line: ConfiguredLine, address: str, pairs: Pairs, verify: bool, as_json: bool) -> None:
+    """Write the pairs to points of a line that another program owns, which holds its limits and keeps the record."""
+    remote = connect(address)
+    prepared = [(name, line.prepare_write(name, values, bus=remote, verify=verify)) for name, values in pairs]
+    async with remote:
+        for name, send in prepared:
+            await send()
+            emit(json_line(point=name, ok=True) if as_json else f"{name} ok")
 
 
 async def pass_on(line: ConfiguredLine, wish: Wish, send: Send) -> None:

@@ -15,7 +15,8 @@ from busmaster.bus.limits import Limit
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
-from busmaster.bus.requester import WriteOptions
+from busmaster.bus.requester import NodeSource, WriteOptions
+from busmaster.config.access import access_of
 from busmaster.config.kept_times import KeptTimes
 from busmaster.config.names import expanded, listed
 from busmaster.config.point_section import PointSection, check_suits, sort_of
@@ -66,7 +67,8 @@ class ConfiguredLine:
         self._limits = list(self._held_limits())
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
-        self.gate = Gate(self.bus, read_only=read_only)
+        self.gate = Gate(self.bus, read_only=read_only, access=access_of(file.service, self))
+        self.gate.safe_state = self.safe_state
         self.outputs = Distributor(self.bus, tell, gate=self.gate, asks=asks)
         self._kept_times = KeptTimes(self.bus, self._tell)
         self.gate.record = self.outputs.record
@@ -115,6 +117,8 @@ class ConfiguredLine:
             node.lift(limit)
         self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
+        self.gate.safe_state = self.safe_state
+        self.gate.access = access_of(file.service, self, self.gate.access.secrets)
         for name, group in list(self.groups.items()):
             same = before.groups[name] == file.groups.get(name) and wanted[name] == self._wanted[name]
             # by identity: points are equal whatever their scale and unit, which may be what changed
@@ -136,9 +140,16 @@ class ConfiguredLine:
             raise InvalidCommand(f"no such point {name!r}: use NODE/ITEM with one of {', '.join(self.nodes)}")
         return self._point(node, item)
 
-    def prepare_write(self, name: str, values: Sequence[float], **options: Unpack[WriteOptions]) -> Send:
+    def points_named(self, text: str) -> Iterator[NamedPoint]:
+        """Yield the points that `drive4-8/speed,current` names. Raises InvalidCommand for what is none of the line."""
+        return (self._point(*name) for name in self._names(text))
+
+    def prepare_write(
+        self, name: str, values: Sequence[float], *, bus: NodeSource | None = None, **options: Unpack[WriteOptions]
+    ) -> Send:
         """Return what writes a value to the point that the file calls so, or the values of a run, in the point's unit.
 
+        It goes over `bus`, where that is another than the line's own: that of the program that owns the line.
         `RequestOptions` says what the options are. Raises InvalidCommand for what cannot be sent, or is beyond a limit.
         """
         point = self.point(name)
@@ -149,7 +160,8 @@ class ConfiguredLine:
                 point.encode(tuple(values))
             except (ArithmeticError, TypeError, ValueError) as error:
                 raise InvalidCommand(f"{name} does not take {len(values)} values: {error}") from None
-        handle = self.nodes[name.partition("/")[0]]
+        where = name.partition("/")[0]
+        handle = self.nodes[where] if bus is None else handle_of(self.file.nodes[where], bus)
         # one call, whatever it takes on the line: half of it must not be taken for nothing, or for the whole
         [send] = handle.prepare_write(point.source.item, list(map(point.unscaled, values)), **options)
         return send
@@ -209,12 +221,8 @@ class ConfiguredLine:
         self.groups = {name: self.groups[name] for name in self.file.groups}  # in the file's order
 
     def _handle(self, node: NodeSection) -> Handle:
-        options = dict(node.options)
-        if node.kind.takes_decimals:
-            options["decimals"] = decimals_of(node)
         with node.table.at():
-            make: Callable[..., Handle] = node.kind.handle
-            handle = make(self.bus, node.address, timings=node.timings, retries=node.retries, **options)
+            handle = handle_of(node, self.bus, timings=node.timings, retries=node.retries)
             own = Node.of(handle)
             if node.reply_time is not None:
                 own.reply_time = node.reply_time  # until it is measured
@@ -406,6 +414,15 @@ def _known(handle: Handle, item: str, points: Iterable[str]) -> Point[Any]:
         if near := guess(item, points):
             raise InvalidCommand(f"no such item {item!r}{near}") from None
         raise
+
+
+def handle_of(node: NodeSection, bus: NodeSource, **options: Any) -> Handle:
+    """Return the handle of a node of the file, with the options of its protocol, on a bus. Raises InvalidCommand."""
+    options |= node.options
+    if node.kind.takes_decimals:
+        options["decimals"] = decimals_of(node)
+    make: Callable[..., Handle] = node.kind.handle
+    return make(bus, node.address, **options)
 
 
 def decimals_of(node: NodeSection) -> dict[str, int]:

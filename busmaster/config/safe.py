@@ -22,8 +22,10 @@ from busmaster.bus.node import Node
 from busmaster.bus.requester import Priority
 from busmaster.config.points import NamedPoint
 from busmaster.config.table import Table
+from busmaster.contract.exchange import Command
 from busmaster.errors import BusClosed, BusError, InvalidCommand, NotStarted
 from busmaster.gate.gate import Gate, Wish, outcome_of
+from busmaster.gate.permission import Permission
 from busmaster.gate.record import Outcome
 
 WITHIN = 2.0
@@ -69,6 +71,7 @@ class SafeWrite:
     point: NamedPoint
     value: float
     node: Node
+    command: Command[None]
     prepare: Callable[[float], Send]
     """Makes what writes it and reads it back, in so many seconds."""
 
@@ -106,7 +109,7 @@ class SafeWrite:
             return send
 
         prepare(LONGEST)  # what would be refused at the end is refused when the file is read
-        return cls(point, value, node, prepare)
+        return cls(point, value, node, command, prepare)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,16 +122,38 @@ class SafeState:
     def __bool__(self) -> bool:
         return bool(self.writes)
 
-    async def enter(self, gate: Gate, by: str) -> dict[str, BusError | None]:
+    @property
+    def values(self) -> dict[str, float]:
+        """Return the value of each point, by its name."""
+        return {write.point.key: write.value for write in self.writes}
+
+    def refusal(self, permission: Permission) -> str:
+        """Return why somebody may not have it sent, "" if he may."""
+        return next(
+            (why for write in self.writes if (why := permission.refusal(write.node, write.command))),
+            "",
+        )
+
+    async def enter(self, gate: Gate, by: str, *, leaving: bool = True) -> dict[str, BusError | None]:
         """Send all, urgently, read them back, and return by point why it was not confirmed, None if it was.
 
-        From now on the bus takes no other write. Nodes are served at the same time, each in the file's order; what
-        fails is tried again until the time is over. `by` says for the record who wants it.
+        From now on the bus takes no other write; unless the line is not left (`leaving`): then it does so afterwards,
+        and what waited, or was decided before, is not sent. Nodes are served at the same time, each in the file's
+        order; what fails is tried again until the time is over. `by` says for the record who wants it.
         """
         if not self.writes:
             return {}
+        take_writes_again = gate.bus.take_only_safe_writes()
+        try:
+            for write in self.writes:
+                write.node.note_stop()
+            return await self._send(gate, by)
+        finally:
+            if not leaving:
+                take_writes_again()
+
+    async def _send(self, gate: Gate, by: str) -> dict[str, BusError | None]:
         bus = gate.bus
-        bus.take_only_safe_writes()
         deadline = bus.now() + self.within
         by_node: dict[Node, list[Leaving]] = {}
         for write in self.writes:

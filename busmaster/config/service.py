@@ -1,36 +1,175 @@
-"""Whether other programs may use the line of a file, and who."""
+"""Whether other programs may use the line of a file, who, and how they come: `[service]`."""
 
 from __future__ import annotations
 
 import grp
+import os
+import pwd
+import stat
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+from busmaster.config.names import NODE_NAME
 from busmaster.config.recording import read_mode
 from busmaster.config.table import Table
+from busmaster.contract.arguments import host_and_port
+from busmaster.errors import InvalidCommand
+from busmaster.gate.permission import digest_of
+from busmaster.service.tcp import check_listening
 
 MODE = 0o600
+SHORTEST = 16
+"""Characters of a token: what is shorter may be guessed."""
+ROLES = ("read", "write")
+
+
+@dataclass(frozen=True, slots=True)
+class RoleSection:
+    """What a user, a group or a token may do. `only`: the points that may be written, as the file has them, if not all
+    may.
+    """
+
+    who: str
+    writes: bool
+    only: tuple[str, ...] | None
+    table: Table = field(compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceSection:
-    """What `[service]` says: whether a socket is served, its mode, and the number of its group, if it is given one."""
+    """What `[service]` says: whether a socket is served, its mode, and the number of its group, if it is given one.
+
+    `listen` is where programs may come by TCP, None for nowhere; the tokens that they show are in `token_file`. Roles
+    are by the numbers of users and groups, and by the names of tokens; they may change while the line runs.
+    """
 
     enabled: bool
     mode: int
     group: int | None
+    listen: tuple[str, int] | None
+    token_file: str | None
+    users: Mapping[int, RoleSection] = field(compare=False)
+    groups: Mapping[int, RoleSection] = field(compare=False)
+    tokens: Mapping[str, RoleSection] = field(compare=False)
     table: Table = field(compare=False, repr=False)
+
+    def secrets(self) -> dict[str, bytes]:
+        """Read the tokens, and return the digest of each by its name.
+
+        Raises FileError, naming the line and no token, for a file that cannot be read, that others may read, or that
+        has not all tokens of which the section speaks.
+        """
+        if self.token_file is None:
+            return {}
+        with self.table.at("token_file"):
+            secrets = dict(_tokens(self.token_file))
+            if not secrets:
+                raise InvalidCommand(f"there are no tokens in {self.token_file}: a line is a name and its token")
+        for name, role in self.tokens.items():
+            if name not in secrets:
+                raise role.table.error(f"there is no token {name!r} in {self.token_file}")
+        return secrets
 
 
 def read_service(table: Table) -> ServiceSection:
     """Read `[service]`. Raises FileError, naming line and key, for what is wrong in it."""
-    table.only("enabled", "mode", "group")
+    table.only("enabled", "mode", "group", "listen", "token_file", "users", "groups", "tokens")
     group = table.text("group", None)
     mode = read_mode(table, "mode") if "mode" in table else MODE if group is None else 0o660
-    return ServiceSection(table.flag("enabled", True), mode, None if group is None else _number(table, group), table)
+    token_file = table.text("token_file", None)
+    listen = None
+    if "listen" in table:
+        with table.at("listen"):
+            listen = host_and_port(table.text("listen"))
+            check_listening(listen, tokens=token_file is not None)
+    elif token_file is not None:
+        raise table.error('tokens are for TCP: say where, as listen = "127.0.0.1:7420"', "token_file")
+    return ServiceSection(
+        enabled=table.flag("enabled", True),
+        mode=mode,
+        group=None if group is None else _group(table, "group", group),
+        listen=listen,
+        token_file=token_file,
+        users={_user(each): _role(each, "user") for each in table.tables("users")},
+        groups={_group(each, None, each.name): _of_group(each, mode) for each in table.tables("groups")},
+        tokens={_token(each, token_file): _role(each, "token") for each in table.tables("tokens")},
+        table=table,
+    )
 
 
-def _number(table: Table, group: str) -> int:
+def _role(table: Table, kind: str) -> RoleSection:
+    table.only("role", "allow_writes")
+    writes = table.choice("role", ROLES) == "write"
+    only = table.texts("allow_writes", None)
+    if only is not None and not (writes and only):
+        raise table.error('names what a role = "write" may write: leave it out for all of the line', "allow_writes")
+    return RoleSection(f"{kind} {table.name}", writes, only, table)
+
+
+def _of_group(table: Table, mode: int) -> RoleSection:
+    if not mode & 0o066:
+        raise table.error(f"no group comes to a socket of mode {mode:04o}: say whose it is, as group = {table.name!r}")
+    return _role(table, "group")
+
+
+def _user(table: Table) -> int:
+    try:
+        return pwd.getpwnam(table.name).pw_uid
+    except KeyError:
+        raise table.error(f"there is no user {table.name!r} on this machine") from None
+
+
+def _group(table: Table, key: str | None, group: str) -> int:
     try:
         return grp.getgrnam(group).gr_gid
     except KeyError:
-        raise table.error(f"there is no group {group!r} on this machine", "group") from None
+        way = () if key is None else (key,)
+        raise table.error(f"there is no group {group!r} on this machine", *way) from None
+
+
+def _token(table: Table, token_file: str | None) -> str:
+    if token_file is None:
+        raise table.error("a token is written in a file of its own: say which, as token_file")
+    return table.name
+
+
+def _tokens(path: str) -> Iterator[tuple[str, bytes]]:
+    """Yield the names and digests of a file of tokens. Raises InvalidCommand."""
+    known: set[str] = set()
+    for number, line in enumerate(_private_text(path).splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        name = words[0]
+        if len(words) != 2 or not NODE_NAME.fullmatch(name):
+            raise InvalidCommand(f"{path}:{number}: a line is a name and its token")
+        if len(words[1]) < SHORTEST:
+            raise InvalidCommand(
+                f"{path}:{number}: the token of {name} has less than {SHORTEST} characters: "
+                "make one with openssl rand -hex 32"
+            )
+        if name in known:
+            raise InvalidCommand(f"{path}:{number}: there are two tokens {name!r}")
+        known.add(name)
+        yield name, digest_of(words[1])
+
+
+def _private_text(path: str) -> str:
+    """Return what is in a file. Raises InvalidCommand where others may read it, or write it."""
+    try:
+        with open(path, encoding="utf-8", opener=_no_device) as file:
+            found = os.fstat(file.fileno())
+            if not stat.S_ISREG(found.st_mode):
+                raise InvalidCommand(f"{path} is no file")
+            # A group may read it: so may that of a credential that systemd hands over.
+            if found.st_mode & 0o027 or found.st_uid not in (0, os.getuid()):
+                raise InvalidCommand(f"others may read {path}, or change it: chmod 600 {path}, as its only user")
+            return file.read()
+    except OSError as error:
+        raise InvalidCommand(f"{path} cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise InvalidCommand(f"{path} is no text") from None
+
+
+def _no_device(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC)

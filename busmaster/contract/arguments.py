@@ -14,6 +14,7 @@ from typing import NamedTuple, SupportsIndex
 
 from busmaster.errors import InvalidCommand
 
+HIGHEST_PORT = 65535
 MOST_DIGITS = 20
 """Of a number in a text: none here has more, and Python makes no number of some thousands."""
 
@@ -49,6 +50,14 @@ def seconds(value: object, what: str) -> float:
 def is_decimal(text: str) -> bool:
     """Return whether a text is a whole number without a sign, in digits as the command line takes them: 20 at most."""
     return text.isascii() and text.isdigit() and len(text) <= MOST_DIGITS
+
+
+def host_and_port(text: str) -> tuple[str, int]:
+    """Return the host and the port of `HOST:PORT`. Raises InvalidCommand."""
+    host, colon, port = text.rpartition(":")
+    if not colon or not host or not is_decimal(port) or int(port) > HIGHEST_PORT:
+        raise InvalidCommand(f"a TCP address is written HOST:PORT, like 127.0.0.1:5020, not {text!r}")
+    return host.strip("[]"), int(port)
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:

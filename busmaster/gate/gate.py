@@ -5,15 +5,16 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from math import inf
 from types import TracebackType
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
+from busmaster.contract.exchange import Command
 from busmaster.errors import (
     BusError,
     InvalidCommand,
@@ -24,6 +25,7 @@ from busmaster.errors import (
     VerifyFailed,
     WriteUnconfirmed,
 )
+from busmaster.gate.permission import EVERYTHING, Access, Permission
 from busmaster.gate.record import Outcome, WriteRecord, this_user
 
 FRESH = 1.0
@@ -41,7 +43,8 @@ class Wish:
     """What somebody outside wants to have written.
 
     `arrived` is when it came, by the bus's clock; None of a person who waits for its end. `expires` is when it is no
-    longer meant, in seconds since 1970; None where it does not say so.
+    longer meant, in seconds since 1970; None where it does not say so. `command` is what a program would have sent,
+    which is held against its `permission`; None where the door's own list has named the point.
     """
 
     door: str
@@ -52,10 +55,29 @@ class Wish:
     arrived: float | None = None
     expires: float | None = None
     id: str = ""
+    command: Command[Any] | None = None
+    permission: Permission = EVERYTHING
 
 
 Keep: TypeAlias = Callable[[Wish, Outcome, str, Any, float], WriteRecord]
 """Keeps a record: of what was wished, what became of it and why, the value before, and the seconds that it took."""
+
+
+class SafeWrites(Protocol):
+    """The safe state of a line."""
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Return the value of each of its points, by its name; of no point where there is no safe state."""
+        ...
+
+    def refusal(self, permission: Permission, /) -> str:
+        """Return why somebody may not have it sent, "" if he may."""
+        ...
+
+    async def enter(self, gate: Gate, by: str, /, *, leaving: bool = True) -> Mapping[str, BusError | None]:
+        """Send it, and return by point why it was not confirmed, None if it was."""
+        ...
 
 
 class Passage:
@@ -107,18 +129,31 @@ class Gate:
 
     `record` is told of every one.
 
+    `access` says what other programs may do.
+
     `write` never raises but when it is cancelled: whatever somebody sends, it ends as a record.
     """
 
-    def __init__(self, bus: Bus, *, read_only: bool = False) -> None:
+    def __init__(self, bus: Bus, *, read_only: bool = False, access: Access | None = None) -> None:
         self.read_only = read_only
         self.leaving = False
+        self.access = access or Access()
+        self.safe_state: SafeWrites | None = None
+        """What the line's file calls safe; None of a line without a file."""
+        self.on_access: list[Callable[[], None]] = []
+        """Called when other tokens hold."""
         self.record: Callable[[WriteRecord], None] = lambda _: None
         self.bus = bus
         self._log = logging.getLogger("busmaster.audit")
         self._log.addHandler(logging.NullHandler())
         self._user = this_user()
         self._running: dict[str, int] = {}
+
+    def take_secrets(self, secrets: Mapping[str, bytes]) -> None:
+        """Have these tokens hold from now on, and no other: their digests by their names."""
+        self.access = replace(self.access, secrets=secrets)
+        for tell in self.on_access:
+            tell()
 
     def refusal(self, wish: Wish) -> str:
         """Return why it is not let through, "" if it is."""
@@ -128,6 +163,8 @@ class Gate:
             return "this line is read-only"
         if wish.point is None:
             return "the line's file does not allow this: see allow_commands"
+        if wish.command is not None and (refusal := wish.permission.refusal(wish.point.node, wish.command)):
+            return refusal
         if self._left(wish) <= 0:
             return "it is too old: nothing was sent"
         if self._running.get(wish.door, 0) >= MOST_AT_ONCE:

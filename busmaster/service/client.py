@@ -15,9 +15,11 @@ from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import checked_priority
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
+from busmaster.gate.permission import Permission
 from busmaster.service.errands import Errand, Line
 from busmaster.service.failures import said_error
 from busmaster.service.messages import (
+    MOST_CHECKED,
     MOST_NODES,
     MOST_POINTS,
     MOST_REQUESTS,
@@ -56,6 +58,11 @@ class Client:
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
         self._log = logging.getLogger("busmaster.service")
+
+    @property
+    def permission(self) -> Permission:
+        """Return what it may do, as it is now."""
+        return self.peer.permission(self._line.gate.access)
 
     @property
     def errands(self) -> tuple[Errand, ...]:
@@ -102,6 +109,9 @@ class Client:
         if method == "request":
             self._begin(number, params)
             return
+        if method == "safe":
+            self._begin_safe(number, params)
+            return
         try:
             answer = self._answer(method, params)
         except (BusError, InvalidCommand, Malformed) as error:
@@ -121,7 +131,7 @@ class Client:
                 self._end_stream(params.get("stream", -1))
             case "stop":
                 node = self._nodes.get((str(params.get("protocol")), params.get("address", -1)))
-                if node is not None:
+                if node is not None and self.permission.reaches(node):
                     node.note_stop()
 
     def _answer(self, method: str, params: Mapping[str, Any]) -> Any:
@@ -129,6 +139,12 @@ class Client:
         match method:
             case "node":
                 return self._name_node(params)
+            case "check":
+                if len(params["commands"]) > MOST_CHECKED:
+                    raise InvalidCommand(f"{MOST_CHECKED} writes are checked at once, and no more")
+                for command in params["commands"]:
+                    Errand.of({**params, "command": command}, self, self._line).check()
+                return None
             case "statistics":
                 return said_statistics(self._line.bus.statistics())
             case "groups":
@@ -211,6 +227,23 @@ class Client:
         del self._running[number], self._errands[number]
         errand.give_up()  # a task that is cancelled before its first step runs nothing of it
 
+    def _begin_safe(self, number: int, params: Mapping[str, Any]) -> None:
+        try:
+            sending = self._line.safe_wishes.begin(params["writes"], self.peer)
+        except InvalidCommand as error:
+            self._refuse(number, error)
+        except (KeyError, TypeError, ValueError) as error:
+            self._refuse(number, InvalidCommand(f"safe: {type(error).__name__}: {error}"))
+        else:
+            sending.add_done_callback(partial(self._safe_sent, number))
+
+    def _safe_sent(self, number: int, sending: asyncio.Task[dict[str, Any]]) -> None:
+        error = WriteUnconfirmed("the program that owns the line ends") if sending.cancelled() else sending.exception()
+        if error is None:
+            self._say({"id": number, "result": sending.result()})
+        else:
+            self._refuse(number, error if isinstance(error, Exception) else BusError(str(error)))
+
     def _say(self, message: Mapping[str, Any]) -> None:
         self.outbox.put(written(message))
 
@@ -241,7 +274,7 @@ class Client:
             raise InvalidCommand("a poll group reads: it writes nothing")
         phase = params.get("phase")
         group = self._line.bus.poll_group(
-            f"{str(params['name'])[:40]} ({self.peer.program} {self.peer.pid}-{self._number})",
+            f"{str(params['name'])[:40]} ({self.peer.short}-{self._number})",
             period=seconds(params["period"], "a period"),
             points=read,
             phase=None if phase is None else seconds(phase, "a phase"),

@@ -16,7 +16,9 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
 from busmaster.gate.gate import FRESH, Gate, Wish
+from busmaster.gate.permission import Permission
 from busmaster.service.peers import Peer
+from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast
 from busmaster.service.telling import protocol_of
 
@@ -33,6 +35,9 @@ class Line(Protocol):
 
     @property
     def gate(self) -> Gate: ...
+
+    @property
+    def safe_wishes(self) -> SafeWishes: ...
 
     def broadcast_of(self, group: PollGroup, /) -> Broadcast:
         """Return what tells the cycles of a poll group."""
@@ -52,6 +57,9 @@ class Asker(Protocol):
 
     @property
     def peer(self) -> Peer: ...
+
+    @property
+    def permission(self) -> Permission: ...
 
     def node(self, name: str, address: int, /) -> Node:
         """Return a node of the line. Raises InvalidCommand."""
@@ -73,7 +81,7 @@ class Errand:
         options: CommandOptions,
         *,
         line: Line,
-        peer: Peer,
+        asker: Asker,
         stops_seen: int | None,
         stop: bool,
         asked: float,
@@ -84,7 +92,7 @@ class Errand:
         self._touches = touches
         self._options = options
         self._line = line
-        self._peer = peer
+        self._asker = asker
         self._stops_seen = stops_seen
         self._stop = stop
         self._asked = asked
@@ -108,7 +116,7 @@ class Errand:
             None if touches is None else protocol.read_back(touches),
             given,
             line=line,
-            peer=asker.peer,
+            asker=asker,
             stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
             stop=params.get("stop") is True and _check_stop(node, command),
             asked=min(now, seconds(params.get("asked", now), "asked")),
@@ -117,6 +125,17 @@ class Errand:
     @property
     def text(self) -> str:
         return str(self.command)
+
+    def check(self) -> None:
+        """Raise InvalidCommand for a write that would be refused now: a record is kept of that."""
+        wish = self._wish()
+        try:
+            if self.command.writes and (refusal := self._line.gate.refusal(wish)):
+                raise InvalidCommand(f"{self.node.label}: {refusal}")
+            self.node.check(self.command, stop=self._stop)
+        except InvalidCommand as error:
+            self._line.gate.refuse(wish, str(error))
+            raise
 
     async def run(self) -> Any:
         """Run it and return its value. Raises BusError or InvalidCommand; every write passes the gate."""
@@ -186,7 +205,15 @@ class Errand:
             if point is not None:
                 value = _value(point, changes, value)
         point = point or Point(self.node, self.text, command)
-        return Wish(door=DOOR, by=str(self._peer), name=point.key, point=point, value=value)
+        return Wish(
+            door=DOOR,
+            by=str(self._asker.peer),
+            name=point.key,
+            point=point,
+            value=value,
+            command=command,
+            permission=self._asker.permission,
+        )
 
 
 def _check_stop(node: Node, command: Command[Any]) -> bool:

@@ -106,13 +106,6 @@ def _device(port: str) -> str:
     return os.path.realpath(name) if name.startswith("/") else name
 
 
-def owner_of(port: str) -> Owner | None:
-    """Return who serves `unix:PATH`, or the line that has this name or port; None if nobody says so."""
-    if port.startswith("unix:"):
-        return _read(Path(socket_path(port)).with_suffix(".line"))
-    return find_owner(port)
-
-
 def socket_path(address: str) -> str:
     """Return the socket that `unix:PATH`, or a line's or a port's name, stands for. Raises InvalidCommand."""
     if address.startswith("unix:"):

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from busmaster.contract.arguments import host_and_port
 from busmaster.errors import (
     Addressed,
     BusClosed,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 GRACE = 0.25
 """Seconds beyond `finish_within` in which the line's owner, who knows more, may say what became of a request."""
 CONNECT_WITHIN = 10.0
+TCP = "tcp://"
 GONE = "the connection to the program that owns the line was lost"
 AGAIN = "see whether it runs, and connect again"
 
@@ -67,9 +69,14 @@ class Link:
     """One connection to the owner of a line. `on_news` is told, in its order, what comes unasked."""
 
     def __init__(
-        self, address: str, on_news: Callable[[str, Mapping[str, Any]], None], on_lost: Callable[[], None]
+        self,
+        address: str,
+        token: str | None,
+        on_news: Callable[[str, Mapping[str, Any]], None],
+        on_lost: Callable[[], None],
     ) -> None:
         self.address = address
+        self._token = token
         self._on_news = on_news
         self._on_lost = on_lost
         self._connection: ClientConnection | None = None
@@ -83,11 +90,13 @@ class Link:
     async def open(self, program: str) -> dict[str, Any]:
         """Connect, agree on a version, and return what the owner says of the line. Raises LineDown."""
         connect, refused, _ = _websockets()
-        path = socket_path(self.address)
+        where, place = _where(self.address)
+        headers = None if self._token is None else {"Authorization": f"Bearer {self._token}"}
         try:
             connection = await connect(
-                path,
-                uri="ws://localhost/",
+                "ws://busmaster/",
+                **place,
+                additional_headers=headers,
                 compression=None,
                 max_size=LONGEST_MESSAGE,
                 open_timeout=CONNECT_WITHIN,
@@ -96,8 +105,7 @@ class Link:
                 proxy=None,
             )
         except (OSError, TimeoutError, refused) as error:
-            what = getattr(error, "strerror", None) or str(error) or "it does not answer"
-            raise self._unreachable(path, what) from error
+            raise _unreachable(where, error, shown=self._token is not None) from error
         self._connection = connection
         hello = Asked(0, asyncio.get_running_loop().create_future(), False, None, None)
         self._asked[0] = hello
@@ -226,8 +234,27 @@ class Link:
         else:
             asked.future.set_result(said.get("result"))
 
-    def _unreachable(self, path: str, why: str) -> LineDown:
-        return LineDown(f"no program serves {path}: {why}", hint="start busmaster run, or see busmaster status")
+
+def _where(address: str) -> tuple[str, dict[str, Any]]:
+    """Return where that is for messages, and for the library. Raises InvalidCommand."""
+    if address.startswith(TCP):
+        text = address.removeprefix(TCP).rstrip("/")
+        host, port = host_and_port(text)
+        return text, {"host": host, "port": port}
+    path = socket_path(address)
+    return path, {"path": path, "unix": True}
+
+
+def _unreachable(where: str, error: Exception, *, shown: bool) -> LineDown:
+    response = getattr(error, "response", None)
+    match None if response is None else response.status_code:
+        case 401:
+            what = "does not know this token" if shown else "wants a token"
+            return LineDown(f"{where} {what}", hint="its owner has the tokens in a file, see [service] of LINE.toml")
+        case 503:
+            return LineDown(f"{where} has too many programs already", hint="end one, see busmaster status")
+    why = getattr(error, "strerror", None) or str(error) or "it does not answer"
+    return LineDown(f"no program serves {where}: {why}", hint="start busmaster run, or see busmaster status")
 
 
 def _websockets() -> tuple[Any, type[Exception], type[Exception]]:
@@ -236,8 +263,8 @@ def _websockets() -> tuple[Any, type[Exception], type[Exception]]:
     Raises InvalidCommand, with what to install, where it is missing.
     """
     try:
-        from websockets.asyncio.client import unix_connect
+        from websockets.asyncio.client import connect
         from websockets.exceptions import ConnectionClosed, WebSocketException
     except ImportError:
         raise InvalidCommand("a line of another program needs websockets: pip install 'busmaster[service]'") from None
-    return unix_connect, WebSocketException, ConnectionClosed
+    return connect, WebSocketException, ConnectionClosed

@@ -24,6 +24,8 @@ MOST_UNREAD = 256
 """Messages of streams that one client has not read: beyond it the oldest is dropped, and counted."""
 MOST_WAITING = MOST_UNREAD + 2 * MOST_REQUESTS
 """Messages for one client that are not sent yet, beyond which nothing more is taken from it."""
+MOST_CHECKED = 64
+"""Writes of one question whether the line would take them."""
 MOST_NODES = 1024
 MOST_STREAMS = 32
 MOST_POINTS = 1000

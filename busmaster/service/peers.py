@@ -1,4 +1,4 @@
-"""Who is at the other end of a Unix socket, as the kernel says."""
+"""Who is at the other end of a connection: as the kernel says of a Unix socket, as a token says on TCP."""
 
 from __future__ import annotations
 
@@ -6,27 +6,102 @@ import pwd
 import socket
 import struct
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
+
+from busmaster.gate.permission import Access, Permission
 
 CREDENTIALS = struct.Struct("3i")
+PEER_GROUPS = 59
+"""SO_PEERGROUPS, which Python does not name."""
+MOST_GROUPS = 256
+"""What Python has room for; of a user with more only the first group counts."""
+
+
+class Peer(Protocol):
+    """Whoever has connected; `str` of it is what is on record of him."""
+
+    @property
+    def short(self) -> str:
+        """What his poll groups are called after."""
+        ...
+
+    def may_stay(self, access: Access, /) -> bool:
+        """Return whether he may still be here, now that other tokens may hold."""
+        ...
+
+    def permission(self, access: Access, /) -> Permission:
+        """Return what he may do."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
-class Peer:
-    """A process of this machine."""
+class Process:
+    """A process of this machine, which has connected the Unix socket."""
 
     pid: int
+    uid: int
+    gids: tuple[int, ...]
     user: str
     program: str
+
+    @property
+    def short(self) -> str:
+        return f"{self.program} {self.pid}"
+
+    def may_stay(self, _: Access) -> bool:
+        """Return True: the socket's mode says which processes come."""
+        return True
+
+    def permission(self, access: Access) -> Permission:
+        """Return what its user and groups may do."""
+        return access.of_process(self.uid, self.gids)
 
     def __str__(self) -> str:
         return f"{self.user}, {self.program} (process {self.pid})"
 
 
-def peer_of(connected: Any) -> Peer:
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """Whoever has connected by TCP, and showed a token; `token` is its name, "" for none."""
+
+    token: str
+    address: str
+
+    @property
+    def short(self) -> str:
+        return f"{self.token} {self.address}".strip()
+
+    def may_stay(self, access: Access) -> bool:
+        """Return whether the token still holds; without one, whether none is needed."""
+        return self.token in access.secrets if self.token else not access.secrets
+
+    def permission(self, access: Access) -> Permission:
+        """Return what whoever has the token may do."""
+        return access.of_token(self.token)
+
+    def __str__(self) -> str:
+        return f"{f'token {self.token}' if self.token else 'without a token'}, from {self.address}"
+
+
+def process_of(connected: Any) -> Process:
     """Return who has connected a Unix socket."""
-    pid, uid, _ = CREDENTIALS.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
-    return Peer(pid, user_name(uid), program_name(pid))
+    pid, uid, gid = CREDENTIALS.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
+    return Process(pid, uid, (gid, *_more_groups(connected)), user_name(uid), program_name(pid))
+
+
+def holder_of(connected: Any, token: str) -> Holder:
+    """Return who has connected by TCP with a token of this name."""
+    host, port, *_ = connected.getpeername()
+    return Holder(token, f"{host}:{port}")
+
+
+def _more_groups(connected: Any) -> tuple[int, ...]:
+    """Return the groups of a process beside its first."""
+    try:
+        said: bytes = connected.getsockopt(socket.SOL_SOCKET, PEER_GROUPS, 4 * MOST_GROUPS)
+    except OSError:  # an older kernel, or more groups than fit
+        return ()
+    return struct.unpack(f"{len(said) // 4}I", said)
 
 
 def user_name(uid: int) -> str:

@@ -21,10 +21,11 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
-from busmaster.errors import BusClosed, InvalidCommand
+from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.planning.merging import Merge
-from busmaster.service.link import Asked, Link
-from busmaster.service.messages import said_timings, value_of
+from busmaster.service.link import TCP, Asked, Link
+from busmaster.service.messages import MOST_CHECKED, said_timings, value_of
+from busmaster.service.safe import outcomes_of
 from busmaster.service.telling import (
     event_of,
     point_of,
@@ -38,12 +39,14 @@ T = TypeVar("T")
 EVENT_BUFFER = 256
 
 
-def connect(address: str) -> RemoteBus:
-    """Return the bus that another program of this machine owns, for `async with`, which connects.
+def connect(address: str, *, token: str | None = None) -> RemoteBus:
+    """Return the bus that another program owns, for `async with`, which connects.
 
-    `address` is `unix:PATH`, or the name of a line or of its port, as `busmaster status` lists them.
+    `address` is `unix:PATH`, or the name of a line or of its port, as `busmaster status` lists them; or
+    `tcp://HOST:PORT`, where a `token` that the line's owner knows may be needed. The token goes over the network as it
+    is. Raises InvalidCommand for a token anywhere else: there the kernel says who comes.
     """
-    return RemoteBus(address)
+    return RemoteBus(address, token=token)
 
 
 class RemoteNode:
@@ -96,7 +99,11 @@ class RemoteNode:
         raise InvalidCommand(f"{self.label}: limits are held by the program that owns the line: set {limit.name} there")
 
     def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
-        """Do nothing: the line checks each write as it comes. Of several writes, those before a bad one are written."""
+        """Have the line check these writes when the bus is entered: entering raises InvalidCommand for a bad one.
+
+        Later it does nothing: the line checks each write as it comes. Of several, those before a bad one are written.
+        """
+        self._bus.prepare(self, commands, stop is True)
 
     async def request(
         self,
@@ -147,6 +154,11 @@ class RemoteNode:
         if given := {name: value for name, value in options.items() if value is not None and name not in LEFT_OUT}:
             params["options"] = given
         return params
+
+    def said_check(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
+        """Return writes of this node as the line is asked whether it would take them."""
+        said = [self._protocol.write_down(command) for command in commands]
+        return {"protocol": self.profile.name, "address": self.address, "commands": said, "stop": stop}
 
 
 LEFT_OUT = ("verify", "safe")
@@ -224,11 +236,17 @@ class RemoteBus:
     Handles take it as they take a Bus: `MicroFlexDrive(remote, 7)`. What is safe lives with the line: a stop of any
     program counts for all, limits and the record of writes are the owner's. A node that the owner does not have is
     asked as this program says, and leaves the line with it. Entering raises LineDown if nobody serves the line, and
-    InvalidCommand for a name that nobody's line has. A lost connection is not made again: enter a new RemoteBus.
+    InvalidCommand for a name that nobody's line has, and for a write that was prepared before and that the line would
+    not take. A lost connection is not made again: enter a new RemoteBus.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, *, token: str | None = None) -> None:
+        if token is not None and not address.startswith(TCP):
+            raise InvalidCommand(f"{address} takes no token: it is for tcp://HOST:PORT")
+        if token is not None and not (token.isascii() and token.isprintable() and token.split() == [token]):
+            raise InvalidCommand("a token is of letters, digits and signs, without spaces")
         self.address = address
+        self._token = token
         self.line = ""
         """The name of the line's port, once it is entered."""
         self.about: Mapping[str, Any] = {}
@@ -242,11 +260,13 @@ class RemoteBus:
         self._count = 0
         self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
+        self._prepared: list[tuple[RemoteNode, tuple[Command[Any], ...], bool]] = []
+        """Writes that are to be checked before the first of them is sent."""
 
     async def __aenter__(self) -> RemoteBus:
         if self._link is not None:
             raise InvalidCommand(f"the bus of {self.address} was entered already: enter it once, and share it")
-        link = Link(self.address, self._hear, self._lost)
+        link = Link(self.address, self._token, self._hear, self._lost)
         self._link = link
         said = await link.open(sys.argv[0])
         self.about, self.line = said, said["line"]
@@ -256,6 +276,13 @@ class RemoteBus:
                 node.label = known["label"]
         for node in self._named:
             self._name(node)
+        try:
+            for node, commands, stop in self._prepared:
+                for first in range(0, len(commands), MOST_CHECKED):
+                    await self._ask("check", node.said_check(commands[first : first + MOST_CHECKED], stop))
+        except BaseException:
+            await link.close()
+            raise
         return self
 
     async def __aexit__(
@@ -276,6 +303,11 @@ class RemoteBus:
         if self._link is None:
             raise BusClosed("the bus is not open", node=node, command=command)
         return self._link
+
+    def prepare(self, node: RemoteNode, commands: tuple[Command[Any], ...], stop: bool) -> None:
+        """Have these writes checked when the bus is entered, if it is not yet."""
+        if self._link is None:
+            self._prepared.append((node, commands, stop))
 
     def now(self) -> float:
         """Return the time of the line's clock, in seconds: that of the machine, which is the same for all programs."""
@@ -360,6 +392,14 @@ class RemoteBus:
         params |= {"phase": phase, "priority": priority}
         return await self._follow("poll", name, wanted, params)
 
+    async def enter_safe_state(self, values: Mapping[str, float]) -> dict[str, BusError | None]:
+        """Have the line's owner send its safe state, and return by point why it was not confirmed, None if it was.
+
+        `values` is what the caller takes that to be, by the names of the file's points. Raises InvalidCommand, and
+        nothing is sent, if it is something else, or this program may not write all of it.
+        """
+        return outcomes_of(await self._ask("safe", {"writes": dict(values)}, writes=True))
+
     async def groups(self) -> tuple[str, ...]:
         """Return the names of the line's poll groups."""
         return tuple(group["name"] for group in await self._ask("groups", {}))
@@ -381,8 +421,8 @@ class RemoteBus:
 
     # inside
 
-    async def _ask(self, method: str, params: Mapping[str, Any]) -> Any:
-        asked = self.link.ask(method, params)
+    async def _ask(self, method: str, params: Mapping[str, Any], *, writes: bool = False) -> Any:
+        asked = self.link.ask(method, params, writes=writes)
         return await self.link.answer(asked)
 
     async def _follow(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import socket
 from collections.abc import Collection, Hashable
 from functools import partial
 from http import HTTPStatus
@@ -33,8 +34,10 @@ from busmaster.service.messages import (
     written,
 )
 from busmaster.service.outbox import Outbox
-from busmaster.service.peers import peer_of
+from busmaster.service.peers import Peer, process_of
+from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
+from busmaster.service.tcp import HostPort, check_listening, holder, is_our_name, listening
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -55,9 +58,11 @@ class Service:
     """Serve a bus that is open, on a Unix socket, in `async with`. It ends before the bus is closed.
 
     `path` is the socket's; without it, it is NAME.sock in this user's runtime folder, where `name` is that of the
-    line, by default its port's. Every write passes `gate`: without one, its own, which keeps a record in the log
-    "busmaster.audit". `mode` and `group`, a number, are the socket's. Entering raises InvalidCommand where the socket
-    is served by another process, which it names, or cannot be made.
+    line, by default its port's. Every write passes `gate`, which says who may do what: without one, its own, which
+    keeps a record in the log "busmaster.audit", and lets this user write and others read. `mode` and `group`, a number,
+    are the socket's. `listen` is a host and a port where programs may come by TCP too: off this machine only where the
+    gate knows tokens. Entering raises InvalidCommand where the socket is served by another process, which it names,
+    or cannot be made.
     """
 
     def __init__(
@@ -69,17 +74,22 @@ class Service:
         path: Path | str | None = None,
         mode: int = 0o600,
         group: int | None = None,
+        listen: HostPort | None = None,
     ) -> None:
         self.bus = bus
         self.gate = gate or Gate(bus)
+        if listen is not None:
+            check_listening(listen, tokens=bool(self.gate.access.secrets))
+        self.safe_wishes = SafeWishes(self.gate)
         self.name = name or line_name(bus.endpoint.name)
         self.refused = 0
         """Connections that were one too many, or that began with what no client says."""
         self._path = None if path is None else Path(path).absolute()
         self._mode = mode
         self._group = group
+        self._listen = listen
         self._served: ServedSocket
-        self._server: Server
+        self._servers: list[Server] = []
         self._clients: dict[Client, ServerConnection] = {}
         self._count = 0
         self._groups: dict[PollGroup, GroupBroadcast] = {}
@@ -94,12 +104,20 @@ class Service:
         return self._served.owner.address
 
     @property
+    def tcp_address(self) -> str | None:
+        """Return what `connect` takes of a program that comes by TCP; None where none can."""
+        if self._listen is None:
+            return None
+        host, port = self._servers[-1].sockets[0].getsockname()[:2]
+        return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
+
+    @property
     def clients(self) -> tuple[Client, ...]:
         """Return the programs that are connected."""
         return tuple(self._clients)
 
     async def __aenter__(self) -> Service:
-        serve = _websockets()
+        _websockets()  # before anything is made
         path = self._path or runtime_folder() / f"{self.name}.sock"
         endpoint = self.bus.endpoint
         settings = endpoint.settings
@@ -115,21 +133,18 @@ class Service:
         served = ServedSocket(owner, mode=self._mode, group=self._group)
         self._served = served.__enter__()
         try:
-            self._server = await serve(
-                self._serve,
-                sock=self._served.socket,
-                process_request=self._check_request,
-                origins=[None],
-                compression=None,
-                max_size=LONGEST_MESSAGE,
-                close_timeout=CLOSE_WITHIN,
-                server_header=None,
-                logger=_quiet(),
-            )
+            sockets = [self._served.socket]
+            if self._listen is not None:
+                sockets.append(await asyncio.to_thread(listening, self._listen))
+            for opened in sockets:
+                self._servers.append(await self._serve_at(opened))
         except BaseException:
+            for server in self._servers:
+                server.close()
             served.__exit__(None, None, None)
             raise
         self.bus.on_stop.append(self._tell_stop)
+        self.gate.on_access.append(self._let_go)
         return self
 
     async def __aexit__(
@@ -137,7 +152,10 @@ class Service:
     ) -> None:
         """Let nobody in any more, tell all clients what became of their requests, and let them go."""
         self.bus.on_stop.remove(self._tell_stop)
-        self._server.close(close_connections=False)
+        self.gate.on_access.remove(self._let_go)
+        await self.safe_wishes.close()
+        for server in self._servers:
+            server.close(close_connections=False)
         for client in self.clients:
             client.release()
         try:
@@ -149,7 +167,8 @@ class Service:
             for connection in self._clients.values():
                 connection.transport.abort()
             try:
-                await self._server.wait_closed()
+                for server in self._servers:
+                    await server.wait_closed()
             finally:
                 self._served.__exit__(None, None, None)
 
@@ -192,19 +211,57 @@ class Service:
 
     # one connection
 
+    async def _serve_at(self, opened: socket.socket) -> Server:
+        by_path, by_port = _websockets()
+        serve = by_path if opened.family == socket.AF_UNIX else by_port
+        server: Server = await serve(
+            self._serve,
+            sock=opened,
+            process_request=self._check_request,
+            origins=[None],
+            compression=None,
+            max_size=LONGEST_MESSAGE,
+            close_timeout=CLOSE_WITHIN,
+            server_header=None,
+            logger=_quiet(),
+        )
+        return server
+
     def _check_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Refuse whoever is one too many, and what may be a page's: its Origin is refused by the library."""
-        host = request.headers.get("Host", "").partition(":")[0]
-        if host not in HOSTS:
+        """Refuse whoever is one too many, or shows no token, and what may be a page's.
+
+        An Origin is refused by the library.
+        """
+        host = request.headers.get("Host", "")
+        if host.partition(":")[0] not in HOSTS and not (self._listen and is_our_name(host, self._listen)):
             self.refused += 1
             return connection.respond(HTTPStatus.FORBIDDEN, f"no such host: {host[:40]!r}\n")
+        if self._peer(connection, request) is None:
+            self.refused += 1
+            return connection.respond(HTTPStatus.UNAUTHORIZED, "a token that is known here is needed\n")
         if len(self._clients) >= MOST_CLIENTS:
             self.refused += 1
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_CLIENTS} programs are here already\n")
         return None
 
+    def _peer(self, connection: ServerConnection, request: Request) -> Peer | None:
+        """Return who has connected; None for whoever shows no token where one is needed."""
+        connected = connection.transport.get_extra_info("socket")
+        if connected.family == socket.AF_UNIX:
+            return process_of(connected)
+        return holder(connected, request.headers, self.gate.access)
+
+    def _let_go(self) -> None:
+        """Let those go whose token holds no more."""
+        for client, connection in self._clients.items():
+            if not client.peer.may_stay(self.gate.access):
+                connection.transport.abort()
+
     async def _serve(self, connection: ServerConnection) -> None:
-        peer = peer_of(connection.transport.get_extra_info("socket"))
+        assert connection.request is not None
+        peer = self._peer(connection, connection.request)
+        if peer is None:  # its token held as it came, and not any more
+            return
         connection.transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]  # asyncio's own, not declared
         self._count += 1
 
@@ -263,8 +320,9 @@ class Service:
             "baudrate": owner.baudrate,
             "framing": owner.framing,
             "echo": owner.echo,
+            "tcp": self.tcp_address,
             "process": owner.pid,
-            "read_only": self.gate.read_only,
+            "read_only": self.gate.read_only or not client.permission.writes,
             "clients": len(self._clients),
             "nodes": nodes,
         }
@@ -291,13 +349,13 @@ async def _send(connection: ServerConnection, text: str) -> None:
         raise
 
 
-def _websockets() -> Any:
-    """Return what serves. Raises InvalidCommand, with what to install, where it is missing."""
+def _websockets() -> tuple[Any, Any]:
+    """Return what serves a Unix socket, and a port. Raises InvalidCommand where it is not installed."""
     try:
-        from websockets.asyncio.server import unix_serve
+        from websockets.asyncio.server import serve, unix_serve
     except ImportError:
         raise InvalidCommand("the service needs websockets: pip install 'busmaster[service]'") from None
-    return unix_serve
+    return unix_serve, serve
 
 
 def _closed() -> type[Exception]:

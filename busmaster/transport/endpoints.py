@@ -81,6 +81,11 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
     """
     if not isinstance(url, str):
         raise InvalidCommand(f"a port is named by text, such as '/dev/ttyUSB0?baudrate=57600', not {url!r}")
+    if is_served(url):
+        raise InvalidCommand(
+            f"{url} is a line that a busmaster serves, which read, write, poll and scan take: here a port is needed, "
+            "and a serial device server is written socket://HOST:PORT"
+        )
     if "://" not in url:
         path, _, query = url.partition("?")
         if HOST_PORT.fullmatch(path) and not path.startswith(USB):  # usb:12345678 looks like a host and its port
@@ -95,6 +100,11 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
     if scheme != "socket":
         raise InvalidCommand(f"no such kind of port: {scheme}://; use a device path, usb:SERIAL or socket://HOST:PORT")
     return _tcp_port(url)
+
+
+def is_served(address: str) -> bool:
+    """Return whether an address is that of a line which another program serves, and no port of this one's."""
+    return address.startswith(("unix:", "tcp://"))
 
 
 def _serial_port(path: str, options: dict[str, Any], defaults: LineSettings | None) -> SerialPort:

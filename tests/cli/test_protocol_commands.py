@@ -154,3 +154,16 @@ def test_a_rate_that_no_device_has_is_said_once_and_the_command_goes_on(
     assert [line for line in told if "warning" in line] == [
         f"busmaster: warning: {mscs.path.removeprefix('socket://')}: MSC devices speak at 9600 baud alone, not at 19200"
     ]
+
+
+def test_decimals_of_a_write_are_said_with_it(mentor: Command) -> None:
+    assert mentor("write", "1.17=-47.6", "--decimals", "1").out == "1.17 ok\n"
+    assert mentor("read", "1.17").out == "1.17 -476\n"
+    assert mentor("write", "1.17=1.5,-2.5", "--decimals", "1").out == "1.17 ok\n"
+    assert mentor("read", "1.17:2").lines == ["1.17 15", "1.18 -25"]
+
+
+def test_decimals_are_refused_where_the_line_carries_the_point(msc: Command) -> None:
+    done = msc("write", "2008=1.5", "--decimals", "1")
+    assert done.status == 2
+    assert "leave --decimals out" in done.err

@@ -7,10 +7,11 @@ import json
 import os
 import re
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import pytest
 from busmaster import Hcp2Controller, connect
 from busmaster.emulator.serve import TcpServer
 from busmaster.service.folder import find_owner
-from tests.cli.conftest import ENVIRONMENT, ROOT, Command, serve, started
+from tests.cli.conftest import ENVIRONMENT, ROOT, Command, ended_once, serve, started
 from tests.patience import PATIENCE
 
 TEXT = """
@@ -82,7 +83,10 @@ def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, con
         port = controllers.path.removeprefix("socket://")
         assert ran.err == (f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n")
         ran = busmaster("read", address, *HCP2, "--node", "2", "1")
+        assert (ran.status, ran.out, ran.err) == (0, "1 123.456\n", "")
+        ran = busmaster("read", controllers.path.replace("127.0.0.1", "localhost"), *HCP2, "--node", "2", "1")
         assert (ran.status, ran.out) == (0, "1 123.456\n")
+        assert "is owned by process" in ran.err
 
         async def program() -> None:
             async with connect("slitter") as remote:
@@ -150,12 +154,11 @@ def test_a_line_whose_file_says_so_is_served_to_nobody(busmaster: Command, file:
         process.communicate(timeout=PATIENCE)
 
 
-@pytest.mark.parametrize("arguments", [("run",), ("serve",), ("write", "winder/force=5")])
-def test_a_second_master_on_a_line_that_is_owned_is_refused(file: Path, arguments: tuple[str, ...]) -> None:
-    command, *rest = arguments
-    with owner("serve", str(file)) as (process, address):
+@pytest.mark.parametrize("command", ["run", "serve"])
+def test_a_second_master_on_a_line_that_is_owned_is_refused(file: Path, command: str) -> None:
+    with owner("serve", str(file)) as (process, _):
         ran = subprocess.run(
-            [sys.executable, "-m", "busmaster", command, str(file), *rest],
+            [sys.executable, "-m", "busmaster", command, str(file)],
             check=False,
             cwd=ROOT,
             env=ENVIRONMENT,
@@ -164,10 +167,7 @@ def test_a_second_master_on_a_line_that_is_owned_is_refused(file: Path, argument
             timeout=PATIENCE,
         )
     assert ran.returncode == 1
-    assert f"is owned by process {process.pid}; end that first" in ran.stderr
-    assert "two masters on one line garble each other" in ran.stderr
-    assert (f"or write by node and item through {address}" in ran.stderr) == (command == "write")
-    assert audit(file.parent) == []
+    assert f"is owned by process {process.pid}; end that first: two masters on one line garble each other" in ran.stderr
 
 
 def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_same(file: Path) -> None:
@@ -245,3 +245,217 @@ def test_the_section_of_the_service_is_checked_with_its_line(busmaster: Command,
         assert ran.status == 2
         assert complaint in ran.err
         assert "slitter.toml" in ran.err
+
+
+# every command with a PORT
+
+
+def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, controllers: TcpServer) -> None:
+    with owner("serve", str(file)) as (process, address):
+        port = controllers.path.removeprefix("socket://")
+        said = f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n"
+        ran = busmaster("scan", controllers.path, *HCP2, "--nodes", "2-4", "--timeout", "20")
+        assert (ran.status, [line.split()[0] for line in ran.lines]) == (0, ["2", "3"])
+        assert ran.err.startswith(said)
+        options = ("--nodes", "2,3", "--items", "1", "--period", "0.02")
+        ran = ended_once(lambda lines: len(lines) >= 5, "poll", controllers.path, *HCP2, *options)
+        assert ran.status == 130
+        assert {line.split()[1] for line in ran.lines} == {"2/1", "3/1"}
+        assert ran.err.startswith(said)
+        assert re.search(r"poll: \d+ cycles, \d+ missed, period", ran.err)
+        ran = ended_once(lambda lines: len(lines) >= 1, "poll", address, *HCP2, *options, "--json")
+        cycle = json.loads(ran.lines[0])
+        assert (cycle["group"], cycle["samples"]["2/1"]["value"]) == ("poll", 0)
+        assert busmaster("poll", address, *HCP2, *options, "--seconds", "0.05").status == 0
+
+
+def test_a_poll_whose_owner_ends_says_so(file: Path, controllers: TcpServer) -> None:
+    with (
+        owner("serve", str(file)) as (process, address),
+        started("poll", address, *HCP2, "--nodes", "2", "--items", "1", "--period", "0.02") as polling,
+    ):
+        assert polling.stdout is not None
+        polling.stdout.readline()
+        process.terminate()
+        _, err = polling.communicate(timeout=PATIENCE)
+        assert polling.returncode == 1
+        assert "the connection to the program that owns the line was lost" in err
+
+
+def test_nothing_is_written_through_an_owner_unless_all_may_be(
+    busmaster: Command, file: Path, controllers: TcpServer
+) -> None:
+    with owner("serve", str(file)) as (process, address):
+        for refused in ("10=501", "300=1", "1=nothing"):
+            ran = busmaster("write", address, *HCP2, "--node", "1", "1=5", refused, "2=6")
+            assert (ran.status, ran.out) == (2, "")
+        assert busmaster("read", address, *HCP2, "--node", "1", "1", "2").lines == ["1 0", "2 0"]
+        ran = busmaster("write", address, *HCP2, "--node", "1", "1=5", "10=500", "2=6")
+        assert ran.lines == ["1 ok", "10 ok", "2 ok"]
+        process.terminate()
+        process.wait(PATIENCE)
+    assert [(row[1], row[3]) for row in audit(file.parent)] == [
+        ("winder/force", "refused"),
+        ("1/write element 1 = 5", "written"),
+        ("winder/force", "written"),
+        ("1/write element 2 = 6", "written"),
+    ]
+
+
+def test_commands_that_need_a_port_of_their_own_say_so_of_a_line_that_is_served(busmaster: Command, file: Path) -> None:
+    for command in (
+        ("monitor", "unix:/run/line.sock", *HCP2),
+        ("doctor", "tcp://127.0.0.1:7420", *HCP2),
+        ("doctor", "unix:/run/line.sock"),
+        ("run", str(file), "--port", "unix:/run/line.sock"),
+    ):
+        ran = busmaster(*command)
+        assert (ran.status, ran.out) == (2, "")
+        assert "is a line that a busmaster serves, which read, write, poll and scan take" in ran.err
+        assert ran.err.count("\n") == 1
+
+
+# by TCP
+
+
+def test_commands_come_by_tcp_with_the_token_of_the_environment(
+    busmaster: Command, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tokens = tmp_path / "slitter.tokens"
+    tokens.write_text("hmi a-token-of-the-hmi-0001\nlogger a-token-of-the-logger-2\n")
+    tokens.chmod(0o600)
+    file.write_text(f"""{file.read_text()}
+[service]
+listen = "127.0.0.1:0"
+token_file = "{tokens}"
+tokens.hmi = {{ role = "write", allow_writes = ["winder/*"] }}
+""")
+    with owner("serve", str(file)) as (process, _):
+        [line] = (line for line in (json.loads(text) for text in busmaster("status", "--json").lines))
+        address = line["tcp"]
+        assert address.startswith("tcp://127.0.0.1:")
+        assert "wants a token" in busmaster("read", address, *HCP2, "--node", "2", "1").err
+        monkeypatch.setenv("BUSMASTER_TOKEN", "a-token-of-the-logger-2")
+        assert busmaster("read", address, *HCP2, "--node", "2", "1").out == "1 0\n"
+        ran = busmaster("write", address, *HCP2, "--node", "1", "1=5")
+        assert (ran.status, ran.out) == (2, "")
+        assert "token logger may read this line and not write" in ran.err
+        monkeypatch.setenv("BUSMASTER_TOKEN", "a-token-of-the-hmi-0001")
+        assert busmaster("write", address, *HCP2, "--node", "1", "1=5").out == "1 ok\n"
+        ran = busmaster("write", address, *HCP2, "--node", "2", "1=5")
+        assert (ran.status, ran.out) == (2, "")
+        assert "token hmi may not write this: see allow_writes" in ran.err
+        ran = busmaster("read", address, *HCP2, "--baud", "9600", "--node", "2", "1")
+        assert (ran.status, ran.out) == (2, "")
+        assert "not 9600 baud" in ran.err
+        tokens.write_text("hmi another-token-0003\n")
+        process.send_signal(signal.SIGHUP)
+        assert process.stderr is not None
+        while "was read again" not in process.stderr.readline():
+            pass
+        assert "does not know this token" in busmaster("read", address, *HCP2, "--node", "2", "1").err
+
+
+def test_tokens_that_others_may_read_keep_a_line_from_starting(busmaster: Command, file: Path, tmp_path: Path) -> None:
+    tokens = tmp_path / "slitter.tokens"
+    tokens.write_text("hmi a-token-of-the-hmi-0001\n")
+    tokens.chmod(0o644)
+    file.write_text(f'{file.read_text()}\n[service]\nlisten = "127.0.0.1:0"\ntoken_file = "{tokens}"\n')
+    ran = busmaster("serve", str(file))
+    assert ran.status == 2
+    assert f"service.token_file: others may read {tokens}, or change it: chmod 600 {tokens}" in ran.err
+    assert busmaster("plan", str(file)).status != 2  # no affair of those who only read the file
+
+
+# the safe state
+
+SAFE = '[safe]\nwithin = 2.0\nrepeatable = ["winder/force"]\nwrites = { "winder/force" = 1.5 }\n'
+
+
+def test_safe_has_the_owner_send_the_safe_state_and_the_line_goes_on(
+    busmaster: Command, file: Path, controllers: TcpServer
+) -> None:
+    file.write_text(file.read_text() + SAFE)
+    with owner("serve", str(file)) as (process, address):
+        assert busmaster("write", address, *HCP2, "--node", "1", "10=300").status == 0
+        ran = busmaster("safe", str(file))
+        assert (ran.status, ran.out) == (0, "winder/force ok\n")
+        port = controllers.path.removeprefix("socket://")
+        assert ran.err == f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n"
+        assert busmaster("read", address, *HCP2, "--node", "1", "10").out == "10 15\n"
+        assert busmaster("write", address, *HCP2, "--node", "1", "10=30").status == 0
+        other = file.with_name("other.toml")
+        other.write_text(file.read_text().replace('"winder/force" = 1.5', '"winder/force" = 2'))
+        ran = busmaster("safe", str(other))
+        assert (ran.status, ran.out) == (2, "")
+        assert "has the safe state winder/force = 1.5, and not winder/force = 2" in ran.err
+        assert busmaster("read", address, *HCP2, "--node", "1", "10").out == "10 30\n"
+        process.terminate()
+        process.wait(PATIENCE)
+    assert [row for row in audit(file.parent) if row[0] == "safe"] == [("safe", "winder/force", 1.5, "written")] * 2
+
+
+def test_options_of_a_node_that_differ_from_the_owners_are_named_with_its_own(
+    busmaster: Command, file: Path, controllers: TcpServer
+) -> None:
+    with owner("serve", str(file)) as (_, address):
+        for options, complaint in (
+            (("--timeout", "7"), "other timings (a reply window of 7 ms, not 100 ms)"),
+            (("--retries", "9"), "other retries (9, not 2)"),
+        ):
+            ran = busmaster("read", address, *HCP2, *options, "--node", "1", "1")
+            assert (ran.status, ran.out) == (2, "")
+            assert complaint in ran.err
+
+
+# lines of the system
+
+
+def test_status_lists_the_lines_of_the_system_too_and_which_of_them_are_not_for_this_user(
+    busmaster: Command, file: Path, tmp_path: Path, controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = tmp_path / "run" / "busmaster"
+    folder = system / "slitter"
+    folder.mkdir(parents=True)
+    monkeypatch.setattr("busmaster.service.folder.SYSTEM", system)
+    monkeypatch.setitem(ENVIRONMENT, "RUNTIME_DIRECTORY", str(folder))  # as systemd says it
+    with owner("serve", str(file)) as (process, address):
+        assert address == f"unix:{folder}/slitter.sock"
+        ran = busmaster("status", "--json")
+        said = json.loads(ran.out)
+        assert (said["address"], said["process"], said["error"]) == (address, process.pid, None)
+        assert busmaster("read", controllers.path, *HCP2, "--node", "2", "1").out == "1 0\n"
+        # Root may connect whatever the mode, so that the socket itself cannot show this.
+        monkeypatch.setattr(socket.socket, "connect", refuse(socket.socket.connect))
+        ran = busmaster("status")
+        assert ran.status == 0
+        assert ran.lines[1].split()[:3] == ["slitter", controllers.path.removeprefix("socket://"), str(process.pid)]
+        assert ran.lines[1].endswith("not for this user")
+
+
+def refuse(connect: Callable[[socket.socket, Any], None]) -> Callable[[socket.socket, Any], None]:
+    """What the kernel answers whoever is not in the group of a socket."""
+
+    def refused(self: socket.socket, address: Any) -> None:
+        if self.family == socket.AF_UNIX:
+            raise PermissionError(13, "Permission denied")
+        connect(self, address)
+
+    return refused
+
+
+def test_points_of_a_file_are_written_through_its_lines_owner(
+    busmaster: Command, file: Path, controllers: TcpServer
+) -> None:
+    with owner("serve", str(file)) as (process, address):
+        ran = busmaster("write", str(file), "winder/force=30", "winder/2=7", "--verify")
+        assert (ran.status, ran.out) == (0, "winder/force ok\nwinder/2 ok\n")
+        assert f"is owned by process {process.pid}: asking through {address}" in ran.err
+        ran = busmaster("write", str(file), "winder/2=8", "winder/force=51")
+        assert (ran.status, ran.out) == (2, "")
+        assert busmaster("read", address, *HCP2, "--node", "1", "10", "2").lines == ["10 300", "2 7"]
+        process.terminate()
+        process.wait(PATIENCE)
+    assert [(row[0], row[1], row[2], row[3]) for row in audit(file.parent)][:1] == [
+        ("service", "winder/force", 30.0, "written")
+    ]

@@ -16,10 +16,12 @@ from busmaster import Bus, Hcp2Controller, MemoryPort, MicroFlexDrive, RemoteBus
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.line import Line
 from busmaster.gate.gate import Gate
+from busmaster.gate.permission import Access
 from busmaster.gate.record import WriteRecord
 from busmaster.registry import make_device
 from busmaster.service.messages import read, written
 from tests.patience import PATIENCE
+from tests.service.schema import check_owner
 
 PATIENT = Timings.uniform(ReplyTiming(0.3, 0.3, 0.3, 0.02))
 """Of a node that is not there: what is asked of it is on the wire for a while."""
@@ -59,12 +61,14 @@ async def until(fact: Callable[[], object]) -> None:
 
 
 @contextlib.asynccontextmanager
-async def served(folder: Path, *, read_only: bool = False) -> AsyncIterator[Served]:
+async def served(
+    folder: Path, *, read_only: bool = False, access: Access | None = None, listen: tuple[str, int] | None = None
+) -> AsyncIterator[Served]:
     devices = [make_device("hcp2", 5), make_device("hcp2", 6), make_device("microflex", 7)]
     async with Bus(MemoryPort(Line(Hcp2Controller.profile.line, devices, paced=False))) as bus:
-        gate, records = Gate(bus, read_only=read_only), list[WriteRecord]()
+        gate, records = Gate(bus, read_only=read_only, access=access), list[WriteRecord]()
         gate.record = records.append
-        async with Service(bus, gate=gate, path=folder / "line.sock") as service:
+        async with Service(bus, gate=gate, path=folder / "line.sock", listen=listen) as service:
             yield Served(bus, service, gate, records)
 
 
@@ -92,7 +96,9 @@ class Raw:
         await self.connection.send(written(message))
 
     async def hear(self) -> dict[str, Any]:
-        return read(await self.connection.recv())
+        said = read(await self.connection.recv())
+        check_owner(said)
+        return said
 
     async def ask(self, method: str, **params: Any) -> dict[str, Any]:
         await self.say(id=1, method=method, params=params)

@@ -1,0 +1,52 @@
+"""Every message that programs and owners exchange in these tests is one of docs/service.schema.json."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import pytest
+
+from busmaster.service import link
+from busmaster.service.messages import written
+from tests.service import schema
+
+HELLO = 0
+
+
+@pytest.fixture(autouse=True)
+def _by_the_schema(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Hold what both sides say against the schema. What a test says by hand, rightly or not, is not held."""
+    wrong: list[str] = []
+    asked: dict[tuple[link.Link, int], str] = {}
+    ask, take = link.Link.ask, link.Link._take
+
+    def note(check: Callable[[Any], None], said: Any) -> None:
+        try:
+            check(said)
+        except schema.ValidationError as error:
+            wrong.append(f"{said!r:.400}: {error.message:.400}")
+
+    def asked_for(self: link.Link, method: str, *arguments: Any, **options: Any) -> link.Asked:
+        request = ask(self, method, *arguments, **options)
+        asked[self, request.number] = method
+        return request
+
+    def say(message: Mapping[str, Any]) -> str:
+        text = written(message)
+        note(schema.check_program, schema.heard(text))
+        return text
+
+    def hear(self: link.Link, said: Mapping[str, Any]) -> None:
+        note(schema.check_owner, said)
+        number = said.get("id")
+        if number is not None and "result" in said:
+            method = "hello" if number == HELLO else asked[self, number]
+            note(lambda result: schema.check_result(method, result), said["result"])
+        take(self, said)
+
+    monkeypatch.setattr(link.Link, "ask", asked_for)
+    monkeypatch.setattr(link.Link, "_take", hear)
+    monkeypatch.setattr("busmaster.service.link.written", say)
+    yield
+    assert not wrong
