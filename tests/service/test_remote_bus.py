@@ -378,7 +378,6 @@ def test_a_program_that_has_the_line_and_stands_still_is_told_from_one_that_is_n
         asyncio.run(run())
 
 
-
 def test_limits_and_the_safe_state_stay_with_the_owner(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         Hcp2Controller(line.bus, 5).point("1").limit(maximum=10)
