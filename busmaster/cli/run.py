@@ -107,11 +107,11 @@ class Running:
         try:
             async with self.line:
                 entered = True
-                async with served(self.line, tell=self._view.silent):
-                    try:
+                try:
+                    async with served(self.line, tell=self._view.silent):
                         return await self._poll()
-                    finally:
-                        await self._leave()
+                finally:
+                    await self._leave()
         finally:
             for counts in self.line.outputs.statistics() if entered else ():
                 note(output_text(counts))

@@ -1,4 +1,4 @@
-"""A signal while `run` reads its file again: the safe state waits for no output that is being replaced."""
+"""A `run` that ends while it does something else: the safe state is sent, and waits for nothing."""
 
 from __future__ import annotations
 
@@ -72,6 +72,23 @@ def test_the_safe_state_is_sent_while_a_file_that_is_read_again_still_waits_for_
     with serve("hcp2", 1) as winder:
         path.write_text(TEXT.replace("PORT", winder.path))
         assert anyio.run(left_safely)
+
+
+def test_the_safe_state_is_sent_where_serving_the_line_to_others_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "line.toml"
+
+    def served(*_: object, **__: object) -> None:
+        raise OSError("no more sockets")
+
+    monkeypatch.setattr("busmaster.cli.run.served", served)
+    with serve("hcp2", 1) as winder:
+        path.write_text(TEXT.replace("PORT", winder.path))
+        line = ConfiguredLine(load(path), wait_for_port=True)
+        with pytest.raises(OSError, match="no more sockets"):
+            anyio.run(Running(line, str(path), View(silent=True), Hangups(), None).run)
+        assert winder.call(held) == 1.5
 
 
 def held(line: Line, now: float) -> float | None:
