@@ -7,7 +7,6 @@ one can come when the next begins (R3), unless its window was learned (R15). It 
 owner pumps `poll_transmit`, then `poll_event`, and arms a timer for `poll_timeout`. Calls too early change nothing.
 
 The line is in one of five states; `_line_due` is when the state ends by itself.
-from busmaster.arbiter.mark import Mark
 
 =========  =====================  =======================  ==========================  ====================
 state      data received          its deadline             line_up / line_down         submit, poll due
@@ -184,12 +183,7 @@ class LineMachine:
         """Do what is due. If `unread`, bytes have come that were not handed over: the line's silence is not known."""
         deadlines = self._deadlines
         if now >= deadlines.earliest_other:
-            if now >= deadlines.failing:
-                self.dispatcher.fail_more(now)
-            if now >= deadlines.schedule:
-                self.dispatcher.release_polls(now)
-            if now >= deadlines.expiry and not unread:
-                self.dispatcher.expire(now)
+            self.dispatcher.handle_timeout(now, unread)
             if now >= deadlines.health:
                 self._enter(self.state, now)
                 self.dispatcher.probe(now, self.state is READY)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from importlib.util import find_spec
 
 from busmaster.cli.output import Level, note
 from busmaster.config import ConfiguredLine, LineFile
@@ -26,13 +25,18 @@ async def served(line: ConfiguredLine, *, tell: bool) -> AsyncIterator[None]:
     Says where it is served if it is to `tell`.
     """
     section = line.file.service
-    said = bool(section.table.data)
-    if not section.enabled or (find_spec("websockets") is None and not (said or tell)):
+    if not section.enabled:
         yield
         return
     name = line_name(os.path.basename(line.file.path).removesuffix(".toml"))
     service = Service(
-        line.bus, gate=line.gate, name=name, mode=section.mode, group=section.group, listen=section.listen
+        line.bus,
+        gate=line.gate,
+        name=name,
+        mode=section.mode,
+        group=section.group,
+        share=section.share,
+        listen=section.listen,
     )
     try:
         await service.__aenter__()

@@ -5,38 +5,45 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import AsyncIterator, Hashable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
+from functools import partial
+from math import inf
 from types import TracebackType
 from typing import Any, TypeVar, Unpack
 
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.bus.alarms import BusEvent
+from busmaster.bus.exclusive import checked_hold
 from busmaster.bus.limits import Limit
 from busmaster.bus.points import Point
-from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, RequestOptions
+from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, Requester, RequestOptions
 from busmaster.bus.samples import Sample
-from busmaster.bus.snapshots import Snapshot, Stream
+from busmaster.bus.snapshots import Stream
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.planning.merging import Merge
-from busmaster.service.link import TCP, Asked, Link
+from busmaster.service.link import TCP, Link
 from busmaster.service.messages import MOST_CHECKED, said_timings, value_of
+from busmaster.service.remote_group import RemoteGroup
 from busmaster.service.safe import outcomes_of
+from busmaster.service.sequences import Room, held_remotely, shortened
 from busmaster.service.telling import (
     event_of,
-    point_of,
     protocol_of,
     said_points,
-    snapshot_of,
     statistics_of,
 )
 
 T = TypeVar("T")
 EVENT_BUFFER = 256
+POINTS_IN_A_MESSAGE = 50
+LEFT_OUT = ("verify", "safe")
+"""Options that are of no use on another's line: where they are said, they are false."""
 
 
 def connect(address: str, *, token: str | None = None) -> RemoteBus:
@@ -83,12 +90,13 @@ class RemoteNode:
         self._bus.link.tell("stop", {"protocol": self.profile.name, "address": self.address})
 
     def now(self) -> float:
-        """Return the time of the line's clock, in seconds: that of the machine, which is the same for all programs."""
+        """Return the time of the line's clock, in seconds: that of its owner's machine."""
         return self._bus.now()
 
-    def latest(self, point: Hashable, /) -> Sample[Any] | None:
-        """Return None: only the line knows of every write that makes a sample stale."""
-        return None
+    def latest(self, point: Any, /) -> Sample[Any] | None:
+        """Return the youngest good sample of a point in this program's poll groups, unless a write, by whatever
+        program, has made it stale: any write to the node does."""
+        return self._bus.latest(point)
 
     def merge_reads(self, merge: Merge, /) -> None:
         """Have the profile propose `merge`. What is merged on the line is its owner's affair."""
@@ -120,16 +128,47 @@ class RemoteNode:
         If the connection is lost meanwhile, a write raises WriteUnconfirmed, or NotStarted where it was not handed over
         yet, and a read LineDown. Cancelling it cancels it there.
         """
+        return await self.ask(command, None, touches=touches, stops_seen=stops_seen, stop=stop, **options)
+
+    async def ask(
+        self,
+        command: Command[T],
+        sequence: int | None,
+        /,
+        *,
+        touches: Command[Any] | None,
+        stops_seen: int | None,
+        stop: bool,
+        **options: Unpack[CommandOptions],
+    ) -> T:
+        """Do what `request` does, within a sequence of this program, if it is given the number of one."""
         chosen = RequestOptions.of(options, self.label) if options else ORDINARY
         if chosen.verify:
             raise InvalidCommand(f"{self.label}: verify is for what writes a value through a handle")
         if chosen.safe:
             raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
-        params = self._said(command, options, touches, stops_seen, stop)
-        link = self._bus.opened(self, str(command))
-        asked = link.ask("request", params, writes=command.writes, node=self, command=str(command))
-        value: T = value_of(await link.answer(asked, chosen.finish_within))
-        return value
+        link, room = self._bus.opened(self, command), self._bus.room
+        # What is of a sequence waits for nothing else of this program, which waits for the sequence.
+        waits = sequence is None and chosen.priority is not Priority.URGENT
+        waited = await room.take(chosen, self, command) if waits else 0.0
+        try:
+            left: Mapping[str, Any] = {**options, **shortened(chosen, waited)} if waited else options
+            params = self._said(command, left, touches, stops_seen, stop)
+            if sequence is not None:
+                params["sequence"] = sequence
+            asked = link.ask("request", params, writes=command.writes, node=self, command=command)
+            value: T = value_of(await link.answer(asked, left.get("finish_within")))
+            return value
+        finally:
+            if waits:
+                room.give_back()
+
+    def exclusive(self, *, max_hold: float = 0.5) -> AbstractAsyncContextManager[Requester]:
+        """Return, for `async with`, this node for one sequence of requests: see `Requester.exclusive`.
+
+        The line is held no longer than the connection lasts.
+        """
+        return held_remotely(self, self._bus, checked_hold(max_hold, self.label))
 
     def _said(
         self,
@@ -140,10 +179,10 @@ class RemoteNode:
         stop: bool,
     ) -> dict[str, Any]:
         params: dict[str, Any] = {
-            "protocol": self.profile.name,
-            "address": self.address,
+            "protocol": self._profile.name,
+            "address": self._address,
             "command": self._protocol.write_down(command),
-            "asked": self.now(),
+            "asked": self._bus.now(),
         }
         if touches is not None:
             params["touches"] = self._protocol.write_down(touches)
@@ -151,83 +190,15 @@ class RemoteNode:
             params["stops_seen"] = stops_seen
         if stop:
             params["stop"] = True
-        if given := {name: value for name, value in options.items() if value is not None and name not in LEFT_OUT}:
-            params["options"] = given
+        if options:
+            given = {name: value for name, value in options.items() if value is not None}
+            params["options"] = {name: given[name] for name in given if name not in LEFT_OUT}
         return params
 
     def said_check(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
         """Return writes of this node as the line is asked whether it would take them."""
         said = [self._protocol.write_down(command) for command in commands]
         return {"protocol": self.profile.name, "address": self.address, "commands": said, "stop": stop}
-
-
-LEFT_OUT = ("verify", "safe")
-
-
-class RemoteGroup:
-    """A poll group of the line. Iterate it, or look at `latest`; close it when it is not read any more."""
-
-    def __init__(self, bus: RemoteBus, name: str, number: int, points: tuple[Point[Any], ...]) -> None:
-        self.name = name
-        self.period = 0.0
-        self.latest: Snapshot | None = None
-        """That of its last cycle."""
-        self.dropped = 0
-        """Cycles that this program was too slow for, counted by the line's owner."""
-        self._bus = bus
-        self._number = number
-        self._own = points
-        self._points = points
-        self._set = -1
-        self._consumers: list[Stream[Snapshot]] = []
-        self._over = False
-
-    @property
-    def points(self) -> tuple[Point[Any], ...]:
-        return self._points
-
-    def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
-        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
-        if self._over:
-            raise BusClosed(f"poll group {self.name!r} is closed")
-        return Stream(self._consumers, buffer)
-
-    async def __aiter__(self) -> AsyncIterator[Snapshot]:
-        consumer = self.subscribe()
-        try:
-            async for snapshot in consumer:
-                yield snapshot
-        finally:
-            consumer.close()
-
-    def close(self) -> None:
-        """Read it no more; one that this program made ends."""
-        if not self._over:
-            self._bus.end_stream(self._number)
-
-    def hear(self, method: str, params: Mapping[str, Any]) -> None:
-        """Take what the line's owner says of it."""
-        body = params["body"]
-        for consumer in self._consumers:
-            consumer.dropped += params["dropped"] - self.dropped
-        self.dropped = params["dropped"]
-        if method == "points":
-            self._set = body["set"]
-            # By its own points, a program gets the values that they decode.
-            if not self._own:
-                self._points = tuple(point_of(said, self._bus.find) for said in body["points"])
-        elif method == "snapshot" and body["set"] == self._set:
-            self.latest = snapshot_of(body, self.name, self._points)
-            for consumer in self._consumers:
-                consumer.put(self.latest)
-        elif method == "ended":
-            self._bus.end_stream(self._number)
-
-    def end(self) -> None:
-        """End those who read it, after what they hold."""
-        self._over = True
-        for consumer in list(self._consumers):
-            consumer.close()
 
 
 class RemoteBus:
@@ -252,12 +223,19 @@ class RemoteBus:
         self.about: Mapping[str, Any] = {}
         """What the owner says of the line: its name, settings and process."""
         self._link: Link | None = None
+        self._ahead = 0.0
+        """Seconds by which the clock of the owner's machine is ahead of this one, less what its hello took to come."""
         self._nodes: dict[tuple[str, int], RemoteNode] = {}
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
         """Those of them of which the owner knows."""
         self._groups: dict[int, RemoteGroup] = {}
         self._count = 0
+        self._sequences = 0
+        self.room = Room(self.now)
+        """For what is asked: so much of it is under way at a time."""
+        self._touched: dict[tuple[str, int], float] = {}
+        """When the last write to a node ended."""
         self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
         self._prepared: list[tuple[RemoteNode, tuple[Command[Any], ...], bool]] = []
@@ -270,6 +248,8 @@ class RemoteBus:
         self._link = link
         said = await link.open(sys.argv[0])
         self.about, self.line = said, said["line"]
+        if self.address.startswith(TCP):  # another machine, perhaps: its clock began at another moment
+            self._ahead = said["now"] - time.monotonic()
         for known in said["nodes"]:
             node = self._nodes.get((known["protocol"], known["address"]))
             if node is not None:
@@ -298,10 +278,15 @@ class RemoteBus:
             raise BusClosed("the bus is not open")
         return self._link
 
-    def opened(self, node: RemoteNode, command: str) -> Link:
+    def new_sequence(self) -> int:
+        """Return the number of one more sequence of requests."""
+        self._sequences += 1
+        return self._sequences
+
+    def opened(self, node: RemoteNode, command: Command[Any]) -> Link:
         """Return the connection for a request. Raises BusClosed, naming it, before the bus is entered."""
         if self._link is None:
-            raise BusClosed("the bus is not open", node=node, command=command)
+            raise BusClosed("the bus is not open", node=node, command=str(command))
         return self._link
 
     def prepare(self, node: RemoteNode, commands: tuple[Command[Any], ...], stop: bool) -> None:
@@ -310,8 +295,8 @@ class RemoteBus:
             self._prepared.append((node, commands, stop))
 
     def now(self) -> float:
-        """Return the time of the line's clock, in seconds: that of the machine, which is the same for all programs."""
-        return time.monotonic()
+        """Return the time of the line's clock, in seconds: that of its owner's machine."""
+        return time.monotonic() + self._ahead
 
     # nodes
 
@@ -387,10 +372,19 @@ class RemoteBus:
         priority: Priority = Priority.POLL,
     ) -> RemoteGroup:
         """Have `points` read every `period` seconds, as `Bus.poll_group`; it ends with this program."""
-        wanted = tuple(points)
-        params: dict[str, Any] = {"name": name, "period": period, "points": said_points(wanted)}
-        params |= {"phase": phase, "priority": priority}
-        return await self._follow("poll", name, wanted, params)
+        params = {"name": name, "period": period, "phase": phase, "priority": priority}
+        return await self._follow("poll", name, tuple(points), params)
+
+    def latest(self, point: Point[T]) -> Sample[T] | None:
+        """Return the youngest good sample of a point in a poll group of this program, unless a write to its node, by
+        whatever program, has ended since it was read."""
+        node, profile = point.node, point.node.profile
+        addresses = (node.address,) if profile.broadcast is None else (node.address, profile.broadcast)
+        touched = [self._touched.get((profile.name, address), -inf) for address in addresses]
+        snapshots = [group.latest for group in self._groups.values() if group.own and group.latest is not None]
+        samples = [snapshot.samples[point] for snapshot in snapshots if point in snapshot.samples]
+        good = (one for one in samples if one.error is None and one.started is not None and one.started > max(touched))
+        return max(good, key=lambda one: one.finished, default=None)
 
     async def enter_safe_state(self, values: Mapping[str, float]) -> dict[str, BusError | None]:
         """Have the line's owner send its safe state, and return by point why it was not confirmed, None if it was.
@@ -430,10 +424,16 @@ class RemoteBus:
     ) -> RemoteGroup:
         self._count += 1
         number = self._count
-        group = self._groups[number] = RemoteGroup(self, name, number, points)
-        asked: Asked = self.link.ask(method, {**params, "stream": number})
+        group = RemoteGroup(name, points, find=self.find, end=partial(self.end_stream, number))
+        self._groups[number] = group
+        said = said_points(points)
         try:
-            group.period = (await self.link.answer(asked))["period"]
+            while len(said) > POINTS_IN_A_MESSAGE:
+                await self._ask("gather", {"stream": number, "points": said[:POINTS_IN_A_MESSAGE]})
+                del said[:POINTS_IN_A_MESSAGE]
+            if said:
+                params = {**params, "points": said}
+            group.period = (await self._ask(method, {**params, "stream": number}))["period"]
         except BaseException:
             self.end_stream(number)
             raise
@@ -444,6 +444,8 @@ class RemoteBus:
             node = self._nodes.get((params["protocol"], params["address"]))
             if node is not None:
                 node.stops = params["stops"]
+        elif method == "touched":
+            self._touched[params["protocol"], params["address"]] = params["when"]
         elif method == "event":
             event = event_of(params["body"], self.find)
             for stream in self._events:
@@ -455,5 +457,6 @@ class RemoteBus:
     def _lost(self) -> None:
         for group in list(self._groups.values()):
             group.end()
+        self._groups.clear()  # what is written from now on is not heard of any more
         for stream in list(self._events):
             stream.close()

@@ -185,6 +185,23 @@ def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_sa
     assert f"is served already by process {process.pid}" in ran.stderr
 
 
+def test_where_the_extra_is_not_installed_a_line_runs_and_says_what_it_takes_to_share_it(
+    file: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "websockets.py").write_text("raise ImportError")
+    ran = subprocess.run(
+        [sys.executable, "-m", "busmaster", "run", str(file), "--plain", "--seconds", "0.1"],
+        check=True,
+        cwd=ROOT,
+        env={**ENVIRONMENT, "PYTHONPATH": f"{tmp_path}:{ROOT}"},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert ran.stderr.count("no other program can use this line: ") == 1
+    assert "pip install 'busmaster[service]'" in ran.stderr
+
+
 def test_an_owner_that_was_killed_leaves_nothing_in_the_way(file: Path, controllers: TcpServer) -> None:
     with owner("serve", str(file)) as (process, first):
         process.send_signal(signal.SIGKILL)
@@ -239,6 +256,7 @@ def test_the_section_of_the_service_is_checked_with_its_line(busmaster: Command,
         ('group = "no-such-group"', "there is no group 'no-such-group' on this machine"),
         ('mode = "rw"', "a mode is octal"),
         ("port = 5020", "port"),
+        ("share = 0.01", "must be 0.1 to 10, not 0.01"),
     ):
         file.write_text(f"{text}[service]\n{said}\n")
         ran = busmaster("plan", str(file))

@@ -15,6 +15,7 @@ from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.output import Output
+from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.transaction import Transaction
 from busmaster.contract.exchange import FrameError
 from busmaster.wire import readers
@@ -49,6 +50,7 @@ pytestmark = pytest.mark.timeout(LIMIT + 30)
 LINE = Setup(commands=(READ, WRITE))
 MSC = Setup(kind="msc", commands=(READ,), lapse=2.5)
 LATE = replace(LINE, receive_latency=0.016)
+SEQUENCES = replace(LINE, commands=(READ,), longest_hold=0.3)
 TURNS = replace(LINE, commands=(READ, WRITE_THERE), second_timing=True)
 
 
@@ -221,6 +223,33 @@ def with_two_said_at_once(patch: Any) -> None:
     patch.setattr(Output, "unsent", lambda output, count, now: None)
 
 
+def without_sequences(patch: Any) -> None:
+    """Whoever waits goes next, though the line is held."""
+    patch.setattr(SharedBacklog, "_hold_for", lambda backlog, hold, priority: None)
+
+
+def with_a_sequence_that_never_ends(patch: Any) -> None:
+    right = SharedBacklog._hold_for
+
+    def hold_for(backlog: SharedBacklog, *arguments: Any) -> None:
+        right(backlog, *arguments)
+        backlog._deadlines.hold = inf
+
+    patch.setattr(SharedBacklog, "_hold_for", hold_for)
+
+
+def with_what_a_sequence_leaves_behind(patch: Any) -> None:
+    """As it was: what waits of a sequence that is left is taken out, and told to nobody."""
+
+    def end_hold(dispatcher: Dispatcher, now: float, hold: Any = None) -> None:
+        backlog = dispatcher.share()
+        hold = hold or backlog.hold
+        if hold is not None:
+            backlog.end_hold(hold, now)
+
+    patch.setattr(Dispatcher, "end_hold", end_hold)
+
+
 @pytest.mark.parametrize(
     ("plant", "setup", "rule"),
     [
@@ -248,6 +277,9 @@ def with_two_said_at_once(patch: Any) -> None:
         (with_no_deadline_behind_a_first_byte, LINE, "progress"),
         (with_damage_that_completes, replace(LINE, adversary=(FLIPS,)), "R5"),
         (with_two_said_at_once, replace(LINE, adversary=(HELD,)), "R1"),
+        (without_sequences, SEQUENCES, "R9"),
+        (with_a_sequence_that_never_ends, SEQUENCES, "progress"),
+        (with_what_a_sequence_leaves_behind, SEQUENCES, "R8"),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )
