@@ -44,7 +44,6 @@ class Choice:
         `last_byte` is when the last byte came, in seconds.
         """
         dispatcher, in_step, alike = self._dispatcher, self._in_step, self._alike
-        self._last_byte = last_byte
         while (transaction := dispatcher.next(now)) is not None:
             node = transaction.node
             try:
@@ -60,18 +59,19 @@ class Choice:
         if answers == in_step.last and not exchange.later:
             too_many = alike.another(exchange, last_byte, now)
             if too_many or in_step.alert:
-                return self._carefully((transaction, exchange), now, too_many)
+                return self._carefully((transaction, exchange), now, last_byte, too_many)
         elif in_step.alert:
-            return self._carefully((transaction, exchange), now)
+            return self._carefully((transaction, exchange), now, last_byte)
         else:
             alike.count = 0
         alike.node = node
         in_step.before, in_step.last = in_step.last, answers
         return transaction, exchange
 
-    def _carefully(self, first: Chosen, now: float, too_many: bool = False) -> Chosen | float:
+    def _carefully(self, first: Chosen, now: float, last_byte: float, too_many: bool = False) -> Chosen | float:
         """Choose as `next` does, where something is owed or doubted, or `too_many` answers were alike."""
         in_step = self._in_step
+        self._last_byte = last_byte
         in_step.lapse(now)
         chosen: Chosen | float = first
         transaction, exchange = first

@@ -100,18 +100,17 @@ class Dispatcher:
         if self.fault is not None:
             self._end(transaction, now, name_error(self.fault(), transaction))
             return True
-        if transaction.writes and transaction.priority is URGENT:  # even if it fails below: no enable may follow it
-            self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
+        changed = transaction.writes  # it may have superseded others, which is to be told
         queue = self.backlog.queues[transaction.priority]
-        waiting = queue.live
-        if transaction.writes:
-            waiting = max(waiting, len(self.writes.queues[node]))  # those that are parked are in no class
+        if changed and transaction.priority is URGENT:  # even if it fails below: no enable may follow it
+            self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
+        # writes that are parked are in no class
+        waiting = max(queue.live, len(self.writes.queues[node])) if changed else queue.live
         if waiting >= self._capacity and (waiting := self.writes.waiting_of(transaction)) >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return True
         if (node.health is DOWN or now < node.suspended_until) and not self._may_ask(transaction, now):
             return True
-        changed = transaction.writes  # it may have superseded others, which is to be told
         if changed:
             self.writes.queues[node].append(transaction)
         if transaction.start_by < inf:
@@ -164,7 +163,9 @@ class Dispatcher:
     def started(self, transaction: Transaction, now: float) -> None:
         """Note that the next attempt of a transaction goes out now."""
         counters = self.counters
-        if transaction.attempts == 0 and not transaction.check:
+        if transaction.attempts:
+            transaction.first_byte = -inf
+        elif not transaction.check:
             counters.waits[transaction.priority].record(now - transaction.queued)
             transaction.exchanges_ahead = counters.exchanges - transaction.exchanges_ahead
             transaction.settling_ahead = counters.spent[SETTLING] - transaction.settling_ahead
@@ -176,7 +177,6 @@ class Dispatcher:
         transaction.phase = ON_WIRE
         transaction.attempts += 1
         transaction.started = now
-        transaction.first_byte = -inf
         transaction.late = False  # an earlier attempt may have been; this one's value is not late for that
 
     # what came of an attempt

@@ -133,9 +133,9 @@ class Transaction:
         self.node = node
         self.command = command
         self.priority = priority
-        self.writes = command.writes
+        self.writes = writes = command.writes
         self.idempotent = command.idempotent if idempotent is None else idempotent
-        if probe or (self.writes and not self.idempotent):
+        if probe or (writes and not self.idempotent):
             self.retries = 0  # whatever number was given: that alone does not make a write repeatable
         else:
             self.retries = node.retries if retries is None else retries

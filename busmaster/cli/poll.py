@@ -92,7 +92,7 @@ class Cycles:
         text = f"poll: {self._last.cycle} cycles, {self._last.missed} missed"
         periods = [later - earlier for earlier, later in pairwise(self._started)]
         if periods:
-            text += f", period {fmean(periods) * 1000:.2f} ms mean, {(p99_of(periods) or 0.0) * 1000:.2f} ms p99"
+            text += f", period {fmean(periods) * 1000:.2f} ms mean, {p99_of(periods) * 1000:.2f} ms p99"
         note(text)
 
 

@@ -18,7 +18,7 @@ from busmaster.cli.lines import file_argument, load, other_port, port_option
 from busmaster.cli.output import Level, note, number_text
 from busmaster.cli.reaching import check_no_owner
 from busmaster.cli.safe import tell_unsafe
-from busmaster.cli.serving import secrets_of, served
+from busmaster.cli.serving import secrets_of, served, service_of
 from busmaster.cli.systemd import ServiceManager
 from busmaster.cli.watching import Watch, follow
 from busmaster.config import ConfiguredLine, LineFile
@@ -104,11 +104,12 @@ class Running:
         """Run the line until it is told to end, send its safe state, and return the exit status."""
         entered = False
         self.line.outputs.tell = self._tell_of_output
+        service = service_of(self.line)  # now: it keeps what happens as the line is opened
         try:
             async with self.line:
                 entered = True
                 try:
-                    async with served(self.line, tell=self._view.silent):
+                    async with served(service, tell=self._view.silent) as self.watch.service:
                         return await self._poll()
                 finally:
                     await self._leave()
@@ -163,7 +164,8 @@ class Running:
         except (InvalidCommand, OSError) as error:
             note(f"the file was read again, and nothing of it taken: {error}", Level.ERROR)
         else:
-            self.watch.title = file.title
+            if self.watch.service is not None:
+                self.watch.service.title = file.title
             self.watch.replace_groups(self.line.groups.values())
             note(f"{self._path} was read again", Level.NOTICE)
             self._say_what_is_polled()

@@ -302,6 +302,12 @@ class AskingConnection(Connection):
             return str(self._core.handshake_exc)
         return None if said is None else said.reason
 
+    @property
+    def owner_ended(self) -> bool:
+        """Return whether the other end let go of us because it ends in good order."""
+        said = self._core.close_rcvd
+        return said is not None and said.code == GOING_AWAY
+
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         request = self._core.connect()

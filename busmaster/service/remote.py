@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
 from functools import partial
@@ -30,6 +30,7 @@ from busmaster.planning.merging import Merge
 from busmaster.service.link import TCP, Link
 from busmaster.service.messages import MOST_CHECKED, said_timings, value_of
 from busmaster.service.remote_group import RemoteGroup
+from busmaster.service.remote_overview import RemoteOverview
 from busmaster.service.safe import outcomes_of
 from busmaster.service.sequences import Room, held_remotely, shortened
 from busmaster.service.telling import (
@@ -229,7 +230,7 @@ class RemoteBus:
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
         """Those of them of which the owner knows."""
-        self._groups: dict[int, RemoteGroup] = {}
+        self._streams: dict[int, RemoteGroup | RemoteOverview] = {}
         self._count = 0
         self._sequences = 0
         self.room = Room(self.now)
@@ -381,7 +382,8 @@ class RemoteBus:
         node, profile = point.node, point.node.profile
         addresses = (node.address,) if profile.broadcast is None else (node.address, profile.broadcast)
         touched = [self._touched.get((profile.name, address), -inf) for address in addresses]
-        snapshots = [group.latest for group in self._groups.values() if group.own and group.latest is not None]
+        groups = [stream for stream in self._streams.values() if isinstance(stream, RemoteGroup)]
+        snapshots = [group.latest for group in groups if group.own and group.latest is not None]
         samples = [snapshot.samples[point] for snapshot in snapshots if point in snapshot.samples]
         good = (one for one in samples if one.error is None and one.started is not None and one.started > max(touched))
         return max(good, key=lambda one: one.finished, default=None)
@@ -406,12 +408,19 @@ class RemoteBus:
             self.link.ask("events", {"stream": 0})
         return stream
 
+    async def overview(self, hear: Callable[[str, Mapping[str, Any]], None]) -> RemoteOverview:
+        """Have `hear` told what a person sees of the line, some times a second, as docs/service.md has it."""
+        self._count += 1
+        overview = self._streams[self._count] = RemoteOverview(self.link, self.now, hear)
+        await self._ask("overview", {"stream": self._count})
+        return overview
+
     def end_stream(self, number: int) -> None:
         """Have a stream told no more."""
-        group = self._groups.pop(number, None)
-        if group is not None:
+        stream = self._streams.pop(number, None)
+        if stream is not None:
             self.link.tell("end", {"stream": number})
-            group.end()
+            stream.end()
 
     # inside
 
@@ -425,7 +434,7 @@ class RemoteBus:
         self._count += 1
         number = self._count
         group = RemoteGroup(name, points, find=self.find, end=partial(self.end_stream, number))
-        self._groups[number] = group
+        self._streams[number] = group
         said = said_points(points)
         try:
             while len(said) > POINTS_IN_A_MESSAGE:
@@ -451,12 +460,12 @@ class RemoteBus:
             for stream in self._events:
                 if event is not None:
                     stream.put(event)
-        elif (group := self._groups.get(params.get("stream", -1))) is not None:
-            group.hear(method, params)
+        elif (listener := self._streams.get(params.get("stream", -1))) is not None:
+            listener.hear(method, params)
 
     def _lost(self) -> None:
-        for group in list(self._groups.values()):
-            group.end()
-        self._groups.clear()  # what is written from now on is not heard of any more
+        for listener in list(self._streams.values()):
+            listener.end()
+        self._streams.clear()  # what is written from now on is not heard of any more
         for stream in list(self._events):
             stream.close()

@@ -139,6 +139,11 @@ def test_run_serves_its_line_and_status_lists_it(busmaster: Command, file: Path,
         assert (said["name"], said["port"], said["process"]) == ("slitter", port, process.pid)
         assert (said["programs"], said["up"], said["nodes"], said["error"]) == (0, 1, 1, None)
         assert busmaster("status").lines[1].split()[:4] == ["slitter", port, str(process.pid), "0"]
+        controllers.close()
+        while (said := json.loads(busmaster("status", "--json").out))["state"] != "offline":
+            pass
+        assert (said["up"], said["nodes"]) == (0, 1)
+        assert busmaster("status").lines[1].split()[4:] == ["offline", "0/1"]
         process.terminate()
         process.communicate(timeout=PATIENCE)
     assert busmaster("status").out == ""
@@ -297,7 +302,7 @@ def test_a_poll_whose_owner_ends_says_so(file: Path, controllers: TcpServer) -> 
         process.terminate()
         _, err = polling.communicate(timeout=PATIENCE)
         assert polling.returncode == 1
-        assert "the connection to the program that owns the line was lost" in err
+        assert "the program that owns the line has ended" in err
 
 
 def test_nothing_is_written_through_an_owner_unless_all_may_be(

@@ -111,6 +111,7 @@ def past_legs(view: View) -> None:
         elif view.past(leg._follows_until) and arbiter.state is SETTLING:
             pass  # a stray would start it anew
     else:
+        leg.reply_came = False  # it is not while something is asked
         leg._follows = None  # by `begin`
         leg._follows_until = -inf
     if not world.setup.may(setups.HELD) and view.past(leg.out, longest_quiet(world), strictly=True):
@@ -138,8 +139,11 @@ def past_silences(view: View) -> None:
 def past_stragglers(view: View) -> None:
     """Who was not answered is blamed within STRAGGLER_MEMORY; where nobody's lateness is raised, never."""
     strays = view.world.arbiter._unasked
-    if not view.world.setup.in_step:
-        strays.run.clear()  # `InStep.heard` alone reads it
+    trust, leg = view.world.arbiter._trust, view.world.arbiter._leg
+    if not leg.goes_on:
+        trust._unheard = None  # what comes is not asked whether it is that reply
+    if not view.world.setup.in_step and trust._unheard is None:
+        strays.run.clear()  # else `InStep.heard` alone reads it
     one = strays.unanswered_one
     if one is not None and not (view.world.setup.may(setups.RAISED) and not view.past(one[1], STRAGGLER_MEMORY, True)):
         strays.unanswered_one = None

@@ -128,7 +128,7 @@ class AnyStep:
 
     owe = lapse = forgive = answered = said = said_twice = heard = nothing
 
-    def perhaps(self, *arguments: Any) -> bool:
+    def perhaps(self, *arguments: Any, **named: Any) -> bool:
         return bool(choose(2))
 
     clashes = doubts = perhaps

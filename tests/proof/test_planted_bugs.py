@@ -17,8 +17,11 @@ from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.output import Output
 from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.trust import Trust
 from busmaster.contract.exchange import FrameError
+from busmaster.protocols.msc.exchange import is_sound
 from busmaster.wire import readers
+from busmaster.wire.readers import ACK, STX
 from tests.planted import (
     with_a_cancellation_that_clears_the_exchange,
     without_lateness,
@@ -29,7 +32,7 @@ from tests.planted import (
 from tests.proof.explore import Explorer
 from tests.proof.history import as_test, retell, told
 from tests.proof.instants import seconds, set_unit
-from tests.proof.kinds import KINDS, READ, WRITE, WRITE_THERE
+from tests.proof.kinds import KINDS, READ, READ_THERE, WRITE, WRITE_THERE
 from tests.proof.setups import (
     CANCELS,
     FLIPS,
@@ -132,6 +135,15 @@ def with_a_damaged_ack_that_is_none(patch: Any) -> None:
 
     patch.setattr(Leg, "came_unasked", lambda leg, now: None)
     patch.setattr(LineMachine, "_take_unasked", in_settling)
+
+
+def with_any_late_packet_for_the_reply(patch: Any) -> None:
+    """Whatever packet ends what came: also one before the ACK."""
+    patch.setattr(Trust, "is_late_reply", lambda trust, run, now: is_sound(run[run.find(STX) :]))
+
+
+def with_a_late_ack_for_the_reply(patch: Any) -> None:
+    patch.setattr(Trust, "is_late_reply", lambda trust, run, now: run == ACK)
 
 
 def with_an_end_that_any_answer_moves(patch: Any) -> None:
@@ -267,6 +279,8 @@ def with_what_a_sequence_leaves_behind(patch: Any) -> None:
         (with_a_stray_that_uses_up_the_packet, replace(MSC, adversary=(STRAYS,)), "R1"),
         (without_the_packet_behind_an_ack, MSC, "R1"),
         (with_a_damaged_ack_that_is_none, replace(MSC, adversary=(FLIPS,)), "R1"),
+        (with_any_late_packet_for_the_reply, replace(MSC, commands=(READ, READ_THERE), lost_acknowledgements=1), "R1"),
+        (with_a_late_ack_for_the_reply, MSC, "R1"),
         (with_an_end_that_any_answer_moves, replace(LINE, adversary=(STRAYS,)), "R1"),
         (without_the_turnaround, TURNS, "R1"),
         (without_the_time_of_the_write, replace(LINE, adversary=(FROZEN,)), "R1"),
