@@ -271,6 +271,9 @@ def _unreachable(where: str, error: BaseException, connection: AskingConnection 
             return LineDown(f"{where} {what}", hint="its owner has the tokens in a file, see [service] of LINE.toml")
         case 503:
             return LineDown(f"{where} has too many programs already", hint="end one, see busmaster status")
+    if isinstance(error, TimeoutError):
+        what = f"the program that serves {where} did not answer in {CONNECT_WITHIN:g} s"
+        return LineDown(what, hint="if it stands still, end it: the line is its own as long as it is there")
     complaint = None if connection is None else connection.complaint
     why = complaint or getattr(error, "strerror", None) or str(error) or "it does not answer"
     return LineDown(f"no program serves {where}: {why}", hint="start busmaster run, or see busmaster status")

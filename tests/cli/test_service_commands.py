@@ -159,10 +159,26 @@ def test_a_line_whose_file_says_so_is_served_to_nobody(busmaster: Command, file:
         process.communicate(timeout=PATIENCE)
 
 
-def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_same(file: Path) -> None:
+@pytest.mark.parametrize("command", ["run", "serve"])
+def test_a_second_master_on_a_line_that_is_owned_is_refused(file: Path, command: str) -> None:
     with owner("serve", str(file)) as (process, _):
         ran = subprocess.run(
-            [sys.executable, "-m", "busmaster", "serve", str(file), "--seconds", "0.1"],
+            [sys.executable, "-m", "busmaster", command, str(file)],
+            check=False,
+            cwd=ROOT,
+            env=ENVIRONMENT,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+        )
+    assert ran.returncode == 1
+    assert f"is owned by process {process.pid}; end that first: two masters on one line garble each other" in ran.stderr
+
+
+def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_same(file: Path) -> None:
+    with owner("serve", str(file)) as (process, _), serve("hcp2", 1) as other:
+        ran = subprocess.run(
+            [sys.executable, "-m", "busmaster", "serve", str(file), "--port", other.path, "--seconds", "0.1"],
             check=True,
             cwd=ROOT,
             env=ENVIRONMENT,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 from pathlib import Path
 
 import pytest
@@ -363,6 +364,23 @@ def test_nobody_there_is_said_with_what_to_do(tmp_path: Path) -> None:
                 pass
 
     asyncio.run(run())
+
+
+def test_a_program_that_has_the_line_and_stands_still_is_told_from_one_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.service.link.CONNECT_WITHIN", 0.05)
+    path = tmp_path / "line.sock"
+
+    async def run() -> None:
+        with pytest.raises(LineDown, match=r"that serves .*line.sock did not answer in 0.05 s; if it stands still"):
+            async with connect(f"unix:{path}"):
+                pass
+
+    with socket.socket(socket.AF_UNIX) as stopped:
+        stopped.bind(str(path))
+        stopped.listen()  # the system lets others in, and nobody looks
+        asyncio.run(run())
 
 
 def test_limits_and_the_safe_state_stay_with_the_owner(tmp_path: Path) -> None:
