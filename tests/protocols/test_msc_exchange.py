@@ -374,6 +374,14 @@ def test_the_end_of_a_packet_that_was_asked_for_again_is_passed_over_and_not_ask
     assert exchange.feed(REPLY) == Done(1234, send=ACK)
 
 
+def test_fewer_bytes_than_a_packet_has_before_it_are_passed_over_and_not_asked_for_again() -> None:
+    """Another unit's NAK, say: a NAK of ours would have the packet said twice, the second time into the next exchange."""
+    exchange = acked()
+    assert exchange.feed(NAK) is MORE
+    assert says(exchange.expired(True)) == b""
+    assert exchange.feed(REPLY) == Done(1234, send=ACK)
+
+
 def test_what_never_becomes_a_packet_is_passed_over_a_few_times_and_no_more() -> None:
     exchange = acked()
     assert says(exchange.feed(BAD)) == NAK

@@ -187,9 +187,9 @@ class PacketExchange(Generic[T]):
             raise FrameError(what, send=ACK)
         if not arrived:
             raise FrameError("no packet followed the ACK", send=ACK)
-        # The end of a packet, pushed out of it by a byte of noise: it was asked for again already. A second NAK would
-        # have it said twice, into the next exchange.
-        passed_over = self._naks > 0 and self._lost and arrived < FRAMING
+        # Fewer bytes than any packet has are none: noise, another unit's NAK, the end of one that was asked for again
+        # already. A NAK would have the packet that is still to come said twice, into the next exchange.
+        passed_over = self._lost and arrived < FRAMING
         return self._ask_again(FrameError(what, send=ACK), b"" if passed_over else NAK)
 
     def abandon(self) -> FrameError | Refused:
