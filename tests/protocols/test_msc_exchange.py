@@ -375,7 +375,7 @@ def test_the_end_of_a_packet_that_was_asked_for_again_is_passed_over_and_not_ask
 
 
 def test_fewer_bytes_than_a_packet_has_before_it_are_passed_over_and_not_asked_for_again() -> None:
-    """Another unit's NAK, say: a NAK of ours would have the packet said twice, the second time into the next exchange."""
+    """Another unit's NAK, say: a NAK of ours would have the packet said twice, into the next exchange."""
     exchange = acked()
     assert exchange.feed(NAK) is MORE
     assert says(exchange.expired(True)) == b""
