@@ -167,6 +167,30 @@ def test_a_token_that_holds_no_more_ends_what_came_with_it_and_no_other(tmp_path
     on_a_port(tmp_path, story)
 
 
+def test_another_token_of_the_same_name_ends_what_came_with_the_old_one(tmp_path: Path) -> None:
+    async def story(line: Served, address: str) -> None:
+        async with connect(address, token=SECRETS["hmi"]) as gone, connect(address, token=SECRETS["logger"]) as stays:
+            line.gate.take_secrets({**TOKENS.secrets, "hmi": digest_of("a-newer-token-of-the-hmi")})
+            with pytest.raises(LineDown):
+                await Hcp2Controller(gone, 5).read(1)
+            assert await Hcp2Controller(stays, 5).read(1) == 0
+        async with connect(address, token="a-newer-token-of-the-hmi") as new:
+            assert await Hcp2Controller(new, 5).read(1) == 0
+
+    on_a_port(tmp_path, story)
+
+
+def test_who_may_not_hold_the_line_is_told_so(tmp_path: Path) -> None:
+    async def story(line: Served, address: str) -> None:
+        async with connect(address, token=SECRETS["logger"]) as remote:
+            async with Hcp2Controller(remote, 5).exclusive() as held:
+                with pytest.raises(InvalidCommand, match="node 5: token logger may not hold the line for it"):
+                    await held.read(1)
+            assert await Hcp2Controller(remote, 5).read(1) == 0
+
+    on_a_port(tmp_path, story)
+
+
 def test_a_token_is_for_tcp_and_is_one_word() -> None:
     with pytest.raises(InvalidCommand, match="takes no token"):
         connect("unix:/run/line.sock", token="a-token-of-the-hmi-0001")
