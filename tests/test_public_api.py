@@ -19,7 +19,7 @@ import busmaster
 from busmaster import errors
 from tests.patience import PATIENCE
 
-OPTIONAL = ("click", "rich", "msgspec", "textual", "aiomqtt", "prometheus_client", "matplotlib", "websockets")
+OPTIONAL = ("click", "rich", "textual", "aiomqtt", "prometheus_client", "matplotlib", "websockets")
 
 
 def order(name: str) -> tuple[object, ...]:
@@ -91,14 +91,14 @@ def test_what_is_not_needed_is_not_loaded(what: str, unneeded: str) -> None:
 def test_the_command_line_without_its_extra_says_which_one_to_install() -> None:
     code = (
         "import importlib.util as u, sys; find = u.find_spec; "
-        "u.find_spec = lambda name, *rest: None if name in ('click', 'rich', 'msgspec') else find(name, *rest); "
+        "u.find_spec = lambda name, *rest: None if name in ('click', 'rich') else find(name, *rest); "
         "from busmaster.cli import main; sys.exit(main(['--help']))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=False, timeout=PATIENCE, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr == (
-        "busmaster: the command line needs click, rich, msgspec, which the extra named cli brings: "
+        "busmaster: the command line needs click, rich, which the extra named cli brings: "
         "pip install 'busmaster[cli]'\n"
     )
 

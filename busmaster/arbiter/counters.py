@@ -49,6 +49,11 @@ class NodeStatistics:
     learned: tuple[LearnedTimes, ...] = ()
     """Of each kind of command that it was asked, where its reply times are learned."""
 
+    @property
+    def fruitless(self) -> int:
+        """Attempts that brought no value."""
+        return self.no_reply + self.garbled + self.refused
+
 
 @dataclass(frozen=True, slots=True)
 class DriverErrors:

@@ -79,8 +79,8 @@ class LineMachine:
         self._closed = False
         # the exchange on the wire
         self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency, byte_time)
-        self._wire = OnWire(self._leg, self._echo, self._deadlines, self.dispatcher.urgent_waits)
         self._in_step = InStep(strict)
+        self._wire = OnWire(self._leg, self._echo, self._deadlines, self._in_step, self.dispatcher.urgent_waits)
         self._choice = Choice(self.dispatcher, self._in_step, self._wire)
         self._trust = Trust(self._in_step)
         # the line

@@ -115,6 +115,7 @@ class Trust:
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
         if paid is not None and node is not None and node.learning is not None and paid.awaited is not None:
+            node.unheard = 0  # heard, if late: whatever else it owes, it is asked for itself
             first_byte = unasked.last_byte - (len(run) - 1) * wire.leg.byte_time - wire.leg.latency
             if first_byte - paid.asked > LATE_SHARE * paid.awaited.window:
                 node.learning.was_late()

@@ -48,6 +48,10 @@ class Limiter:
         """Hold a further limit: what is already limited stays so."""
         self._of.setdefault(node, NodeLimits(node)).limits.append(limit)
 
+    def of(self, node: Requester) -> tuple[Limit, ...]:
+        """Return the limits of a node's own quantities."""
+        return tuple(self._of[node].limits) if node in self._of else ()
+
     def drop(self, node: Requester, limit: Limit) -> None:
         """Hold it no longer; the others stay."""
         if node in self._of and limit in self._of[node].limits:

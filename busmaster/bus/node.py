@@ -204,6 +204,11 @@ class Node:
         if self.shared.limiter is not None:
             self.shared.limiter.drop(self, limit)
 
+    @property
+    def limits(self) -> tuple[Limit, ...]:
+        """Return the limits that are held."""
+        return () if self.shared.limiter is None else self.shared.limiter.of(self)
+
     def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
         """Raise InvalidCommand if one of these writes is beyond a limit: before the first of several is sent.
 

@@ -138,8 +138,10 @@ class PollGroup(Cycles):
         self._poll.paused = True
 
     def resume(self) -> None:
-        """Go back on the grid."""
-        self._poll.paused = False
+        """Go back on the grid. The time in between is no period."""
+        if self._poll.paused:
+            self._poll.paused = False
+            self._tally.last = None
 
     def demand(self) -> None:
         """Poll now, off the grid. A cycle that is running serves."""
@@ -165,6 +167,11 @@ class PollGroup(Cycles):
         """Return an immutable snapshot of its counts."""
         self._line.check_loop()
         return self._tally.statistics(self._poll)
+
+    @property
+    def recent_periods(self) -> tuple[float, ...]:
+        """Return the seconds from cycle to cycle of the last thousand, without the time for which it was paused."""
+        return tuple(self._tally.recent)
 
     def reset_statistics(self) -> None:
         """Start its counts again; cycles keep their numbers."""

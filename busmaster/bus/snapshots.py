@@ -21,6 +21,7 @@ from busmaster.errors import BusClosed
 
 T = TypeVar("T")
 
+RECENT_PERIODS = 1000
 NO_SAMPLES = dict.fromkeys(Quality, 0)
 """To be copied: a count of each quality."""
 
@@ -59,9 +60,10 @@ class Snapshot(Mapping[Point[Any], Sample[Any]]):
 class GroupStatistics:
     """Of a group since it was made, or its statistics were reset; times in seconds.
 
-    `period` as asked, `achieved` as seen (mean). `jitter` runs from a cycle's due time to its start, `cycle_time` to
-    its last value. `good`, `late`, `stale` and `bad` count samples. What its cycles waited for before they started, on
-    average: `exchanges_ahead` of others, and `settling_ahead` seconds after somebody's uncertain outcome.
+    `period` as asked, `achieved` as seen (mean), without the time for which it was paused. `jitter` runs from a cycle's
+    due time to its start, `cycle_time` to its last value. `good`, `late`, `stale` and `bad` count samples. What its
+    cycles waited for before they started, on average: `exchanges_ahead` of others, and `settling_ahead` seconds after
+    somebody's uncertain outcome.
     """
 
     cycles: int
@@ -81,14 +83,21 @@ class GroupStatistics:
 class Tally:
     """What a group counts; the rest is counted by its poll."""
 
-    __slots__ = ("cycle_time", "cycles", "exchanges_ahead", "first", "last", "missed", "samples", "settling_ahead")
+    __slots__ = (
+        *("cycle_time", "cycles", "exchanges_ahead", "last", "missed", "periods", "recent", "samples"),
+        *("settling_ahead", "spanned"),
+    )
 
     def __init__(self, poll: Poll) -> None:
         self.missed = poll.missed
         """Missed before the count began."""
         self.cycles = 0
-        self.first: float | None = None
-        self.last = 0.0
+        self.last: float | None = None
+        """When the cycle before began; None where there was none, or a pause since."""
+        self.spanned = 0.0
+        """Seconds from cycle to cycle, of all `periods` that were seen."""
+        self.periods = 0
+        self.recent: deque[float] = deque(maxlen=RECENT_PERIODS)
         self.exchanges_ahead = 0
         self.settling_ahead = 0.0
         self.cycle_time = Histogram()
@@ -102,9 +111,11 @@ class Tally:
         for quality, number in qualities.items():
             self.samples[quality] += number
         begun = poll.started if poll.started > -inf else poll.due
-        if self.first is None:
-            self.first = begun
-        self.last = begun
+        if self.last is not None:
+            self.spanned += begun - self.last
+            self.periods += 1
+            self.recent.append(begun - self.last)
+        self.last = None if poll.paused else begun
         self.cycles += 1
         self.cycle_time.record(poll.finished - poll.due)
         for transaction in poll.results[:1]:
@@ -119,7 +130,7 @@ class Tally:
             cycles=cycles,
             missed=poll.missed - self.missed,
             period=poll.period,
-            achieved=(self.last - self.first) / (cycles - 1) if self.first is not None and cycles > 1 else 0.0,
+            achieved=self.spanned / self.periods if self.periods else 0.0,
             jitter=Quantiles.of(poll.jitter),
             cycle_time=Quantiles.of(self.cycle_time),
             good=self.samples[Quality.GOOD],

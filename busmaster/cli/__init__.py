@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 WRONG_USAGE, INTERRUPTED = 2, 130
-NEEDED = ("click", "rich", "msgspec")
+NEEDED = ("click", "rich")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

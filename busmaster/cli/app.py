@@ -32,6 +32,7 @@ COMMANDS = (
     "run",
     "serve",
     "status",
+    "top",
     "safe",
     "plan",
     "points",

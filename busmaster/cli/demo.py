@@ -6,7 +6,7 @@ import itertools
 import subprocess
 import sys
 from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import anyio
 import click
@@ -16,13 +16,15 @@ from busmaster.cli.arguments import View, plain_option, seconds_option
 from busmaster.cli.demo_line import CONTROLLERS, DRIVES, SETTINGS
 from busmaster.cli.ending import until_ended
 from busmaster.cli.watching import Watch, follow
-from busmaster.errors import BusError
+from busmaster.errors import BusError, LineDown
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from busmaster.transport.serial_port import SerialPort
 
 PERIOD = 0.2
 COMMAND_EVERY = 2.0
+MOST_TAKEN = 8
+"""Terminals that other programs may have taken, as one does that waits for a lost line of that name, before it ends."""
 SPEEDS = (25.0, -40.0, 60.0, 0.0, 80.0, -15.0, 40.0)
 """References in %, one drive after another; more of them than drives, so that each gets another the next time round."""
 
@@ -36,8 +38,14 @@ def command(seconds: float | None, plain: bool) -> int:
     Controllers (nodes 1 to 3) move their axes, MicroFlex drives (4 to 8) get a new speed reference now and then, and
     one of them loses its wire for some seconds. Nothing is connected or listened to. Ctrl-C ends it.
     """
-    with emulated_line() as path:
-        return until_ended(demo, path, View(seconds=seconds, plain=plain))
+    view = View(seconds=seconds, plain=plain)
+    with ExitStack() as lines:  # a terminal that is taken is kept: else the next one would be the same
+        for _ in range(MOST_TAKEN):
+            try:
+                return until_ended(demo, lines.enter_context(emulated_line()), view)
+            except LineDown as error:
+                taken = error
+        raise taken
 
 
 @contextmanager
@@ -64,7 +72,10 @@ def emulated_line() -> Iterator[str]:
 
 
 async def demo(path: str, view: View) -> int:
-    """Poll the line at `path` and command its drives, until the view ends: return the exit status."""
+    """Poll the line at `path` and command its drives, until the view ends: return the exit status.
+
+    Raises LineDown if that port cannot be opened.
+    """
     bus = Bus(SerialPort(path, baudrate=SETTINGS.baudrate))
     axes = [Hcp2Controller(bus, address).axis(0) for address in CONTROLLERS]
     drives = [MicroFlexDrive(bus, address) for address in DRIVES]

@@ -1,78 +1,55 @@
-"""The other end of the screen: starts its process, feeds it frames, and hears what the person presses."""
+"""The live view of the line that this process owns: `busmaster top` in a process of its own, so that drawing never
+disturbs the line."""
 
 from __future__ import annotations
 
-import asyncio
 import os
-import socket
 import subprocess
 import sys
+import tempfile
 import termios
-from collections.abc import Callable
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import anyio
 
-from busmaster.cli.app import FAILED, INTERRUPTED, OK
-from busmaster.cli.messages import Action, Frame, decode_action, encode
+from busmaster.cli.app import FAILED
+from busmaster.gate.gate import Gate
+from busmaster.service.service import Service
 
-INTERVAL = 0.2
-"""Seconds between frames: values that move, at a cost of well under 1 % of a processor here."""
-ENDINGS = {"quit": OK, "interrupt": INTERRUPTED}
-LEAVE_SCREEN = b"\x1b[?1000l\x1b[?1003l\x1b[?1006l\x1b[?2004l\x1b[?25h\x1b[?1049l"
-"""No mouse, no bracketed paste, a cursor, and the page of before."""
+LEAVE_SCREEN = b"\x1b[?1000l\x1b[?1003l\x1b[?1006l\x1b[?2004l\x1b[?1004l\x1b[<u\x1b[?25h\x1b[?1049l"
+"""No mouse, no bracketed paste, no reports of focus, the usual keyboard, a cursor, and the page of before."""
 FAREWELL = 3.0
 """Seconds in which the screen gives the terminal back."""
+ENDED_BY_A_PERSON = (0, 130)
 
 
-async def draw(picture: Callable[[], Frame], act: Callable[[Action], object]) -> int:
-    """Show `picture()` until the person quits (0), presses Ctrl-C (130), or the screen's process fails (1).
+async def draw(address: str) -> int:
+    """Show the line at an address until the person quits (0) or presses Ctrl-C (130), or the view ends itself (1).
 
     Cancelling it gives the terminal back.
     """
     before = terminal_state()
-    ours, theirs = socket.socketpair()
-    with theirs:  # left open here, it would hide from `hear` that the screen has ended
-        command = [sys.executable, "-m", "busmaster.cli.live", str(theirs.fileno())]
-        process = await anyio.to_thread.run_sync(
-            lambda: subprocess.Popen(command, pass_fds=[theirs.fileno()]), abandon_on_cancel=False
-        )
-    ours.setblocking(False)
-    reader, writer = await asyncio.open_connection(sock=ours)
-    status = FAILED
+    command = [sys.executable, "-m", "busmaster", "top", address, "--of-owner"]
+    process = await anyio.to_thread.run_sync(lambda: subprocess.Popen(command), abandon_on_cancel=False)
     try:
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(feed, writer, picture)
-            status = await hear(reader, act)
-            tasks.cancel_scope.cancel()
+        await anyio.to_thread.run_sync(process.wait, abandon_on_cancel=True)
     finally:
-        writer.close()
         with anyio.CancelScope(shield=True):
             await anyio.to_thread.run_sync(see_off, process)
-        if process.returncode:  # one that was killed has left the terminal as it was drawing on it
+        if process.returncode < 0:  # one that was killed has left the terminal as it was drawing on it
             restore_terminal(before)
-    return status
+    return process.returncode if process.returncode in ENDED_BY_A_PERSON else FAILED
 
 
-async def feed(writer: asyncio.StreamWriter, picture: Callable[[], Frame]) -> None:
-    """Send a frame at each interval, but none while the screen has not taken the one before."""
-    while not writer.is_closing():
-        if writer.transport.get_write_buffer_size() == 0:
-            writer.write(encode(picture()))
-        await anyio.sleep(INTERVAL)
-
-
-async def hear(reader: asyncio.StreamReader, act: Callable[[Action], object]) -> int:
-    """Pass on what the person asks for, until it is to end, and return the exit status."""
-    try:
-        while line := await reader.readline():
-            action = decode_action(line)
-            if action.kind in ENDINGS:
-                return ENDINGS[action.kind]
-            act(action)
-    except ConnectionError:
-        pass
-    return FAILED
+@asynccontextmanager
+async def served_here(gate: Gate, title: str) -> AsyncIterator[Service]:
+    """Serve a line to this process's own view alone: what is not to be served to others, or cannot be."""
+    with tempfile.TemporaryDirectory(prefix="busmaster-") as folder:
+        async with Service(gate.bus, gate=gate, path=Path(folder) / "view.sock", title=title) as service:
+            yield service
 
 
 def terminal_state() -> list[Any] | None:
@@ -94,7 +71,8 @@ def restore_terminal(before: list[Any] | None) -> None:
 
 
 def see_off(process: subprocess.Popen[bytes]) -> None:
-    """Wait for the screen, which ends by itself when its socket does; kill it after FAREWELL seconds."""
+    """End the view, which gives the terminal back; kill it after FAREWELL seconds."""
+    process.terminate()
     try:
         process.wait(FAREWELL)
     except subprocess.TimeoutExpired:

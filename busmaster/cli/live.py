@@ -1,329 +1,342 @@
-"""The screen: a process of its own that draws frames and sends back keys, so that drawing never disturbs the line.
-
-Started by `watch` as `python -m busmaster.cli.live DESCRIPTOR`, a connected socket. It ends when the socket does.
-Only the terminal's own colours are used: those that a light background swallows (yellow, white) are not.
-"""
+"""The screen: draws the picture of a line, and says to the line's owner what the person wishes."""
 
 from __future__ import annotations
 
 import asyncio
-import socket
-import sys
-from collections import defaultdict, deque
-from collections.abc import Sequence
-from typing import Any, ClassVar
+import time
+from collections.abc import Callable, Coroutine, Mapping
+from functools import partial
+from typing import Any, ClassVar, Protocol
 
 from rich.text import Text
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
-from textual.screen import Screen as TextualScreen
-from textual.widgets import DataTable, Footer, Static
+from textual.widgets import Static
 
-from busmaster.cli.dialog import AskValue
-from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row, decode_frame, encode
-from busmaster.cli.output import value_text
+from busmaster.cli.app import INTERRUPTED
+from busmaster.cli.cells import column_widths, fit, gauge_line, group_line, header_line, row_line, title_line
+from busmaster.cli.details import details_text
+from busmaster.cli.dialog import STYLE as STYLE_OF_DIALOGS
+from busmaster.cli.dialog import AskValue, AskWords, AskYes, Show
+from busmaster.cli.parsing import parse_value
+from busmaster.cli.picture import Frame, Group, Node, Picture, Row, matching
+from busmaster.cli.table import Table
+from busmaster.errors import BusError, InvalidCommand
 
-FRAME_LIMIT = 1 << 22
-"""Bytes of the longest frame: some ten thousand points."""
-BARS = "▁▂▃▄▅▆▇█"
-RIPPLE = 0.1
-GAUGE = 20
+SUSPENDED_FOR = 60.0
+SILENT_AFTER = 2.0
+"""Seconds without a word of the line's owner after which that is said."""
+ASKED_EVERY = 1.0
+"""Seconds between two questions for the details that are shown."""
 EVENTS = 3
-HEALTH_STYLES = {
-    "up": "green",
-    "suspended": "magenta",
-    "unknown": "dim",
-    "suspect": "bold magenta",
-    "down": "reverse red",
-}
-COLUMNS = {"NODE": 8, "ITEM": 16, "VALUE": 10, "UNIT": 6, "TREND": 6, "AGE": 4, "P50ms": 5, "HEALTH": 9}
-"""With a space on each side of a column these are the 80 columns of the smallest terminal."""
-GROWTH = {"ITEM": 8, "VALUE": 10, "TREND": 16}
-"""How much wider a column gets, in this order, where the terminal is wider."""
-LONGEST_TREND = COLUMNS["TREND"] + GROWTH["TREND"]
-NUMBERS = ("VALUE", "AGE", "P50ms")
-OLD_AFTER = 3
-"""Periods after which a value's age is worth a look."""
+ORDERS = ("listed", "item", "oldest", "trouble")
+STYLE = """
+Screen { background: ansi_default; color: ansi_default; }
+Screen Static { background: ansi_default; color: ansi_default; }
+#head, #columns, #foot { height: auto; }
+"""
+KEYS = (
+    ("?", "keys"),
+    ("q", "quit"),
+    ("Enter", "details"),
+    ("/", "filter"),
+    ("o", "order"),
+    ("p", "pause"),
+    ("s", "suspend"),
+    ("w", "write"),
+    ("d", "poll now"),
+)
+HELP = """\
+?       these keys
+↑ ↓     another row; also Page up, Page down, Home, End
+Enter   details of the row: limits, last exchange, past
+/       only rows with some words: node, item, group, health
+o       order: by node, by item, oldest first, trouble first
+p P     pause the row's group, all groups; again: go on
+d D     poll the row's group now, all groups
+s       suspend the row's node, or let it go on (asks)
+w       write the row's point (asks)
+q       {leave}
+Ctrl-C  the same, with exit status 130
+
+!  could not be read: its last good value, growing old
+↑ ↓  beyond its limit     ~  came late     ?  older than a write to it"""
 
 
-def sparkline(numbers: Sequence[float | None]) -> str:
-    """Draw the last values between their own lowest and highest; a gap where there was none.
+class Line(Protocol):
+    """What a person may do on a line."""
 
-    A ripple is not a trend.
-    """
-    known = [number for number in numbers if number is not None]
-    if not known:
-        return ""
-    low, high = min(known), max(known)
-    span = max(high - low, RIPPLE * max(abs(low), abs(high))) or 1.0
-    return "".join(" " if x is None else BARS[round((x - low) / span * (len(BARS) - 1))] for x in numbers)
+    async def pause(self, group: str, paused: bool, /) -> None: ...
 
+    async def demand(self, group: str, /) -> None: ...
 
-def age_text(seconds: float | None) -> str:
-    """Return an age as `2.5s`, `30s` or `12m`; `-` for none."""
-    if seconds is None:
-        return "-"
-    if seconds < 10:
-        return f"{seconds:.1f}s"
-    return f"{seconds:.0f}s" if seconds < 600 else f"{seconds / 60:.0f}m"
+    async def suspend(self, protocol: str, address: int, for_: float, /) -> None: ...
+
+    async def details(self, group: str, key: str, /) -> Mapping[str, Any]: ...
+
+    async def write(self, group: str, key: str, value: Any, /) -> None: ...
 
 
-def clock_text(seconds: float) -> str:
-    """Return seconds as `H:MM:SS`."""
-    minutes, seconds = divmod(int(seconds), 60)
-    return f"{minutes // 60:d}:{minutes % 60:02d}:{seconds:02d}"
-
-
-def fit(text: str, width: int) -> str:
-    """Return the text, cut short with an ellipsis if it is wider than `width` columns."""
-    return text if len(text) <= width else text[: width - 1] + "…"
-
-
-def title_line(frame: Frame, width: int) -> Text:
-    """Draw the first line: the title, the port, and the time since the start."""
-    left = Text.assemble((f" {frame.title}", "bold"), f"  {frame.port}")
-    clock = clock_text(frame.now)
-    left.truncate(width - len(clock) - 2, overflow="ellipsis", pad=True)
-    return left + Text(f" {clock} ")
-
-
-def gauge_line(frame: Frame) -> Text:
-    """Draw how busy the line is, its state, and how many requests wait."""
-    filled = min(GAUGE, round(frame.utilisation * GAUGE))
-    style = "red" if frame.utilisation > 0.9 else "green"
-    return Text.assemble(
-        " line ",
-        ("━" * filled, style),
-        ("─" * (GAUGE - filled), "dim"),
-        f" {frame.utilisation:4.0%} busy  ",
-        (frame.line, "" if frame.line == "ready" else "bold red"),
-        f"  {frame.backlog} waiting",
-    )
-
-
-def group_line(group: GroupRow) -> Text:
-    """Draw the line of one poll group: its periods in milliseconds, and its cycles."""
-    line = Text.assemble(" ", (group.name, "bold"), f" every {group.period * 1000:g} ms")
-    if group.achieved is not None:
-        line.append(f", achieved {group.achieved * 1000:.1f}")
-        if group.p99 is not None:
-            line.append(f" (p99 {group.p99 * 1000:.1f})")
-    line.append(f"  cycle {group.cycles}  ")
-    line.append(f"missed {group.missed}", style="bold red" if group.missed else "")
-    if group.paused:
-        line.append("  paused", style="bold magenta")
-    return line
-
-
-def column_widths(width: int) -> dict[str, int]:
-    """Return the width of each column in a terminal of `width` columns."""
-    widths = dict(COLUMNS)
-    spare = width - sum(widths.values()) - 2 * len(widths)
-    for name, growth in GROWTH.items():
-        more = max(0, min(growth, spare))
-        widths[name] += more
-        spare -= more
-    return widths
-
-
-def right(text: str, width: int, style: str = "") -> Text:
-    """Return the text flush right in `width` columns."""
-    return Text(fit(text, width).rjust(width), style=style)
-
-
-class Screen(App[None]):
-    """Draws what `take_frame` is given. `send` carries the person's actions."""
+class Screen(App[int]):
+    """Draws `picture` whenever `take_picture` says that there is news. Its result is an exit status."""
 
     ENABLE_COMMAND_PALETTE = False
-    CSS = """
-    Screen { background: ansi_default; color: ansi_default; }
-    #head { height: auto; }
-    #points { height: 1fr; background: ansi_default; color: ansi_default;
-        scrollbar-size: 0 1; }
-    #points > .datatable--header { background: ansi_default; color: ansi_default; text-style: bold underline; }
-    #points > .datatable--cursor { background: ansi_default; color: ansi_default; text-style: reverse; }
-    #points > .datatable--hover { background: ansi_default; }
-    #events { height: auto; max-height: 4; text-style: dim; }
-    Toast { background: ansi_default; color: ansi_default; }
-    Footer { background: ansi_default; color: ansi_default; }
-    FooterKey { background: ansi_default; color: ansi_default; }
-    FooterKey .footer-key--key { background: ansi_default; color: ansi_blue; text-style: bold; }
-    FooterKey .footer-key--description { background: ansi_default; color: ansi_default; }
-    """
+    CSS = f"{STYLE}{STYLE_OF_DIALOGS}"
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("q", "leave('quit')", "quit"),
-        Binding("ctrl+c", "leave('interrupt')", show=False, priority=True),
-        Binding("p", "ask('pause')", "pause polling"),
-        Binding("d", "ask('demand')", "poll now"),
-        Binding("s", "suspend", "suspend node"),
-        Binding("w", "write", "write value"),
-        Binding("up,down,pageup,pagedown", "scroll", "scroll", key_display="↑↓", show=True),
+        Binding("q", "leave(0)", show=False),
+        Binding("ctrl+c", f"leave({INTERRUPTED})", show=False, priority=True),
+        Binding("question_mark,h,f1", "help", show=False),
+        Binding("enter", "details", show=False),
+        Binding("slash", "filter", show=False),
+        Binding("o", "order", show=False),
+        Binding("p", "pause(False)", show=False),
+        Binding("P", "pause(True)", show=False),
+        Binding("d", "demand(False)", show=False),
+        Binding("D", "demand(True)", show=False),
+        Binding("s", "suspend", show=False),
+        Binding("w", "write", show=False),
     ]
 
-    def __init__(self, connection: socket.socket | None) -> None:
-        super().__init__()
-        self.connection = connection
-        self.writer: asyncio.StreamWriter | None = None
-        self.frame: Frame | None = None
-        self.trends: defaultdict[tuple[int, str, str], deque[float | None]] = defaultdict(
-            lambda: deque(maxlen=LONGEST_TREND)
-        )
-        self.shown: list[tuple[str, str]] = []
-        self.widths = dict(COLUMNS)
+    def __init__(self, picture: Picture, line: Line, *, read_only: bool = False, leave: str = "leave") -> None:
+        super().__init__(ansi_color=True)  # the terminal's own colours; and none at all with NO_COLOR
+        self.picture = picture
+        self.line = line
+        self.read_only = read_only
+        self.leave = leave
+        """What q does, in words."""
+        self.words = ""
+        self.order = ORDERS[0]
+        self.said: tuple[float, str] | None = None
+        """What became of the last wish, and when."""
+        self.heard = time.monotonic()
+        self.head = Static(id="head")
+        self.columns = Static(id="columns")
+        self.table = Table(self._row_line)
+        self.foot = Static(id="foot")
+        self._widths = column_widths(80)
+        self._of_node: Mapping[tuple[str, int], Node] = {}
+        self._of_group: Mapping[str, Group] = {}
+        self._due = False
 
     def compose(self) -> ComposeResult:
-        yield Static(id="head")
-        yield DataTable(id="points", cursor_type="row", cursor_foreground_priority="renderable")
-        yield Static(id="events")
-        yield Footer(show_command_palette=False)
+        yield from (self.head, self.columns, self.table, self.foot)
 
     def on_mount(self) -> None:
-        """Begin to hear the connection."""
+        """Begin to draw."""
         self.theme = "ansi-dark"
         self.table.focus()
-        if self.connection is not None:
-            self.run_worker(self.listen(self.connection), exit_on_error=True)
+        self.set_interval(SILENT_AFTER / 2, self.draw)
+        self.draw()
 
     def on_resize(self) -> None:
-        """Fit the columns to the terminal's new width."""
-        self.widths = column_widths(self.size.width)
-        self.shown = []
-        self.table.clear(columns=True)
-        for name, width in self.widths.items():
-            self.table.add_column(right(name, width) if name in NUMBERS else Text(name), width=width, key=name)
-        if self.frame:
-            self.take_frame(self.frame)
+        """Fit the picture to the terminal's new size."""
+        self.call_after_refresh(self.draw)
 
-    @property
-    def base(self) -> TextualScreen[object]:
-        """The picture, under whatever question is open."""
-        return self.screen_stack[0]
+    # drawing
 
-    @property
-    def selected(self) -> Row | None:
-        """The row under the cursor, None where there is none."""
-        rows, index = self.frame.rows if self.frame else (), self.table.cursor_row
-        return rows[index] if index < len(rows) else None
+    def take_picture(self) -> None:
+        """Draw what there is news of, soon. May be called from outside."""
+        self.heard = time.monotonic()
+        if not self._due and self.is_running:
+            self._due = True
+            self.call_later(self.draw)
 
-    @property
-    def table(self) -> DataTable[Text]:
-        """The table of the points."""
-        table: DataTable[Text] = self.base.query_one("#points", DataTable)
-        return table
+    def draw(self) -> None:
+        """Draw all that there is."""
+        self._due = False
+        frame = self.picture.frame
+        if frame is None:
+            self.head.update(Text(fit(" waiting for the program that owns the line", self.size.width)))
+            return
+        self._widths = column_widths(self.size.width)
+        self._of_node = self.picture.nodes
+        groups = self.picture.groups
+        self._of_group = {group.name: group for group in groups}
+        self.table.show(self._rows())
+        self.head.update(self._head(frame, groups))
+        self.columns.update(header_line(self._widths))
+        self.foot.update(self._foot(frame))
 
-    async def listen(self, connection: socket.socket) -> None:
-        """Take every frame that the connection brings; end the screen when it ends."""
-        # asyncio's own limit, 64 KiB a line, raises at some hundred points
-        reader, self.writer = await asyncio.open_connection(sock=connection, limit=FRAME_LIMIT)
-        try:
-            while line := await reader.readline():
-                self.take_frame(decode_frame(line))
-            self.exit()
-        finally:
-            self.writer.close()
+    def _rows(self) -> list[Row]:
+        places = {key: place for place, key in enumerate(self._of_node)}
+        rows = sorted(
+            matching(self.picture.rows, self._of_node, self.words),
+            key=lambda row: places.get((row.protocol, row.address), len(places)),
+        )
+        match self.order:
+            case "item":
+                rows.sort(key=lambda row: row.item)
+            case "oldest":
+                rows.sort(key=lambda row: -1.0 if row.asked is None else row.asked)
+            case "trouble":
+                rows.sort(key=self._soundness)
+        return rows
 
-    def send(self, action: Action) -> None:
-        """Send what the person asked for, as long as somebody is there to hear it."""
-        if self.writer is not None and not self.writer.is_closing():
-            self.writer.write(encode(action))
+    def _soundness(self, row: Row) -> tuple[bool, bool, bool, bool]:
+        node = self._of_node.get((row.protocol, row.address))
+        up = node is not None and node.health == "up"
+        return not row.error, up, not row.alarm, row.quality not in ("late", "stale")
 
-    def action_leave(self, kind: Any) -> None:
-        """Say that the person leaves, and end."""
-        self.send(Action(kind))
-        self.exit()
+    def _row_line(self, row: Row, selected: bool) -> Text:
+        assert self.picture.frame is not None
+        node, group = self._of_node.get((row.protocol, row.address)), self._of_group.get(row.group)
+        return row_line(row, node, group, self.picture.frame, self._widths, selected)
 
-    def action_ask(self, kind: Any) -> None:
-        """Send an action on all groups."""
-        self.send(Action(kind))
+    def _head(self, frame: Frame, groups: list[Group]) -> Text:
+        width, room = self.size.width, max(1, self.size.height // 8)
+        silent = time.monotonic() - self.heard
+        lines = [title_line(frame, width, silent if silent > SILENT_AFTER else 0.0), gauge_line(frame, width)]
+        shown = groups
+        if len(groups) > room:  # the selected row's is among those that are shown
+            row = self.table.selected
+            first = [group for group in groups if row is not None and group.name == row.group]
+            shown = (first + [group for group in groups if group not in first])[: max(1, room - 1)]
+        lines += [group_line(group, width) for group in shown]
+        if len(shown) < len(groups):
+            lines.append(Text(fit(f" and {len(groups) - len(shown)} more groups", width)))
+        if frame.left_out:
+            lines.append(Text(fit(f" {frame.left_out} points more than are shown", width), "bold"))
+        return Text("\n").join(lines)
+
+    def _foot(self, frame: Frame) -> Text:
+        width, row = self.size.width, self.table.selected
+        lines: list[Text] = []
+        if row is not None and row.error:
+            lines.append(Text(fit(f" {row.name}: {row.error}", width), "bold"))
+        happened = [*frame.events, *([self.said] if self.said else [])]
+        began = frame.now - frame.elapsed
+        for when, text in sorted(happened)[-EVENTS if self.size.height >= 24 else -1 :]:
+            lines.append(Text(fit(f" {when - began:7.1f} s  {text}", width)))
+        shown = [
+            text for text in (self.words and f"filter: {self.words}", self.order != "listed" and self.order) if text
+        ]
+        lines.append(keys_line(width, self.leave, ", ".join(shown)))
+        return Text("\n").join(lines)
+
+    # what the person wishes
+
+    def _wish(self, what: str, doing: Callable[[], Coroutine[Any, Any, None]], done: str = "") -> None:
+        """Have it done while the picture goes on, and say what became of it."""
+
+        async def run() -> None:
+            try:
+                await doing()
+            except (BusError, InvalidCommand) as error:
+                self._say(f"{what}: {error.what if isinstance(error, BusError) else error}")
+            else:
+                if done:
+                    self._say(done)
+
+        self.run_worker(run(), exit_on_error=False)
+
+    def _say(self, text: str) -> None:
+        self.said = (self.picture.frame.now if self.picture.frame else 0.0), text
+        self.draw()
+
+    def action_leave(self, status: int) -> None:
+        """End it."""
+        self.exit(status)
+
+    def action_help(self) -> None:
+        """Show the keys."""
+        self.push_screen(Show(Text(HELP.format(leave=self.leave))))
+
+    def action_filter(self) -> None:
+        """Ask which rows are shown."""
+
+        def take(words: str | None) -> None:
+            if words is not None:
+                self.words = words
+                self.draw()
+
+        self.push_screen(AskWords(self.words), take)
+
+    def action_order(self) -> None:
+        """Show the rows in another order."""
+        self.order = ORDERS[(ORDERS.index(self.order) + 1) % len(ORDERS)]
+        self.draw()
+
+    def _chosen(self, all_groups: bool) -> list[Group]:
+        row = self.table.selected
+        return [group for group in self._of_group.values() if all_groups or (row and group.name == row.group)]
+
+    def action_pause(self, all_groups: bool) -> None:
+        """Pause the row's group, or all groups, or go on with what is paused."""
+        groups = self._chosen(all_groups)
+        paused = not all(group.paused for group in groups)
+        for group in groups:
+            self._wish(f"pause {group.name}", partial(self.line.pause, group.name, paused))
+
+    def action_demand(self, all_groups: bool) -> None:
+        """Poll the row's group, or all groups, now."""
+        for group in self._chosen(all_groups):
+            self._wish(f"poll {group.name}", partial(self.line.demand, group.name))
 
     def action_suspend(self) -> None:
-        """Ask for the selected point's node to be suspended, or to go on."""
-        row = self.selected
-        if row is not None:
-            self.send(Action("suspend", row.node))
+        """Ask whether the row's node is to be suspended, or to go on."""
+        row = self.table.selected
+        node = self._of_node.get((row.protocol, row.address)) if row is not None else None
+        if node is None:
+            return
+        rests = node.health == "suspended"
+        question = (
+            f"let {node.label} go on" if rests else f"suspend {node.label} for {SUSPENDED_FOR:.0f} s, all its polls"
+        )
+
+        def take(meant: bool | None) -> None:
+            if meant:
+                seconds = 0.0 if rests else SUSPENDED_FOR
+                self._wish(question, partial(self.line.suspend, node.protocol, node.address, seconds))
+
+        self.push_screen(AskYes(f"{question}?"), take)
 
     def action_write(self) -> None:
         """Ask for a value of the selected point, and again whether to write it."""
-        row = self.selected
-        if row is None or self.frame is None:
+        row, frame = self.table.selected, self.picture.frame
+        if row is None or frame is None:
             return
-        if self.frame.read_only or not row.writable:
-            # a name may have brackets, which would be taken for markup
-            self.notify(f"{row.node} {row.item} is read-only", markup=False)
+        if self.read_only or frame.read_only or not row.writable:
+            self._say(f"{row.name} is read-only" if not row.writable else "this view is read-only")
             return
 
-        def send(value: str | None) -> None:
-            if value is not None:
-                self.send(Action("write", row.node, row.item, value))
+        def take(text: str | None) -> None:
+            if text is not None:
+                name = f"{row.name} = {text}"
+                self._wish(name, partial(self.line.write, row.group, row.key, parse_value(text)), f"{name} written")
 
-        self.push_screen(AskValue(f"{row.node} {row.item}", row.unit), send)
+        self.push_screen(AskValue(row.name, row.unit), take)
 
-    def action_scroll(self) -> None:
-        """Stand in the footer for the table's own keys."""
+    def action_details(self) -> None:
+        """Show all that is known of the selected point, as it changes."""
+        row = self.table.selected
+        if row is None:
+            return
+        shown = Show(self._details(row, {}))
 
-    def take_frame(self, frame: Frame) -> None:
-        """Draw this frame."""
-        self.frame = frame
-        width = self.size.width
-        head = [title_line(frame, width), gauge_line(frame), *map(group_line, frame.groups)]
-        self.base.query_one("#head", Static).update(Text("\n").join(head))
-        events = frame.events[-EVENTS:]
-        self.base.query_one("#events", Static).update(Text("\n".join(fit(f" {event}", width) for event in events)))
-        self.draw_rows(frame)
+        async def follow() -> None:
+            await self.push_screen(shown)
+            while shown.is_attached:
+                try:
+                    told = await self.line.details(row.group, row.key)
+                except (BusError, InvalidCommand) as error:
+                    told = {"gone": str(error)}
+                shown.update(self._details(row, told))
+                await asyncio.sleep(ASKED_EVERY)
 
-    def draw_rows(self, frame: Frame) -> None:
-        """Draw the points of a frame: only the cells that have changed, unless other points are shown."""
-        table, nodes = self.table, {node.label: node for node in frame.nodes}
-        keys = [(row.node, row.item) for row in frame.rows]
-        if keys != self.shown:
-            table.clear()
-            self.shown = keys
-            for number in range(len(keys)):
-                table.add_row(*(Text() for _ in COLUMNS), key=str(number))  # two groups may have the same point
-        old = OLD_AFTER * max((group.period for group in frame.groups), default=1.0)
-        before = ""
-        for number, row in enumerate(frame.rows):
-            trend = self.trends[number, row.node, row.item]
-            trend.append(row.value if isinstance(row.value, int | float) and not row.error else None)
-            cells = point_cells(row, list(trend)[-self.widths["TREND"] :], old, self.widths)
-            if row.node != before:
-                cells |= node_cells(nodes.get(row.node, NodeRow(row.node, "")), self.widths)
-            for name, cell in cells.items():
-                shown = table.get_cell(str(number), name)
-                if (shown, shown.style) != (cell, cell.style):  # texts are equal to rich whatever their style
-                    table.update_cell(str(number), name, cell)
-            before = row.node
+        self.run_worker(follow(), exit_on_error=False)
+
+    def _details(self, row: Row, told: Mapping[str, Any]) -> Text:
+        now = next((one for one in self.picture.rows if one.identity == row.identity), row)
+        node, group = self._of_node.get((row.protocol, row.address)), self._of_group.get(row.group)
+        return details_text(now, node, group, told, self.picture.frame, max(20, self.size.width - 4))
 
 
-def point_cells(row: Row, trend: list[float | None], old: float, widths: dict[str, int]) -> dict[str, Text]:
-    """Return the cells of one point. An age beyond `old` seconds stands out."""
-    style = "red" if row.error else "magenta" if row.late else "bold"
-    return {
-        "ITEM": Text(fit(row.item, widths["ITEM"])),
-        "VALUE": right(value_text(row.value, row.precision), widths["VALUE"], style),
-        "UNIT": Text(fit(row.unit, widths["UNIT"])),
-        "TREND": Text(sparkline(trend), style="blue"),
-        "AGE": right(age_text(row.age), widths["AGE"], "red" if row.age is not None and row.age > old else ""),
-    }
-
-
-def node_cells(node: NodeRow, widths: dict[str, int]) -> dict[str, Text]:
-    """Return the cells of a node, which stand beside the node's first point."""
-    return {
-        "NODE": Text(fit(node.label, widths["NODE"]), style="bold"),
-        "P50ms": right(f"{node.p50 * 1000:.1f}" if node.requests else "", widths["P50ms"]),
-        "HEALTH": Text(fit(node.health, widths["HEALTH"]), style=HEALTH_STYLES.get(node.health, "")),
-    }
-
-
-def main() -> int:
-    """Draw until the socket ends. The one argument is its descriptor."""
-    connection = socket.socket(fileno=int(sys.argv[1]))
-    connection.setblocking(False)
-    screen = Screen(connection)
-    screen.run()
-    return screen.return_code or 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def keys_line(width: int, leave: str, shown: str) -> Text:
+    """Draw the keys, as many as there is room for, and what is shown of the rows."""
+    line = Text(f" {shown} " if shown else " ", "reverse" if shown else "")
+    for key, label in KEYS:
+        more = Text.assemble((key, "bold"), f" {leave if key == 'q' else label}  ")
+        if line.cell_len + more.cell_len > width:
+            break
+        line = Text.assemble(line, more) if line.cell_len > 1 else Text.assemble(" ", more)
+    return line

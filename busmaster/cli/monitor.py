@@ -72,12 +72,13 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
     """Listen to the line of a file until Ctrl-C. Nothing is ever sent, whoever asks for it."""
     protocol = only_protocol(file)
     kind = find(protocol)
-    line = ConfiguredLine(silent(file), tell=note)  # never entered: its bus opens no port
+    line = ConfiguredLine(silent(file), tell=note, asks=False)  # never entered: its bus opens no port
     points = {point for group in file.groups for point in line.members(group)}
     overheard = Overheard(kind.protocol, points)
 
     def show(snapshot: Snapshot) -> None:
-        emit_all([json_line(**cycle_fields(snapshot, snapshot.wall_at))] if as_json else plain_values(snapshot))
+        fields = {**cycle_fields(snapshot, snapshot.wall_at), "time": utc(snapshot.wall_at(snapshot.finished))}
+        emit_all([json_line(**fields)] if as_json else plain_values(snapshot))
 
     async def tell(events: Stream[BusEvent]) -> None:
         async for event in events:

@@ -18,18 +18,13 @@ def secrets_of(file: LineFile) -> dict[str, bytes]:
     return file.service.secrets() if file.service.enabled else {}
 
 
-@asynccontextmanager
-async def served(line: ConfiguredLine, *, tell: bool) -> AsyncIterator[None]:
-    """Serve the line to other programs, unless its file says otherwise. One that cannot be served runs all the same.
-
-    Says where it is served if it is to `tell`.
-    """
+def service_of(line: ConfiguredLine) -> Service | None:
+    """Return what is to serve the line to other programs; None where its file does not want that."""
     section = line.file.service
     if not section.enabled:
-        yield
-        return
+        return None
     name = line_name(os.path.basename(line.file.path).removesuffix(".toml"))
-    service = Service(
+    return Service(
         line.bus,
         gate=line.gate,
         name=name,
@@ -37,17 +32,29 @@ async def served(line: ConfiguredLine, *, tell: bool) -> AsyncIterator[None]:
         group=section.group,
         share=section.share,
         listen=section.listen,
+        title=line.file.title,
     )
+
+
+@asynccontextmanager
+async def served(service: Service | None, *, tell: bool) -> AsyncIterator[Service | None]:
+    """Serve a line, and yield what serves it; None for a line that cannot be served, which runs all the same.
+
+    Says where it is served if it is to `tell`.
+    """
+    if service is None:
+        yield None
+        return
     try:
         await service.__aenter__()
     except InvalidCommand as error:
         note(f"no other program can use this line: {error}", Level.WARNING)
-        yield
+        yield None
         return
     try:
         if tell:
             by_tcp = "" if service.tcp_address is None else f" and {service.tcp_address}"
-            note(f"{line.file.title} is served at {service.address}{by_tcp}", Level.NOTICE)
-        yield
+            note(f"{service.title} is served at {service.address}{by_tcp}", Level.NOTICE)
+        yield service
     finally:
         await service.__aexit__(None, None, None)

@@ -24,8 +24,8 @@ NOT_FOR_US = "not for this user"
 @json_option
 def command(as_json: bool) -> int:
     """List the lines that programs of this user serve, and those of the system in /run/busmaster: name, port, process,
-    programs that use it, how busy it is, and how many of its nodes are up. The exit status is 1 if one does not answer;
-    one that is not for this user is listed as such.
+    programs that use it, how busy it is, or that it is offline, and how many of its nodes are up. The exit status is 1
+    if one does not answer; one that is not for this user is listed as such.
     """
     return until_ended(status, as_json)
 
@@ -45,12 +45,14 @@ async def status(as_json: bool) -> int:
 async def ask(owner: Owner) -> dict[str, Any]:
     """Return how a line is, or why its owner does not say so."""
     line: dict[str, Any] = {"name": owner.name, "port": owner.port, "address": owner.address, "process": owner.pid}
-    line |= {"tcp": None, "programs": None, "utilisation": None, "up": None, "nodes": None, "error": None}
+    line |= {"tcp": None, "programs": None, "utilisation": None, "state": None}
+    line |= {"up": None, "nodes": None, "error": None}
     try:
         async with asyncio.timeout(ANSWER_WITHIN), connect(owner.address) as remote:
             nodes, line["tcp"] = remote.about["nodes"], remote.about["tcp"]
             line["programs"] = remote.about["clients"] - 1  # without this one
-            line["up"] = sum(node["health"] == "up" for node in nodes)
+            line["state"] = remote.about.get("state", "ready")
+            line["up"] = 0 if line["state"] == "offline" else sum(node["health"] == "up" for node in nodes)
             line["nodes"] = len(nodes)
             line["utilisation"] = (await remote.statistics()).utilisation
     except (BusError, TimeoutError) as error:
@@ -66,4 +68,5 @@ def cells(line: dict[str, Any]) -> tuple[str, ...]:
     first = line["name"], line["port"], str(line["process"])
     if line["error"]:
         return *first, "", "", line["error"]
-    return *first, str(line["programs"]), f"{line['utilisation']:.1%}", f"{line['up']}/{line['nodes']}"
+    busy = "offline" if line["state"] == "offline" else f"{line['utilisation']:.1%}"
+    return *first, str(line["programs"]), busy, f"{line['up']}/{line['nodes']}"

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import sys
-from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Iterator
+from contextlib import AsyncExitStack
 from dataclasses import replace
-from importlib.util import find_spec
-from statistics import fmean
 from typing import Any, Protocol
 
 import anyio
@@ -20,33 +18,24 @@ from busmaster.arbiter.learned import LearnedTimes
 from busmaster.arbiter.state import LineState
 from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.bus import Bus
-from busmaster.bus.points import Point
-from busmaster.bus.polling import PollGroup, Quality, Sample, Snapshot
+from busmaster.bus.polling import PollGroup, Snapshot
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import View
-from busmaster.cli.drawing import draw
-from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row
+from busmaster.cli.drawing import draw, served_here
 from busmaster.cli.output import Level, SteadyOutput, emit_all, json_line, note, value_text
-from busmaster.cli.parsing import parse_value
+from busmaster.cli.top import what_is_missing
 from busmaster.doctor import uart
 from busmaster.errors import BusError, InvalidCommand
-from busmaster.gate.gate import Gate, Wish
-from busmaster.outputs.values import cycle_fields, event_text
+from busmaster.gate.gate import Gate
+from busmaster.outputs.values import cycle_fields, event_text, utc
+from busmaster.service.service import Service
 
-KEPT_PERIODS = 1_000
-KEPT_EVENTS = 8
 LINE = ""
 """Stands for the line itself among what is in trouble."""
-SUSPENDED_FOR = 60.0
-UTILISATION_WINDOW = 1.0
-COUNTED_EVERY = 0.5
-"""Seconds between two looks at the counts of nodes and groups."""
-STATES = {LineState.OFFLINE: "offline", LineState.SETTLING: "settling"}
-"""What is worth a word: a line in use is ready."""
 
 
 class Watch:
-    """What a person sees of a bus while its groups are polled. Times are in seconds since it was made.
+    """What is told of a bus while its groups are polled. Times are in seconds since it was made.
 
     `view` says how it is shown, `gate` is what the writes of the screen pass. `steady`: that nobody can print any more
     does not end it. It hears what happens to the bus from the start on, before that is entered too.
@@ -60,17 +49,11 @@ class Watch:
         self.gate = gate or Gate(bus, read_only=view.read_only)
         self.start = bus.now()
         self.groups: list[PollGroup] = []
-        self.events: deque[str] = deque(maxlen=KEPT_EVENTS)
+        self.service: Service | None = None
+        """What the screen is a client of, while there is one."""
         self._heard = bus.events()
         self._troubles: set[str] = set()
         self._tasks: TaskGroup | None = None
-        self._periods: dict[str, deque[float]] = {}
-        self._started: dict[str, float] = {}
-        self._good: dict[Point[Any], Sample[Any]] = {}
-        self._counted = -math.inf
-        self._node_rows: tuple[NodeRow, ...] = ()
-        self._group_rows: tuple[GroupRow, ...] = ()
-        self._loads: deque[tuple[float, float]] = deque()
 
     def since(self, time: float) -> float:
         """Return a time of the bus in seconds since the start."""
@@ -79,7 +62,6 @@ class Watch:
     def add(self, group: PollGroup) -> None:
         """Show this group too, from now on."""
         self.groups.append(group)
-        self._periods[group.name] = deque(maxlen=KEPT_PERIODS)
         if self._tasks is not None:
             self._begin(self._tasks, group)
 
@@ -88,41 +70,27 @@ class Watch:
         wanted = list(groups)
         for gone in [group for group in self.groups if group not in wanted]:
             self.groups.remove(gone)
-            self._started.pop(gone.name, None)
         for group in wanted:
             if group not in self.groups:
                 self.add(group)
         self.groups.sort(key=wanted.index)
-        self._counted = -math.inf
 
     def show_groups(self, tasks: TaskGroup) -> None:
-        """Take in the cycles of all groups, those that are added later too, and print them unless there is a screen."""
+        """Print the cycles of all groups, those that are added later too, unless there is a screen."""
         self._tasks = tasks
         for group in self.groups:
             self._begin(tasks, group)
 
     def _begin(self, tasks: TaskGroup, group: PollGroup) -> None:
-        tasks.start_soon(count_cycles if shown_on_screen(self.view) or self.view.silent else print_cycles, self, group)
-
-    def saw(self, snapshot: Snapshot) -> None:
-        """Count one cycle, and keep the good values: a point that fails shows its last one, growing old."""
-        self._good.update((point, sample) for point, sample in snapshot.samples.items() if sample.error is None)
-        if snapshot.started is None:
-            return
-        before = self._started.get(snapshot.group)
-        if before is not None:
-            self._periods[snapshot.group].append(snapshot.started - before)
-        self._started[snapshot.group] = snapshot.started
+        if not (shown_on_screen(self.view) or self.view.silent):
+            tasks.start_soon(print_cycles, self, group)
 
     async def listen(self) -> None:
-        """Keep the last events, as text, until cancelled."""
+        """Tell on standard error what happens to the bus and matters, until cancelled."""
         async for event in self._heard:
-            text = event_text(event)
             level = self._level(event)
-            if text and level is not None:
-                self.announce(text, level)
-            elif text:
-                self.tell(text)
+            if (text := event_text(event)) and level is not None and self.may_print():
+                note(text, level)
 
     def _level(self, event: BusEvent) -> Level | None:
         """Return how much an event matters to whoever is not looking: a loss, and its end, once each.
@@ -155,8 +123,9 @@ class Watch:
         return trouble
 
     def tell(self, text: str) -> None:
-        """Add to the last events."""
-        self.events.append(f"{self.bus.now() - self.start:7.1f} s  {text}")
+        """Add to what the screen shows of the last events."""
+        if self.service is not None:
+            self.service.journal.note(text)
 
     def announce(self, text: str, level: Level = Level.NOTICE) -> None:
         """Add to the last events; print a line on standard error, unless the screen that shows them is there."""
@@ -168,128 +137,22 @@ class Watch:
         """Tell whether a line may be printed on standard error: it must not tear the picture that is drawn there."""
         return not (shown_on_screen(self.view) and sys.stderr.isatty())
 
-    def picture(self) -> Frame:
-        """Return the frame for the screen. Cheap: it is taken on the loop that owns the line."""
-        now = self.bus.now()
-        if now >= self._counted + COUNTED_EVERY:
-            self._counted = now
-            self._node_rows = tuple(self._nodes())
-            self._group_rows = tuple(map(self._group, self.groups))
-        statistics = self.bus.statistics()
-        return Frame(
-            title=self.title,
-            port=self.port,
-            now=now - self.start,
-            line=STATES.get(self.bus.state, "ready"),
-            utilisation=self._utilisation(now, statistics.busy + statistics.settling),
-            backlog=statistics.backlog,
-            rows=tuple(self._row(point, group.latest, now) for group in self.groups for point in group.points),
-            nodes=self._node_rows,
-            groups=self._group_rows,
-            events=tuple(self.events),
-            read_only=self.view.read_only,
-        )
-
-    @property
-    def port(self) -> str:
-        """The name of the port, with the rate and framing where it has them."""
-        settings = self.bus.endpoint.settings
-        name = self.bus.endpoint.name
-        return f"{name}  {settings.baudrate} {settings.framing}" if settings else name
-
-    async def act(self, action: Action) -> None:
-        """Do what the person asked for. What cannot be done is an event."""
-        match action.kind:
-            case "demand":
-                for group in self.groups:
-                    group.demand()
-            case "pause":
-                self._pause()
-            case "suspend":
-                self._suspend(action.target)
-            case "write":
-                await self._write(action)
-        self._counted = -math.inf
-
-    def _pause(self) -> None:
-        """Pause all groups, or go on with them. The time in between is no period."""
-        paused = all(group.paused for group in self.groups)
-        self._started.clear()
-        for group in self.groups:
-            group.resume() if paused else group.pause()
-
-    def _suspend(self, label: str) -> None:
-        """Suspend the node for SUSPENDED_FOR seconds, or go on with it."""
-        for node in self.bus.nodes:
-            if node.label == label:
-                node.suspend(0.0 if node.suspended else SUSPENDED_FOR)
-                self.tell(f"{label} is suspended for {SUSPENDED_FOR:.0f} s" if node.suspended else f"{label} goes on")
-
-    async def _write(self, action: Action) -> None:
-        points = {(point.node.label, point.item): point for group in self.groups for point in group.points}
-        point = points.get((action.target, action.item))
-        if point is None:
-            return
-        name = f"{action.target} {action.item}"
-        try:
-            value = parse_value(action.value)
-        except InvalidCommand as error:
-            self.tell(f"{name} = {action.value}: {error}")
-            return
-        write = await self.gate.write(Wish(door="screen", by="key w", name=point.key, point=point, value=value))
-        self.tell(f"{name} = {action.value}{' written' if write.ok else f': {write.error}'}")
-
-    def _utilisation(self, now: float, busy: float) -> float:
-        self._loads.append((now, busy))
-        while len(self._loads) > 2 and self._loads[1][0] <= now - UTILISATION_WINDOW:
-            self._loads.popleft()
-        since, busy_then = self._loads[0]
-        return max(0.0, min(1.0, (busy - busy_then) / (now - since))) if now > since else 0.0
-
-    def _nodes(self) -> Iterator[NodeRow]:
-        for node in self.bus.nodes:
-            counts = node.statistics()
-            latency = counts.latency
-            health = "suspended" if node.suspended else node.health.value
-            failed = counts.no_reply + counts.garbled + counts.refused
-            yield NodeRow(node.label, health, counts.attempts, failed, latency.p50, latency.p99)
-
-    def _row(self, point: Point[Any], latest: Snapshot | None, now: float) -> Row:
-        good, sample = self._good.get(point), latest.samples.get(point) if latest else None
-        value = good.value if good else None
-        return Row(
-            point.node.label,
-            point.item,
-            # by its exact type: words and flags are ints, too, and are shown by their names
-            value if type(value) in (int, float) or value is None else value_text(value, point.meaning.precision),
-            short_unit(point.unit),
-            good.age(now) if good else None,
-            good is not None and good.quality is Quality.LATE,
-            sample.error.what if sample and sample.error else "",
-            point.writable,
-            point.meaning.precision,
-        )
-
-    def _group(self, group: PollGroup) -> GroupRow:
-        periods = self._periods[group.name]
-        counts = group.statistics()
-        mean = fmean(periods) if periods else None
-        return GroupRow(group.name, group.period, mean, p99_of(periods), counts.cycles, counts.missed, group.paused)
-
     def summarise(self) -> None:
         """Print the summary on standard error: cycles, missed, achieved period, utilisation; a line for each node."""
         counts = self.bus.statistics()
         if self.bus.state is LineState.SETTLING and not (counts.exchanges or counts.unasked_bytes):
             note("nothing was asked: a new line rests until replies to an earlier master are past; let it run longer")
-        for group in map(self._group, self.groups):
-            text = f"{group.name}: {group.cycles} cycles, {group.missed} missed"
-            if group.achieved is not None and group.p99 is not None:
-                text += f", period {group.achieved * 1000:.2f} ms mean, {group.p99 * 1000:.2f} ms p99"
+        for group in self.groups:
+            seen, periods = group.statistics(), group.recent_periods
+            text = f"{group.name}: {seen.cycles} cycles, {seen.missed} missed"
+            if periods:
+                text += f", period {seen.achieved * 1000:.2f} ms mean, {p99_of(periods) * 1000:.2f} ms p99"
             note(f"{text}, line {counts.utilisation:.1%} busy")
-        for node in self._nodes():
+        for node in self.bus.nodes:
+            of_node = node.statistics()
             note(
-                f"{node.label}: {node.requests} requests, {node.failed} failed, "
-                f"p50 {node.p50 * 1000:.2f} ms, p99 {node.p99 * 1000:.2f} ms"
+                f"{node.label}: {of_node.attempts} requests, {of_node.fruitless} failed, "
+                f"p50 {of_node.latency.p50 * 1000:.2f} ms, p99 {of_node.latency.p99 * 1000:.2f} ms"
             )
         for bus_node in self.bus.nodes:
             if text := learned_text(bus_node.statistics().learned):
@@ -306,15 +169,10 @@ def learned_text(learned: Iterable[LearnedTimes]) -> str:
     return windows and f"learned windows: {windows}"
 
 
-def p99_of(periods: Iterable[float]) -> float | None:
-    """Return the period that 99 % do not exceed, None without any."""
+def p99_of(periods: Iterable[float]) -> float:
+    """Return the period that 99 % do not exceed."""
     ordered = sorted(periods)
-    return ordered[math.ceil(0.99 * len(ordered)) - 1] if ordered else None
-
-
-def short_unit(unit: str) -> str:
-    """Shorten a unit: a column has no room for "% of rated current"."""
-    return unit.partition(" of ")[0]
+    return ordered[math.ceil(0.99 * len(ordered)) - 1]
 
 
 class Clock(Protocol):
@@ -328,15 +186,16 @@ class Clock(Protocol):
 
 
 def json_cycle(watch: Clock, snapshot: Snapshot) -> str:
-    """Return a cycle as one JSON object."""
-    return json_line(**cycle_fields(snapshot, watch.since))
+    """Return a cycle as one JSON object: its times are in seconds since the start, but for `time`, when it was over."""
+    return json_line(**cycle_fields(snapshot, watch.since), time=utc(snapshot.wall_at(snapshot.finished)))
 
 
-def plain_cycle(watch: Clock, snapshot: Snapshot) -> Iterator[str]:
-    """Yield a line a sample: seconds since the start, node and item, the value, or what went wrong."""
+def plain_cycle(snapshot: Snapshot) -> Iterator[str]:
+    """Yield a line a sample: the time of day at the end of its cycle, node and item, the value, or what went wrong."""
+    time = utc(snapshot.wall_at(snapshot.finished))
     for point, sample in snapshot.samples.items():
         value = error_text(sample.error) if sample.error else value_text(sample.value, point.meaning.precision)
-        yield f"{snapshot.finished - watch.start:.3f} {point.key} {value}"
+        yield f"{time} {point.key} {value}"
 
 
 def error_text(error: BusError) -> str:
@@ -346,22 +205,15 @@ def error_text(error: BusError) -> str:
 
 def print_cycle(watch: Watch, snapshot: Snapshot) -> None:
     """Print one cycle, as JSON or as plain lines."""
-    lines = [json_cycle(watch, snapshot)] if watch.view.as_json else plain_cycle(watch, snapshot)
+    lines = [json_cycle(watch, snapshot)] if watch.view.as_json else plain_cycle(snapshot)
     emit_all(lines) if watch.output is None else watch.output.print(lines)
 
 
 async def print_cycles(watch: Watch, group: PollGroup) -> None:
     """Print every cycle, in a thread: a reader that is slow costs snapshots, never line time."""
     async for snapshot in group:
-        watch.saw(snapshot)
         # abandoned: a reader that has stopped reading would keep the command from ending
         await anyio.to_thread.run_sync(print_cycle, watch, snapshot, abandon_on_cancel=True)
-
-
-async def count_cycles(watch: Watch, group: PollGroup) -> None:
-    """Count every cycle, and print none."""
-    async for snapshot in group:
-        watch.saw(snapshot)
 
 
 async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] | None = None) -> int:
@@ -370,15 +222,15 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
     `beside` runs meanwhile, and is cancelled at the end.
     """
     view = watch.view
-    on_screen = shown_on_screen(view)
-    if not on_screen and wants_screen(view):
-        note("the live view needs the extra named tui (pip install 'busmaster[tui]'); plain lines instead")
+    if wants_screen(view) and (missing := what_is_missing()):
+        note(f"the live view needs {missing}; plain lines instead")
     status = OK
 
     async def show(tasks: TaskGroup) -> None:
         """Draw beside the others: a screen that takes its time to end holds up nothing else that is to be done then."""
         nonlocal status
-        status = await draw(watch.picture, lambda action: tasks.start_soon(watch.act, action))
+        assert watch.service is not None
+        status = await draw(watch.service.address)
         if status == FAILED and watch.output is not None:
             status = OK
             watch.view = replace(view, plain=True)  # what happens is told on standard error from now on
@@ -386,17 +238,24 @@ async def follow(watch: Watch, beside: Callable[[], Coroutine[Any, Any, None]] |
         else:
             tasks.cancel_scope.cancel()
 
-    try:
-        with anyio.move_on_after(view.seconds):
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(watch.listen)
-                if beside is not None:
-                    tasks.start_soon(beside)
-                watch.show_groups(tasks)
-                if on_screen:
-                    tasks.start_soon(show, tasks)
-    finally:
-        watch.summarise()
+    async with AsyncExitStack() as stack:
+        if shown_on_screen(view) and watch.service is None:
+            try:
+                watch.service = await stack.enter_async_context(served_here(watch.gate, watch.title))
+            except (OSError, InvalidCommand) as error:  # no folder for it, say: the line runs all the same
+                note(f"there is no live view: {error}; plain lines instead", Level.WARNING)
+                watch.view = view = replace(view, plain=True)
+        try:
+            with anyio.move_on_after(view.seconds):
+                async with anyio.create_task_group() as tasks:
+                    tasks.start_soon(watch.listen)
+                    if beside is not None:
+                        tasks.start_soon(beside)
+                    watch.show_groups(tasks)
+                    if shown_on_screen(view):
+                        tasks.start_soon(show, tasks)
+        finally:
+            watch.summarise()
     return status
 
 
@@ -406,5 +265,5 @@ def wants_screen(view: View) -> bool:
 
 
 def shown_on_screen(view: View) -> bool:
-    """Tell whether a screen is wanted, and the library that draws is there."""
-    return wants_screen(view) and find_spec("textual") is not None
+    """Tell whether a screen is wanted, and what it needs is there."""
+    return wants_screen(view) and not what_is_missing()

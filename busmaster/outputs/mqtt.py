@@ -91,7 +91,8 @@ class Outgoing(NamedTuple):
 class MqttOutput(SpillingOutput):
     """`commands` are the points, by their key, that may be written. Raises InvalidCommand if the extra is missing.
 
-    Without `in_charge` it says nothing of the state of the line and its nodes, nor that it is there.
+    Without `in_charge` it says nothing of the state of the line and its nodes, nor that it is there. Without `asks` it
+    says that it is there, and what it heard; how line and nodes are, nobody knows who does not ask them.
     """
 
     def __init__(
@@ -104,6 +105,7 @@ class MqttOutput(SpillingOutput):
         commands: Mapping[str, Point[Any]] | None = None,
         gate: Gate | None = None,
         in_charge: bool = True,
+        asks: bool = True,
     ) -> None:
         check_extra("aiomqtt", "mqtt")
         super().__init__(kind, settings, say)
@@ -112,6 +114,7 @@ class MqttOutput(SpillingOutput):
         self._bus = bus
         self._gate = gate or Gate(bus)
         self._in_charge = in_charge
+        self._asks = asks
         self._commands = {topic_part(key): point for key, point in (commands or {}).items()}
         self._arriving: Commands
         self._leaving = threading.Event()
@@ -308,10 +311,10 @@ class MqttOutput(SpillingOutput):
         """Yield what is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
         if not self._in_charge:
             return
-        now: dict[str, tuple[str, str | None]] = {
-            "line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")
-        }
-        for node in self._bus.nodes:
+        now: dict[str, tuple[str, str | None]] = {}
+        if self._asks:
+            now["line"] = ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")
+        for node in self._bus.nodes if self._asks else ():
             now[f"health/{topic_part(node.label.removeprefix('node '))}"] = ("health", node.health.value)
         alarms = self._bus.alarms
         if alarms is not self._alarms:

@@ -14,7 +14,7 @@ from busmaster.arbiter.transaction import Priority
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
-from busmaster.bus.requester import checked_priority
+from busmaster.bus.requester import Requester, checked_priority
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
 from busmaster.gate.permission import Permission
@@ -34,6 +34,7 @@ from busmaster.service.messages import (
     written,
 )
 from busmaster.service.outbox import Outbox
+from busmaster.service.overview import said_details
 from busmaster.service.peers import Peer
 from busmaster.service.streams import Broadcast, GroupBroadcast
 from busmaster.service.telling import point_of, protocol_of, said_statistics
@@ -81,14 +82,16 @@ class Client:
 
     def tell(self, stream: int, method: str, body: str) -> None:
         """Say something of a stream; it is dropped where the client does not keep up."""
+        self.outbox.put_news(stream, self._news(stream, method, body))
+
+    def tell_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
+        """Say something of a part of a stream that replaces what was said of it before."""
+        self.outbox.put_latest((stream, method, part), self._news(stream, method, body))
+
+    def _news(self, stream: int, method: str, body: str) -> str:
         dropped = self.dropped.get(stream, 0)
         head = f'{{"jsonrpc":"2.0","method":"{method}","params":{{"stream":{stream},"dropped":{dropped},"body":'
-        self.outbox.put_news(stream, f"{head}{body}}}}}")
-
-    def tell_surely(self, stream: int, method: str, body: dict[str, Any]) -> None:
-        """Say something of a stream that replaces what was said of it before."""
-        params = {"stream": stream, "dropped": self.dropped.get(stream, 0), "body": body}
-        self.outbox.put_latest((stream, method), written({"method": method, "params": params}))
+        return f"{head}{body}}}}}"
 
     def tell_stops(self, node: NodeRecord) -> None:
         """Say how often a node was told to stop, if this client knows it."""
@@ -121,7 +124,7 @@ class Client:
             raise Malformed("the id of a request is a whole number")
         if number in self._errands:
             raise Malformed(f"request {number} is under way already")
-        if method == "request":
+        if method in ("request", "write"):
             self._begin(number, params)
             return
         if method == "safe":
@@ -169,18 +172,46 @@ class Client:
             case "groups":
                 return [{"name": group.name, "period": group.period} for group in self._line.bus.groups]
             case "subscribe":
-                group = next((one for one in self._line.bus.groups if one.name == params["group"]), None)
-                if group is None:
-                    names = ", ".join(one.name for one in self._line.bus.groups) or "none"
-                    raise InvalidCommand(f"no poll group {params['group']!r}; there are: {names}")
-                return self._follow(params, self._line.broadcast_of(group))
+                return self._follow(params, self._line.broadcast_of(self._line.group(params["group"])))
             case "events":
                 return self._follow(params, self._line.events())
             case "gather":
                 return self._gather(params)
             case "poll":
                 return self._poll(params)
+            case "overview":
+                return self._follow(params, self._line.overview())
+            case "details":
+                return said_details(*self._line.point(params["group"], params["key"]))
+            case "pause" | "demand" | "suspend":
+                return self._steer(method, params)
         raise Malformed(f"no method {method[:40]!r}", NO_METHOD)
+
+    def _steer(self, method: str, params: Mapping[str, Any]) -> None:
+        """Do what changes how the line is polled, for all who use it: it is told whose wish that was.
+
+        Raises InvalidCommand where he may not write to the nodes that it is about.
+        """
+        if method == "suspend":
+            node = self._line.node(params["protocol"], params["address"])
+            self._check_steering(node)
+            node.suspend(params["for"])
+            did = f"{node.label} is suspended for {params['for']:g} s" if node.suspended else f"{node.label} goes on"
+        else:
+            group = self._line.group(params["group"])
+            if method == "demand":
+                group.demand()
+                return
+            self._check_steering(*(point.node for point in group.points))
+            group.pause() if params["paused"] is True else group.resume()
+            did = f"{group.name} {'is paused' if group.paused else 'goes on'}"
+        self._line.journal.note(f"{did}, says {self.peer}")
+
+    def _check_steering(self, *nodes: Requester) -> None:
+        if not all(map(self.permission.reaches, nodes)):
+            raise InvalidCommand(
+                f"{self.permission.who} may not have this rest: that is for who may write to its nodes"
+            )
 
     # nodes
 

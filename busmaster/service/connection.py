@@ -78,6 +78,8 @@ class Connection(asyncio.BufferedProtocol):
         self._transport: asyncio.Transport | None = None
         self._loop: asyncio.AbstractEventLoop
         self._is_open = False
+        self._talks = False
+        """Whether messages are said and heard: it is open, and the end of it is not said yet."""
         self._rest = bytearray()
         """The beginning of a frame that has not come whole."""
         self._longest = longest + LONGEST_HEAD
@@ -100,12 +102,12 @@ class Connection(asyncio.BufferedProtocol):
 
     def say(self, text: str) -> None:
         """Say a message: nothing where the connection ends already."""
-        if self._is_open and self._core.state == _OPEN and not self.transport.is_closing():
+        if self._talks and not self.transport.is_closing():
             self.transport.write(text_frame(text.encode(), masked=not self._serves))
 
     def close(self, code: int = NORMAL, reason: str = "") -> None:
         """Say that this is the end, behind all that was said; the other end has CLOSE_WITHIN to agree."""
-        if self._is_open and self._core.state == _OPEN:
+        if self._talks:
             self._core.send_close(code, reason)
             self._write()
         elif not self._is_open:
@@ -123,7 +125,8 @@ class Connection(asyncio.BufferedProtocol):
 
     def resume(self) -> None:
         """Read on."""
-        self.transport.resume_reading()
+        if self._transport is not None:
+            self._transport.resume_reading()
 
     async def closed(self) -> None:
         """Return when the connection is over."""
@@ -151,7 +154,7 @@ class Connection(asyncio.BufferedProtocol):
                 if size <= 0:
                     return
                 self._feed(self._cut(size))
-            elif self._core.state != _OPEN or (size := frame_size(self._rest)) > self._longest:
+            elif not self._talks or (size := frame_size(self._rest)) > self._longest:
                 self._feed(self._cut(len(self._rest)))
             elif len(self._rest) < size:
                 return
@@ -179,7 +182,7 @@ class Connection(asyncio.BufferedProtocol):
         for timer in self._timers.values():
             timer.cancel()
         self._core.receive_eof()
-        self._is_open = False
+        self._is_open = self._talks = False
         self._over.set()
         self._hearer.lost()
 
@@ -189,7 +192,7 @@ class Connection(asyncio.BufferedProtocol):
         raise NotImplementedError
 
     def _open(self) -> None:
-        self._is_open = True
+        self._is_open = self._talks = True
         self._set_timer("ping", PING_EVERY, self._ping)
         self._hearer.opened()
 
@@ -230,6 +233,7 @@ class Connection(asyncio.BufferedProtocol):
 
     def _write(self) -> None:
         transport = self.transport
+        self._talks = self._is_open and self._core.state == _OPEN
         for data in self._core.data_to_send():
             if transport.is_closing():
                 return
@@ -244,7 +248,7 @@ class Connection(asyncio.BufferedProtocol):
         """Let go of one of whom nothing came since it was pinged. While nothing is read from it that says nothing."""
         if self._silent and self.transport.is_reading():
             self.abort()
-        elif self._core.state == _OPEN:
+        elif self._talks:
             self._silent = True
             self._core.send_ping(b"")
             self._write()
@@ -304,6 +308,12 @@ class AskingConnection(Connection):
         """Return why the other end let go of us, "" as long as it has not said so."""
         said = self._core.close_rcvd
         return "" if said is None else said.reason
+
+    @property
+    def owner_ended(self) -> bool:
+        """Return whether the other end let go of us because it ends in good order."""
+        said = self._core.close_rcvd
+        return said is not None and said.code == GOING_AWAY
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Collection, Hashable, Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 from busmaster.arbiter.clients import LineClient
@@ -16,8 +17,10 @@ from busmaster.contract.arguments import seconds
 from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
-from busmaster.gate.gate import FRESH, Gate, Wish
+from busmaster.gate.gate import FRESH, NEVER_SENT, Gate, Wish, outcome_of
 from busmaster.gate.permission import Permission
+from busmaster.service.messages import value_of
+from busmaster.service.overview import Journal
 from busmaster.service.peers import Peer
 from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast
@@ -53,6 +56,25 @@ class Line(Protocol):
         """Return what tells of line and nodes."""
         ...
 
+    def overview(self) -> Broadcast:
+        """Return what tells what a person sees of it."""
+        ...
+
+    @property
+    def journal(self) -> Journal: ...
+
+    def group(self, name: str, /) -> PollGroup:
+        """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
+        ...
+
+    def point(self, group: str, key: str, /) -> tuple[PollGroup, Point[Any]]:
+        """Return a point of a poll group, and the group. Raises InvalidCommand if there is none."""
+        ...
+
+    def node(self, protocol: str, address: int, /) -> Node:
+        """Return a node that is on the line. Raises InvalidCommand if there is none."""
+        ...
+
     def named(self, node: Node, places: Collection[Hashable], /) -> Point[Any] | None:
         """Return the point of a poll group that reads these places of a node."""
         ...
@@ -80,14 +102,51 @@ class Asker(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is asked for: a command for a node, and what reads what it writes (`touches`); perhaps its point."""
+
+    node: Node
+    command: Command[Any]
+    touches: Command[Any] | None
+    value: Any
+    """As the record of a write has it."""
+    point: Point[Any] | None = None
+
+    @classmethod
+    def of_node(cls, params: Mapping[str, Any], asker: Asker) -> Task:
+        """Return a command that a client names. Raises InvalidCommand for what the protocol does not have."""
+        node, protocol = asker.node(params["protocol"], params["address"]), protocol_of(params["protocol"])
+        command, touches = protocol.read_back(params["command"]), params.get("touches")
+        return cls(node, command, None if touches is None else protocol.read_back(touches), str(command))
+
+    @classmethod
+    def of_point(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Task:
+        """Return the write of a value to a point of a poll group.
+
+        Raises InvalidCommand, and keeps a record of it, for what cannot be written.
+        """
+        _, point = line.point(params["group"], params["key"])
+        value = value_of(params["value"])
+        assert isinstance(point.node, Node)
+        try:
+            if point.encode is None:
+                raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
+            return cls(point.node, point.encode(value), point.command, value, point)
+        except NEVER_SENT as error:
+            by, permission = str(asker.peer), asker.permission
+            wish = Wish(door=DOOR, by=by, name=point.key, point=point, value=value, permission=permission)
+            refusal = line.gate.refusal(wish) or outcome_of(error)[1]
+            line.gate.refuse(wish, refusal)
+            raise InvalidCommand(refusal) from None
+
+
 class Errand:
     """One command with its options, for one client."""
 
     def __init__(
         self,
-        node: Node,
-        command: Command[Any],
-        touches: Command[Any] | None,
+        task: Task,
         options: CommandOptions,
         *,
         line: Line,
@@ -97,10 +156,10 @@ class Errand:
         stop: bool,
         asked: float,
     ) -> None:
-        self.node = node
-        self.command = command
+        self.node = task.node
+        self.command = task.command
         self.journey = Journey()
-        self._touches = touches
+        self._task = task
         self._options = options
         self._line = line
         self._asker = asker
@@ -114,10 +173,8 @@ class Errand:
     @classmethod
     def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
-        node = asker.node(params["protocol"], params["address"])
-        protocol = protocol_of(params["protocol"])
-        command = protocol.read_back(params["command"])
-        touches = params.get("touches")
+        task = Task.of_point(params, asker, line) if "key" in params else Task.of_node(params, asker)
+        node, command = task.node, task.command
         given = cast("CommandOptions", dict(params.get("options", {})))
         if given:
             if not set(given) <= OPTIONS:
@@ -125,9 +182,7 @@ class Errand:
             RequestOptions.of(given, node.label)  # checked here, before it may wait
         now, stops_seen = line.bus.now(), params.get("stops_seen")
         return cls(
-            node,
-            command,
-            None if touches is None else protocol.read_back(touches),
+            task,
             given,
             line=line,
             asker=asker,
@@ -189,7 +244,7 @@ class Errand:
             value = await self.node.followed_request(
                 self.command,
                 self.journey,
-                touches=self._touches,
+                touches=self._task.touches,
                 stops_seen=self._stops_seen,
                 stop=self._stop,
                 client=self._client,
@@ -234,9 +289,8 @@ class Errand:
 
     def _wish(self) -> Wish:
         """Return what is on record of it: by the name of a point and in its unit, where the owner polls that."""
-        command, point = self.command, None
-        value: Any = self.text
-        if isinstance(command, Changing):
+        command, point, value = self.command, self._task.point, self._task.value
+        if point is None and isinstance(command, Changing):
             changes = command.changes(self.node.profile)
             point = self._line.named(self.node, changes.keys())
             if point is not None:

@@ -28,6 +28,7 @@ from busmaster.service.messages import LONGEST_ANSWER, VERSIONS, read, written
 GRACE = 0.25
 """Seconds beyond `finish_within` in which the line's owner, who knows more, may say what became of a request."""
 CONNECT_WITHIN = 10.0
+ENDED = "the program that owns the line has ended"
 READ_AT_ONCE = 1 << 16
 TCP = "tcp://"
 GONE = "the connection to the program that owns the line was lost"
@@ -141,14 +142,18 @@ class Link:
         command: Command[Any] | None = None,
     ) -> Asked:
         """Ask something, after all that was said before; its future has the answer. Raises LineDown or BusClosed."""
-        if self._over is not None:
-            kind, what, hint = self._over
-            raise kind(what, node=node, command=_text(command), hint=hint)
+        self.check(node, command)
         self._count += 1
         asked = Asked(self._count, asyncio.get_running_loop().create_future(), writes, node, command)
         self._asked[asked.number] = asked
         self._put(written({"id": asked.number, "method": method, "params": params}), asked)
         return asked
+
+    def check(self, node: Addressed | None = None, command: Command[Any] | None = None) -> None:
+        """Raise LineDown or BusClosed, saying why, once the connection is over."""
+        if self._over is not None:
+            kind, what, hint = self._over
+            raise kind(what, node=node, command=_text(command), hint=hint)
 
     async def answer(self, asked: Asked, finish_within: float | None = None) -> Any:
         """Wait for an answer. Cancelling it cancels the request at the line too."""
@@ -194,6 +199,8 @@ class Link:
 
     def lost(self) -> None:
         """Tell whoever waits that the connection is over."""
+        if self._connection is not None and self._connection.owner_ended:
+            self._end(LineDown, ENDED, "start it, and connect again")
         self._end(LineDown, GONE, AGAIN)
 
     # inside
@@ -212,8 +219,8 @@ class Link:
         if farewell:
             return LineDown(f"{where} does not let this program in: {farewell}", hint="see busmaster status")
         if connection is not None and isinstance(error, TimeoutError):
-            what = f"a program serves {where}, and has said nothing for {CONNECT_WITHIN:g} s"
-            return LineDown(what, hint="see whether it stands still")
+            what = f"the program that serves {where} did not answer in {CONNECT_WITHIN:g} s"
+            return LineDown(what, hint="if it stands still, end it: the line is its own as long as it is there")
         if complaint is None and isinstance(error, OSError) and not isinstance(error, BusError):
             complaint = os.strerror(error.errno) if error.errno else str(error) or "it does not answer"
         if complaint is None:

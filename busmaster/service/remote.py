@@ -5,20 +5,16 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import Iterable, Mapping
-from contextlib import AbstractAsyncContextManager
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from math import inf
 from types import TracebackType
-from typing import Any, TypeVar, Unpack
+from typing import Any, TypeVar
 
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.bus.alarms import BusEvent
-from busmaster.bus.exclusive import checked_hold
-from busmaster.bus.limits import Limit
 from busmaster.bus.points import Point
-from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, Requester, RequestOptions
+from busmaster.bus.requester import Priority
 from busmaster.bus.samples import Sample
 from busmaster.bus.snapshots import Stream
 from busmaster.contract.exchange import Command
@@ -26,12 +22,13 @@ from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed, BusError, InvalidCommand
-from busmaster.planning.merging import Merge
 from busmaster.service.link import TCP, Link
-from busmaster.service.messages import MOST_CHECKED, said_timings, value_of
+from busmaster.service.messages import MOST_CHECKED, said_timings
 from busmaster.service.remote_group import RemoteGroup
+from busmaster.service.remote_node import RemoteNode
+from busmaster.service.remote_overview import RemoteOverview
 from busmaster.service.safe import outcomes_of
-from busmaster.service.sequences import Room, held_remotely, shortened
+from busmaster.service.sequences import Room
 from busmaster.service.telling import (
     event_of,
     protocol_of,
@@ -42,8 +39,6 @@ from busmaster.service.telling import (
 T = TypeVar("T")
 EVENT_BUFFER = 256
 POINTS_IN_A_MESSAGE = 50
-LEFT_OUT = ("verify", "safe")
-"""Options that are of no use on another's line: where they are said, they are false."""
 
 
 def connect(address: str, *, token: str | None = None) -> RemoteBus:
@@ -54,151 +49,6 @@ def connect(address: str, *, token: str | None = None) -> RemoteBus:
     is. Raises InvalidCommand for a token anywhere else: there the kernel says who comes.
     """
     return RemoteBus(address, token=token)
-
-
-class RemoteNode:
-    """One node of a line that another program owns. Handles and points work on it as on a node of this process."""
-
-    def __init__(self, bus: RemoteBus, profile: Profile, address: int) -> None:
-        self.stops = 0
-        """How often it was told to stop, by whatever program, since this one named it."""
-        self.label = profile.label(address)
-        self._bus = bus
-        self._profile = profile
-        self._address = address
-        self._protocol = protocol_of(profile.name)
-
-    @property
-    def line(self) -> str:
-        """Return the name of its line's port."""
-        return self._bus.line
-
-    @property
-    def address(self) -> int:
-        return self._address
-
-    @property
-    def profile(self) -> Profile:
-        return self._profile
-
-    def __repr__(self) -> str:
-        return f"<RemoteNode {self.profile.name} {self.address} of {self._bus.address}>"
-
-    def note_stop(self) -> None:
-        """Tell the line that this node is being told to stop, ahead of whatever is asked of it from now on."""
-        self.stops += 1
-        self._bus.link.tell("stop", {"protocol": self.profile.name, "address": self.address})
-
-    def now(self) -> float:
-        """Return the time of the line's clock, in seconds: that of its owner's machine."""
-        return self._bus.now()
-
-    def latest(self, point: Any, /) -> Sample[Any] | None:
-        """Return the youngest good sample of a point in this program's poll groups, unless a write, by whatever
-        program, has made it stale: any write to the node does."""
-        return self._bus.latest(point)
-
-    def merge_reads(self, merge: Merge, /) -> None:
-        """Have the profile propose `merge`. What is merged on the line is its owner's affair."""
-        self._profile = replace(self._profile, merge=merge)
-
-    def limit(self, limit: Limit, /) -> None:
-        """Raise InvalidCommand: limits are held by the program that owns the line, for all programs."""
-        raise InvalidCommand(f"{self.label}: limits are held by the program that owns the line: set {limit.name} there")
-
-    def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
-        """Have the line check these writes when the bus is entered: entering raises InvalidCommand for a bad one.
-
-        Later it does nothing: the line checks each write as it comes. Of several, those before a bad one are written.
-        """
-        self._bus.prepare(self, commands, stop is True)
-
-    async def request(
-        self,
-        command: Command[T],
-        /,
-        *,
-        touches: Command[Any] | None = None,
-        stops_seen: int | None = None,
-        stop: bool = False,
-        **options: Unpack[CommandOptions],
-    ) -> T:
-        """Run one command on the line and return its value: as `Requester.request`, with the same errors.
-
-        If the connection is lost meanwhile, a write raises WriteUnconfirmed, or NotStarted where it was not handed over
-        yet, and a read LineDown. Cancelling it cancels it there.
-        """
-        return await self.ask(command, None, touches=touches, stops_seen=stops_seen, stop=stop, **options)
-
-    async def ask(
-        self,
-        command: Command[T],
-        sequence: int | None,
-        /,
-        *,
-        touches: Command[Any] | None,
-        stops_seen: int | None,
-        stop: bool,
-        **options: Unpack[CommandOptions],
-    ) -> T:
-        """Do what `request` does, within a sequence of this program, if it is given the number of one."""
-        chosen = RequestOptions.of(options, self.label) if options else ORDINARY
-        if chosen.verify:
-            raise InvalidCommand(f"{self.label}: verify is for what writes a value through a handle")
-        if chosen.safe:
-            raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
-        link, room = self._bus.opened(self, command), self._bus.room
-        # What is of a sequence waits for nothing else of this program, which waits for the sequence.
-        waits = sequence is None and chosen.priority is not Priority.URGENT
-        waited = await room.take(chosen, self, command) if waits else 0.0
-        try:
-            left: Mapping[str, Any] = {**options, **shortened(chosen, waited)} if waited else options
-            params = self._said(command, left, touches, stops_seen, stop)
-            if sequence is not None:
-                params["sequence"] = sequence
-            asked = link.ask("request", params, writes=command.writes, node=self, command=command)
-            value: T = value_of(await link.answer(asked, left.get("finish_within")))
-            return value
-        finally:
-            if waits:
-                room.give_back()
-
-    def exclusive(self, *, max_hold: float = 0.5) -> AbstractAsyncContextManager[Requester]:
-        """Return, for `async with`, this node for one sequence of requests: see `Requester.exclusive`.
-
-        The line is held no longer than the connection lasts.
-        """
-        return held_remotely(self, self._bus, checked_hold(max_hold, self.label))
-
-    def _said(
-        self,
-        command: Command[Any],
-        options: Mapping[str, Any],
-        touches: Command[Any] | None,
-        stops_seen: int | None,
-        stop: bool,
-    ) -> dict[str, Any]:
-        params: dict[str, Any] = {
-            "protocol": self._profile.name,
-            "address": self._address,
-            "command": self._protocol.write_down(command),
-            "asked": self._bus.now(),
-        }
-        if touches is not None:
-            params["touches"] = self._protocol.write_down(touches)
-        if stops_seen is not None:
-            params["stops_seen"] = stops_seen
-        if stop:
-            params["stop"] = True
-        if options:
-            given = {name: value for name, value in options.items() if value is not None}
-            params["options"] = {name: given[name] for name in given if name not in LEFT_OUT}
-        return params
-
-    def said_check(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
-        """Return writes of this node as the line is asked whether it would take them."""
-        said = [self._protocol.write_down(command) for command in commands]
-        return {"protocol": self.profile.name, "address": self.address, "commands": said, "stop": stop}
 
 
 class RemoteBus:
@@ -229,7 +79,7 @@ class RemoteBus:
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
         """Those of them of which the owner knows."""
-        self._groups: dict[int, RemoteGroup] = {}
+        self._streams: dict[int, RemoteGroup | RemoteOverview] = {}
         self._count = 0
         self._sequences = 0
         self.room = Room(self.now)
@@ -381,7 +231,8 @@ class RemoteBus:
         node, profile = point.node, point.node.profile
         addresses = (node.address,) if profile.broadcast is None else (node.address, profile.broadcast)
         touched = [self._touched.get((profile.name, address), -inf) for address in addresses]
-        snapshots = [group.latest for group in self._groups.values() if group.own and group.latest is not None]
+        groups = [stream for stream in self._streams.values() if isinstance(stream, RemoteGroup)]
+        snapshots = [group.latest for group in groups if group.own and group.latest is not None]
         samples = [snapshot.samples[point] for snapshot in snapshots if point in snapshot.samples]
         good = (one for one in samples if one.error is None and one.started is not None and one.started > max(touched))
         return max(good, key=lambda one: one.finished, default=None)
@@ -406,12 +257,19 @@ class RemoteBus:
             self.link.ask("events", {"stream": 0})
         return stream
 
+    async def overview(self, hear: Callable[[str, Mapping[str, Any]], None]) -> RemoteOverview:
+        """Have `hear` told what a person sees of the line, some times a second, as docs/service.md has it."""
+        self._count += 1
+        overview = self._streams[self._count] = RemoteOverview(self.link, self.now, hear)
+        await self._ask("overview", {"stream": self._count})
+        return overview
+
     def end_stream(self, number: int) -> None:
         """Have a stream told no more."""
-        group = self._groups.pop(number, None)
-        if group is not None:
+        stream = self._streams.pop(number, None)
+        if stream is not None:
             self.link.tell("end", {"stream": number})
-            group.end()
+            stream.end()
 
     # inside
 
@@ -425,7 +283,7 @@ class RemoteBus:
         self._count += 1
         number = self._count
         group = RemoteGroup(name, points, find=self.find, end=partial(self.end_stream, number))
-        self._groups[number] = group
+        self._streams[number] = group
         said = said_points(points)
         try:
             while len(said) > POINTS_IN_A_MESSAGE:
@@ -451,12 +309,12 @@ class RemoteBus:
             for stream in self._events:
                 if event is not None:
                     stream.put(event)
-        elif (group := self._groups.get(params.get("stream", -1))) is not None:
-            group.hear(method, params)
+        elif (listener := self._streams.get(params.get("stream", -1))) is not None:
+            listener.hear(method, params)
 
     def _lost(self) -> None:
-        for group in list(self._groups.values()):
-            group.end()
-        self._groups.clear()  # what is written from now on is not heard of any more
+        for listener in list(self._streams.values()):
+            listener.end()
+        self._streams.clear()  # what is written from now on is not heard of any more
         for stream in list(self._events):
             stream.close()

@@ -7,6 +7,7 @@ import logging
 import os
 import socket
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
@@ -35,6 +36,7 @@ from busmaster.service.messages import (
     written,
 )
 from busmaster.service.outbox import Outbox
+from busmaster.service.overview import Journal, Overview, state_text
 from busmaster.service.peers import Peer, find_name, process_of
 from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
@@ -61,8 +63,9 @@ class Service:
     keeps a record in the log "busmaster.audit", and lets this user write and others read. `mode` and `group`, a number,
     are the socket's. `listen` is a host and a port where programs may come by TCP too: off this machine only where the
     gate knows tokens. Each program takes turns with the others and with this one; `share`, 0.1 to 10, weighs its line
-    time: with 0.5, half as much as this one has, as long as both wait. Entering raises InvalidCommand where the socket
-    is served by another process, which it names, or cannot be made.
+    time: with 0.5, half as much as this one has, as long as both wait. `title` is written over what a person sees of
+    the line. Entering raises InvalidCommand where the socket is served by another process, which it names, or cannot be
+    made.
     """
 
     def __init__(
@@ -76,6 +79,7 @@ class Service:
         group: int | None = None,
         share: float = 1.0,
         listen: HostPort | None = None,
+        title: str = "",
     ) -> None:
         if isinstance(share, bool) or not LEAST_SHARE <= share <= MOST_SHARE:
             raise InvalidCommand(f"a program's share is a number from {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share!r}")
@@ -86,6 +90,10 @@ class Service:
             check_listening(listen, tokens=bool(self.gate.access.secrets))
         self.safe_wishes = SafeWishes(self.gate)
         self.name = name or line_name(bus.endpoint.name)
+        self.title = title or self.name
+        """What is written over what a person sees of the line."""
+        self.journal = Journal(bus)
+        """What happens from now on, also before it is entered."""
         self.refused = 0
         """Connections that were one too many, or that began with what no client says."""
         self._path = None if path is None else Path(path).absolute()
@@ -102,6 +110,7 @@ class Service:
         self.reception = Reception()
         self._groups: dict[PollGroup, GroupBroadcast] = {}
         self._events: EventBroadcast | None = None
+        self._overview: Overview | None = None
         self._points: dict[object, Point[Any]] = {}
         self._points_of: list[tuple[str, tuple[Point[Any], ...]]] = []
         self._log = logging.getLogger("busmaster.service")
@@ -160,6 +169,7 @@ class Service:
             served.__exit__(None, None, None)
             raise
         self.bus.on_stop.append(self._tell_stop)
+        self.journal.begin()
         self.bus.on_touched.append(self._tell_touched)
         self.gate.on_access.append(self._let_go)
         return self
@@ -180,10 +190,7 @@ class Service:
         for visit in visits:
             visit.bid_farewell()
         try:
-            async with asyncio.timeout(CLOSE_WITHIN):
-                await _closed(visits)
-        except TimeoutError:
-            pass  # one that does not listen
+            await _closed(visits)
         finally:
             for visit in visits:
                 visit.connection.abort()
@@ -193,6 +200,7 @@ class Service:
                     await asyncio.wait(self._leaving)
             finally:
                 self._served.__exit__(None, None, None)
+                await self.journal.close()
 
     # what clients share
 
@@ -207,6 +215,35 @@ class Service:
         if self._events is None:
             self._events = EventBroadcast(self.bus, self._end_events)
         return self._events
+
+    def overview(self) -> Broadcast:
+        """Return what tells what a person sees of the line."""
+        if self._overview is None:
+            self._overview = Overview(self.bus, self.gate, self.journal, lambda: self.title, self._end_overview)
+        return self._overview
+
+    def group(self, name: str) -> PollGroup:
+        """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
+        found = next((group for group in self.bus.groups if group.name == name), None)
+        if found is None:
+            names = ", ".join(group.name for group in self.bus.groups) or "none"
+            raise InvalidCommand(f"no poll group {name!r}; there are: {names}")
+        return found
+
+    def point(self, group: str, key: str) -> tuple[PollGroup, Point[Any]]:
+        """Return a point of a poll group, and the group. Raises InvalidCommand if there is none."""
+        found = self.group(group)
+        for point in found.points:
+            if point.key == key:
+                return found, point
+        raise InvalidCommand(f"poll group {group!r} has no point {key!r}")
+
+    def node(self, protocol: str, address: int) -> Node:
+        """Return a node that is on the line. Raises InvalidCommand if there is none."""
+        for node in self.bus.nodes:
+            if (node.profile.name, node.address) == (protocol, address):
+                return node
+        raise InvalidCommand(f"there is no node {address} of {protocol} on this line")
 
     def named(self, node: Node, places: Collection[Hashable]) -> Point[Any] | None:
         """Return the point of a poll group that reads these places of a node."""
@@ -226,6 +263,9 @@ class Service:
 
     def _end_events(self) -> None:
         self._events = None
+
+    def _end_overview(self) -> None:
+        self._overview = None
 
     def _tell_stop(self, record: NodeRecord) -> None:
         for client in self._clients:
@@ -357,10 +397,14 @@ class Service:
             "process": owner.pid,
             "read_only": self.gate.read_only or not client.permission.writes,
             "clients": len(self._clients),
+            "state": state_text(self.bus),
             "nodes": nodes,
         }
 
 
 async def _closed(visits: Iterable[Visit]) -> None:
-    for visit in visits:
-        await visit.connection.closed()
+    """Wait until connections are over, for CLOSE_WITHIN: there may be one that does not listen."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(CLOSE_WITHIN):
+            for visit in visits:
+                await visit.connection.closed()

@@ -26,8 +26,8 @@ class Reader(Protocol):
         """Say something of a stream; it is dropped where the client does not keep up."""
         ...
 
-    def tell_surely(self, stream: int, method: str, body: dict[str, Any]) -> None:
-        """Say something of a stream that replaces what was said of it before."""
+    def tell_surely(self, stream: int, method: str, body: str, part: int = 0) -> None:
+        """Say something of a part of a stream that replaces what was said of it before."""
         ...
 
 
@@ -59,17 +59,20 @@ class Broadcast:
 
     async def _run(self) -> None:
         try:
-            async for method, body in self._bodies():
-                for number, (reader, stream) in enumerate(list(self.readers)):
-                    if number and number % READERS_IN_A_TURN == 0:
-                        await asyncio.sleep(0)
-                    if (reader, stream) in self.readers:
-                        reader.tell(stream, method, body)
+            await self._tell()
         except Exception:  # a value that cannot be said, a mistake in an encoder: those who read it are told it ended
             logging.getLogger("busmaster.service").exception("a stream ended")
         self._on_end()
         for reader, stream in self.readers:
-            reader.tell_surely(stream, "ended", {})
+            reader.tell_surely(stream, "ended", "{}")
+
+    async def _tell(self) -> None:
+        async for method, body in self._bodies():
+            for number, (reader, stream) in enumerate(list(self.readers)):
+                if number and number % READERS_IN_A_TURN == 0:
+                    await asyncio.sleep(0)
+                if (reader, stream) in self.readers:
+                    reader.tell(stream, method, body)
 
     def _bodies(self) -> AsyncIterator[tuple[str, str]]:
         raise NotImplementedError
@@ -90,9 +93,9 @@ class GroupBroadcast(Broadcast):
         super().join(reader, stream)
 
     def _tell_points(self, *places: Place) -> None:
-        points = said_points(self._points)
+        body = encoded({"set": self._set, "points": said_points(self._points)})
         for reader, stream in places:
-            reader.tell_surely(stream, "points", {"set": self._set, "points": points})
+            reader.tell_surely(stream, "points", body)
 
     async def _bodies(self) -> AsyncIterator[tuple[str, str]]:
         stream = self.group.subscribe()

@@ -1,150 +1,253 @@
-"""The screen, drawn in a terminal of given size: what stands on it, and what its keys send."""
+"""The screen, drawn in a terminal of given size: what stands on it, and what its keys do to the line."""
 
 from __future__ import annotations
 
-import socket
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from typing import Any
 
-import msgspec
 import pytest
 from rich.cells import cell_len
+from textual.pilot import Pilot
 
-from busmaster.cli.live import COLUMNS, Screen, age_text, clock_text, column_widths, sparkline
-from busmaster.cli.messages import Action, Frame, GroupRow, NodeRow, Row, decode_action, decode_frame, encode
+from busmaster.cli.live import Screen
+from busmaster.cli.picture import Picture
+from busmaster.errors import WriteUnconfirmed
+from tests.cli.pictures import GROUP, node, row, tell, three_drives
 
-OUTPUTS = Row("node 5", "outputs", 0, writable=True)
-
-
-def frame(rows: int = 3, *, now: float = 61.0, paused: bool = False) -> Frame:
-    points = [Row(f"node {n}", "axis0.position", n + 0.5, "mm", 0.1) for n in range(1, rows)]
-    return Frame(
-        title="busmaster poll",
-        port="/dev/ttyUSB0  57600 8N1",
-        now=now,
-        line="ready",
-        utilisation=0.53,
-        backlog=2,
-        rows=(*points, Row("node 9", "axis0.position", None, "mm", 12.3, False, "no reply within 100 ms")),
-        nodes=(*(NodeRow(f"node {n}", "up", 10, 0, 0.0031, 0.004) for n in range(1, rows)), NodeRow("node 9", "down")),
-        groups=(GroupRow("axes", 0.2, 0.2, 0.2011, 61, 1, paused),),
-        events=("   3.1 s  node 9 is down, was suspect",),
-    )
+SIZES = [(60, 20), (80, 24), (120, 40)]
+sizes = pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
 
 
-def picture(screen: Screen) -> list[str]:
+class Wishes:
+    """A line that does nothing but remember what was wished, and fails where it is told to."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[Any, ...]] = []
+        self.error: Exception | None = None
+
+    async def pause(self, group: str, paused: bool, /) -> None:
+        self.said.append(("pause", group, paused))
+
+    async def demand(self, group: str, /) -> None:
+        self.said.append(("demand", group))
+
+    async def suspend(self, protocol: str, address: int, for_: float, /) -> None:
+        self.said.append(("suspend", protocol, address, for_))
+
+    async def details(self, group: str, key: str, /) -> Mapping[str, Any]:
+        timeline = {"queued": 1.0, "started": 1.004, "first_byte": 1.009, "last_byte": 1.012, "attempts": 1}
+        limit = {"name": "outputs", "minimum": 0, "maximum": 7, "max_step": None, "writable": True}
+        told = {"command": "read element 10", "hint": "", "low": None, "high": 5.5, "limits": [limit]}
+        return told | {"timeline": timeline | {"exchanges_ahead": 2, "settling_ahead": 0.0}}
+
+    async def write(self, group: str, key: str, value: Any, /) -> None:
+        self.said.append(("write", group, key, value))
+        if self.error is not None:
+            raise self.error
+
+
+@asynccontextmanager
+async def drawn(
+    picture: Picture, size: tuple[int, int] = (80, 24), *, read_only: bool = False
+) -> AsyncIterator[tuple[Screen, Wishes, Pilot[int]]]:
+    line = Wishes()
+    screen = Screen(picture, line, read_only=read_only)
+    async with screen.run_test(size=size) as pilot:
+        await pilot.pause()
+        yield screen, line, pilot
+
+
+def lines(screen: Screen) -> list[str]:
     return ["".join(segment.text for segment in strip) for strip in screen.screen._compositor.render_strips()]
 
 
+def table(screen: Screen) -> list[list[str]]:
+    """The words of the rows."""
+    return [line.split() for line in lines(screen) if line.startswith("node ")]
+
+
+@sizes
 @pytest.mark.asyncio
-async def test_the_picture_fits_80_by_24_and_says_what_the_frame_says() -> None:
-    screen = Screen(None)
-    async with screen.run_test(size=(80, 24)) as pilot:
-        screen.take_frame(frame())
-        await pilot.pause()
-        lines = picture(screen)
-    assert len(lines) == 24
-    assert {cell_len(line) for line in lines} == {80}
-    text = "\n".join(lines)
-    assert "busmaster poll  /dev/ttyUSB0  57600 8N1" in lines[0]
-    assert "0:01:01" in lines[0]
-    assert "53% busy  ready  2 waiting" in lines[1]
-    assert "axes every 200 ms, achieved 200.0 (p99 201.1)  cycle 61  missed 1" in lines[2]
-    assert "node 1    axis0.position" in text
-    assert "node 9 is down, was suspect" in text
-    assert "quit" in lines[-1]
-    dead = next(line for line in lines if line.strip().startswith("node 9") and "axis0" in line)
-    assert dead.split()[3:] == ["-", "mm", "12s", "down"]
-
-
-@pytest.mark.asyncio
-async def test_a_number_is_shown_with_as_many_digits_as_its_point_has() -> None:
-    screen = Screen(None)
-    async with screen.run_test(size=(80, 24)) as pilot:
-        rows = (Row("node 1", "speed", 12.3456, precision=1), Row("node 1", "pull", 12.3456))
-        screen.take_frame(msgspec.structs.replace(frame(), rows=rows))
-        await pilot.pause()
-        lines = [line.split() for line in picture(screen)]
-    assert [line[2:4] for line in lines if line[:2] == ["node", "1"]] == [["speed", "12.3"]]
-    assert [line[:2] for line in lines if line[:1] == ["pull"]] == [["pull", "12.3456"]]
-
-
-@pytest.mark.asyncio
-async def test_two_groups_may_hold_the_same_point_and_the_rows_may_change() -> None:
-    screen = Screen(None)
-    async with screen.run_test(size=(80, 24)) as pilot:
-        for rows in ((OUTPUTS, OUTPUTS), (OUTPUTS,), (Row("node 6", "inputs", 7), OUTPUTS)):
-            screen.take_frame(msgspec.structs.replace(frame(), rows=rows))
-        await pilot.pause()
-        lines = picture(screen)
-    assert [line.split()[2:4] for line in lines if line.startswith(" node ")] == [
-        ["inputs", "7"],
-        ["outputs", "0"],
+async def test_the_picture_fits_and_says_what_the_owner_says(size: tuple[int, int]) -> None:
+    nodes = (node(1), node(2), node(9, "down"))
+    async with drawn(tell(Picture(), *three_drives(), nodes=nodes), size) as (screen, _, _):
+        shown = lines(screen)
+        rows = table(screen)
+    width, height = size
+    assert len(shown) == height
+    assert {cell_len(line) for line in shown} == {width}
+    assert "busmaster poll  /dev/ttyUSB0  57600 8N1" in shown[0]
+    assert "0:01:01" in shown[0]
+    assert "53% busy  ready  2 waiting" in shown[1]
+    assert shown[2].startswith(" axes every 200 ms  missed 1  cycle 61")
+    assert [words[:3] for words in rows] == [
+        ["node", "1", "axis0.position"],
+        ["node", "2", "axis0.position"],
+        ["node", "9", "axis0.position"],
     ]
+    assert [words[-1] for words in rows] == ["up", "up", "down"]
+    assert rows[0][3:5] == ["1.5", "mm"]
+    assert rows[2][3:5] == ["!", "-"]
+    assert "node 9 is down, was suspect" in "\n".join(shown)
+    assert "quit" in shown[-1] or "leave" in shown[-1]
 
 
 @pytest.mark.asyncio
-async def test_columns_stay_aligned_when_values_change_and_the_terminal_grows() -> None:
-    screen = Screen(None)
-    async with screen.run_test(size=(80, 24)) as pilot:
-        screen.take_frame(frame())
+async def test_the_whole_of_a_wide_terminal_is_used_and_columns_stay_aligned() -> None:
+    picture = tell(Picture(), *three_drives())
+    async with drawn(picture) as (screen, _, pilot):
         await pilot.resize_terminal(120, 40)
-        for now in range(5):
-            screen.take_frame(frame(now=now))
         await pilot.pause()
-        lines = picture(screen)
-    header = next(line for line in lines if "VALUE" in line)
-    row = next(line for line in lines if "1.5" in line)
-    assert header.index("VALUE") + len("VALUE") == row.index("1.5") + len("1.5")
-    assert header.index("HEALTH") == row.index("up")
-    assert {cell_len(line) for line in lines} == {120}
+        shown = lines(screen)
+    header = next(line for line in shown if "VALUE" in line)
+    drawn_row = next(line for line in shown if "1.5" in line)
+    assert header.index("VALUE") + len("VALUE") == drawn_row.index("1.5") + len("1.5")
+    assert header.index("HEALTH") == drawn_row.index("up")
+    assert {cell_len(line) for line in shown} == {120}
 
 
 @pytest.mark.asyncio
-async def test_keys_send_actions_and_ctrl_c_is_told_from_quit() -> None:
-    ours, theirs = socket.socketpair()
-    theirs.setblocking(False)
-    screen = Screen(theirs)
-    with ours:
-        async with screen.run_test(size=(80, 24)) as pilot:
-            ours.sendall(encode(frame()))
-            while screen.frame is None:
-                await pilot.pause()
-            await pilot.press("p", "d", "ctrl+c")
+async def test_no_colour_gives_a_picture_in_the_terminals_own_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What stands out does so by its words, marks and weight."""
+    monkeypatch.setenv("NO_COLOR", "1")
+    nodes = (node(1), node(2), node(9, "down"))
+    async with drawn(tell(Picture(), *three_drives(), nodes=nodes)) as (screen, _, pilot):
+        for keys in ((), ("w",), ("escape", "question_mark")):
+            await pilot.press(*keys)
             await pilot.pause()
-        received = ours.recv(4096).splitlines()
-    assert list(map(decode_action, received)) == [
-        Action("pause"),
-        Action("demand"),
-        Action("interrupt"),
+            segments = [segment for strip in screen.screen._compositor.render_strips() for segment in strip]
+            colours = {part for one in segments if one.style for part in (one.style.color, one.style.bgcolor) if part}
+            assert {colour.name for colour in colours} <= {"default"}
+            assert "node 9" in "".join(lines(screen)) or keys
+
+
+@pytest.mark.asyncio
+async def test_only_colours_that_light_and_dark_grounds_both_show_are_used() -> None:
+    rows = (*three_drives(), row(3, quality="late"), row(4, quality="stale"))
+    nodes = (node(1), node(2, "suspect"), node(3, "suspended"), node(4, "unknown"), node(9, "down"))
+    async with drawn(tell(Picture(), *rows, nodes=nodes, utilisation=0.99, state="offline")) as (screen, _, _):
+        segments = [segment for strip in screen.screen._compositor.render_strips() for segment in strip]
+    colours = {part for one in segments if one.style for part in (one.style.color, one.style.bgcolor) if part}
+    assert {colour.name for colour in colours} <= {"default", "red", "magenta", "color(1)", "color(5)"}
+
+
+@pytest.mark.asyncio
+async def test_the_selection_stays_on_its_row_through_every_change() -> None:
+    picture = tell(Picture(), *three_drives())
+    async with drawn(picture) as (screen, _, pilot):
+        await pilot.press("down")
+        before = screen.table.selected
+        assert before is not None
+        assert before.name == "node 2 axis0.position"
+        changes: list[dict[str, Any]] = [{"set": 2}, {"set": 3}]
+        for number, change in enumerate(changes):
+            tell(picture, row(number + 3, "inputs", 1), row(number + 5, "inputs", 1), *three_drives(), **change)
+            screen.take_picture()
+            await pilot.pause()
+            now = screen.table.selected
+            assert now is not None
+            assert now.identity == before.identity
+        await pilot.press("o")
+        await pilot.resize_terminal(60, 20)
+        await pilot.press("slash", *"axis0", "enter")
+        await pilot.pause()
+        now = screen.table.selected
+        assert now is not None
+        assert now.identity == before.identity
+        assert len(table(screen)) == 3
+
+
+@pytest.mark.asyncio
+async def test_rows_are_filtered_by_words_and_ordered_by_trouble() -> None:
+    nodes = (node(1), node(2), node(9, "down"))
+    async with drawn(tell(Picture(), *three_drives(), nodes=nodes)) as (screen, _, pilot):
+        await pilot.press("slash", *"down axis0", "enter")
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["9"]
+        assert "filter: down axis0" in lines(screen)[-1]
+        await pilot.press("slash", *(["backspace"] * 10), "enter")
+        tell(screen.picture, *three_drives(), row(10, "inputs", alarm="high"), nodes=(*nodes, node(10)), set=2)
+        await pilot.press("o", "o", "o")
+        await pilot.pause()
+        assert [words[1] for words in table(screen)] == ["9", "10", "1", "2"]
+        assert "trouble" in lines(screen)[-1]
+
+
+@pytest.mark.asyncio
+async def test_an_offline_line_is_not_up() -> None:
+    async with drawn(tell(Picture(), *three_drives(), state="offline", losses=1)) as (screen, _, _):
+        shown = "\n".join(lines(screen))
+        assert [words[-1] for words in table(screen)] == ["offline"] * 3
+    assert "offline  2 waiting  lost 1 time" in shown
+
+
+@pytest.mark.asyncio
+async def test_a_paused_group_rests_and_is_not_late() -> None:
+    paused = {**GROUP, "paused": True}
+    async with drawn(tell(Picture(), *three_drives(), groups=(paused,), now=5000.0)) as (screen, _, _):
+        shown = lines(screen)
+    assert shown[2].startswith(" axes  paused  every 200 ms")
+    assert "rests up" in " ".join(next(line for line in shown if line.startswith("node 1")).split()).replace("3.1 ", "")
+
+
+@pytest.mark.asyncio
+async def test_a_value_that_could_not_be_read_came_late_or_left_its_limits_has_a_mark() -> None:
+    rows = (row(1, error="no reply"), row(2, quality="late"), row(3, alarm="high"), row(4, alarm="low"))
+    async with drawn(tell(Picture(), *rows, row(5, quality="stale"), row(6))) as (screen, _, _):
+        assert [words[3] for words in table(screen)] == ["!", "~", "↑", "↓", "?", "0"]
+
+
+@pytest.mark.asyncio
+async def test_many_groups_leave_room_for_the_points_and_that_of_the_row_is_shown() -> None:
+    groups = tuple({**GROUP, "name": f"group{number}"} for number in range(30))
+    async with drawn(tell(Picture(), row(group="group17"), groups=groups), (60, 20)) as (screen, _, _):
+        shown = lines(screen)
+    assert shown[2].startswith(" group17 every")
+    assert shown[3].startswith(" and 29 more groups")
+    assert any(line.startswith("node 5") for line in shown)
+
+
+@pytest.mark.asyncio
+async def test_keys_pause_poll_and_suspend_what_is_selected_or_all() -> None:
+    groups = (GROUP, {**GROUP, "name": "slow", "paused": True})
+    nodes = (node(5), node(6, "suspended"))
+    rows = (row(5), row(6, "inputs", group="slow"))
+    async with drawn(tell(Picture(), *rows, nodes=nodes, groups=groups)) as (_, line, pilot):
+        await pilot.press("p", "d", "P", "s", "n", "s", "y", "down", "p", "s", "y")
+        await pilot.pause()
+    assert line.said == [
+        ("pause", "axes", True),
+        ("demand", "axes"),
+        ("pause", "axes", True),
+        ("pause", "slow", True),
+        ("suspend", "hcp2", 5, 60.0),
+        ("pause", "slow", False),
+        ("suspend", "hcp2", 6, 0.0),
     ]
 
 
-class Recording(Screen):
-    """Keeps what would go through the socket."""
-
-    def __init__(self, connection: socket.socket | None) -> None:
-        super().__init__(connection)
-        self.sent: list[Action] = []
-
-    def send(self, action: Action) -> None:
-        self.sent.append(action)
-
-
-async def pressed(*keys: str, row: Row, read_only: bool = False) -> list[Action]:
-    """What the screen sends when these keys are pressed on that row."""
-    screen = Recording(None)
-    async with screen.run_test(size=(80, 24)) as pilot:
-        screen.take_frame(msgspec.structs.replace(frame(), rows=(row,), read_only=read_only))
+@pytest.mark.asyncio
+@pytest.mark.parametrize(("key", "status"), [("q", 0), ("ctrl+c", 130)])
+async def test_ctrl_c_is_told_from_leaving(key: str, status: int) -> None:
+    async with drawn(tell(Picture(), row())) as (screen, _, pilot):
+        await pilot.press(key)
         await pilot.pause()
+    assert screen.return_value == status
+
+
+async def pressed(*keys: str, point: Any, read_only: bool = False) -> list[tuple[Any, ...]]:
+    """What is wished of the line when these keys are pressed on that row."""
+    async with drawn(tell(Picture(), point), read_only=read_only) as (_, line, pilot):
         await pilot.press(*keys)
         await pilot.pause()
-    return screen.sent
+    return line.said
 
 
 @pytest.mark.asyncio
 async def test_a_value_is_written_once_it_was_asked_whether_it_is_meant() -> None:
-    assert await pressed("w", *"1", "full_stop", "5", "enter", "y", row=OUTPUTS) == [
-        Action("write", "node 5", "outputs", "1.5")
-    ]
+    written = await pressed("w", *"1", "full_stop", "5", "enter", "y", point=row())
+    assert written == [("write", "axes", "5/outputs", 1.5)]
 
 
 @pytest.mark.asyncio
@@ -159,57 +262,94 @@ async def test_a_value_is_written_once_it_was_asked_whether_it_is_meant() -> Non
     ],
 )
 async def test_a_value_that_was_not_confirmed_is_not_written(keys: tuple[str, ...]) -> None:
-    assert await pressed(*keys, row=OUTPUTS) == []
+    assert await pressed(*keys, point=row()) == []
 
 
 @pytest.mark.asyncio
 async def test_what_is_read_only_asks_for_no_value() -> None:
-    assert await pressed("w", "5", "enter", "y", row=OUTPUTS, read_only=True) == []
-    assert await pressed("w", "5", "enter", "y", row=Row("node 5", "inputs", 0)) == []
+    assert await pressed("w", "5", "enter", "y", point=row(), read_only=True) == []
+    assert await pressed("w", "5", "enter", "y", point=row(writable=False)) == []
 
 
 @pytest.mark.asyncio
-async def test_the_node_of_the_selected_row_is_suspended() -> None:
-    assert await pressed("s", row=OUTPUTS) == [Action("suspend", "node 5")]
+async def test_it_is_said_what_became_of_a_write() -> None:
+    async with drawn(tell(Picture(), row())) as (screen, line, pilot):
+        await pilot.press("w", "1", "enter", "y")
+        await pilot.pause()
+        assert "node 5 outputs = 1 written" in "\n".join(lines(screen))
+        line.error = WriteUnconfirmed("no reply within 100 ms")
+        await pilot.press("w", "2", "enter", "y")
+        await pilot.pause()
+        assert "node 5 outputs = 2: no reply within 100 ms" in "\n".join(lines(screen))
 
 
-def test_messages_come_back_as_they_were_sent() -> None:
-    assert decode_frame(encode(frame())) == frame()
-    assert decode_action(encode(Action("write", "node 5", "1", "2.5"))) == Action("write", "node 5", "1", "2.5")
-    assert encode(frame()).count(b"\n") == 1
+@sizes
+@pytest.mark.asyncio
+async def test_details_show_limits_and_the_last_exchange_of_a_point(size: tuple[int, int]) -> None:
+    async with drawn(tell(Picture(), row(value=3, unit="V")), size) as (screen, _, pilot):
+        await pilot.press("enter")
+        shown = ""
+        while "exchange" not in shown:
+            await pilot.pause()
+            shown = " ".join(" ".join(line.strip("│ ") for line in lines(screen)).split())
+        await pilot.press("escape")
+        assert len(screen.screen_stack) == 1
+    assert "node 5 outputs (5/outputs) value 3 V, asked for 0.1s ago" in shown
+    assert "limits written from 0 to 7; alarm high 5.5" in shown
+    assert "exchange waited 4.0 ms behind 2, reply after 5.0 ms, whole after 8.0 ms" in shown
 
 
-def test_the_narrowest_terminal_is_80_columns_and_wider_ones_are_used() -> None:
-    assert sum(COLUMNS.values()) + 2 * len(COLUMNS) == 80
-    for width in range(80, 114):
-        assert sum(column_widths(width).values()) + 2 * len(COLUMNS) == width
+@pytest.mark.asyncio
+@pytest.mark.parametrize("keys", [("w",), ("s",), ("slash",), ("enter",), ("question_mark",)])
+async def test_the_terminal_may_change_its_size_while_something_is_asked(keys: tuple[str, ...]) -> None:
+    async with drawn(tell(Picture(), *three_drives(), row()), (120, 40)) as (screen, line, pilot):
+        await pilot.press("end", *keys)
+        for size in ((60, 20), (80, 24), (40, 10), (120, 40)):
+            await pilot.resize_terminal(*size)
+            await pilot.pause()
+            assert {cell_len(shown) for shown in lines(screen)} == {size[0]}
+        await pilot.press("escape")
+        await pilot.pause()
+        assert len(screen.screen_stack) == 1
+        assert [words[1] for words in table(screen)] == ["1", "2", "9", "5"]
+    assert line.said == []
 
 
-def test_a_trend_spans_its_own_lowest_and_highest_and_shows_gaps() -> None:
-    assert sparkline([0.0, None, 1.0]) == "▁ █"
-    assert sparkline([5.0, 5.0]) == "▁▁"
-    assert sparkline([None, None]) == ""
+@pytest.mark.asyncio
+async def test_silence_of_the_owner_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with drawn(tell(Picture(), row())) as (screen, _, pilot):
+        screen.heard -= 10
+        screen.draw()
+        await pilot.pause()
+        assert "no news for 1" in lines(screen)[0]
+        screen.take_picture()
+        await pilot.pause()
+        assert "no news" not in lines(screen)[0]
 
 
-def test_ages_and_clocks_fit_their_columns() -> None:
-    assert [age_text(age) for age in (None, 0.04, 9.94, 12.3, 599, 6000)] == [
-        "-",
-        "0.0s",
-        "9.9s",
-        "12s",
-        "599s",
-        "100m",
-    ]
-    assert clock_text(3661.9) == "1:01:01"
+@pytest.mark.asyncio
+async def test_keys_do_nothing_before_there_is_a_picture() -> None:
+    async with drawn(Picture()) as (screen, line, pilot):
+        assert "waiting for the program that owns the line" in lines(screen)[0]
+        await pilot.press("p", "P", "d", "s", "w", "enter", "o", "up", "down", "end")
+        await pilot.pause()
+        assert len(screen.screen_stack) == 1
+    assert line.said == []
 
 
-def test_nothing_that_a_frame_says_is_obeyed_by_a_terminal() -> None:
+@pytest.mark.asyncio
+async def test_nothing_that_the_owner_says_is_obeyed_by_a_terminal() -> None:
     """A title, an error or a device's text with escape sequences in it is shown as text."""
     evil = "\x1b[2J\x9b31m\x07"
-    told = msgspec.structs.replace(
-        frame(), title=evil, line=evil, events=(evil,), rows=(Row(evil, evil, evil, evil, error=evil),)
-    )
-    drawn = decode_frame(encode(told))
-    shown = [drawn.title, drawn.line, *drawn.events, *(text for row in drawn.rows for text in (row.node, row.item))]
-    assert set(shown) == {r"\u001b[2J\u009b31m\u0007"}
-    assert all(str(field).isprintable() for row in drawn.rows for field in msgspec.structs.astuple(row))
+    point, held = row(5, evil, evil, unit=evil, error=evil, group=evil)
+    point["node"] = evil
+    nodes = (node(5, evil, label=evil),)
+    said = {"title": evil, "state": evil, "line": evil, "settings": evil, "events": [[1.0, evil]]}
+    groups = ({**GROUP, "name": evil},)
+    async with drawn(tell(Picture(), (point, held), nodes=nodes, groups=groups, **said)) as (screen, _, pilot):
+        for key in ("up", "enter"):
+            await pilot.press(key)
+            await pilot.pause()
+            shown = "".join(lines(screen))
+            assert shown.isprintable()
+            assert r"\u001b[2J" in shown

@@ -11,16 +11,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from fcntl import ioctl
 from pathlib import Path
 from struct import pack
 from termios import TIOCSWINSZ, tcgetattr
 
 import pytest
+import serial
 
-from busmaster.emulator.serve import TcpServer
-from tests.cli.conftest import ENVIRONMENT, ROOT, ended_once, started
+from busmaster.cli import demo
+from busmaster.cli.demo_line import make_line
+from busmaster.emulator.serve import TcpServer, serve_pty
+from tests.cli.conftest import ENVIRONMENT, ROOT, Command, ended_once, started
 from tests.patience import PATIENCE
 
 HCP2 = ("--protocol", "hcp2")
@@ -110,15 +113,26 @@ def test_the_demo_ends_by_itself_after_its_seconds() -> None:
     assert (done.returncode, "Traceback" in done.stderr) == (0, False)
 
 
+def test_the_demo_takes_another_terminal_where_one_is_taken(
+    busmaster: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with serve_pty(make_line()) as taken, serve_pty(make_line()) as free, serial.Serial(taken.path, exclusive=True):
+        paths = [taken.path, free.path]
+        monkeypatch.setattr(demo, "emulated_line", lambda: nullcontext(paths.pop(0)))
+        ran = busmaster("demo", "--seconds", "0.1", "--plain")
+    assert (ran.status, paths) == (0, [])
+    assert "in use" not in ran.err
+
+
 class Terminal:
     """A real pseudo-terminal of 80 by 24, and what was drawn on it."""
 
-    def __init__(self, *arguments: str) -> None:
+    def __init__(self, *arguments: str, program: tuple[str, ...] = ("-m", "busmaster")) -> None:
         self.master, slave = pty.openpty()
         ioctl(slave, TIOCSWINSZ, pack("HHHH", 24, 80, 0, 0))
         self.before = tcgetattr(slave)
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "busmaster", *arguments],
+            [sys.executable, *program, *arguments],
             cwd=ROOT,
             env=ENVIRONMENT | {"TERM": "xterm-256color", "PYTHONWARNINGS": ""},
             stdin=slave,

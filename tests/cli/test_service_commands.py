@@ -139,6 +139,11 @@ def test_run_serves_its_line_and_status_lists_it(busmaster: Command, file: Path,
         assert (said["name"], said["port"], said["process"]) == ("slitter", port, process.pid)
         assert (said["programs"], said["up"], said["nodes"], said["error"]) == (0, 1, 1, None)
         assert busmaster("status").lines[1].split()[:4] == ["slitter", port, str(process.pid), "0"]
+        controllers.close()
+        while (said := json.loads(busmaster("status", "--json").out))["state"] != "offline":
+            pass
+        assert (said["up"], said["nodes"]) == (0, 1)
+        assert busmaster("status").lines[1].split()[4:] == ["offline", "0/1"]
         process.terminate()
         process.communicate(timeout=PATIENCE)
     assert busmaster("status").out == ""
@@ -154,10 +159,26 @@ def test_a_line_whose_file_says_so_is_served_to_nobody(busmaster: Command, file:
         process.communicate(timeout=PATIENCE)
 
 
-def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_same(file: Path) -> None:
+@pytest.mark.parametrize("command", ["run", "serve"])
+def test_a_second_master_on_a_line_that_is_owned_is_refused(file: Path, command: str) -> None:
     with owner("serve", str(file)) as (process, _):
         ran = subprocess.run(
-            [sys.executable, "-m", "busmaster", "serve", str(file), "--seconds", "0.1"],
+            [sys.executable, "-m", "busmaster", command, str(file)],
+            check=False,
+            cwd=ROOT,
+            env=ENVIRONMENT,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+        )
+    assert ran.returncode == 1
+    assert f"is owned by process {process.pid}; end that first: two masters on one line garble each other" in ran.stderr
+
+
+def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_same(file: Path) -> None:
+    with owner("serve", str(file)) as (process, _), serve("hcp2", 1) as other:
+        ran = subprocess.run(
+            [sys.executable, "-m", "busmaster", "serve", str(file), "--port", other.path, "--seconds", "0.1"],
             check=True,
             cwd=ROOT,
             env=ENVIRONMENT,
@@ -281,7 +302,7 @@ def test_a_poll_whose_owner_ends_says_so(file: Path, controllers: TcpServer) -> 
         process.terminate()
         _, err = polling.communicate(timeout=PATIENCE)
         assert polling.returncode == 1
-        assert "the connection to the program that owns the line was lost" in err
+        assert "the program that owns the line has ended" in err
 
 
 def test_nothing_is_written_through_an_owner_unless_all_may_be(

@@ -11,11 +11,9 @@ from typing import Any
 
 import pytest
 
+from busmaster.arbiter.clients import LineClient
 from busmaster.bus.node import Node
 from busmaster.bus.requester import Priority
-from busmaster.cli.arguments import View
-from busmaster.cli.messages import Action
-from busmaster.cli.watching import Watch
 from busmaster.cli.write import pass_on, prepare
 from busmaster.config import ConfiguredLine, emulated_line
 from busmaster.config.sections import read
@@ -23,6 +21,7 @@ from busmaster.config.source import Source
 from busmaster.contract.exchange import Command
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BusError, InvalidCommand, Superseded
+from busmaster.gate.permission import EVERYTHING
 from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.outputs.mqtt_commands import Answer, Commands
 from busmaster.protocols.ct_ansi import codec as ct_ansi
@@ -32,6 +31,9 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
+from busmaster.service.errands import Errand
+from busmaster.service.peers import Process
+from busmaster.service.service import Service
 from busmaster.testing.virtual_time import run_in_virtual_time
 
 FILE = """
@@ -170,13 +172,28 @@ def by_mqtt(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     return write
 
 
+class Person:
+    """Who looks at the line, and writes by a key."""
+
+    peer = Process(1, 0, (), "busmaster")
+    permission = EVERYTHING
+
+    def node(self, name: str, address: int, /) -> Node:
+        raise AssertionError("a person names points")
+
+    def client_of(self, sequence: int | None, node: Node, /) -> LineClient:
+        return node.shared.add_client(1.0)
+
+    def stops_before(self, node: Node, /) -> int:
+        return 0
+
+
 def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
-        watch = Watch(plant.line.bus, "", View(plain=True), gate=plant.line.gate)
-        for group in plant.line.groups.values():
-            watch.add(group)
-        await watch.act(Action("write", "drive", name, str(value)))
-        raise_if(plant.records[-1].error)
+        params = {"group": "all", "key": f"drive/{name}", "value": value}
+        errand = Errand.of(params, Person(), Service(plant.line.bus, gate=plant.line.gate))
+        errand.begin(lambda _: None)
+        await errand.future
 
     return write
 

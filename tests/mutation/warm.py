@@ -14,7 +14,7 @@ import signal
 import sys
 import time
 
-LIBRARIES = ("anyio", "click", "hypothesis", "msgspec", "pytest", "pytest_asyncio", "pytest_timeout", "rich", "serial")
+LIBRARIES = ("anyio", "click", "hypothesis", "pytest", "pytest_asyncio", "pytest_timeout", "rich", "serial")
 LOOKS = 0.05
 """Seconds between two looks at a child."""
 

@@ -258,6 +258,18 @@ def test_one_message_of_each_program_is_taken_before_the_second_of_any() -> None
     assert len({turn for _, turn in taken}) == len(taken)
 
 
+def test_a_service_ends_though_a_connection_has_only_just_been_taken(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE):
+            async with served(tmp_path) as line:
+                with socket.socket(socket.AF_UNIX) as stranger:
+                    stranger.connect(line.address.removeprefix("unix:"))
+                    await until(lambda: line.service.strangers)  # its end is there, and not connected to it yet
+            assert line.service.strangers == 0
+
+    asyncio.run(run())
+
+
 def test_it_runs_on_uvloop_too(tmp_path: Path) -> None:
     uvloop = pytest.importorskip("uvloop")
 

@@ -392,19 +392,6 @@ def test_a_program_that_could_not_connect_leaves_no_error_that_nobody_hears(
     asyncio.run(run())
 
 
-def test_an_owner_that_stands_still_is_not_taken_for_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link, "CONNECT_WITHIN", 0.05)
-
-    async def run() -> None:
-        with socket.socket(socket.AF_UNIX) as silent:  # the kernel takes connections for it
-            silent.bind(f"{tmp_path}/line.sock")
-            silent.listen()
-            with pytest.raises(LineDown, match=r"a program serves .*line.sock, and has said nothing for 0.05 s; see"):
-                await connect(f"unix:{tmp_path}/line.sock").__aenter__()
-
-    asyncio.run(run())
-
-
 def test_an_owner_of_another_version_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def story(line: Served) -> None:
         monkeypatch.setattr(link, "VERSIONS", (99,))
@@ -412,6 +399,23 @@ def test_an_owner_of_another_version_says_so(tmp_path: Path, monkeypatch: pytest
             await connect(line.address).__aenter__()
 
     on_a_line(tmp_path, story)
+
+
+def test_a_program_that_has_the_line_and_stands_still_is_told_from_one_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.service.link.CONNECT_WITHIN", 0.05)
+    path = tmp_path / "line.sock"
+
+    async def run() -> None:
+        with pytest.raises(LineDown, match=r"that serves .*line.sock did not answer in 0.05 s; if it stands still"):
+            async with connect(f"unix:{path}"):
+                pass
+
+    with socket.socket(socket.AF_UNIX) as stopped:
+        stopped.bind(str(path))
+        stopped.listen()  # the system lets others in, and nobody looks
+        asyncio.run(run())
 
 
 def test_limits_and_the_safe_state_stay_with_the_owner(tmp_path: Path) -> None:

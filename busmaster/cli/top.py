@@ -1,0 +1,112 @@
+"""`busmaster top`: the live view of a line that another process owns."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from collections.abc import Mapping
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from busmaster.cli.app import FAILED
+from busmaster.cli.ending import until_ended
+from busmaster.cli.lines import is_line_file, load
+from busmaster.cli.picture import Picture
+from busmaster.cli.reaching import owner_of, token_for
+from busmaster.contract.profile import LineSettings
+from busmaster.errors import LineDown
+from busmaster.service.folder import find_owner, line_name, owners
+from busmaster.service.remote import connect
+from busmaster.transport.endpoints import endpoint, is_served
+
+if TYPE_CHECKING:
+    from busmaster.cli.live import Screen
+
+ANY_RATE = LineSettings(9600)
+"""Of a port whose owner is looked for: which rate it has is nothing to that."""
+TERMINAL_LOOKED_AT = 1.0
+"""Seconds between two looks at whether the terminal is still there."""
+
+
+@click.command(short_help="Show a line that another process owns, live.")
+@click.argument("line", required=False, metavar="[LINE|unix:PATH|PORT]")
+@click.option("--read-only", is_flag=True, help="No key writes to a node.")
+@click.option("--of-owner", is_flag=True, hidden=True, help="It is the view of the program that owns the line.")
+def command(line: str | None, read_only: bool, of_owner: bool) -> int:
+    """Show the points, groups and nodes of a line as they change, until q or Ctrl-C. The line goes on.
+
+    LINE is the name that `busmaster status` lists, its LINE.toml or its port; without it, the one line that runs.
+    Several may look at once. Keys pause a group, suspend a node and write a value: the key ? lists them.
+    """
+    if missing := what_is_missing():
+        raise click.UsageError(f"the live view needs {missing}")
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise click.UsageError("top draws on a terminal: for values in a file or a pipe see busmaster poll and read")
+    return until_ended(top, address_of(line), read_only, of_owner)
+
+
+def what_is_missing() -> str:
+    """Return what is to be installed for the live view, "" for nothing."""
+    extras = {"textual": "tui", "websockets": "service"}
+    missing = [extra for module, extra in extras.items() if find_spec(module) is None]
+    return f"an extra: pip install 'busmaster[{','.join(missing)}]'" if missing else ""
+
+
+def address_of(line: str | None) -> str:
+    """Return the address of the line that is meant. Raises LineDown if none runs, UsageError if it is not clear."""
+    if line is None:
+        running = [owner for owner in owners() if os.access(owner.socket, os.W_OK)]
+        if not running:
+            raise LineDown("no line of this user is served", hint="start busmaster run LINE.toml")
+        if len(running) > 1:
+            names = ", ".join(owner.name for owner in running)
+            raise click.UsageError(f"several lines run: say which, one of {names}")
+        return running[0].address
+    if is_served(line):
+        return line
+    if not is_line_file(line):
+        owner = find_owner(line) or owner_of(endpoint(line, defaults=ANY_RATE))
+        return line if owner is None else owner.address  # for what is said of a name that nobody has
+    owner = find_owner(line_name(os.path.basename(line).removesuffix(".toml"))) or owner_of(load(line).port)
+    if owner is None:
+        raise LineDown(f"no program of this user serves the line of {line}", hint=f"start busmaster run {line}")
+    return owner.address
+
+
+async def top(address: str, read_only: bool = False, of_owner: bool = False) -> int:
+    """Show a line until the person leaves, and return the exit status. Raises LineDown when its owner is gone."""
+    from busmaster.cli.live import Screen
+
+    picture = Picture()
+    screen: Screen | None = None
+
+    def hear(method: str, body: Mapping[str, Any]) -> None:
+        picture.hear(method, body)
+        if method == "frame" and screen is not None:
+            screen.take_picture()
+
+    async with connect(address, token=token_for(address)) as remote:
+        overview = await remote.overview(hear)
+        leave = "end the run" if of_owner else "leave"
+        screen = Screen(picture, overview, read_only=read_only or remote.about["read_only"], leave=leave)
+        ended = asyncio.ensure_future(overview.over())
+        looking = asyncio.ensure_future(hang_up(screen))
+        ended.add_done_callback(lambda _: screen.exit(FAILED))  # the terminal is given back, then it is said why
+        try:
+            status = await screen.run_async()
+            if ended.done():
+                await ended
+        finally:
+            ended.cancel()
+            looking.cancel()
+    return FAILED if status is None else status
+
+
+async def hang_up(screen: Screen) -> None:
+    """End the screen when its terminal is gone: nothing that is read there says so."""
+    while os.isatty(sys.stdin.fileno()):  # noqa: ASYNC110  nobody tells it
+        await asyncio.sleep(TERMINAL_LOOKED_AT)
+    screen.exit(FAILED)
