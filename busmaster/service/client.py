@@ -167,6 +167,8 @@ class Client:
                 for command in params["commands"]:
                     Errand.of({**params, "command": command}, self, self._line).check()
                 return None
+            case "now":
+                return self._line.bus.now()
             case "statistics":
                 return said_statistics(self._line.bus.statistics())
             case "groups":

@@ -301,3 +301,17 @@ def test_a_program_of_a_machine_with_another_clock_reads_and_writes_by_the_owner
             assert await point.read(max_age=PATIENCE) == 3
 
     on_a_port(tmp_path, story)
+
+
+def test_a_program_that_was_busy_while_it_connected_writes_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = [60.0]  # by so much it heard the first that the owner said of its clock
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + (late.pop() if late else 0))
+    monkeypatch.setattr("busmaster.service.remote.time", clock)
+
+    async def story(line: Served, address: str) -> None:
+        async with connect(address, token=SECRETS["hmi"]) as remote:
+            await Hcp2Controller(remote, 5).write(1, 3)
+
+    on_a_port(tmp_path, story)
