@@ -185,6 +185,11 @@ class Protocol:
         if kind is None:
             raise InvalidCommand(f"{self.name} has no command {name!r}: use {', '.join(self.commands)}")
         arguments = {key: _frozen(value) for key, value in written.items() if key != "command"}
+        parts = dict(_parts_of(kind))
+        needed = {part for part, default in parts.items() if default is dataclasses.MISSING}
+        if not needed <= arguments.keys() <= parts.keys():
+            wrong = ", ".join(sorted(needed - arguments.keys() | arguments.keys() - parts.keys()))
+            raise InvalidCommand(f"{self.name}: {name} has the arguments {', '.join(parts)}: look at {wrong}")
         for part in _options_of(kind):
             # An option has one form: neither a number nor a text stands for true.
             if not isinstance(arguments.get(part, False), bool):

@@ -19,7 +19,7 @@ from busmaster.contract.arguments import seconds, whole_number
 from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
 from busmaster.gate.permission import Permission
 from busmaster.service.errands import Errand, Line
-from busmaster.service.failures import said_error
+from busmaster.service.failures import misfit, said_error
 from busmaster.service.messages import (
     MOST_CHECKED,
     MOST_HOLDS,
@@ -62,8 +62,8 @@ class Client:
         self._groups: dict[int, PollGroup] = {}
         self._turn = line.bus.shared.add_client(line.share)
         """What its requests take turns by, with those of the others."""
-        self._holds: dict[int, Hold] = {}
-        """Its sequences that nobody comes between, by the number that it gave them."""
+        self._holds: dict[int, Hold | str] = {}
+        """Its sequences that nobody comes between, by the number that it gave them; or why one could not be begun."""
         self._gathered: dict[int, list[Point[Any]]] = {}
         """Points for poll groups that it will make, by the streams of those."""
         self._log = logging.getLogger("busmaster.service")
@@ -135,7 +135,7 @@ class Client:
         except (BusError, InvalidCommand, Malformed) as error:
             self._refuse(number, error)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            self._refuse(number, InvalidCommand(f"{method}: {type(error).__name__}: {error}"))
+            self._refuse(number, misfit(method, error))
         else:
             self._say({"id": number, "result": answer})
 
@@ -167,6 +167,8 @@ class Client:
                 for command in params["commands"]:
                     Errand.of({**params, "command": command}, self, self._line).check()
                 return None
+            case "now":
+                return self._line.bus.now()
             case "statistics":
                 return said_statistics(self._line.bus.statistics())
             case "groups":
@@ -259,7 +261,7 @@ class Client:
         except (BusError, InvalidCommand) as error:
             self._refuse(number, error)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            self._refuse(number, InvalidCommand(f"request: {type(error).__name__}: {error}"))
+            self._refuse(number, misfit("request", error))
         else:
             self._errands[number] = errand
 
@@ -285,7 +287,7 @@ class Client:
         except InvalidCommand as error:
             self._refuse(number, error)
         except (KeyError, TypeError, ValueError) as error:
-            self._refuse(number, InvalidCommand(f"safe: {type(error).__name__}: {error}"))
+            self._refuse(number, misfit("safe", error))
         else:
             sending.add_done_callback(partial(self._safe_sent, number))
 
@@ -312,24 +314,34 @@ class Client:
         if sequence is None:
             return self._turn
         hold = self._holds.get(sequence)
+        if isinstance(hold, str):
+            raise InvalidCommand(hold)
         if hold is None or hold.node is not node.record:
             raise InvalidCommand(f"{node.label}: no sequence {sequence} was begun for it, of {MOST_HOLDS} at most")
         return hold
 
     def _hold(self, params: Mapping[str, Any]) -> None:
-        """Begin a sequence; the requests of one that cannot be begun are refused."""
+        """Begin a sequence; the requests of one that cannot be begun are told why."""
         number = params.get("sequence")
-        if isinstance(number, int) and number not in self._holds and len(self._holds) < MOST_HOLDS:
+        if isinstance(number, int) and not isinstance(self._holds.get(number), Hold) and len(self._holds) < MOST_HOLDS:
             try:
-                node = self.node(params["protocol"], params["address"])
-                if self.permission.reaches(node):  # who may only read keeps nobody waiting so
-                    self._holds[number] = node.hold(seconds(params["max_hold"], "max_hold"), self._turn)
-            except (InvalidCommand, KeyError):
-                self._log.debug("%s cannot hold the line so: %s", self.peer, params)
+                self._holds[number] = self._begin_hold(params)
+            except InvalidCommand as error:
+                self._holds[number] = str(error)
+            except KeyError as missing:
+                self._holds[number] = f"a sequence is held with protocol, address and max_hold: {missing} is missing"
+
+    def _begin_hold(self, params: Mapping[str, Any]) -> Hold:
+        node = self.node(params["protocol"], params["address"])
+        if not self.permission.reaches(node):  # who may only read keeps nobody waiting so
+            raise InvalidCommand(
+                f"{node.label}: {self.permission.who} may not hold the line for it: who may write to it does"
+            )
+        return node.hold(seconds(params["max_hold"], "max_hold"), self._turn)
 
     def _release(self, sequence: int) -> None:
         hold = self._holds.pop(sequence, None)
-        if hold is not None:
+        if isinstance(hold, Hold):
             self._line.bus.shared.release(hold)
 
     # streams

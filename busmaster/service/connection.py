@@ -300,11 +300,14 @@ class AskingConnection(Connection):
 
     @property
     def complaint(self) -> str | None:
-        """Return why the other end did not let us in, or let go of us, as far as it has said so."""
+        """Return why the other end cannot be spoken with, None as long as it can."""
+        return None if self._core.handshake_exc is None else str(self._core.handshake_exc)
+
+    @property
+    def farewell(self) -> str:
+        """Return why the other end let go of us, "" as long as it has not said so."""
         said = self._core.close_rcvd
-        if self._core.handshake_exc is not None:
-            return str(self._core.handshake_exc)
-        return None if said is None else said.reason
+        return "" if said is None else said.reason
 
     @property
     def owner_ended(self) -> bool:

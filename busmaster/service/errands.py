@@ -235,7 +235,12 @@ class Errand:
             if refusal := self._line.gate.refusal(wish):
                 raise InvalidCommand(f"{self.node.label}: {refusal}")
             if (age := self._line.bus.now() - self._asked) > FRESH:
-                raise NotStarted(f"it came {age:.1f} s after it was asked for", node=self.node, command=self.text)
+                raise NotStarted(
+                    f"it came {age:.1f} s after it was asked for",
+                    node=self.node,
+                    command=self.text,
+                    hint="see whether the program that asked, or the one that owns the line, stood still meanwhile",
+                )
             value = await self.node.followed_request(
                 self.command,
                 self.journey,

@@ -27,6 +27,12 @@ def said_error(error: Exception) -> dict[str, Any]:
     return {"code": INTERNAL, "message": f"{type(error).__name__}: {error}"}
 
 
+def misfit(method: str, error: Exception) -> InvalidCommand:
+    """Return the error for a request whose parameters are none of its method's."""
+    what = f"{error} is missing" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
+    return InvalidCommand(f"{method}: {what}; service.schema.json has its parameters")
+
+
 def error_data(error: BusError, depth: int = 0) -> dict[str, Any]:
     """Return the class of an error by the nearest name that every client knows, and its fields."""
     name = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in KNOWN), "BusError")

@@ -173,8 +173,11 @@ class ServedSocket:
             except BlockingIOError:
                 os.close(self._lock)
                 other = _read(self._line)
-                who = f"process {other.pid}, for {other.port}" if other is not None else "another process"
-                raise InvalidCommand(f"{self._path} is served already by {who}: use it, or end that first") from None
+                who = "another process" if other is None else f"process {other.pid}, for {other.port}"
+                mend = "use it, or end that first"
+                if other is not None and _device(other.port) != _device(self.owner.port):
+                    mend = "call this line something else, after which its socket is named"
+                raise InvalidCommand(f"{self._path} is served already by {who}: {mend}") from None
             os.close(self._lock)
         os.ftruncate(self._lock, 0)
         os.write(self._lock, json.dumps(asdict(self.owner)).encode())

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections import deque
 from collections.abc import Callable, Mapping
+from http import HTTPStatus
 from typing import Any
 
 from busmaster.contract.arguments import host_and_port
@@ -110,10 +112,11 @@ class Link:
                     await loop.create_connection(self._connect, *place)
                 said: dict[str, Any] = await hello.future
         except BaseException as error:
-            connection = self._connection
+            hello.future.cancel()  # nobody hears any more what becomes of it
+            shut = self._shut(where, error)
             await self.close()
-            if isinstance(error, OSError) or (connection is not None and connection.complaint is not None):
-                raise _unreachable(where, error, connection, shown=self._token is not None) from error
+            if shut is not None:
+                raise shut from error
             raise
         return said
 
@@ -202,6 +205,28 @@ class Link:
 
     # inside
 
+    def _shut(self, where: str, error: BaseException) -> LineDown | None:
+        """Return why nobody let us in, None where it is not the other end's doing."""
+        connection = self._connection
+        status = None if connection is None else connection.status
+        farewell = "" if connection is None else connection.farewell
+        complaint = None if connection is None else connection.complaint
+        if status == HTTPStatus.UNAUTHORIZED:
+            what = f"{where} {'wants a token' if self._token is None else 'does not know this token'}"
+            return LineDown(what, hint="its owner has the tokens in a file, see [service] of LINE.toml")
+        if status == HTTPStatus.SERVICE_UNAVAILABLE:
+            return LineDown(f"{where} has too many programs already", hint="end one, see busmaster status")
+        if farewell:
+            return LineDown(f"{where} does not let this program in: {farewell}", hint="see busmaster status")
+        if connection is not None and isinstance(error, TimeoutError):
+            what = f"the program that serves {where} did not answer in {CONNECT_WITHIN:g} s"
+            return LineDown(what, hint="if it stands still, end it: the line is its own as long as it is there")
+        if complaint is None and isinstance(error, OSError) and not isinstance(error, BusError):
+            complaint = os.strerror(error.errno) if error.errno else str(error) or "it does not answer"
+        if complaint is None:
+            return None
+        return LineDown(f"no program serves {where}: {complaint}", hint="start busmaster run, or see busmaster status")
+
     def _takes_more(self) -> bool:
         return self._is_open and self._connection is not None and not self._connection.full
 
@@ -262,18 +287,3 @@ def _where(address: str) -> tuple[str, tuple[str, int] | None]:
         return socket_path(address), None
     text = address.removeprefix(TCP).rstrip("/")
     return text, host_and_port(text)
-
-
-def _unreachable(where: str, error: BaseException, connection: AskingConnection | None, *, shown: bool) -> LineDown:
-    match None if connection is None else connection.status:
-        case 401:
-            what = "does not know this token" if shown else "wants a token"
-            return LineDown(f"{where} {what}", hint="its owner has the tokens in a file, see [service] of LINE.toml")
-        case 503:
-            return LineDown(f"{where} has too many programs already", hint="end one, see busmaster status")
-    if isinstance(error, TimeoutError):
-        what = f"the program that serves {where} did not answer in {CONNECT_WITHIN:g} s"
-        return LineDown(what, hint="if it stands still, end it: the line is its own as long as it is there")
-    complaint = None if connection is None else connection.complaint
-    why = complaint or getattr(error, "strerror", None) or str(error) or "it does not answer"
-    return LineDown(f"no program serves {where}: {why}", hint="start busmaster run, or see busmaster status")

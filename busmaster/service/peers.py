@@ -6,7 +6,7 @@ import asyncio
 import pwd
 import socket
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from busmaster.gate.permission import Access, Permission
@@ -76,6 +76,8 @@ class Holder:
 
     token: str
     address: str
+    digest: bytes | None = field(default=None, repr=False)
+    """Of the token that was shown: another of the same name does not stand for it."""
 
     @property
     def short(self) -> str:
@@ -83,7 +85,7 @@ class Holder:
 
     def may_stay(self, access: Access) -> bool:
         """Return whether the token still holds; without one, whether none is needed."""
-        return self.token in access.secrets if self.token else not access.secrets
+        return access.secrets.get(self.token) == self.digest if self.token else not access.secrets
 
     def permission(self, access: Access) -> Permission:
         """Return what whoever has the token may do."""
@@ -100,10 +102,10 @@ def process_of(connected: Any) -> Process:
     return Process(pid, uid, (gid, *_more_groups(connected)), program_name(pid))
 
 
-def holder_of(connected: Any, token: str) -> Holder:
-    """Return who has connected by TCP with a token of this name."""
+def holder_of(connected: Any, token: str, digest: bytes | None) -> Holder:
+    """Return who has connected by TCP with a token of this name and digest."""
     host, port, *_ = connected.getpeername()
-    return Holder(token, f"{host}:{port}")
+    return Holder(token, f"{host}:{port}", digest)
 
 
 def _more_groups(connected: Any) -> tuple[int, ...]:

@@ -39,6 +39,8 @@ from busmaster.service.telling import (
 T = TypeVar("T")
 EVENT_BUFFER = 256
 POINTS_IN_A_MESSAGE = 50
+CLOCK_IS_HEARD = 3
+"""How often, as this program, which is beginning, may be busy elsewhere when it is: its writes would seem old."""
 
 
 def connect(address: str, *, token: str | None = None) -> RemoteBus:
@@ -74,7 +76,7 @@ class RemoteBus:
         """What the owner says of the line: its name, settings and process."""
         self._link: Link | None = None
         self._ahead = 0.0
-        """Seconds by which the clock of the owner's machine is ahead of this one, less what its hello took to come."""
+        """Seconds by which the clock of the owner's machine is ahead of this one, less what it took to hear that."""
         self._nodes: dict[tuple[str, int], RemoteNode] = {}
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
@@ -98,8 +100,6 @@ class RemoteBus:
         self._link = link
         said = await link.open(sys.argv[0])
         self.about, self.line = said, said["line"]
-        if self.address.startswith(TCP):  # another machine, perhaps: its clock began at another moment
-            self._ahead = said["now"] - time.monotonic()
         for known in said["nodes"]:
             node = self._nodes.get((known["protocol"], known["address"]))
             if node is not None:
@@ -107,6 +107,8 @@ class RemoteBus:
         for node in self._named:
             self._name(node)
         try:
+            if self.address.startswith(TCP):  # another machine, perhaps: its clock began at another moment
+                self._ahead = max([await self._hear_clock() for _ in range(CLOCK_IS_HEARD)])
             for node, commands, stop in self._prepared:
                 for first in range(0, len(commands), MOST_CHECKED):
                     await self._ask("check", node.said_check(commands[first : first + MOST_CHECKED], stop))
@@ -272,6 +274,11 @@ class RemoteBus:
             stream.end()
 
     # inside
+
+    async def _hear_clock(self) -> float:
+        """Return by how much the owner's clock is ahead: less by what it took to hear it, never more."""
+        now: float = await self._ask("now", {})
+        return now - time.monotonic()
 
     async def _ask(self, method: str, params: Mapping[str, Any], *, writes: bool = False) -> Any:
         asked = self.link.ask(method, params, writes=writes)

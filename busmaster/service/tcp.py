@@ -57,9 +57,9 @@ def holder(connected: socket.socket, shown: Sequence[str], access: Access) -> Ho
     """Return who has connected, by the Authorization headers that he shows; None where a token that is known is needed,
     and he shows none, or something else. None is needed where there are none."""
     if not shown and not access.secrets:
-        return holder_of(connected, "")
+        return holder_of(connected, "", None)
     if len(shown) != 1:
         return None
     kind, _, secret = shown[0].partition(" ")
     name = access.token_name(secret.strip()) if kind.lower() == "bearer" else None
-    return None if name is None else holder_of(connected, name)
+    return None if name is None else holder_of(connected, name, access.secrets[name])

@@ -143,10 +143,11 @@ def test_a_command_is_written_down_and_read_back(name: str, command: Command[Any
     [
         ({}, "hcp has no command None: use read, write"),
         ({"command": "erase"}, "hcp has no command 'erase'"),
-        ({"command": "read"}, "element"),
+        ({"command": "read"}, "hcp: read has the arguments element: look at element"),
         ({"command": "read", "element": 100}, "element"),
         ({"command": "read", "element": "1"}, "element"),
-        ({"command": "read", "element": 1, "node": 3}, "node"),
+        ({"command": "read", "element": 1, "node": 3}, "hcp: read has the arguments element: look at node"),
+        ({"command": "write"}, "write has the arguments element, values, idempotent: look at element, values"),
     ],
 )
 def test_what_was_written_down_is_checked_again(written: dict[str, object], complaint: str) -> None:

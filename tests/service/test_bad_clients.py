@@ -90,6 +90,7 @@ def test_a_write_that_took_long_to_come_is_not_sent(tmp_path: Path) -> None:
             said = await client.ask("request", **{**READ, "command": write}, asked=line.bus.now() - 5)
             assert said["error"]["data"]["error"] == "NotStarted"
             assert "it came 5.0 s after it was asked for" in said["error"]["message"]
+            assert "the line is busy" not in said["error"]["message"]
         assert [outcome for _, outcome in line.audit()] == ["not started"]
 
     on_a_line(tmp_path, story)
@@ -146,7 +147,7 @@ def test_garbage_ends_the_conversation_with_its_reason(said: str | bytes, compla
 @pytest.mark.parametrize(
     ("method", "params", "complaint"),
     [
-        ("request", {}, "protocol"),
+        ("request", {}, "request: 'protocol' is missing; service.schema.json has its parameters"),
         ("request", {**READ, "protocol": "profibus"}, "no such protocol"),
         ("request", {**READ, "address": 999}, "address 999 does not exist"),
         ("request", {**READ, "address": [5]}, "request: TypeError"),
@@ -367,8 +368,16 @@ def test_a_socket_that_is_served_names_its_process_and_one_of_a_dead_process_is_
     path = tmp_path / "a.sock"
     with (
         ServedSocket(Owner("a", "/dev/ttyUSB0", str(path), os.getpid())),
-        pytest.raises(InvalidCommand, match=rf"served already by process {os.getpid()}, for /dev/ttyUSB0"),
+        pytest.raises(
+            InvalidCommand, match=rf"by process {os.getpid()}, for /dev/ttyUSB0: call this line something else"
+        ),
         ServedSocket(Owner("a", "/dev/ttyUSB1", str(path), os.getpid())),
+    ):
+        pass
+    with (
+        ServedSocket(Owner("a", "/dev/ttyUSB0", str(path), os.getpid())),
+        pytest.raises(InvalidCommand, match="for /dev/ttyUSB0: use it, or end that first"),
+        ServedSocket(Owner("a", "/dev/ttyUSB0", str(path), os.getpid())),
     ):
         pass
     with socket.socket(socket.AF_UNIX) as left:

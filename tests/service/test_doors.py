@@ -167,6 +167,30 @@ def test_a_token_that_holds_no_more_ends_what_came_with_it_and_no_other(tmp_path
     on_a_port(tmp_path, story)
 
 
+def test_another_token_of_the_same_name_ends_what_came_with_the_old_one(tmp_path: Path) -> None:
+    async def story(line: Served, address: str) -> None:
+        async with connect(address, token=SECRETS["hmi"]) as gone, connect(address, token=SECRETS["logger"]) as stays:
+            line.gate.take_secrets({**TOKENS.secrets, "hmi": digest_of("a-newer-token-of-the-hmi")})
+            with pytest.raises(LineDown):
+                await Hcp2Controller(gone, 5).read(1)
+            assert await Hcp2Controller(stays, 5).read(1) == 0
+        async with connect(address, token="a-newer-token-of-the-hmi") as new:
+            assert await Hcp2Controller(new, 5).read(1) == 0
+
+    on_a_port(tmp_path, story)
+
+
+def test_who_may_not_hold_the_line_is_told_so(tmp_path: Path) -> None:
+    async def story(line: Served, address: str) -> None:
+        async with connect(address, token=SECRETS["logger"]) as remote:
+            async with Hcp2Controller(remote, 5).exclusive() as held:
+                with pytest.raises(InvalidCommand, match="node 5: token logger may not hold the line for it"):
+                    await held.read(1)
+            assert await Hcp2Controller(remote, 5).read(1) == 0
+
+    on_a_port(tmp_path, story)
+
+
 def test_a_token_is_for_tcp_and_is_one_word() -> None:
     with pytest.raises(InvalidCommand, match="takes no token"):
         connect("unix:/run/line.sock", token="a-token-of-the-hmi-0001")
@@ -275,5 +299,19 @@ def test_a_program_of_a_machine_with_another_clock_reads_and_writes_by_the_owner
             await anext(cycles)
             assert abs(remote.now() - line.bus.now()) < PATIENCE
             assert await point.read(max_age=PATIENCE) == 3
+
+    on_a_port(tmp_path, story)
+
+
+def test_a_program_that_was_busy_while_it_connected_writes_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = [60.0]  # by so much it heard the first that the owner said of its clock
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + (late.pop() if late else 0))
+    monkeypatch.setattr("busmaster.service.remote.time", clock)
+
+    async def story(line: Served, address: str) -> None:
+        async with connect(address, token=SECRETS["hmi"]) as remote:
+            await Hcp2Controller(remote, 5).write(1, 3)
 
     on_a_port(tmp_path, story)

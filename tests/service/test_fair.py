@@ -210,11 +210,16 @@ def test_a_program_holds_the_line_for_so_many_sequences_and_none_that_cannot_be(
                 pass
         async with raw(line) as client:
             read = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
-            for params in ({}, {"max_hold": 6.0}, {"max_hold": "x"}, {"max_hold": 1.0, "protocol": "none"}):
+            for params, complaint in (
+                ({}, "'max_hold' is missing"),
+                ({"max_hold": 6.0}, "held for 5 s at most"),
+                ({"max_hold": "x"}, "max_hold"),
+                ({"max_hold": 1.0, "protocol": "none"}, "no such protocol"),
+            ):
                 named = {"sequence": 1, "protocol": "hcp2", "address": 5, **params}
                 await client.say(method="hold", params=named)
                 said = await client.ask("request", **read, sequence=1)
-                assert "no sequence 1" in said["error"]["message"]
+                assert complaint in said["error"]["message"]
             for number in range(MOST_HOLDS + 1):
                 params = {"sequence": number, "protocol": "hcp2", "address": 5, "max_hold": 1.0}
                 await client.say(method="hold", params=params)

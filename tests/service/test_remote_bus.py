@@ -6,6 +6,7 @@ import asyncio
 import json
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -34,9 +35,10 @@ from busmaster.errors import (
     WriteUnconfirmed,
 )
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.service import link
 from busmaster.service.failures import error_of, said_error
 from busmaster.service.link import Link
-from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, served, until
+from tests.service.lines import ABSENT, PATIENT, Served, on_a_line, on_a_served_line, served, until
 
 TAKE = Link._take
 
@@ -362,8 +364,41 @@ def test_nobody_there_is_said_with_what_to_do(tmp_path: Path) -> None:
         with pytest.raises(InvalidCommand, match="no program of this user serves 'slitter'"):
             async with connect("slitter"):
                 pass
+        with socket.create_server(("127.0.0.1", 0)) as left:
+            port = left.getsockname()[1]
+        with pytest.raises(LineDown, match=f"no program serves 127.0.0.1:{port}: Connection refused; start"):
+            async with connect(f"tcp://127.0.0.1:{port}"):
+                pass
 
     asyncio.run(run())
+
+
+def test_a_program_that_could_not_connect_leaves_no_error_that_nobody_hears(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[link.Asked] = []
+    make = link.Asked
+
+    def kept(*arguments: Any) -> link.Asked:
+        asked.append(make(*arguments))
+        return asked[-1]
+
+    async def run() -> None:
+        monkeypatch.setattr(link, "Asked", kept)
+        with pytest.raises(LineDown):
+            await connect(f"unix:{tmp_path}/line.sock").__aenter__()
+        assert [one.future.cancelled() for one in asked] == [True]
+
+    asyncio.run(run())
+
+
+def test_an_owner_of_another_version_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(line: Served) -> None:
+        monkeypatch.setattr(link, "VERSIONS", (99,))
+        with pytest.raises(LineDown, match=r"does not let this program in: versions \[99\] are not spoken here, but"):
+            await connect(line.address).__aenter__()
+
+    on_a_line(tmp_path, story)
 
 
 def test_a_program_that_has_the_line_and_stands_still_is_told_from_one_that_is_not_there(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from typing import Any
 
 import pytest
 from jsonschema import Draft202012Validator
 
+from busmaster.registry import Protocol, protocols
 from tests.service import schema
 
 PAGE = (schema.PATH.parent / "service.md").read_text()
@@ -81,3 +83,14 @@ def test_what_an_owner_says_is_one_of_its_messages(said: dict[str, Any], right: 
     else:
         with pytest.raises(schema.ValidationError):
             schema.check_owner(said)
+
+
+@pytest.mark.parametrize("protocol", protocols(), ids=lambda protocol: protocol.name)
+def test_the_page_has_the_commands_of_every_protocol_with_their_arguments(protocol: Protocol) -> None:
+    said = []
+    for name, kind in protocol.commands.items():
+        arguments = [part for part in dataclasses.fields(kind) if part.init]  # type: ignore[arg-type]
+        needless = [part.default is not dataclasses.MISSING for part in arguments]
+        shown = [f"[{part.name}]" if left else part.name for part, left in zip(arguments, needless, strict=True)]
+        said.append(f"`{' '.join([name, *shown])}`")
+    assert f"| {protocol.name} | {', '.join(said)} |" in PAGE
