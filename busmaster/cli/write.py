@@ -39,7 +39,7 @@ Pairs = Sequence[tuple[str, tuple[float, ...]]]
     "--decimals",
     type=Whole(min=0),
     metavar="N",
-    help="mentor, ct-ansi: so many of a value's digits are behind its point, as in 1.17=-47.6 with 1.",
+    help="How many of the last digits on the line are behind the point, where it carries none: 1 for 1.17=-47.6.",
 )
 @json_option
 def command(
