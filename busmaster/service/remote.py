@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import AsyncIterator, Callable, Hashable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from types import TracebackType
 from typing import Any, TypeVar, Unpack
 
@@ -25,6 +26,7 @@ from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.planning.merging import Merge
 from busmaster.service.link import TCP, Asked, Link
 from busmaster.service.messages import MOST_CHECKED, said_timings, value_of
+from busmaster.service.remote_exchanges import RemoteExchanges
 from busmaster.service.remote_overview import RemoteOverview
 from busmaster.service.safe import outcomes_of
 from busmaster.service.telling import (
@@ -257,7 +259,7 @@ class RemoteBus:
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
         """Those of them of which the owner knows."""
-        self._streams: dict[int, RemoteGroup | RemoteOverview] = {}
+        self._streams: dict[int, RemoteGroup | RemoteOverview | RemoteExchanges] = {}
         self._count = 0
         self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
@@ -419,6 +421,13 @@ class RemoteBus:
         overview = self._streams[self._count] = RemoteOverview(self.link, self.now, hear)
         await self._ask("overview", {"stream": self._count})
         return overview
+
+    async def exchanges(self, hear: Callable[[Mapping[str, Any]], None]) -> RemoteExchanges:
+        """Have `hear` told what passes on the line, exchange by exchange, as docs/service.md has it."""
+        self._count += 1
+        exchanges = self._streams[self._count] = RemoteExchanges(hear, partial(self.end_stream, self._count))
+        await self._ask("exchanges", {"stream": self._count})
+        return exchanges
 
     def end_stream(self, number: int) -> None:
         """Have a stream told no more."""

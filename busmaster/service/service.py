@@ -22,6 +22,7 @@ from busmaster.contract.places import Placed
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
 from busmaster.service.client import Client
+from busmaster.service.exchanges import ExchangesBroadcast
 from busmaster.service.folder import Owner, ServedSocket, line_name, runtime_folder
 from busmaster.service.messages import (
     GOING_AWAY,
@@ -102,6 +103,7 @@ class Service:
         self._groups: dict[PollGroup, GroupBroadcast] = {}
         self._events: EventBroadcast | None = None
         self._overview: Overview | None = None
+        self._exchanges: ExchangesBroadcast | None = None
         self._points: dict[object, Point[Any]] = {}
         self._points_of: list[tuple[str, tuple[Point[Any], ...]]] = []
         self._log = logging.getLogger("busmaster.service")
@@ -202,6 +204,12 @@ class Service:
             self._overview = Overview(self.bus, self.gate, self.journal, lambda: self.title, self._end_overview)
         return self._overview
 
+    def exchanges(self) -> Broadcast:
+        """Return what tells what passes on the line."""
+        if self._exchanges is None:
+            self._exchanges = ExchangesBroadcast(self.bus, self._end_exchanges)
+        return self._exchanges
+
     def group(self, name: str) -> PollGroup:
         """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
         found = next((group for group in self.bus.groups if group.name == name), None)
@@ -246,6 +254,9 @@ class Service:
 
     def _end_overview(self) -> None:
         self._overview = None
+
+    def _end_exchanges(self) -> None:
+        self._exchanges = None
 
     def _tell_stop(self, record: NodeRecord) -> None:
         for client in self._clients:
