@@ -9,7 +9,7 @@ import pytest
 from busmaster.doors import following
 from busmaster.doors.following import Connected, Lost
 from busmaster.errors import InvalidCommand, LineDown, NotStarted
-from tests.doors.lines import assert_only_polled, followed, poll, shows
+from tests.doors.lines import assert_goes_on_alone, followed, poll, shows
 from tests.patience import PATIENCE
 from tests.service.lines import served, until
 
@@ -69,14 +69,13 @@ async def test_a_door_that_is_read_only_writes_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.asyncio
-async def test_doors_that_come_and_go_ask_nothing_of_the_line_and_leave_nothing(tmp_path: Path) -> None:
+async def test_doors_that_come_and_go_leave_nothing_with_the_line(tmp_path: Path) -> None:
     async with served(tmp_path) as line:
         poll(line)
         for _ in range(20):
             async with followed(tmp_path) as door:
                 await shows(door)
-        await line.alone()
-        assert_only_polled(line)
+        await assert_goes_on_alone(line)
 
 
 @pytest.mark.asyncio

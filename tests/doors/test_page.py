@@ -196,8 +196,10 @@ async def test_when_the_owner_goes_it_says_so_and_when_it_is_back_all_is_well(br
             assert "what is shown is old" in await asyncio.to_thread(browser.text, "#trouble")
 
 
-@pytest.mark.parametrize(("width", "height", "phone"), [(1400, 1000, False), (390, 844, True), (320, 640, True)])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(
+    ("width", "height", "phone", "scheme"),
+    [(1400, 1000, False, "light"), (1400, 1000, False, "dark"), (390, 844, True, "dark"), (320, 640, True, "light")],
+)
 @pytest.mark.asyncio
 async def test_forty_nodes_fit_any_width_light_and_dark(
     browser: Browser, tmp_path: Path, width: int, height: int, phone: bool, scheme: str

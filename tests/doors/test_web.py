@@ -21,7 +21,7 @@ from busmaster.doors.audience import MOST_EXCHANGES, Seat
 from busmaster.doors.web import LONGEST_BODY, PAGE, serving
 from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Access, Permission, digest_of
-from tests.doors.lines import HERE, ONE, Page, assert_only_polled, page, poll, shows
+from tests.doors.lines import HERE, ONE, Page, assert_goes_on_alone, page, poll, shows
 from tests.service.lines import Served, served, until
 
 NETWORK = ("192.0.2.7", 8420)
@@ -346,16 +346,14 @@ async def test_of_what_a_slow_page_has_not_taken_the_latest_of_each_is_told() ->
 
 
 @pytest.mark.asyncio
-async def test_doors_with_pages_that_come_and_go_ask_nothing_of_the_line_and_leave_nothing(tmp_path: Path) -> None:
+async def test_doors_with_pages_that_come_and_go_leave_nothing_with_the_line(tmp_path: Path) -> None:
     async with served(tmp_path) as line:
         poll(line)
         for _ in range(20):
             async with page(tmp_path) as of, stream_of(of) as stream:
                 await stream.send('{"exchanges":true}')
                 await hear(stream, "state", "rows")
-        await line.alone()
-        await until(lambda: not tapped(line))
-        assert_only_polled(line)
+        await assert_goes_on_alone(line)
 
 
 @pytest.mark.asyncio
