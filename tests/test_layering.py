@@ -31,13 +31,14 @@ MAY_IMPORT: dict[str, set[str]] = {
     "registry": {"registry", "bus.handle", "emulator.device", "emulator.traceable", "capture.decode"} | BASE,
     "gate": {"gate", "bus", "arbiter"} | BASE,
     "service": {"service", "gate", "registry", "bus", "arbiter", "planning", "outputs.values"} | BASE,
+    "doors": {"doors", "service", "gate.permission"} | BASE,
     "outputs": {"outputs", "gate", "bus", "arbiter", "files"} | BASE,
     "capture": {"capture", "wire", "registry", "arbiter.tap", "files"} | BASE,
     "doctor": {"doctor", "registry", "capture", "transport", "arbiter", "outputs.values"} | BASE,
     "discovery": {"discovery", "doctor", "registry", "config", "transport", "arbiter"} | BASE,
-    "config": ALL - {"capture", "testing", "cli", "protocols", "discovery"},
-    "testing": ALL - {"cli", "config", "protocols"},
-    "__init__": ALL - {"cli"},
+    "config": ALL - {"capture", "testing", "cli", "doors", "protocols", "discovery"},
+    "testing": ALL - {"cli", "config", "doors", "protocols"},
+    "__init__": ALL - {"cli", "doors"},
     "__main__": ALL,
     "cli": ALL - {"protocols"},
     "cli.demo": ALL,
@@ -68,9 +69,10 @@ OPEN: dict[str, set[str]] = {
     },
     "capture": {"decode", "files", "frames", "pcapng", "recorder", "replay", "telegrams"},
     "cli": {""},
-    "config": {"", "points_table", "points_taking", "rewriting"},
+    "config": {"", "points_table", "points_taking", "rewriting", "service"},
     "contract": {"arguments", "driver", "exchange", "items", "learning", "places", "profile", "timing"},
     "discovery": {"search", "steps", "writing"},
+    "doors": {"following", "web"},
     "doctor": {"adapters", "diagnosis", "examination", "probing", "uart"},
     "emulator": {"chance", "device", "faults", "line", "memory", "motion", "serve", "traceable"},
     "errors": {""},
@@ -79,7 +81,10 @@ OPEN: dict[str, set[str]] = {
     "outputs": {"base", "cells", "distributor", "settings", "values"},
     "planning": {"", "merging"},
     "registry": {""},
-    "service": {"folder", "remote", "remote_group", "service", "tcp"},
+    "service": {
+        *("folder", "messages", "picture", "remote", "remote_exchanges", "remote_group", "remote_overview", "service"),
+        "tcp",
+    },
     "transport": {
         *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "serial_port", "tcp"),
     },
@@ -280,8 +285,8 @@ def test_the_checks_see_an_import_inside_a_function_and_skip_one_for_types() -> 
 def test_what_the_core_may_import_outside_the_package_is_its_three_dependencies() -> None:
     """The extras stay optional: nothing below the command line and the outputs needs them."""
     optional = {"click", "rich", "textual", "aiomqtt", "prometheus_client", "matplotlib"}
-    optional |= {"websockets"}
-    holders = {"cli", "config", "capture", "doctor", "outputs", "service", "testing", "__main__"}
+    optional |= {"asyncua", "starlette", "uvicorn", "websockets"}
+    holders = {"cli", "config", "capture", "doctor", "doors", "outputs", "service", "testing", "__main__"}
     for module in modules():
         if module.split(".")[0] in holders:
             continue

@@ -17,6 +17,7 @@ from busmaster.arbiter.learned import Learning
 from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.state import EXCHANGE, READY
 from busmaster.arbiter.tap import Attempt
+from busmaster.arbiter.tapped import set_tapped
 from busmaster.arbiter.transaction import Poll, Transaction
 from busmaster.contract.learning import Learned, documented
 from busmaster.contract.profile import Profile
@@ -30,7 +31,6 @@ class Arbiter(LineMachine):
     `byte_time` is tau, in seconds. `echo`: what is sent is received too. `receive_latency`: seconds that received bytes
     may lie in an adapter. `capacity`: requests of one class that may wait. `jitter` returns numbers from 0 to 1, by
     which probes are spread. `strict`: answers that could be another's are held until that one would have come (R15).
-    `tapped`: `attempt` says what is on the wire, and the end of each attempt is an event.
     """
 
     name = ""
@@ -51,6 +51,10 @@ class Arbiter(LineMachine):
     def attempt(self) -> Attempt | None:
         """What is on the wire, on a line that is tapped."""
         return self.dispatcher.attempt
+
+    def set_tapped(self, tapped: bool) -> None:
+        """Have `attempt` say what is on the wire, and the end of each attempt be an event, from now on, or no more."""
+        set_tapped(self.dispatcher, tapped)
 
     def add_node(
         self,

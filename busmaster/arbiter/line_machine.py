@@ -36,6 +36,7 @@ from typing import Any, cast
 from busmaster.arbiter.choice import Choice
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
+from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.echo import Echo
 from busmaster.arbiter.events import CameUnasked, LineChange, LineChanged
 from busmaster.arbiter.health import DOWN
@@ -44,7 +45,6 @@ from busmaster.arbiter.leg import UNKNOWN_LATENESS, Leg
 from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.state import EXCHANGE, HOLDOFF, OFFLINE, READY, SETTLING, LineState
-from busmaster.arbiter.tapped import make_dispatcher
 from busmaster.arbiter.trust import COLLIDED, TOO_EARLY, TWO_ANSWERS, Trust, damaged
 from busmaster.arbiter.unasked import LOOK_SLACK, QUIET, UnaskedBytes
 from busmaster.contract.exchange import NO_REPLY, Done, Expect, FrameError
@@ -65,14 +65,13 @@ class LineMachine:
         capacity: int = 1000,
         jitter: Callable[[], float] = lambda: 0.5,
         strict: bool = False,
-        tapped: bool = False,
     ) -> None:
         self.state = OFFLINE
         self.noisy = False
         self._echo = Echo(echo)
         self._deadlines = Deadlines()
         self._counters = LineCounters(now)
-        self.dispatcher = make_dispatcher(tapped, self._deadlines, self._counters, now, capacity, jitter)
+        self.dispatcher = Dispatcher(self._deadlines, self._counters, now, capacity, jitter)
         self.dispatcher.fault = self._offline
         self.events = self.dispatcher.events
         self._cause = "not open yet"

@@ -30,7 +30,7 @@ class Attempt:
 
     `protocol` is the name of its node's protocol. `transaction` numbers the requests of a line from 1, each cycle of a
     poll anew, and `number` the attempts at one of them. `purpose` says why it is asked, where no caller asks: a poll's
-    name, "probe" or "check" (R15).
+    name, "probe" or "check" (R15). `settled` is for how many seconds the line had settled, ever, when it began.
     """
 
     __slots__ = (
@@ -43,6 +43,7 @@ class Attempt:
         "protocol",
         "purpose",
         "result",
+        "settled",
         "timings",
         "transaction",
         "verdict",
@@ -58,6 +59,7 @@ class Attempt:
         transaction: int = 0,
         number: int = 1,
         purpose: str = "",
+        settled: float = 0.0,
     ) -> None:
         self.protocol = protocol
         self.address = address
@@ -66,6 +68,7 @@ class Attempt:
         self.transaction = transaction
         self.number = number
         self.purpose = purpose
+        self.settled = settled
         self.verdict: Verdict | None = None
         self.result: Any = None
         """The value of one that is OK, else what was wrong, in words."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from itertools import count
-from typing import Any
+from typing import Any, cast
 
-from busmaster.arbiter.counters import LineCounters
-from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.dispatcher import Dispatcher
+from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.arbiter.transaction import Transaction
 from busmaster.arbiter.trust import SPOILING
@@ -18,15 +17,18 @@ from busmaster.errors import BusError, Refused
 class TappedDispatcher(Dispatcher):
     """A dispatcher whose `attempt` is what is on the wire, and whose events tell the end of each one."""
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
+    _order_of_transactions: Iterator[int]
+    _numbers: dict[Transaction, int]
+
+    def begin(self) -> None:
+        """Tell of each attempt that begins from now on; of one that is on the wire already, nothing is told."""
         self._order_of_transactions = count(1)
-        self._numbers: dict[Transaction, int] = {}
+        self._numbers = {}
 
     def started(self, transaction: Transaction, now: float) -> None:
         """Begin the attempt that goes out now, with the number of its transaction."""
         super().started(transaction, now)
-        if transaction.attempts == 1:
+        if transaction.attempts == 1 or transaction not in self._numbers:
             self._numbers[transaction] = next(self._order_of_transactions)
         node = transaction.node
         self.attempt = Attempt(
@@ -37,6 +39,7 @@ class TappedDispatcher(Dispatcher):
             transaction=self._numbers[transaction],
             number=transaction.attempts,
             purpose=_purpose(transaction),
+            settled=self.counters.spent[LineState.SETTLING],
         )
 
     def succeeded(self, transaction: Transaction, value: Any, now: float) -> None:
@@ -69,7 +72,8 @@ class TappedDispatcher(Dispatcher):
 
     def _over(self, transaction: Transaction, verdict: Verdict, result: Any, now: float) -> None:
         attempt, self.attempt = self.attempt, None
-        assert attempt is not None
+        if attempt is None:  # it was on the wire before anybody listened
+            return
         attempt.late = transaction.late
         attempt.heard = transaction.wanted or transaction.check
         attempt.end(verdict, result, now)
@@ -80,11 +84,17 @@ class TappedDispatcher(Dispatcher):
         super()._end(transaction, now, error)
 
 
-def make_dispatcher(
-    tapped: bool, deadlines: Deadlines, counters: LineCounters, now: float, capacity: int, jitter: Callable[[], float]
-) -> Dispatcher:
-    """Return the dispatcher of a line, see `Dispatcher`."""
-    return (TappedDispatcher if tapped else Dispatcher)(deadlines, counters, now, capacity, jitter)
+def set_tapped(dispatcher: Dispatcher, tapped: bool) -> None:
+    """Have the dispatcher of a line tell of each attempt from now on, or no more.
+
+    It becomes one of the other kind as it stands, so that a line that nobody listens to pays nothing for it.
+    """
+    dispatcher.attempt = None
+    if tapped:
+        dispatcher.__class__ = TappedDispatcher
+        cast("TappedDispatcher", dispatcher).begin()
+    else:
+        dispatcher.__class__ = Dispatcher
 
 
 def _purpose(transaction: Transaction) -> str:

@@ -27,6 +27,7 @@ from busmaster.bus.polling import PollGroup, Sample, Stream
 from busmaster.bus.requester import checked_priority, checked_retries
 from busmaster.bus.shared_line import SharedLine, running_loop
 from busmaster.bus.suitability import check_company, check_settings
+from busmaster.bus.taps import Taps
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import LineSettings, Profile
@@ -83,7 +84,6 @@ class Bus:
             capacity=capacity,
             jitter=self._random.random,
             strict=strict,
-            tapped=tap is not None,
         )
         self._arbiter.name = endpoint.name
         self._line = line = SharedLine(endpoint.name, self._arbiter)
@@ -95,9 +95,9 @@ class Bus:
             on_event=self._on_event,
             on_written=line.touched,
             paced=lambda transport: is_paced(endpoint, transport),
-            tap=tap,
             name=endpoint.name,
         )
+        self.taps = Taps(self.pump, tap)
         self._nodes: dict[tuple[str, int], Node] = {}
         self._profiles: dict[str, Profile] = {}
         """Of the protocols on this line, by name."""

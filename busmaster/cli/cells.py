@@ -9,7 +9,7 @@ from decimal import Decimal
 from rich.text import Text
 
 from busmaster.cli.output import value_text
-from busmaster.cli.picture import OLD_AFTER, Frame, Group, Node, Row
+from busmaster.service.picture import OLD_AFTER, Frame, Group, Node, Row
 
 BARS = "▁▂▃▄▅▆▇█"
 RIPPLE = 0.1

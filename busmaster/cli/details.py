@@ -9,7 +9,8 @@ from rich.text import Text
 
 from busmaster.cli.cells import age_text, sparkline
 from busmaster.cli.output import number_text, value_text
-from busmaster.cli.picture import Frame, Group, Node, Row, made_printable
+from busmaster.cli.terminal import made_printable
+from busmaster.service.picture import Frame, Group, Node, Row
 
 RECENT = 6
 """Values that are shown as numbers."""

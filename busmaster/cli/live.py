@@ -19,9 +19,9 @@ from busmaster.cli.details import details_text
 from busmaster.cli.dialog import STYLE as STYLE_OF_DIALOGS
 from busmaster.cli.dialog import AskValue, AskWords, AskYes, Show
 from busmaster.cli.parsing import parse_value
-from busmaster.cli.picture import Frame, Group, Node, Picture, Row, matching
 from busmaster.cli.table import Table
 from busmaster.errors import BusError, InvalidCommand
+from busmaster.service.picture import Frame, Group, Node, Picture, Row, matching
 
 SUSPENDED_FOR = 60.0
 SILENT_AFTER = 2.0

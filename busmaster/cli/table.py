@@ -12,7 +12,7 @@ from textual.geometry import Region, Size
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
-from busmaster.cli.picture import Identity, Row
+from busmaster.service.picture import Identity, Row
 
 Draw = Callable[[Row, bool], Text]
 """Returns the line of a row, which is the selected one or not."""

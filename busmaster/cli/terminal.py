@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import unicodedata
+from typing import Any
 
 
 def printable(text: str) -> str:
@@ -15,3 +16,18 @@ def printable(text: str) -> str:
         return text
     # Python calls no space printable but the plain one; those of any width (Zs) move nothing
     return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else json.dumps(c)[1:-1] for c in text)
+
+
+def made_printable(told: Any) -> Any:
+    """Return what was said with nothing in its texts that a terminal would obey."""
+    match told:
+        case str():
+            return printable(told)
+        case dict():
+            if set(told) == {"float"}:  # a number that JSON does not have
+                return float(told["float"])
+            return {name: made_printable(part) for name, part in told.items()}
+        case list():
+            return [made_printable(part) for part in told]
+        case _:
+            return told

@@ -14,11 +14,12 @@ import click
 from busmaster.cli.app import FAILED
 from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import is_line_file, load
-from busmaster.cli.picture import Picture
 from busmaster.cli.reaching import owner_of, token_for
+from busmaster.cli.terminal import made_printable
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import LineDown
 from busmaster.service.folder import find_owner, line_name, owners
+from busmaster.service.picture import Picture
 from busmaster.service.remote import connect
 from busmaster.transport.endpoints import endpoint, is_served
 
@@ -80,7 +81,7 @@ async def top(address: str, read_only: bool = False, of_owner: bool = False) -> 
     """Show a line until the person leaves, and return the exit status. Raises LineDown when its owner is gone."""
     from busmaster.cli.live import Screen
 
-    picture = Picture()
+    picture = Picture(made_printable)
     screen: Screen | None = None
 
     def hear(method: str, body: Mapping[str, Any]) -> None:

@@ -63,9 +63,10 @@ class World:
             capacity=capacity,
             jitter=jitter,
             strict=strict,
-            tapped=tap is not None,
         )
         self.tap = tap
+        if tap is not None:
+            self.arbiter.set_tapped(True)
         self._on_event = on_event
         self._record = record
         self._actions: list[tuple[float, int, Callable[[], object]]] = []

@@ -183,6 +183,8 @@ class Client:
                 return self._poll(params)
             case "overview":
                 return self._follow(params, self._line.overview())
+            case "exchanges":
+                return self._follow(params, self._line.exchanges())
             case "details":
                 return said_details(*self._line.point(params["group"], params["key"]))
             case "pause" | "demand" | "suspend":

@@ -60,6 +60,10 @@ class Line(Protocol):
         """Return what tells what a person sees of it."""
         ...
 
+    def exchanges(self) -> Broadcast:
+        """Return what tells what passes on it."""
+        ...
+
     @property
     def journal(self) -> Journal: ...
 

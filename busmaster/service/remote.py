@@ -24,6 +24,7 @@ from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.service.link import TCP, Link
 from busmaster.service.messages import MOST_CHECKED, said_timings
+from busmaster.service.remote_exchanges import RemoteExchanges
 from busmaster.service.remote_group import RemoteGroup
 from busmaster.service.remote_node import RemoteNode
 from busmaster.service.remote_overview import RemoteOverview
@@ -81,7 +82,7 @@ class RemoteBus:
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
         """Those of them of which the owner knows."""
-        self._streams: dict[int, RemoteGroup | RemoteOverview] = {}
+        self._streams: dict[int, RemoteGroup | RemoteOverview | RemoteExchanges] = {}
         self._count = 0
         self._sequences = 0
         self.room = Room(self.now)
@@ -265,6 +266,13 @@ class RemoteBus:
         overview = self._streams[self._count] = RemoteOverview(self.link, self.now, hear)
         await self._ask("overview", {"stream": self._count})
         return overview
+
+    async def exchanges(self, hear: Callable[[Mapping[str, Any]], None]) -> RemoteExchanges:
+        """Have `hear` told what passes on the line, exchange by exchange, as docs/service.md has it."""
+        self._count += 1
+        exchanges = self._streams[self._count] = RemoteExchanges(hear, partial(self.end_stream, self._count))
+        await self._ask("exchanges", {"stream": self._count})
+        return exchanges
 
     def end_stream(self, number: int) -> None:
         """Have a stream told no more."""

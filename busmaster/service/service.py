@@ -26,6 +26,7 @@ from busmaster.gate.gate import Gate
 from busmaster.registry import protocols
 from busmaster.service.client import Client
 from busmaster.service.connection import CLOSE_WITHIN, check_installed
+from busmaster.service.exchanges import ExchangesBroadcast
 from busmaster.service.folder import Owner, ServedSocket, line_name, runtime_folder
 from busmaster.service.messages import (
     INVALID_PARAMS,
@@ -111,6 +112,7 @@ class Service:
         self._groups: dict[PollGroup, GroupBroadcast] = {}
         self._events: EventBroadcast | None = None
         self._overview: Overview | None = None
+        self._exchanges: ExchangesBroadcast | None = None
         self._points: dict[object, Point[Any]] = {}
         self._points_of: list[tuple[str, tuple[Point[Any], ...]]] = []
         self._log = logging.getLogger("busmaster.service")
@@ -222,6 +224,12 @@ class Service:
             self._overview = Overview(self.bus, self.gate, self.journal, lambda: self.title, self._end_overview)
         return self._overview
 
+    def exchanges(self) -> Broadcast:
+        """Return what tells what passes on the line."""
+        if self._exchanges is None:
+            self._exchanges = ExchangesBroadcast(self.bus, self._end_exchanges)
+        return self._exchanges
+
     def group(self, name: str) -> PollGroup:
         """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
         found = next((group for group in self.bus.groups if group.name == name), None)
@@ -266,6 +274,9 @@ class Service:
 
     def _end_overview(self) -> None:
         self._overview = None
+
+    def _end_exchanges(self) -> None:
+        self._exchanges = None
 
     def _tell_stop(self, record: NodeRecord) -> None:
         for client in self._clients:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from typing import Any, Protocol
 
 from busmaster.bus.bus import Bus
@@ -67,14 +68,15 @@ class Broadcast:
             reader.tell_surely(stream, "ended", "{}")
 
     async def _tell(self) -> None:
-        async for method, body in self._bodies():
-            for number, (reader, stream) in enumerate(list(self.readers)):
-                if number and number % READERS_IN_A_TURN == 0:
-                    await asyncio.sleep(0)
-                if (reader, stream) in self.readers:
-                    reader.tell(stream, method, body)
+        async with contextlib.aclosing(self._bodies()) as bodies:
+            async for method, body in bodies:
+                for number, (reader, stream) in enumerate(list(self.readers)):
+                    if number and number % READERS_IN_A_TURN == 0:
+                        await asyncio.sleep(0)
+                    if (reader, stream) in self.readers:
+                        reader.tell(stream, method, body)
 
-    def _bodies(self) -> AsyncIterator[tuple[str, str]]:
+    def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
         raise NotImplementedError
 
 
@@ -97,7 +99,7 @@ class GroupBroadcast(Broadcast):
         for reader, stream in places:
             reader.tell_surely(stream, "points", body)
 
-    async def _bodies(self) -> AsyncIterator[tuple[str, str]]:
+    async def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
         stream = self.group.subscribe()
         try:
             async for snapshot in stream:
@@ -129,7 +131,7 @@ class EventBroadcast(Broadcast):
         super().__init__(on_end)
         self._bus = bus
 
-    async def _bodies(self) -> AsyncIterator[tuple[str, str]]:
+    async def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
         stream = self._bus.events()
         try:
             async for event in stream:

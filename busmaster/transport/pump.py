@@ -48,12 +48,12 @@ class Pump(asyncio.Protocol):
         on_event: Callable[[Event], None],
         on_written: Callable[[Transaction, float], None] = lambda *_: None,
         paced: Callable[[asyncio.BaseTransport], bool] = lambda _: False,
-        tap: Tap | None = None,
         name: str = "the port",
     ) -> None:
         self.arbiter = arbiter
         self.clock: Callable[[], float] = time.monotonic
-        self.tap = tap
+        self.tap: Tap | None = None
+        """Who hears every byte; the arbiter is to be tapped while there is one."""
         self._on_sample = on_sample
         self._on_cycle = on_cycle
         self._on_event = on_event

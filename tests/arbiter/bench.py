@@ -67,7 +67,9 @@ class Bench:
         strict: bool = False,
         tapped: bool = False,
     ) -> None:
-        self.arbiter = Arbiter(TAU, echo=echo, receive_latency=latency, capacity=capacity, strict=strict, tapped=tapped)
+        self.arbiter = Arbiter(TAU, echo=echo, receive_latency=latency, capacity=capacity, strict=strict)
+        if tapped:
+            self.arbiter.set_tapped(True)
         self.unsent: int | None = None
         """How many bytes the port has not sent yet, for ports that can tell."""
         self.held = False

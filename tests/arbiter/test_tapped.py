@@ -179,3 +179,41 @@ def test_a_reader_that_turns_in_circles_is_a_bug_and_does_not_stop_the_process(t
     assert type(transaction.error) is BusError
     assert isinstance(transaction.error.__cause__, EndlessExchange)
     assert [one.verdict for one in ended(bench)] == [Verdict.GARBLED] * tapped
+
+
+def test_a_line_is_tapped_while_it_runs_and_no_more() -> None:
+    bench = Bench()
+    node = bench.node()
+    before = bench.ask(node)
+    bench.arbiter.set_tapped(True)
+    bench.hear(FIVE, after=0.004)
+    assert before.value == 5.0
+    assert said(bench) == []  # it was on the wire before anybody listened
+    bench.ask(node)
+    bench.hear(FIVE, after=0.004)
+    assert said(bench) == ["1.1 ok: read element 1: 5.0"]
+    after = bench.ask(node)
+    bench.arbiter.set_tapped(False)
+    nothing = bench.arbiter.attempt
+    assert nothing is None
+    bench.hear(FIVE, after=0.004)
+    assert after.value == 5.0
+    assert len(said(bench)) == 1
+
+
+def test_a_retry_of_a_request_that_began_before_anybody_listened_is_told() -> None:
+    bench = Bench()
+    bench.ask(bench.node(), retries=1)
+    bench.arbiter.set_tapped(True)
+    bench.hear(BAD_CHECKSUM, after=0.004)
+    bench.wait(QUIET + 0.11)
+    assert said(bench) == ["1.2 no reply: read element 1: no reply within 100 ms"]
+
+
+def test_an_attempt_says_how_long_the_line_had_settled() -> None:
+    bench = Bench(tapped=True)
+    bench.ask(bench.node(), retries=1)
+    bench.hear(BAD_CHECKSUM, after=0.004)
+    bench.wait(QUIET + 0.11)
+    first, second = ended(bench)
+    assert second.settled - first.settled == pytest.approx(QUIET, abs=0.01)

@@ -11,9 +11,10 @@ from rich.cells import cell_len
 from textual.pilot import Pilot
 
 from busmaster.cli.live import Screen
-from busmaster.cli.picture import Picture
+from busmaster.cli.terminal import made_printable
 from busmaster.errors import WriteUnconfirmed
-from tests.cli.pictures import GROUP, node, row, tell, three_drives
+from busmaster.service.picture import Picture
+from tests.service.pictures import GROUP, node, row, tell, three_drives
 
 SIZES = [(60, 20), (80, 24), (120, 40)]
 sizes = pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
@@ -346,7 +347,11 @@ async def test_nothing_that_the_owner_says_is_obeyed_by_a_terminal() -> None:
     nodes = (node(5, evil, label=evil),)
     said = {"title": evil, "state": evil, "line": evil, "settings": evil, "events": [[1.0, evil]]}
     groups = ({**GROUP, "name": evil},)
-    async with drawn(tell(Picture(), (point, held), nodes=nodes, groups=groups, **said)) as (screen, _, pilot):
+    async with drawn(tell(Picture(made_printable), (point, held), nodes=nodes, groups=groups, **said)) as (
+        screen,
+        _,
+        pilot,
+    ):
         for key in ("up", "enter"):
             await pilot.press(key)
             await pilot.pause()

@@ -17,7 +17,6 @@ from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
-from busmaster.cli.picture import Picture
 from busmaster.emulator.line import Line
 from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.gate.permission import Access, Permission
@@ -25,6 +24,7 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from busmaster.service import overview
 from busmaster.service.overview import COUNTED_AT_ONCE, INTERVAL, PART, Part
+from busmaster.service.picture import Picture
 from busmaster.service.remote_overview import RemoteOverview
 from tests.service.lines import PATIENT, Served, on_a_served_line, raw, until
 from tests.stories import in_virtual_time

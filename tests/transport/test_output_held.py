@@ -120,7 +120,8 @@ def ledger() -> Ledger:
 
 
 def pump_on(ledger: Any) -> Pump:
-    pump = Pump(ledger, on_sample=lambda _, __: None, on_cycle=lambda _: None, on_event=lambda _: None, tap=ledger)
+    pump = Pump(ledger, on_sample=lambda _, __: None, on_cycle=lambda _: None, on_event=lambda _: None)
+    pump.tap = ledger
     pump.clock = lambda: ledger.time
     pump.connection_made(ledger)
     return pump

@@ -6,8 +6,8 @@ from itertools import permutations
 
 import pytest
 
-from busmaster.cli.picture import Picture
-from tests.cli.pictures import FRAME, GROUP, node, row, tell
+from busmaster.service.picture import Picture
+from tests.service.pictures import FRAME, GROUP, node, row, tell
 
 
 @pytest.mark.parametrize("order", list(permutations(("rows", "values", "frame"))))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from busmaster.cli.picture import Picture
+from busmaster.service.picture import Picture
 
 FRAME: dict[str, Any] = {
     "set": 1,

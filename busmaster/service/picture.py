@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
-from busmaster.cli.terminal import printable
+from busmaster.service.messages import value_of
 
 KEPT_VALUES = 120
 """Of each point, for its trend."""
@@ -117,20 +117,24 @@ class Frame:
 
 
 class Picture:
-    """What the line's owner has said, put together. `hear` takes it; nothing of its texts is obeyed by a terminal."""
+    """What the line's owner has said, put together. `hear` takes it.
 
-    def __init__(self) -> None:
+    `clean` makes what was said fit for where it is shown: values as they were, or also texts without what obeys.
+    """
+
+    def __init__(self, clean: Callable[[Any], Any] = value_of) -> None:
+        self._clean = clean
         self.frame: Frame | None = None
         self._set = 0
         self._rows: dict[int, list[Row]] = {}
-        self._values: dict[int, list[Any]] = {}
+        self._values: dict[int, Sequence[Any]] = {}
         self._known: dict[Identity, Row] = {}
         self._groups: dict[int, list[Group]] = {}
         self._nodes: dict[int, list[Node]] = {}
 
     def hear(self, method: str, said: Mapping[str, Any]) -> None:
         """Take one thing that the line's owner says. What a later version says besides is passed over."""
-        body = made_printable(said)
+        body = self._clean(said)
         match method:
             case "frame":
                 self._begin(body.pop("set"))
@@ -158,7 +162,7 @@ class Picture:
             self._rows.clear()
             self._values.clear()
 
-    def _take_rows(self, first: int, said: list[dict[str, Any]]) -> None:
+    def _take_rows(self, first: int, said: Sequence[Mapping[str, Any]]) -> None:
         self._rows[first] = rows = [_made(Row, row) for row in said]
         alike: dict[tuple[str, str], int] = {}
         for row in self.rows:
@@ -195,21 +199,6 @@ class Picture:
 def _made(kind: Any, said: Mapping[str, Any]) -> Any:
     """Return the object of these fields, without those that it does not have."""
     return kind(**{name: said[name] for name in kind.__dataclass_fields__ if name in said})
-
-
-def made_printable(told: Any) -> Any:
-    """Return what was said with nothing in its texts that a terminal would obey."""
-    match told:
-        case str():
-            return printable(told)
-        case dict():
-            if set(told) == {"float"}:  # a number that JSON does not have
-                return float(told["float"])
-            return {name: made_printable(part) for name, part in told.items()}
-        case list():
-            return [made_printable(part) for part in told]
-        case _:
-            return told
 
 
 def matching(rows: list[Row], nodes: Mapping[tuple[str, int], Node], words: str) -> Iterator[Row]:

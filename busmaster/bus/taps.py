@@ -1,0 +1,58 @@
+"""Whoever hears every byte of a line: a recorder, those who look at the wire. They come and go while it runs."""
+
+from __future__ import annotations
+
+from busmaster.arbiter.tap import Attempt, Tap
+from busmaster.transport.pump import Pump
+
+
+class Taps:
+    """The taps of one line. A line that nobody taps pays nothing for it."""
+
+    def __init__(self, pump: Pump, first: Tap | None = None) -> None:
+        self._pump = pump
+        self._taps: list[Tap] = []
+        if first is not None:
+            self.add(first)
+
+    def add(self, tap: Tap) -> None:
+        """Have `tap` told of all that passes from now on; of the exchange that is on the wire, perhaps only the end."""
+        self._taps.append(tap)
+        if len(self._taps) == 1:
+            self._pump.arbiter.set_tapped(True)
+        self._set()
+
+    def remove(self, tap: Tap) -> None:
+        """Tell `tap` nothing more."""
+        self._taps.remove(tap)
+        if not self._taps:
+            self._pump.arbiter.set_tapped(False)
+        self._set()
+
+    def _set(self) -> None:
+        match self._taps:
+            case []:
+                self._pump.tap = None
+            case [tap]:
+                self._pump.tap = tap
+            case taps:
+                self._pump.tap = _Several(tuple(taps))
+
+
+class _Several:
+    """Several taps as one."""
+
+    def __init__(self, taps: tuple[Tap, ...]) -> None:
+        self._taps = taps
+
+    def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        for tap in self._taps:
+            tap.transmitted(now, data, attempt)
+
+    def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
+        for tap in self._taps:
+            tap.received(now, data, attempt)
+
+    def attempted(self, attempt: Attempt, /) -> None:
+        for tap in self._taps:
+            tap.attempted(attempt)

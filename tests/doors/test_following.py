@@ -1,0 +1,106 @@
+"""A line of another program is followed for good: by a real socket, whoever of the two comes and goes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from busmaster.doors import following
+from busmaster.doors.following import Connected, Lost
+from busmaster.errors import InvalidCommand, LineDown, NotStarted
+from tests.doors.lines import assert_goes_on_alone, followed, poll, shows
+from tests.patience import PATIENCE
+from tests.service.lines import served, until
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test waits between two tries."""
+    monkeypatch.setattr(following, "FIRST_PAUSE", 0.001)
+    monkeypatch.setattr(following, "LONGEST_PAUSE", 0.001)
+
+
+@pytest.mark.asyncio
+async def test_a_line_is_followed_again_however_often_its_owner_comes_and_goes(tmp_path: Path) -> None:
+    async with followed(tmp_path) as door:
+        for _ in range(3):
+            async with served(tmp_path) as line:
+                poll(line)
+                await shows(door)
+                assert isinstance(door.state, Connected)
+            await until(lambda: isinstance(door.state, Lost))
+            assert [row.key for row in door.picture.rows] == ["5/10", "5/outputs"]  # what was known last
+
+
+@pytest.mark.asyncio
+async def test_while_the_owner_is_away_a_write_says_so_and_is_not_sent_later(tmp_path: Path) -> None:
+    async with followed(tmp_path) as door:
+        await until(lambda: "no program serves" in getattr(door.state, "why", ""))
+        with pytest.raises(NotStarted, match=r"is not there: .*no program serves"):
+            await door.write("axes", "5/10", 1)
+        with pytest.raises(LineDown, match="is not there"):
+            await door.details("axes", "5/10")
+        async with served(tmp_path) as line:
+            poll(line)
+            await shows(door)
+            assert line.records == []
+
+
+@pytest.mark.asyncio
+async def test_a_write_passes_the_owners_gate(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, followed(tmp_path) as door:
+        poll(line)
+        await shows(door)
+        await door.write("axes", "5/10", 7)
+        assert line.audit() == [("5/10", "written")]
+        await until(lambda: door.picture.rows[0].value == 7)
+
+
+@pytest.mark.asyncio
+async def test_a_door_that_is_read_only_writes_nothing(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, followed(tmp_path, read_only=True) as door:
+        poll(line)
+        await shows(door)
+        assert door.read_only
+        with pytest.raises(InvalidCommand, match="this door is read-only"):
+            await door.write("axes", "5/10", 7)
+        assert line.records == []
+
+
+@pytest.mark.asyncio
+async def test_doors_that_come_and_go_leave_nothing_with_the_line(tmp_path: Path) -> None:
+    async with served(tmp_path) as line:
+        poll(line)
+        for _ in range(20):
+            async with followed(tmp_path) as door:
+                await shows(door)
+        await assert_goes_on_alone(line)
+
+
+@pytest.mark.asyncio
+async def test_a_door_is_told_of_each_picture_and_of_each_change_until_it_no_longer_wants_to_be(tmp_path: Path) -> None:
+    told: list[str] = []
+    async with followed(tmp_path) as door:
+        leave = door.on_picture(lambda method, said: told.append(method))
+        leave_state = door.on_state(lambda: told.append(type(door.state).__name__))
+        async with served(tmp_path) as line:
+            poll(line)
+            await shows(door)
+            await until(lambda: "frame" in told)
+        await until(lambda: "Lost" in told)
+        assert {"rows", "values", "groups", "nodes", "frame", "Connected"} <= set(told)
+        leave()
+        leave_state()
+        told.clear()
+        async with served(tmp_path):
+            await until(lambda: door.is_connected)
+        assert told == []
+
+
+@pytest.mark.asyncio
+async def test_times_of_the_line_are_times_of_day(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, followed(tmp_path) as door:
+        poll(line)
+        await shows(door)
+        assert abs(door.wall_time(line.bus.now() - 3600) - door.wall_time(line.bus.now()) + 3600) < PATIENCE
