@@ -33,6 +33,7 @@ COMMANDS = (
     "serve",
     "status",
     "top",
+    "opcua",
     "safe",
     "plan",
     "points",
