@@ -33,6 +33,7 @@ COMMANDS = (
     "serve",
     "status",
     "top",
+    "web",
     "opcua",
     "safe",
     "plan",

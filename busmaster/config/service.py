@@ -62,9 +62,7 @@ class ServiceSection:
         if self.token_file is None:
             return {}
         with self.table.at("token_file"):
-            secrets = dict(_tokens(self.token_file))
-            if not secrets:
-                raise InvalidCommand(f"there are no tokens in {self.token_file}: a line is a name and its token")
+            secrets = read_tokens(self.token_file)
         for name, role in self.tokens.items():
             if name not in secrets:
                 raise role.table.error(f"there is no token {name!r} in {self.token_file}")
@@ -131,6 +129,14 @@ def _token(table: Table, token_file: str | None) -> str:
     if token_file is None:
         raise table.error("a token is written in a file of its own: say which, as token_file")
     return table.name
+
+
+def read_tokens(path: str) -> dict[str, bytes]:
+    """Return the digest of each token of a file by its name. Raises InvalidCommand, naming no token."""
+    secrets = dict(_tokens(path))
+    if not secrets:
+        raise InvalidCommand(f"there are no tokens in {path}: a line is a name and its token")
+    return secrets
 
 
 def _tokens(path: str) -> Iterator[tuple[str, bytes]]:

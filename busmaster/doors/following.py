@@ -145,9 +145,9 @@ class Following:
         """Take in what is said until the connection ends."""
         self.picture = Picture()
         try:
-            self._overview = await remote.overview(self._hear)
             self._remote = remote
             self._change(Connected(remote.about))
+            self._overview = await remote.overview(self._hear)
             await self._overview.over()
         finally:
             self._remote = self._overview = None

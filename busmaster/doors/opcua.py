@@ -23,7 +23,7 @@ from busmaster.doors.opcua_access import Rules, guard
 from busmaster.doors.opcua_health import Health
 from busmaster.doors.opcua_space import Space, Variable
 from busmaster.doors.opcua_terms import CODES, GOOD, range_of, status_of_sample, status_of_write, type_of
-from busmaster.errors import BusError, InvalidCommand
+from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.service.picture import Row
 from busmaster.service.remote import RemoteBus
 
@@ -106,7 +106,10 @@ class LineServer:
 
     async def _show(self) -> None:
         """Bring what clients see up to what is known of the line."""
-        remote = self._line.remote if self._line.is_connected else None
+        remote = None
+        if self._line.is_connected:
+            with suppress(LineDown):  # it is being left
+                remote = self._line.remote
         if remote is not self._remote:  # what was known is of the connection before
             self._remote = remote
             self._new_rows = True

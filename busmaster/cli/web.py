@@ -1,0 +1,37 @@
+"""`busmaster web`: a page for the operator and a REST API over a line that another process owns."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import click
+
+from busmaster.cli.app import OK
+from busmaster.cli.doors import door_options, following, place_of
+from busmaster.cli.ending import until_ended
+from busmaster.cli.output import note
+from busmaster.config.service import read_tokens
+
+BIND = "127.0.0.1:8420"
+NEEDED = ("starlette", "uvicorn", "websockets")
+
+
+@click.command(short_help="Serve a page and a REST API over a line that another process owns.")
+@door_options(BIND)
+@click.option("--token-file", metavar="FILE", help="Who writes shows a token of this file: a name and its token a line.")
+def command(line: str | None, bind: str, read_only: bool, token_file: str | None) -> int:
+    """Show a line in browsers: values with trends, health, every exchange on the wire, events; and write its points.
+
+    LINE is the name that `busmaster status` lists, its LINE.toml or its port; without it, the one line that runs. The
+    line goes on whatever becomes of the page, and the page waits for a line whose owner is away. /openapi.json says
+    what programs may ask. Beyond this machine (--bind 0.0.0.0:8420) nobody writes without a token, and what is said
+    can be read on the way: put a proxy with TLS before it, or come by ssh -L.
+    """
+    if any(find_spec(module) is None for module in NEEDED):
+        raise click.UsageError("the page needs an extra: pip install 'busmaster[web]'")
+    from busmaster.doors.web import serve
+
+    listen, secrets = place_of(bind), {} if token_file is None else read_tokens(token_file)
+    followed = following(line, read_only=read_only)
+    until_ended(serve, followed, listen, secrets, lambda url: note(f"the page is at {url}"), note)
+    return OK

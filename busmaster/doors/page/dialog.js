@@ -1,0 +1,166 @@
+// One point: what there is to know of it, and writing it, which is asked twice.
+
+import { shown } from "./line.js";
+import { draw_trend } from "./trend.js";
+
+const by = (id) => document.getElementById(id);
+const box = by("point"), form = by("write-form"), field = by("new-value");
+
+export class PointDialog {
+  constructor(colours) {
+    this.colours = colours;
+    this.row = null;
+    this.asked = null; // the value that is to be confirmed
+    this.details = null;
+    this.busy = false;
+    by("shut").addEventListener("click", () => box.close());
+    by("back").addEventListener("click", () => { this.ask(null); field.focus(); });
+    box.addEventListener("close", () => { this.row = null; });
+    field.addEventListener("input", () => { this.ask(null); this.outcome(""); });
+    form.addEventListener("submit", (event) => { event.preventDefault(); this.submit(); });
+  }
+
+  async open(row, may) {
+    Object.assign(this, { row, may, details: null });
+    by("point-name").textContent = `${row.node} ${row.item} (${row.key})`;
+    by("point-unit").textContent = by("new-unit").textContent = row.unit;
+    field.value = "";
+    this.ask(null);
+    this.outcome("");
+    by("write-limits").textContent = "";
+    by("point-facts").replaceChildren();
+    const why = why_not(row, may);
+    form.querySelectorAll("p").forEach((line) => { line.hidden = Boolean(why); });
+    by("go").hidden = Boolean(why);
+    by("ask").hidden = true;
+    by("token-line").hidden = Boolean(why) || !may.wants_token;
+    by("no-write").textContent = why;
+    by("no-write").hidden = !why;
+    this.draw();
+    box.showModal();
+    (why ? by("shut") : field).focus();
+    await this.load(row);
+  }
+
+  async load(row) {
+    let said;
+    try {
+      said = await (await fetch(path_of(row))).json();
+    } catch {
+      return;
+    }
+    if (this.row !== row || !said.details) return;
+    this.details = said.details;
+    by("write-limits").textContent = limits_text(said.details, row.unit);
+    this.draw();
+  }
+
+  // Called whenever there may be another value.
+  draw(line) {
+    const row = this.row && line ? line.rows.find((one) => one.name === this.row.name) : this.row;
+    if (!row || !box.open && line) return;
+    this.row = row;
+    by("point-value").textContent = shown(row.value, row.precision);
+    draw_trend(by("point-trend"), row.past, { ...this.colours(), bounds: true, precision: row.precision });
+    const facts = [["group", row.group], ["protocol", `${row.protocol}, address ${row.address}`]];
+    if (this.details) facts.push(["asked as", this.details.command]);
+    if (this.details && (this.details.low !== null || this.details.high !== null)) facts.push(["alarms", `below ${bound(this.details.low)}, above ${bound(this.details.high)}`]);
+    if (row.error) facts.push(["last cycle", row.error + (this.details?.hint ? `; ${this.details.hint}` : "")]);
+    const text = JSON.stringify(facts);
+    if (text === this.told) return;
+    this.told = text;
+    by("point-facts").replaceChildren(...facts.flatMap(([name, said]) => [element("dt", name), element("dd", said)]));
+  }
+
+  ask(value) {
+    this.asked = value;
+    const ask = by("ask");
+    ask.hidden = by("back").hidden = value === null;
+    field.readOnly = value !== null;
+    if (value !== null) ask.textContent = `Write ${value} ${this.row.unit} to ${this.row.node} ${this.row.item}? It is ${shown(this.row.value, this.row.precision)} ${this.row.unit} now.`;
+    by("go").textContent = value === null ? "Write…" : `Write ${value} ${this.row.unit}`.trim();
+  }
+
+  outcome(text, kind = "") {
+    by("outcome").textContent = text;
+    by("outcome").className = kind;
+  }
+
+  async submit() {
+    if (!this.row || this.busy || by("go").hidden) return;
+    const value = typed(field.value);
+    if (value === null) return this.outcome("Say which value is to be written.", "bad");
+    if (this.asked === null) {
+      const wrong = beyond(value, this.details);
+      if (wrong) return this.outcome(wrong, "bad");
+      return this.ask(value);
+    }
+    await this.write(this.row, this.asked);
+  }
+
+  async write(row, value) {
+    this.busy = by("go").disabled = true;
+    this.outcome("being written");
+    const headers = { "Content-Type": "application/json" };
+    if (by("token").value) headers.Authorization = `Bearer ${by("token").value}`;
+    try {
+      const answer = await fetch(path_of(row), { method: "PUT", headers, body: JSON.stringify({ value }) });
+      const said = await answer.json();
+      this.outcome(answer.ok ? `${value} ${row.unit} was written.` : said.what, answer.ok ? "good" : "bad");
+    } catch {
+      this.outcome("The page's program did not answer: the write may have been sent. Read the value before you write again.", "bad");
+    } finally {
+      this.busy = by("go").disabled = false;
+      if (this.row) this.ask(null);
+    }
+  }
+}
+
+function why_not(row, may) {
+  if (!row.writable) return "This point is read-only.";
+  if (may.read_only) return "This page is read-only: nothing can be written here.";
+  return "";
+}
+
+function path_of(row) {
+  return `/api/points/${encodeURIComponent(row.group)}/${row.key.split("/").map(encodeURIComponent).join("/")}`;
+}
+
+function typed(text) {
+  const said = text.trim();
+  if (!said) return null;
+  return /^[-+]?(\d+[.,]?\d*|[.,]\d+)(e[-+]?\d+)?$/i.test(said) ? Number(said.replace(",", ".")) : said;
+}
+
+function bound(value) {
+  return value === null || value === undefined ? "–" : value;
+}
+
+function limits_text(details, unit) {
+  return details.limits.map((limit) => {
+    const parts = [];
+    if (!limit.writable) parts.push("not to be written");
+    if (limit.minimum !== null) parts.push(`at least ${limit.minimum} ${unit}`);
+    if (limit.maximum !== null) parts.push(`at most ${limit.maximum} ${unit}`);
+    if (limit.max_step !== null) parts.push(`at most ${limit.max_step} ${unit} a step`);
+    return parts.join(", ");
+  }).filter(Boolean).map((text) => `Limits: ${text}.`).join(" ");
+}
+
+// The line refuses it all the same; here it is said before anything is sent.
+function beyond(value, details) {
+  for (const limit of details?.limits ?? []) {
+    if (!limit.writable) return "The line's file says that this is not to be written.";
+    if (typeof value !== "number") continue;
+    if (limit.minimum !== null && value < limit.minimum) return `${value} is below the limit of ${limit.minimum}.`;
+    if (limit.maximum !== null && value > limit.maximum) return `${value} is above the limit of ${limit.maximum}.`;
+  }
+  return "";
+}
+
+export function element(name, text = "", kind = "") {
+  const made = document.createElement(name);
+  made.textContent = text;
+  if (kind) made.className = kind;
+  return made;
+}
