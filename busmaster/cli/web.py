@@ -18,7 +18,7 @@ NEEDED = ("starlette", "uvicorn", "websockets")
 
 @click.command(short_help="Serve a page and a REST API over a line that another process owns.")
 @door_options(BIND)
-@click.option("--token-file", metavar="FILE", help="Who writes shows a token of this file: a name and its token a line.")
+@click.option("--token-file", metavar="FILE", help="A name and a token a line: who writes shows one.")
 def command(line: str | None, bind: str, read_only: bool, token_file: str | None) -> int:
     """Show a line in browsers: values with trends, health, every exchange on the wire, events; and write its points.
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from starlette.responses import PlainTextResponse
+
 from busmaster.gate.permission import Access
 from busmaster.service.tcp import HostPort, is_loopback, is_our_name
 
@@ -83,18 +85,17 @@ class Guarded:
             return
 
         async def send_with_headers(message: Any) -> None:
-            if message["type"] in ("http.response.start", "websocket.http.response.start"):
+            if message["type"] == "http.response.start":
                 message = {**message, "headers": [*message.get("headers", ()), *HEADERS]}
             await send(message)
 
-        if refusal := self._guard.refusal(_headers(scope)):
-            kind = "http" if scope["type"] == "http" else "websocket.http"
-            body = f"{refusal}\n".encode(errors="replace")
-            plain = [(b"content-type", b"text/plain; charset=utf-8"), (b"content-length", str(len(body)).encode())]
-            await send_with_headers({"type": f"{kind}.response.start", "status": 403, "headers": plain})
-            await send({"type": f"{kind}.response.body", "body": body})
-            return
-        await self._application(scope, receive, send_with_headers)
+        refusal = self._guard.refusal(_headers(scope))
+        if refusal and scope["type"] == "websocket":
+            await send({"type": "websocket.close"})  # before it was accepted: it is refused with 403
+        elif refusal:
+            await PlainTextResponse(f"{refusal}\n", 403)(scope, receive, send_with_headers)
+        else:
+            await self._application(scope, receive, send_with_headers)
 
 
 def _headers(scope: Any) -> dict[str, str]:

@@ -56,17 +56,21 @@ class Listener:
         """Exchanges that were left out."""
         self._passages: deque[Passage] = deque()
         self._last: Passage | None = None
+        self._has_begun = False
+        """An attempt began: what came before that may be the answer to one that nobody listened to."""
 
     def transmitted(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
         """Hear what the master says: with a new attempt its request, with none what closes the attempt before."""
         if attempt is None and self._last is not None:
             self._last.add(now, True, data)
         elif attempt is not None:
+            self._has_begun = True
             self._passage(attempt).add(now, True, data)
 
     def received(self, now: float, data: bytes, attempt: Attempt | None, /) -> None:
         """Hear what comes."""
-        self._passage(attempt).add(now, False, data)
+        if self._has_begun:
+            self._passage(attempt).add(now, False, data)
 
     def attempted(self, attempt: Attempt, /) -> None:
         """Hear that an attempt is over, which it says itself."""

@@ -43,7 +43,9 @@ class Browser:
 
     def run(self, script: str, *arguments: Any) -> Any:
         """What a function of this body returns in the page, where it may await."""
-        body = f"const done = arguments[arguments.length - 1]; (async (...given) => {{ {script} }})(...arguments).then(done)"
+        body = (
+            f"const done = arguments[arguments.length - 1];(async (...given) => {{{script}}})(...arguments).then(done)"
+        )
         return self._ask("/execute/async", script=body, args=list(arguments))
 
     def until(self, fact: str, *arguments: Any) -> Any:
@@ -93,7 +95,7 @@ class Browser:
         path.write_bytes(base64.b64decode(answer))
 
     def complaints(self) -> list[str]:
-        """What the page has complained of since this was asked before: what its policy forbids, errors in its scripts."""
+        """What the page has complained of since this was asked before: its policy's refusals, its scripts' errors."""
         return [entry["message"] for entry in self._ask("/se/log", type="browser")]
 
 

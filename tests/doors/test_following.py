@@ -2,43 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 
-from busmaster import Hcp2Controller
 from busmaster.doors import following
-from busmaster.doors.following import Connected, Following, Lost
+from busmaster.doors.following import Connected, Lost
 from busmaster.errors import InvalidCommand, LineDown, NotStarted
+from tests.doors.lines import assert_goes_on_alone, followed, poll, shows
 from tests.patience import PATIENCE
-from tests.service.lines import Served, served, until
-
-
-@contextlib.asynccontextmanager
-async def followed(folder: Path, *, read_only: bool = False) -> AsyncIterator[Following]:
-    """What follows the line of this folder, whether it is served yet or not."""
-    line = Following(lambda: f"unix:{folder}/line.sock", read_only=read_only)
-    task = asyncio.ensure_future(line.follow())
-    try:
-        async with asyncio.timeout(PATIENCE):
-            yield line
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-def poll(line: Served) -> None:
-    controller = Hcp2Controller(line.bus, 5)
-    line.bus.poll_group("axes", period=0.02, points=[controller.point("10")])
-
-
-async def shows(line: Following) -> None:
-    """Wait until the picture of an owner that is there has a value."""
-    await until(lambda: line.is_connected and line.picture.rows and line.picture.rows[0].value is not None)
+from tests.service.lines import served, until
 
 
 @pytest.fixture(autouse=True)
@@ -57,7 +30,7 @@ async def test_a_line_is_followed_again_however_often_its_owner_comes_and_goes(t
                 await shows(door)
                 assert isinstance(door.state, Connected)
             await until(lambda: isinstance(door.state, Lost))
-            assert [row.key for row in door.picture.rows] == ["5/10"]  # what was known last
+            assert [row.key for row in door.picture.rows] == ["5/10", "5/outputs"]  # what was known last
 
 
 @pytest.mark.asyncio
@@ -102,8 +75,7 @@ async def test_doors_that_come_and_go_leave_nothing_with_the_line(tmp_path: Path
         for _ in range(20):
             async with followed(tmp_path) as door:
                 await shows(door)
-        await line.alone()
-        assert line.bus.groups[0].statistics().missed == 0
+        await assert_goes_on_alone(line)
 
 
 @pytest.mark.asyncio

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from busmaster import Hcp2Controller, RemoteBus
-from busmaster.arbiter.tap import Attempt
+from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.errors import NoReply
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.service.exchanges import MOST_BYTES, MOST_KEPT, Listener, said_passage
@@ -92,10 +92,13 @@ def test_a_line_is_tapped_only_while_somebody_looks(tmp_path: Path) -> None:
 
 
 def test_what_nobody_asked_for_and_what_is_long_is_told_within_bounds() -> None:
-    listener = Listener()
+    listener, one = Listener(), attempt()
+    listener.received(0.0, b"of an exchange that nobody listened to", None)
+    listener.transmitted(0.0, b"ask", one)
+    one.end(Verdict.OK, None, 0.0)
     for number in range(3):
         listener.received(float(number), b"x" * MOST_BYTES, None)
-    [passage] = listener.take()
+    _, passage = listener.take()
     told = json.loads(json.dumps(said_passage(passage)))
     check("unasked", told)
     assert (told["begun"], told["ended"], told["bytes"]) == (0.0, 0.0, 3 * MOST_BYTES)

@@ -76,6 +76,9 @@ function draw_head(wrong) {
   by("title").textContent = frame.title;
   document.title = `${state === "ready" ? "" : "✕ "}${frame.title}`;
   by("port").textContent = `${frame.line} ${frame.settings}`;
+  const down = line.all_nodes.filter((node) => node.health === "down").length;
+  by("health").textContent = down ? `✕ ${down} of ${line.all_nodes.length} nodes down` : `${line.all_nodes.length} nodes, none down`;
+  by("health").className = down ? "bad" : "";
   by("load").value = frame.utilisation;
   by("load-text").textContent = `${(frame.utilisation * 100).toFixed(0)} %`;
   by("waiting").textContent = `${frame.backlog} waiting, lost ${frame.losses} ${frame.losses === 1 ? "time" : "times"}${wire.left_out ? `, ${wire.left_out} exchanges not shown` : ""}`;
