@@ -60,7 +60,7 @@ def command(
     from busmaster.doors.opcua_access import Rules
 
     known = None if trusted is None else read_trusted(trusted)
-    rules = Rules(allow=allow, secrets=secrets, trusted=known, is_local=is_local)
+    rules = Rules(allow=allow, secrets=secrets, trusted=known, is_signed=certificate is not None, is_local=is_local)
     pair = None if certificate is None or key is None else (certificate, key)
 
     def opened(url: str) -> None:

@@ -8,9 +8,11 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 from asyncua import Server, ua
+from asyncua.common.utils import ServiceError
 from asyncua.crypto.permission_rules import SimpleRoleRuleset, User, UserRole
 from asyncua.server.address_space import AddressSpace, AttributeService
 
+from busmaster.doors.opcua_terms import CODES
 from busmaster.gate.permission import Access
 
 OPEN = [ua.SecurityPolicyType.NoSecurity]
@@ -35,12 +37,14 @@ class Rules:
 
     `allow` names the points that may be written, by their keys; `*` stands for any letters. `secrets` are digests of
     tokens by name: with them only users who show one write. `trusted` are the certificates (DER) of clients, of which
-    None stands for all. `is_local` says that only programs of this machine can come: no other writes without a token.
+    None stands for all; `is_signed` lets in nobody who says things openly. `is_local` says that only programs of this
+    machine can come: no other writes without a token.
     """
 
     allow: tuple[str, ...] = ()
     secrets: Mapping[str, bytes] = field(default_factory=dict, repr=False)
     trusted: Collection[bytes] | None = None
+    is_signed: bool = False
     is_local: bool = True
 
     def may_be_written(self, key: str) -> bool:
@@ -68,6 +72,8 @@ class Users:
 
         `certificate` is that of the client's channel, which has signed with it.
         """
+        if self._rules.is_signed and certificate is None:  # the library opens such a channel, whatever it offers
+            return None
         if self._rules.trusted is not None and certificate not in self._rules.trusted:
             return None
         if username is None:
@@ -95,6 +101,15 @@ class Writes(AttributeService):  # type: ignore[misc]  # it is untyped
         return [ua.StatusCode(await self._write(wanted, user)) for wanted in params.NodesToWrite]
 
 
+def _nobody(token: Any) -> None:
+    """Find no session: who has lost a connection makes a new one."""
+
+
+def _refuse(*arguments: Any) -> None:
+    """Raise the error of a service that there is not."""
+    raise ServiceError(CODES.BadServiceUnsupported)
+
+
 def guard(server: Server, rules: Rules, write: Write) -> None:
     """Have a server let in and through what the rules say, with encryption where it has a certificate."""
     iserver = server.iserver
@@ -102,6 +117,9 @@ def guard(server: Server, rules: Rules, write: Write) -> None:
     iserver.attribute_service = Writes(iserver.aspace, write)
     iserver.max_connections = MOST_CONNECTIONS
     iserver.max_subscriptions = MOST_SUBSCRIPTIONS
+    # The library binds a session to whoever names it, and keeps that so where he is then refused.
+    iserver.lookup_external_session = _nobody
+    iserver.register_server = iserver.register_server2 = _refuse  # anybody could, and as many as he likes
     server.allow_remote_admin(False)
     has_key = iserver.certificate is not None
     server.set_security_policy(ENCRYPTED + SIGNED if has_key else OPEN, SimpleRoleRuleset())

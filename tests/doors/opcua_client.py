@@ -1,4 +1,4 @@
-"""A client of OPC UA of another library than the server's, and of another time: what it says is on the wire as it says."""
+"""A client of OPC UA that is not of the library that the server is of."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import opcua
 import pytest
 import pytest_asyncio
 from opcua import ua
@@ -255,6 +256,31 @@ async def test_a_subscription_is_told_of_each_change_of_value_and_status(opened:
             await leave.aclose()
             for name in names:
                 await told(name, lambda last: last.status == "BadOutOfService")
+
+
+async def test_nobody_comes_by_the_session_of_another(opened: Opened) -> None:
+    async with opened.owned() as line:
+        line.poll("10")
+        await opened.is_("5/10", "Good")
+
+        def intrude() -> None:
+            thief = opcua.Client(opened.url, timeout=PATIENCE)
+            thief.connect_socket()
+            try:
+                thief.send_hello()
+                thief.open_secure_channel()
+                known = opened.client.client.uaclient._uasocket.authentication_token
+                thief.uaclient._uasocket.authentication_token = known
+                with pytest.raises(ua.UaStatusCodeError, match="BadSessionIdInvalid"):
+                    thief.uaclient.activate_session(ua.ActivateSessionParameters())
+                with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
+                    OtherClient(thief).write("5/10", 1.0)
+                thief.close_secure_channel()
+            finally:
+                thief.disconnect_socket()
+
+        await asyncio.to_thread(intrude)
+        assert line.audit() == []
 
 
 async def test_sessions_that_come_and_go_are_nothing_to_the_line(opened: Opened) -> None:
