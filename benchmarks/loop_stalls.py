@@ -12,15 +12,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
-import selectors
 import time
 from collections.abc import Awaitable, Callable
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 from benchmarks.harness import Claim, Options, Outcome, Table
 from benchmarks.lines import Lines
+from benchmarks.watch import Hold, Watch, watched
 from busmaster import Bus, BusError, Hcp2Controller, Point, PollGroup
 from busmaster.bus.node import Node
 from busmaster.contract.profile import LineSettings
@@ -44,57 +43,17 @@ HELD_BY_DESIGN = "plan"
 COLUMNS = ("call", "hold ms", "collector included: longest ms", "by the clock: longest ms")
 
 
-class Hold(NamedTuple):
-    """The longest of some holds, in milliseconds: our own work, with the garbage collector's, and by the clock."""
-
-    own: float = 0.0
-    cpu: float = 0.0
-    clock: float = 0.0
-
-
 Holds = dict[str, list[Hold]]
 """Of each call, round by round."""
-
-
-class Watch(selectors.DefaultSelector):
-    """A selector that notes how long the loop is away from it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._left: tuple[float, float] | None = None
-        self._collecting = self._collected = 0.0
-        self._longest = Hold()
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        if self._left is not None:
-            cpu, clock = time.thread_time() - self._left[0], time.perf_counter() - self._left[1]
-            hold = (cpu - self._collected, cpu, clock)
-            self._longest = Hold(*(max(a, 1000 * b) for a, b in zip(self._longest, hold, strict=True)))
-        ready = super().select(timeout)
-        self._collected = 0.0
-        self._left = time.thread_time(), time.perf_counter()
-        return ready
-
-    def take(self) -> Hold:
-        """The longest since the last time."""
-        longest, self._longest = self._longest, Hold()
-        return longest
-
-    def collects(self, phase: str, _: dict[str, int]) -> None:
-        """For `gc.callbacks`."""
-        if phase == "start":
-            self._collecting = time.thread_time()
-        else:
-            self._collected += time.thread_time() - self._collecting
 
 
 def run(options: Options) -> Outcome:
     outcome = Outcome()
     calls: Holds = {}
     for _ in range(options.pick(10, 1)):
-        outcome.wrong += _watched(lambda watch: _all_calls(watch, calls))
-        outcome.wrong += _watched(lambda watch: _all_fail(watch, calls, "line lost", _lose))
-        outcome.wrong += _watched(lambda watch: _all_fail(watch, calls, "bus closed", _close))
+        outcome.wrong += watched(lambda watch: _all_calls(watch, calls))
+        outcome.wrong += watched(lambda watch: _all_fail(watch, calls, "line lost", _lose))
+        outcome.wrong += watched(lambda watch: _all_fail(watch, calls, "bus closed", _close))
     table = Table(f"{len(NODES) * len(ELEMENTS)} points, {GROUPS} groups: longest hold of the loop", COLUMNS)
     for name, holds in calls.items():
         own = median(hold.own for hold in holds)
@@ -107,24 +66,6 @@ def run(options: Options) -> Outcome:
     outcome.series = {name: [hold.own for hold in holds] for name, holds in calls.items()}
     _running_line(options, outcome)
     return outcome
-
-
-def _watched(work: Callable[[Watch], Awaitable[int]]) -> int:
-    """Run it on a loop of its own. What is there before is kept from the garbage collector, as an application may."""
-    watch = Watch()
-    gc.collect()
-    gc.freeze()
-    gc.callbacks.append(watch.collects)
-    try:
-        with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner:
-            return runner.run(_awaited(work(watch)))
-    finally:
-        gc.callbacks.remove(watch.collects)
-        gc.unfreeze()
-
-
-async def _awaited(work: Awaitable[int]) -> int:
-    return await work
 
 
 def value_of(node: int, element: int) -> float:
@@ -304,7 +245,7 @@ def _running_line(options: Options, outcome: Outcome) -> None:
     """What is added in one callback by the application holds the loop by its own number of calls."""
     tally = Traffic()
     for _ in range(options.pick(5, 1)):
-        _watched(lambda watch: _add_to_traffic(watch, tally, options.pick(2.0, 1.0)))
+        watched(lambda watch: _add_to_traffic(watch, tally, options.pick(2.0, 1.0)))
     outcome.wrong += tally.wrong
     placed = min(tally.placed)
     hold = median(tally.holds)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -131,7 +132,7 @@ class Bare(asyncio.Protocol):
         self._next = (self._next + 1) % len(self._sends)
         self._left -= 1
         if self._left and self._timer is not None:
-            self._timer.set(self._silence)
+            self._timer.set(time.monotonic() + self._silence)
         elif self._left:
             send += self._sends[self._next]
         if send:

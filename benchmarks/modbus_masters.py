@@ -17,12 +17,12 @@ from typing import Any, Protocol, TypeVar
 
 from benchmarks.harness import Options, installed
 from benchmarks.served_line import SETTINGS
-from busmaster import Bus, BusError, Node, Priority, ReplyTiming, SerialPort, Timings
+from busmaster import Bus, BusError, Node, Priority, ReplyTiming, Timings
 from busmaster.contract.learning import Learned
 from busmaster.planning import longest_hold
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.modbus.codec import SILENCE, ReadRegisters, WriteRegisters
-from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.endpoints import Endpoint, endpoint
 
 T = TypeVar("T")
 
@@ -67,7 +67,7 @@ class Busmaster:
         self._nodes: dict[int, Node] = {}
 
     async def open(self, path: str) -> None:
-        await self.open_endpoint(SerialPort(path, baudrate=SETTINGS.baudrate))
+        await self.open_endpoint(endpoint(path, defaults=SETTINGS))
 
     async def open_endpoint(self, endpoint: Endpoint) -> None:
         self.bus = Bus(endpoint)

@@ -1,4 +1,4 @@
-"""The emulated Modbus line, served on a pty from a process of its own, with its faults set from here.
+"""The emulated Modbus line, served on a pty or by TCP from a process of its own, with its faults set from here.
 
 `python -m benchmarks.served_line` is told what to serve in a line of JSON, and prints the path. Each further line there
 is an order: {"unit": 3, "dead": true} takes a unit off the line, {"log": true} asks for what passed on the line since
@@ -19,7 +19,7 @@ from benchmarks.apart import Apart
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
-from busmaster.emulator.serve import PtyServer
+from busmaster.emulator.serve import PtyServer, TcpServer
 from busmaster.protocols.modbus.device import EmulatedModbus
 
 SETTINGS = LineSettings(57600)
@@ -65,10 +65,11 @@ class LoggedLine(Line):
 
 
 class ServedLine:
-    """Units 1 to `units` on a paced line of 57600 baud. Use it in `with`; `path` is the port."""
+    """Units 1 to `units` on a paced line of 57600 baud, behind a serial server if `tcp`. Use it in `with`; `path` is
+    the port."""
 
-    def __init__(self, units: int, *, delay: dict[str, Any] | None = None, seed: int = 1) -> None:
-        self._order = {"units": units, "delay": delay or {}, "seed": seed}
+    def __init__(self, units: int, *, delay: dict[str, Any] | None = None, seed: int = 1, tcp: bool = False) -> None:
+        self._order = {"units": units, "delay": delay or {}, "seed": seed, "tcp": tcp}
         self.path = ""
         self._server: Apart
 
@@ -120,7 +121,7 @@ def delay_of(options: Mapping[str, Any]) -> Delay:
 def main() -> None:
     order = json.loads(sys.stdin.readline())
     line = LoggedLine(SETTINGS, emulated_units(order["units"], order["delay"]), chance=random.Random(order["seed"]))
-    with PtyServer(line) as server:
+    with TcpServer(line) if order["tcp"] else PtyServer(line) as server:
         print(json.dumps(server.path), flush=True)
         for said in sys.stdin:
             wish = json.loads(said)

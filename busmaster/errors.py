@@ -156,6 +156,12 @@ class NotStarted(BusError, TimeoutError):
     hint = "the line is busy: see bus.statistics() or busmaster plan"
 
 
+class HoldEnded(NotStarted):
+    """The line was no longer held for the exclusive sequence that this request is of. Nothing was sent."""
+
+    hint = "do less between two requests of a sequence, or hold the line for longer (max_hold)"
+
+
 class BacklogFull(BusError):
     """Too many requests are waiting. Nothing was queued."""
 
@@ -195,6 +201,7 @@ __all__ = [
     "BusClosed",
     "BusError",
     "GarbledReply",
+    "HoldEnded",
     "InvalidCommand",
     "LineDown",
     "LineNoisy",

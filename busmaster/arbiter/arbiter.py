@@ -9,6 +9,7 @@ business.
 
 from __future__ import annotations
 
+from busmaster.arbiter.clients import OWN, Hold, LineClient
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.arbiter.events import Event
 from busmaster.arbiter.health import NodeRecord
@@ -34,6 +35,8 @@ class Arbiter(LineMachine):
 
     name = ""
     """What errors call the line."""
+    longest_hold = 0.0
+    """Of the sequences that were begun, the longest time, in seconds, for which one may hold the line."""
 
     @property
     def byte_time(self) -> float:
@@ -108,6 +111,29 @@ class Arbiter(LineMachine):
         """Return whether a caller's time is over while something is on the wire: what has come is handed over first."""
         # A loop that stood still may look at its timers before it reads: what lies unread came in time.
         return self.state is EXCHANGE and now >= self._deadlines.expiry
+
+    def add_client(self, share: float = 1.0) -> LineClient:
+        """Return a client with whom the line's owner and other clients take turns from now on (R9)."""
+        self.dispatcher.share()
+        return LineClient(share)
+
+    def remove_client(self, client: LineClient) -> None:
+        """Forget a client, who has nothing waiting; what it may still have on the wire runs out."""
+        client.over = True
+        self.dispatcher.share().forget(client)
+
+    def exclusive(self, node: NodeRecord, client: LineClient | None, longest: float) -> Hold:
+        """Return what requests name as their client that are one sequence: see `Hold`. It ends with `release`."""
+        self.dispatcher.share()
+        self.longest_hold = max(self.longest_hold, longest)
+        return Hold(node, OWN if client is None else client, longest)
+
+    def release(self, hold: Hold, now: float) -> None:
+        """End a sequence: the line is free for others; what of it was not sent ends as HoldEnded."""
+        if not hold.over:
+            self.dispatcher.end_hold(now, hold)
+        if self.state is READY:
+            self._advance(now)
 
     def submit(self, transaction: Transaction, now: float) -> bool:
         """Queue a transaction, or end it at once.

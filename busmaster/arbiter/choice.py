@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 from busmaster.arbiter.alike import Alike
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import UP, NodeRecord
-from busmaster.arbiter.in_step import InStep
+from busmaster.arbiter.in_step import MOST_UNHEARD, InStep
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.transaction import URGENT, Transaction
 from busmaster.contract.exchange import Command, Exchange
@@ -36,6 +36,8 @@ class Choice:
         self._in_step = in_step
         self._alike = Alike(wire)
         self._gone_before = 0
+        self._held_since = -inf
+        """When the first went before the one that is held back."""
         self._last_byte = -inf
 
     def next(self, now: float, last_byte: float) -> Chosen | float | None:
@@ -44,7 +46,6 @@ class Choice:
         `last_byte` is when the last byte came, in seconds.
         """
         dispatcher, in_step, alike = self._dispatcher, self._in_step, self._alike
-        self._last_byte = last_byte
         while (transaction := dispatcher.next(now)) is not None:
             node = transaction.node
             try:
@@ -60,18 +61,19 @@ class Choice:
         if answers == in_step.last and not exchange.later:
             too_many = alike.another(exchange, last_byte, now)
             if too_many or in_step.alert:
-                return self._carefully((transaction, exchange), now, too_many)
+                return self._carefully((transaction, exchange), now, last_byte, too_many)
         elif in_step.alert:
-            return self._carefully((transaction, exchange), now)
+            return self._carefully((transaction, exchange), now, last_byte)
         else:
             alike.count = 0
         alike.node = node
         in_step.before, in_step.last = in_step.last, answers
         return transaction, exchange
 
-    def _carefully(self, first: Chosen, now: float, too_many: bool = False) -> Chosen | float:
+    def _carefully(self, first: Chosen, now: float, last_byte: float, too_many: bool = False) -> Chosen | float:
         """Choose as `next` does, where something is owed or doubted, or `too_many` answers were alike."""
         in_step = self._in_step
+        self._last_byte = last_byte
         in_step.lapse(now)
         chosen: Chosen | float = first
         transaction, exchange = first
@@ -134,8 +136,9 @@ class Choice:
             other = self._another(first, now, clashes, of)
         if other is None:
             ends = in_step.ends(answers, now)
-            if ends < inf:
-                return ends
+            if ends < inf:  # what its own node owes has to be asked for then, too
+                own = in_step.clashes(answers, ends, first[0].node)
+                return (self._ask_itself(first, now) if own else None) or ends
             asked, silent = self._whom_to_ask(now)
             worth_it = first[0].writes or not first[0].attempts
             if worth_it and not (owing or asked):  # all are silent: a check of its own node costs no more than it would
@@ -154,21 +157,25 @@ class Choice:
 
     def _while_awaited(self, first: Chosen, now: float, answers: Sequence[bytes] | None = None) -> Chosen | None:
         """Return what goes while an owed answer (that could look so) may still be on time, though the line went on: a
-        check of the node that owes it, which shows that it is not to come; else another. Returns None once two were in
-        vain."""
-        if self._gone_before >= MOST_BEFORE - 1:
+        check of the node that owes it, which shows that it is not to come; else another. After two, only checks, which
+        are short where times are learned, and only for a lateness: with the wait that is left that is no longer than
+        MOST_BEFORE exchanges can last. Then returns None."""
+        if not self._gone_before:
+            self._held_since = now
+        two_gone = self._gone_before >= MOST_BEFORE - 1
+        urgent, timings = first[0].priority is URGENT, first[0].node.timings
+        if two_gone and (urgent or now >= self._held_since + timings.read.lateness):
             return None
 
         def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
             return self._in_step.clashes(answers, now, node)
 
         owing = dict.fromkeys(self._in_step.owing(answers, now))
-        other = (
-            self._of_these(owing, now, clashes)
-            or self._ask_check(owing, now, clashes)
-            or self._another(first, now, clashes)
-        )
-        self._gone_before += other is not None
+        other = self._of_these(owing, now, clashes) or self._ask_check(owing, now, clashes)
+        if other is None and not two_gone:
+            other = self._another(first, now, clashes)
+        if other is not None and not two_gone:
+            self._gone_before += 1
         return other
 
     def _of_these(self, nodes: Container[NodeRecord], now: float, unfit: Unfit) -> Chosen | None:
@@ -195,7 +202,10 @@ class Choice:
         """Return a check of a node that owes what it is to be asked for: its answer would not be believed. Returns None
         for a node that is likely to be dead."""
         node = first[0].node
-        if node.silent or self._gone_before >= MOST_BEFORE:  # a death would cost the living an exchange
+        # A death would cost the living an exchange. Where times are learned that is a short one.
+        brief = node.learning is not None and not node.failures
+        dead = node.unheard > MOST_UNHEARD if brief else node.silent
+        if dead or self._gone_before >= MOST_BEFORE:
             return None
         self._gone_before += 1
         return self._ask_check([node], now, lambda answers, node: self._in_step.clashes(answers, now, node))
@@ -276,10 +286,10 @@ def _is_decisive(chosen: Chosen) -> bool:
 
 
 def checks_of(node: NodeRecord) -> Iterator[Command[Any]]:
-    """Yield cheap reads of a node: those that it has answered, then those of its protocol that it has not refused."""
+    """Yield cheap reads of a node: those that it has answered, then those of its protocol that it does not refuse."""
     yield from node.answered.values()
     for command in node.profile.checks:
-        if command not in node.refused:
+        if not node.refuses(command):
             yield command
 
 

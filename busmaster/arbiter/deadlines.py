@@ -32,6 +32,8 @@ class Deadlines:
     """More of what waited for a line that can no longer be used is to fail."""
     health = _Other()
     """A dead node's next probe, or the end of a suspension."""
+    hold = _Other()
+    """The line has been held for one sequence of requests for as long as it may be."""
 
     def __init__(self) -> None:
         self.line = inf
@@ -39,4 +41,4 @@ class Deadlines:
         self.each: dict[str, float] = {}
         """All others, by name."""
         self.earliest_other = inf
-        self.schedule = self.expiry = self.failing = self.health = inf
+        self.schedule = self.expiry = self.failing = self.health = self.hold = inf

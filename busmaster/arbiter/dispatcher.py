@@ -12,17 +12,19 @@ from collections.abc import Callable
 from math import inf
 from typing import Any
 
-from busmaster.arbiter import health
 from busmaster.arbiter.backlog import Backlog
+from busmaster.arbiter.clients import Hold
 from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.endings import make_error, name_error, too_late
-from busmaster.arbiter.events import Event, LatenessLowered, NodeChanged, Overdue, Polled, Sampled
+from busmaster.arbiter.endings import hold_ended, make_error, name_error, too_late
+from busmaster.arbiter.events import Event, Overdue, Polled, Sampled
 from busmaster.arbiter.expiries import Expiries
 from busmaster.arbiter.failing_transactions import FailingTransactions, take_out
-from busmaster.arbiter.health import DOWN, UNKNOWN, UP, Health, NodeRecord
+from busmaster.arbiter.health import DOWN, UP, NodeRecord
+from busmaster.arbiter.node_watch import NodeWatch
 from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.schedule import Schedule
+from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.state import SETTLING
 from busmaster.arbiter.tap import Attempt
 from busmaster.arbiter.transaction import (
@@ -73,7 +75,7 @@ class Dispatcher:
         self.events: deque[Event] = deque()
         self.unnoted: Transaction | None = None
         """The one that has succeeded, until `note_success`."""
-        self.backlog = Backlog()
+        self.backlog: Backlog = Backlog()
         self.schedule = Schedule()
         self.nodes: list[NodeRecord] = []
         self.writes = Writes(self.backlog)
@@ -83,7 +85,7 @@ class Dispatcher:
         self._deadlines = deadlines
         self.probes = Probes(deadlines, self.nodes, now)
         self._capacity = capacity
-        self._jitter = jitter
+        self._watch = NodeWatch(self.nodes, self.probes, self.events, jitter)
         self._expiries = Expiries(deadlines)
         self.failing = FailingTransactions(deadlines)
 
@@ -98,18 +100,17 @@ class Dispatcher:
         if self.fault is not None:
             self._end(transaction, now, name_error(self.fault(), transaction))
             return True
-        if transaction.writes and transaction.priority is URGENT:  # even if it fails below: no enable may follow it
-            self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
+        changed = transaction.writes  # it may have superseded others, which is to be told
         queue = self.backlog.queues[transaction.priority]
-        waiting = queue.live
-        if transaction.writes:
-            waiting = max(waiting, len(self.writes.queues[node]))  # those that are parked are in no class
-        if waiting >= self._capacity:
+        if changed and transaction.priority is URGENT:  # even if it fails below: no enable may follow it
+            self._supersede(node, "overtaken by an urgent write to the same node", now, above=URGENT)
+        # writes that are parked are in no class
+        waiting = max(queue.live, len(self.writes.queues[node])) if changed else queue.live
+        if waiting >= self._capacity and (waiting := self.writes.waiting_of(transaction)) >= self._capacity:
             self._end(transaction, now, make_error(BacklogFull, f"{waiting} requests are waiting already", transaction))
             return True
         if (node.health is DOWN or now < node.suspended_until) and not self._may_ask(transaction, now):
             return True
-        changed = transaction.writes  # it may have superseded others, which is to be told
         if changed:
             self.writes.queues[node].append(transaction)
         if transaction.start_by < inf:
@@ -133,7 +134,7 @@ class Dispatcher:
 
     def next(self, now: float) -> Transaction | None:
         """Take out the transaction that may be sent now, or return None."""
-        while (transaction := self.backlog.pop()) is not None:
+        while (transaction := self.backlog.pop(now)) is not None:
             node = transaction.node
             if transaction.start_by < now and (  # queued right now, it is in time: its caller's clock was read earlier
                 transaction.finish_by <= now or (transaction.queued < now and not transaction.attempts)
@@ -162,7 +163,9 @@ class Dispatcher:
     def started(self, transaction: Transaction, now: float) -> None:
         """Note that the next attempt of a transaction goes out now."""
         counters = self.counters
-        if transaction.attempts == 0 and not transaction.check:
+        if transaction.attempts:
+            transaction.first_byte = -inf
+        elif not transaction.check:
             counters.waits[transaction.priority].record(now - transaction.queued)
             transaction.exchanges_ahead = counters.exchanges - transaction.exchanges_ahead
             transaction.settling_ahead = counters.spent[SETTLING] - transaction.settling_ahead
@@ -174,7 +177,6 @@ class Dispatcher:
         transaction.phase = ON_WIRE
         transaction.attempts += 1
         transaction.started = now
-        transaction.first_byte = -inf
         transaction.late = False  # an earlier attempt may have been; this one's value is not late for that
 
     # what came of an attempt
@@ -203,9 +205,9 @@ class Dispatcher:
             counters.late += 1
         node.last_reply = now
         if node.health is not UP:
-            self._heard(node, now)
+            self._watch.heard(node, now)
         if node.lateness_until < inf:
-            self._lower_lateness(transaction, now)
+            self._watch.lower_lateness(transaction, now)
         if transaction.probe_cost:
             self.probes.budget.refund(transaction.probe_cost - (now - transaction.started))
         transaction.refused_cycles = 0
@@ -221,16 +223,14 @@ class Dispatcher:
             node.counters.no_reply += 1
         else:
             node.counters.garbled += 1
-        worth = doubted or self._worth_a_retry(transaction)
+        worth = doubted or self._watch.is_worth_a_retry(transaction)
         if transaction.retried < transaction.retries and worth and self._wanted(transaction):
             transaction.retried += 1
             node.counters.retries += 1
             self._requeue(transaction, now)
             return
         if not (doubted or transaction.check):
-            before = node.health
-            health.note_failure(node, now, self._jitter)
-            self._report(node, before)
+            self._watch.failed(node, now)
         kind: type[BusError] = NoReply if no_reply else GarbledReply
         if transaction.writes:
             kind = WriteUnconfirmed
@@ -261,7 +261,7 @@ class Dispatcher:
             return
         node.last_reply = now  # a refusal is an answer too (R11)
         if node.health is not UP:
-            self._heard(node, now)
+            self._watch.heard(node, now)
         transaction.refused_cycles += 1
         if transaction.refused_cycles > 1:
             transaction.refused_until = now + REFUSED_POLL_PAUSE
@@ -275,6 +275,24 @@ class Dispatcher:
         """Fail a transaction under which the line was lost: a write may have been carried out."""
         self._end(transaction, now, name_error(error, transaction))
 
+    # clients
+
+    def share(self) -> SharedBacklog:
+        """Return the backlog in which clients take turns, which the line has from now on."""
+        backlog = self.backlog
+        if not isinstance(backlog, SharedBacklog):
+            self.backlog = self.writes.backlog = backlog = SharedBacklog(backlog, self.writes, self._deadlines)
+        return backlog
+
+    def end_hold(self, now: float, hold: Hold | None = None) -> None:
+        """Hold the line no longer for a sequence, the one that lasts if none is given: what of it waits ends so."""
+        backlog = self.share()
+        hold = hold or backlog.hold
+        if hold is not None:
+            for transaction in backlog.end_hold(hold, now):
+                self._end(transaction, now, hold_ended(transaction, hold))
+            self.writes.wake(hold.node, hold.client)
+
     # everything at once
 
     def supersede_writes(self, now: float) -> None:
@@ -287,6 +305,18 @@ class Dispatcher:
         assert self.fault is not None
         self.failing.add(take_out(self.writes.queues.values(), self.backlog), self.fault())
         self.fail_more(now)
+
+    def handle_timeout(self, now: float, unread: bool) -> None:
+        """Do what is due, but for what is the line's; with bytes `unread`, nobody is told that his time is over."""
+        deadlines = self._deadlines
+        if now >= deadlines.failing:
+            self.fail_more(now)
+        if now >= deadlines.schedule:
+            self.release_polls(now)
+        if now >= deadlines.expiry and not unread:
+            self.expire(now)
+        if now >= deadlines.hold:
+            self.end_hold(now)
 
     def fail_more(self, now: float) -> None:
         """End a bounded piece of what was taken out: the deadline has passed already while there is more."""
@@ -407,44 +437,12 @@ class Dispatcher:
             self._end(transaction, now, error)
         return error is None
 
-    def _lower_lateness(self, transaction: Transaction, now: float) -> None:
-        """Put a node's lateness back to what it was, when an hour of prompt replies has passed since it was raised."""
-        node = transaction.node
-        if transaction.late:
-            node.lateness_until = now + health.CALM_LATENESS
-        elif now > node.lateness_until:
-            node.restore_lateness()
-            self.events.append(LatenessLowered(node, node.lateness))
-
-    def _heard(self, node: NodeRecord, now: float) -> None:
-        before = node.health
-        flaps = health.flaps(node, now)
-        health.note_success(node, now)
-        if before is DOWN and not flaps:  # the others may be back too; a flapping node tells nothing about them
-            self.probes.budget.node_returned(now)
-            for other in self.nodes:
-                if other.health is DOWN:
-                    other.probe_at = min(other.probe_at, now)
-        self._report(node, before)
-
-    def _report(self, node: NodeRecord, before: Health) -> None:
-        if node.health is not before:
-            returning = before is DOWN and node.has_hook
-            node.holds += returning
-            self.events.append(NodeChanged(node, before, node.health, returning))
-        self.probes.plan()
-
     # the ways of one transaction
 
-    def _worth_a_retry(self, transaction: Transaction) -> bool:
-        """Return False while the node fails, or for a poll of one never heard, which may not hold up a line's start."""
-        node = transaction.node
-        if node.health is UNKNOWN:
-            return transaction.poll is None
-        return not node.failures and node.health is not DOWN
-
     def _wanted(self, transaction: Transaction) -> bool:
-        return transaction.wanted and not transaction.superseded and self.fault is None
+        client = transaction.client
+        over = client is not None and client.over
+        return transaction.wanted and not (transaction.superseded or over) and self.fault is None
 
     def _requeue(self, transaction: Transaction, now: float) -> None:
         """Put a transaction at the back of its class; a poll's key becomes failure time + period (R7)."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from busmaster.arbiter.clients import Hold
 from busmaster.arbiter.transaction import Transaction
-from busmaster.errors import BusError, NoReply, NotStarted, WriteUnconfirmed
+from busmaster.errors import BusError, HoldEnded, NoReply, NotStarted, WriteUnconfirmed
 
 TOO_LATE = "allow more time, or see bus.statistics(), or busmaster plan, for what holds it up"
 
@@ -31,3 +32,11 @@ def too_late(transaction: Transaction, now: float) -> BusError:
     if kind is NoReply:
         error.hint = TOO_LATE
     return error
+
+
+def hold_ended(transaction: Transaction, hold: Hold) -> BusError:
+    """Return the error of what a sequence still waits for when the line is no longer held for it."""
+    over = f"the {hold.longest:g} s for which the line was held for it are over"
+    if transaction.attempts:
+        return make_error(NoReply, f"not answered, and {over}", transaction)
+    return make_error(HoldEnded, over, transaction)

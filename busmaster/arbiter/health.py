@@ -38,6 +38,8 @@ SILENT = 2
 """Attempts in a row without a byte after which a node is not asked whether it is in step."""
 MOST_ANSWERED = 3
 """Commands that are remembered of a node because it has answered them."""
+KNOWN_TO_REFUSE = 2
+"""Refusals of a check, none of them followed by an answer to it, after which it is not asked for any more."""
 SLOWER, SLOWER_BY = 1.25, 0.001
 """A reply is later than its node usually is if it takes so many times its slowest one, and so many seconds."""
 SLOWEST_DECAY = 0.002
@@ -61,6 +63,7 @@ class NodeRecord:
 
     __slots__ = (
         "_before_raised",
+        "_refused",
         "address",
         "answered",
         "counters",
@@ -78,7 +81,6 @@ class NodeRecord:
         "probe_delay",
         "probed_at",
         "profile",
-        "refused",
         "replies",
         "retries",
         "slowest",
@@ -121,8 +123,8 @@ class NodeRecord:
         """How often it was told to stop: what was decided before must not undo it."""
         self.answered: dict[Sequence[bytes], Command[Any]] = {}
         """A few reads that it has answered, by what their answers look like (R15)."""
-        self.refused: set[Command[Any]] = set()
-        """Checks that it has refused."""
+        self._refused: dict[Command[Any], int] = {}
+        """How often it has refused a check since it has answered it."""
         self.unheard = 0
         """Attempts in a row that brought nothing."""
         self.slowest = 0.0
@@ -136,6 +138,8 @@ class NodeRecord:
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
         """Note that the node has answered this command rightly, after `took` seconds."""
         self.unheard = 0
+        if self._refused:
+            self._refused.pop(command, None)
         # Up at once, down slowly: it decides which answers are believed (R15), and one slow reply among many fast ones
         # is what it must not forget.
         slowest = self.slowest
@@ -153,13 +157,17 @@ class NodeRecord:
         return SLOWER * self.slowest + SLOWER_BY if self.slowest else unknown
 
     def note_refused(self, command: Command[Any]) -> None:
-        """Note that the node has refused this read: it is no check, unless the node has refused them all. Then one of
-        them may have been refused by mistake, and all are checks again."""
+        """Note that the node has refused this read. If it has refused all checks, one of them may have been refused by
+        mistake, and all are checks again."""
         if command in self.profile.checks:
-            self.refused.add(command)
-        if len(self.refused) >= len(self.profile.checks):
-            self.refused.clear()
+            self._refused[command] = min(self._refused.get(command, 0) + 1, KNOWN_TO_REFUSE)
+        if all(self.refuses(check) for check in self.profile.checks):
+            self._refused.clear()
         self.answered = {key: read for key, read in self.answered.items() if read != command}
+
+    def refuses(self, check: Command[Any]) -> bool:
+        """Return whether the node is known to refuse a check: once may be noise, or was said to somebody else."""
+        return self._refused.get(check, 0) >= KNOWN_TO_REFUSE
 
     def raise_lateness(self, lateness: float, now: float) -> None:
         """Raise the node's lateness to at least `lateness` seconds: it was slower than was believed."""

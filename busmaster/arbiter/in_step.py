@@ -122,9 +122,12 @@ class InStep:
         self._doubted = [entry for entry in self._doubted if entry[1] > now]
         self.alert = bool(self.debts or self._doubted or self._doubt_until > now)
 
-    def clashes(self, answers: Sequence[bytes], now: float, node: NodeRecord | None = None) -> bool:
-        """Return whether an answer beginning with one of these keys, of this node if given, could be one owed."""
-        return any(debt.of(node, now) and _could_be(debt, answers) for debt in self.debts)
+    def clashes(
+        self, answers: Sequence[bytes], now: float, node: NodeRecord | None = None, but: float | None = None
+    ) -> bool:
+        """Return whether an answer beginning with one of these keys, of this node if given, could be one owed; `but` to
+        the request that was out then."""
+        return any(debt.of(node, now) and debt.asked != but and _could_be(debt, answers) for debt in self.debts)
 
     def over(self, answers: Sequence[bytes]) -> float:
         """Return when all that is owed and could look so is later than its node's lateness allows."""
@@ -204,15 +207,17 @@ class InStep:
 
     def _heard_late(self, awaited: list[Debt], run: bytes, now: float) -> Debt | None:
         """Do as `heard` does, where the line went on before a reply was over. Talkers may have met, and what is left of
-        two can begin like anything: only whole replies pay, and where it is certain who owed them."""
+        two can begin like anything: only a whole reply pays, and only where nobody owes another one: that could be it,
+        to something else than was asked. Returns who seems to have said it."""
         first = None
         while found := next(((debt, rest) for debt in awaited if (rest := _behind(debt, run)) is not None), None):
             debt, run = found
             first = first or debt
             awaited.remove(debt)
-            if all(other.node is debt.node for other in self.debts if other.key == debt.key):
+            request = (debt.node, debt.asked)
+            if all((other.node, other.asked) == request for other in self.debts if other.awaited is not None):
                 # all that its request left: the lone byte, too, that could have been a part of this reply
-                self.debts = [other for other in self.debts if (other.node, other.asked) != (debt.node, debt.asked)]
+                self.debts = [other for other in self.debts if (other.node, other.asked) != request]
         if run:
             self.owe((ANY_BYTE,), None, now, now)
         return first

@@ -6,8 +6,7 @@ One half-duplex line, many nodes, anonymous replies: at most one exchange is on 
 one can come when the next begins (R3), unless its window was learned (R15). It is told the time and sends nothing: its
 owner pumps `poll_transmit`, then `poll_event`, and arms a timer for `poll_timeout`. Calls too early change nothing.
 
-The line is in one of five states; `_line_due` is when the state ends by itself.
-from busmaster.arbiter.mark import Mark
+The line is in one of five states; `_deadlines.line` is when the state ends by itself.
 
 =========  =====================  =======================  ==========================  ====================
 state      data received          its deadline             line_up / line_down         submit, poll due
@@ -79,15 +78,13 @@ class LineMachine:
         self._closed = False
         # the exchange on the wire
         self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency, byte_time)
-        self._wire = OnWire(self._leg, self._echo, self._deadlines, self.dispatcher.urgent_waits)
         self._in_step = InStep(strict)
+        self._wire = OnWire(self._leg, self._echo, self._deadlines, self._in_step, self.dispatcher.urgent_waits)
         self._choice = Choice(self.dispatcher, self._in_step, self._wire)
         self._trust = Trust(self._in_step)
         # the line
         self._unasked = UnaskedBytes(self.events, self._counters)
-        self._up_at = -inf
-        self._quarantine = -inf
-        self._silent_at = -inf
+        self._up_at = self._quarantine = self._silent_at = -inf
 
     # inputs
 
@@ -143,11 +140,11 @@ class LineMachine:
 
     def transmitted(self, now: float) -> None:
         """Note that the port took what `poll_transmit` gave only now: whoever held the process up meanwhile."""
-        wire = self._wire
-        said_at = wire.output.said_at
+        wire, output = self._wire, self._wire.output
+        said_at = output.said_at
         late = now - said_at
         if late > 0:
-            wire.output.said_at = now
+            output.said_at = now
             leg = self._leg  # as leg.shift does: this is done for every request
             leg.end += late
             leg.out += late
@@ -183,12 +180,7 @@ class LineMachine:
         """Do what is due. If `unread`, bytes have come that were not handed over: the line's silence is not known."""
         deadlines = self._deadlines
         if now >= deadlines.earliest_other:
-            if now >= deadlines.failing:
-                self.dispatcher.fail_more(now)
-            if now >= deadlines.schedule:
-                self.dispatcher.release_polls(now)
-            if now >= deadlines.expiry and not unread:
-                self.dispatcher.expire(now)
+            self.dispatcher.handle_timeout(now, unread)
             if now >= deadlines.health:
                 self._enter(self.state, now)
                 self.dispatcher.probe(now, self.state is READY)
@@ -212,7 +204,8 @@ class LineMachine:
         if now < self._quarantine:
             self._settle(now)
             return True
-        chosen = self._choice.next(now, self._unasked.last_byte)
+        unasked = self._unasked
+        chosen = self._choice.next(now, unasked.last_byte)
         if chosen is None:
             return False
         if type(chosen) is not tuple:
@@ -224,8 +217,8 @@ class LineMachine:
         if self.state is not EXCHANGE:
             self._enter(EXCHANGE, now)
         self._wire.begin(transaction, exchange, now)
-        if self._unasked.unanswered_one is not None:
-            self._unasked.looked(now, self._deadlines.line)
+        if unasked.unanswered_one is not None:
+            unasked.looked(now, self._deadlines.line)
         return True
 
     def _begin_reply(self, data: bytes, now: float) -> bytes:
@@ -294,14 +287,15 @@ class LineMachine:
                 if verdict is not None:
                     self._deadlines.line = verdict
                     return
-            if leg.end > leg.begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
-                leg.end = leg.out = leg.begun_at
-            transaction.node.note_reply(exchange.answers, transaction.command, leg.begun_at - leg.end)
+            begun_at = leg.begun_at
+            if leg.end > begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
+                leg.end = leg.out = begun_at
+            transaction.node.note_reply(exchange.answers, transaction.command, begun_at - leg.end)
             if transaction.node.learning is not None:
                 wire.learn(now)
         if step.send:
             wire.say(step.send, now)
-        wire.transaction = wire.exchange = self._trust.held = None
+        wire.transaction = wire.exchange = None  # and nothing is held: what was has been weighed again
         self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, step.value, now)
         if rest:
@@ -430,6 +424,7 @@ class LineMachine:
         self._leg.came_unasked(now)
         if self.state is OFFLINE:
             return
+        self._leg.reply_came = self._leg.goes_on and self._trust.is_late_reply(bytes(unasked.run), now)
         self._settle(now)
         if not self.noisy:  # on a noisy line nothing is sent, not even an ACK
             self._answer_unasked(unasked.reply_to(data), now)

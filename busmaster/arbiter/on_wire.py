@@ -7,6 +7,7 @@ from typing import Any, cast
 
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.echo import Echo
+from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.learned import LATE_SHARE
 from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.output import Output
@@ -21,6 +22,7 @@ class OnWire:
     __slots__ = (
         "_deadlines",
         "_echo",
+        "_in_step",
         "_urgent_waits",
         "answered",
         "came_unasked",
@@ -30,7 +32,9 @@ class OnWire:
         "transaction",
     )
 
-    def __init__(self, leg: Leg, echo: Echo, deadlines: Deadlines, urgent_waits: Callable[[], bool]) -> None:
+    def __init__(
+        self, leg: Leg, echo: Echo, deadlines: Deadlines, in_step: InStep, urgent_waits: Callable[[], bool]
+    ) -> None:
         self.transaction: Transaction | None = None
         self.exchange: Exchange[Any] | None = None
         self.answered = True
@@ -41,6 +45,7 @@ class OnWire:
         """Bytes came though no answer was due (a broadcast's)."""
         self._echo = echo
         self._deadlines = deadlines
+        self._in_step = in_step
         self._urgent_waits = urgent_waits
 
     def begin(self, transaction: Transaction, exchange: Exchange[Any], now: float) -> None:
@@ -105,14 +110,23 @@ class OnWire:
         return now + (leg.timing.window + leg.latency if self.answered else leg.timing.turnaround)
 
     def _next_leg(self, step: Expect, now: float) -> None:
-        """Begin the next leg. Raises FrameError instead, where a repeat would hold the line past its limit or an urgent
-        command (R9)."""
+        """Begin the next leg. Raises FrameError or Refused instead, where a repeat would hold the line past its limit
+        or an urgent command (R9), or do twice what may have been done (R7)."""
         transaction = self.transaction
         assert transaction is not None
         limit = transaction.node.profile.exchange_limit
         self.learn(now)  # before the next leg begins, which takes the place of this one's times
-        if step.send and limit is not None and (now - transaction.started > limit or self._urgent_waits()):
-            raise cast("Abandonable", self.exchange).abandon()
+        if step.send and limit is not None:
+            too_long = now - transaction.started > limit or self._urgent_waits()
+            if too_long or (transaction.writes and not transaction.idempotent and self._may_be_anothers(now)):
+                raise cast("Abandonable", self.exchange).abandon()
         self._deadlines.line = self.leg.begin(step.timing, len(step.send), step.sizes.longest, now)
         if step.send:
             self.output.add(step.send, now)
+
+    def _may_be_anothers(self, now: float) -> bool:
+        """Return whether what was said to this exchange could be one that is owed (R15): a NAK, too."""
+        transaction, exchange, in_step = self.transaction, self.exchange, self._in_step
+        assert transaction is not None
+        assert exchange is not None
+        return in_step.alert and in_step.clashes(exchange.answers, now, transaction.node)

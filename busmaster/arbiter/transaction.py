@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from math import inf, nextafter
 from typing import Any, NamedTuple
 
+from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.health import DOWN, UNKNOWN, NodeRecord
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.learned import AGAIN, AT_FIRST, AT_LAST, NEVER
@@ -70,6 +71,7 @@ class Transaction:
     __slots__ = (
         "attempts",
         "check",
+        "client",
         "command",
         "deadline",
         "ended_at",
@@ -126,13 +128,14 @@ class Transaction:
         touches: object = None,
         tag: Any = None,
         poll: Poll | None = None,
+        client: LineClient | None = None,
     ) -> None:
         self.node = node
         self.command = command
         self.priority = priority
-        self.writes = command.writes
+        self.writes = writes = command.writes
         self.idempotent = command.idempotent if idempotent is None else idempotent
-        if probe or (self.writes and not self.idempotent):
+        if probe or (writes and not self.idempotent):
             self.retries = 0  # whatever number was given: that alone does not make a write repeatable
         else:
             self.retries = node.retries if retries is None else retries
@@ -144,6 +147,8 @@ class Transaction:
             self.start_by = min(start_by, nextafter(finish_by, -inf))
         self.tag = tag
         self.poll = poll
+        self.client = client
+        """Whose request it is; None is the program that owns the line."""
         self.probe = probe
         self.check = False
         """It is asked for the sake of its answer's likeness alone (R15): nobody waits for it, nothing counts it."""

@@ -19,7 +19,7 @@ from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import SLICE
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Tap
-from busmaster.arbiter.transaction import Phase, Priority
+from busmaster.arbiter.transaction import Priority
 from busmaster.bus.alarms import AlarmChanged, Alarms, BusEvent
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
@@ -97,10 +97,7 @@ class Bus:
             paced=lambda transport: is_paced(endpoint, transport),
             name=endpoint.name,
         )
-        self.taps = Taps(self.pump)
-        """Whoever hears every byte, while the bus runs too."""
-        if tap is not None:
-            self.taps.add(tap)
+        self.taps = Taps(self.pump, tap)
         self._nodes: dict[tuple[str, int], Node] = {}
         self._profiles: dict[str, Profile] = {}
         """Of the protocols on this line, by name."""
@@ -256,9 +253,19 @@ class Bus:
         return tuple(self._nodes.values())
 
     @property
+    def shared(self) -> SharedLine:
+        """Return what the nodes share: the line, and the programs that take turns on it."""
+        return self._line
+
+    @property
     def on_stop(self) -> list[Callable[[NodeRecord], None]]:
         """Return what is told, at once, when a node is told to stop."""
         return self._line.on_stop
+
+    @property
+    def on_touched(self) -> list[Callable[[NodeRecord, float], None]]:
+        """Return those who are told, at once, of which node a write is over, and when it ended."""
+        return self._line.on_touched
 
     @property
     def groups(self) -> tuple[PollGroup, ...]:
@@ -367,9 +374,10 @@ class Bus:
     def worst_case_wait(self, priority: Priority = Priority.COMMAND) -> float:
         """Return how long, in seconds, a request of this class, made now, waits at most until it is sent (R9).
 
-        It reckons with what is polled, what waits already, every node's probe, and each kind of command that was
-        asked or polled so far; with nodes that are dead, late or trickling; not with a line that is never silent. Reply
-        times that are learned do not shorten it: those of the document may come back at any moment.
+        It reckons with what is polled, what waits already, every node's probe, each kind of command that was asked or
+        polled so far, the programs that are connected, and the longest exclusive sequence that was begun; with nodes
+        that are dead, late or trickling; not with a line that is never silent. Reply times that are learned do not
+        shorten it: those of the document may come back at any moment.
         """
         self.check_loop()
         priority = checked_priority(priority)
@@ -384,11 +392,10 @@ class Bus:
             self.endpoint.receive_latency,
             polls=1 + max(polled - low, backlog.waiting(Priority.POLL)),
             background=probed + max(low, backlog.waiting(Priority.BACKGROUND)),
+            sharing=self._line.sharing,
         )
-        queues = self._arbiter.dispatcher.writes.queues.values()
-        parked = sum(write.phase is Phase.PARKED for queue in queues for write in queue)
         longest = max((poll.patience for poll in polls if poll.results), default=1.0)
-        return bound.wait(priority, ahead=backlog.waiting(priority) + parked, patience=longest)
+        return bound.wait(priority, ahead=self._line.ahead(priority), patience=longest)
 
     @property
     def alarms(self) -> Mapping[Point[Any], AlarmChanged | None]:
@@ -467,6 +474,7 @@ class Bus:
                 receive_latency=latency,
                 others=self._asked(),
                 could_merge=could_merge,
+                sharing=self._line.sharing,
             )
         )
 

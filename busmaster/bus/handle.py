@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from typing import Any, ClassVar, TypeAlias, Unpack
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from copy import copy
+from typing import Any, ClassVar, Self, TypeAlias, Unpack
 
 from busmaster.bus.points import Point
 from busmaster.bus.requester import NodeSource, ReadOptions, SeveralRequests, WriteOptions
@@ -53,6 +55,20 @@ class Handle(ABC):
     @abstractmethod
     async def write(self, item: Any, value: Any, /, **options: Unpack[WriteOptions]) -> None:
         """Write a value to an item. `RequestOptions` says what the options are."""
+
+    @asynccontextmanager
+    async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[Self]:
+        """Return, for `async with`, this handle for a sequence of requests: nothing but what is urgent comes between.
+
+        From when the first of them is sent, the line is held until the block is left, `max_hold` seconds at most (up to
+        5), to the end of the exchange that is on the wire then; what is asked in it later raises HoldEnded, and is not
+        sent. Only what is asked of the handle that the block is given is of the sequence: anything else, of this
+        program too, waits.
+        """
+        async with self.node.exclusive(max_hold=max_hold) as held:
+            handle = copy(self)
+            handle.node = held
+            yield handle
 
     @classmethod
     @abstractmethod

@@ -76,12 +76,18 @@ class Limiter:
 
     @asynccontextmanager
     async def passing(
-        self, node: Requester, command: Command[Any], options: RequestOptions, stop: bool = False
+        self,
+        node: Requester,
+        command: Command[Any],
+        options: RequestOptions,
+        stop: bool = False,
+        within: Requester | None = None,
     ) -> AsyncIterator[RequestOptions]:
         """Let a write pass, or raise InvalidCommand before anything is sent. Yields the options that are left for it.
 
         Raises NotStarted where the value before it is needed and cannot be read, Superseded where an urgent write came
-        first. A `stop` passes whatever the limits, and what the node holds after it is not known.
+        first. A `stop` passes whatever the limits, and what the node holds after it is not known. `within` is the node
+        for the sequence that the write is of: only so can the value before it be read meanwhile.
         """
         urgent = options.priority is Priority.URGENT
         reached = list(self._reached(node))
@@ -93,7 +99,7 @@ class Limiter:
             reached = [one for one in reached if one.touched_by(_changes(node, command))]
         async with AsyncExitStack() as held:
             if not (urgent or stop) and any(limit.max_step for one in reached for limit in one.limits):
-                options = await self._step_by_step(held, node, reached, command, options)
+                options = await self._step_by_step(held, node, within, reached, command, options)
             try:
                 yield options
             except BaseException:
@@ -110,6 +116,7 @@ class Limiter:
         self,
         held: AsyncExitStack,
         node: Requester,
+        within: Requester | None,
         reached: list[NodeLimits],
         command: Command[Any],
         options: RequestOptions,
@@ -124,7 +131,8 @@ class Limiter:
                     await held.enter_async_context(one.writing)
                 while unknown := _first_unknown(reached, changes):
                     one, limit = unknown
-                    one.known[limit] = await _value_now(one.node, limit, command, options)
+                    asked = within if within is not None and one.node is node else one.node
+                    one.known[limit] = await _value_now(asked, limit, command, options)
         except TimeoutError as late:
             if isinstance(late, NotStarted):
                 raise

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Hashable, Iterable
+from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterable
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from math import inf
 from threading import get_ident
 from typing import Any, Protocol, TypeVar, Unpack
 
+from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.learned import LearnedTimes
 from busmaster.arbiter.transaction import LEFT, Priority, Timeline, Transaction
+from busmaster.bus.exclusive import HeldNode, checked_hold, hold_ended
 from busmaster.bus.limiter import Limiter
 from busmaster.bus.limits import Limit
 from busmaster.bus.requester import ORDINARY, CommandOptions, Requester, RequestOptions
@@ -264,14 +267,65 @@ class Node:
         touches: Command[Any] | None = None,
         stops_seen: int | None = None,
         stop: bool = False,
+        client: LineClient | None = None,
         **options: Unpack[CommandOptions],
     ) -> T:
-        """Do what `request` does, and say by `journey`, also once this was cancelled, whether it was ever sent."""
+        """Do what `request` does, for a client of the line or within a sequence, and say by `journey`, also once this
+        was cancelled, whether it was ever sent. Raises HoldEnded if the sequence is over."""
+        within = self._within(client, command)
         chosen, limiter = self._options(options), self.shared.limiter
         if limiter is None or not command.writes:
-            return (await self._timed(command, chosen, touches, stops_seen, journey))[0]
-        async with limiter.passing(self, command, chosen, stop) as left:
-            return (await self._timed(command, left, touches, stops_seen, journey))[0]
+            return (await self._timed(command, chosen, touches, stops_seen, journey, client))[0]
+        async with limiter.passing(self, command, chosen, stop or chosen.safe, within) as left:
+            return (await self._timed(command, left, touches, stops_seen, journey, client))[0]
+
+    @asynccontextmanager
+    async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[Requester]:
+        """Return, for `async with`, this node for one sequence of requests: see `Requester.exclusive`."""
+        hold = self.hold(max_hold)
+        try:
+            yield _HeldNode(self, hold)
+        finally:
+            self.shared.release(hold)
+
+    def _within(self, client: LineClient | None, command: Command[Any]) -> Requester | None:
+        """Return the node for the sequence that a request is of, if it is of one. Raises HoldEnded if that is over."""
+        if not isinstance(client, Hold):
+            return None
+        if client.over:
+            raise hold_ended(self, client.longest, command)
+        return _HeldNode(self, client)
+
+    def hold(self, max_hold: float, client: LineClient | None = None) -> Hold:
+        """Return what the requests of one sequence, of a client of the line, name as their client.
+
+        It is to be released. Raises InvalidCommand unless `max_hold` is above 0 s, and 5 s at most.
+        """
+        self.shared.check_loop()
+        return self.shared.arbiter.exclusive(self.record, client, checked_hold(max_hold, self.label))
+
+    def begin_reading(
+        self,
+        command: Command[T],
+        journey: Journey,
+        *,
+        stops_seen: int | None = None,
+        client: LineClient | None = None,
+        **options: Unpack[CommandOptions],
+    ) -> asyncio.Future[T]:
+        """Begin a request of what writes nothing, and return its future: who cancels that calls `give_up` too.
+
+        Raises what `request` raises before anything is sent, and HoldEnded as `followed_request`.
+        """
+        self._within(client, command)
+        chosen = self._options(options) if options else ORDINARY
+        journey.transaction, future = self._start(command, chosen, stops_seen=stops_seen, client=client)
+        return future
+
+    def give_up(self, journey: Journey) -> None:
+        """Cancel what nobody waits for any more."""
+        if journey.transaction is not None:
+            self._give_up(journey.transaction)
 
     async def _timed(
         self,
@@ -280,8 +334,9 @@ class Node:
         touches: Command[Any] | None = None,
         stops_seen: int | None = None,
         journey: Journey | None = None,
+        client: LineClient | None = None,
     ) -> tuple[T, Timeline]:
-        transaction, future = self._start(command, options, False, touches, stops_seen)
+        transaction, future = self._start(command, options, False, touches, stops_seen, client)
         if journey is not None:
             journey.transaction = transaction
         try:
@@ -303,6 +358,7 @@ class Node:
         probe: bool = False,
         touches: Command[Any] | None = None,
         stops_seen: int | None = None,
+        client: LineClient | None = None,
     ) -> tuple[Transaction, asyncio.Future[Any]]:
         record, line = self.record, self.shared
         if self._to_all and not command.writes:
@@ -331,6 +387,9 @@ class Node:
             probe,
             inf if options.finish_within is None else line.now() + options.finish_within,
             self if touches is None else (self, touches),
+            None,
+            None,
+            client,
         )
         return transaction, line.pump.transact(transaction)
 
@@ -396,3 +455,33 @@ def _windows(asked: Timings | Learned | None, own: Timings | Learned) -> str:
 
 def _window(timings: Timings | Learned) -> str:
     return "what is learned" if isinstance(timings, Learned) else f"{timings.read.window * 1000:g} ms"
+
+
+class _HeldNode(HeldNode):
+    """A node of this process, within one sequence."""
+
+    def __init__(self, node: Node, hold: Hold) -> None:
+        super().__init__(node)
+        self.hold = hold
+        self._own = node
+
+    async def request(
+        self,
+        command: Command[T],
+        /,
+        *,
+        touches: Command[Any] | None = None,
+        stops_seen: int | None = None,
+        stop: bool = False,
+        **options: Unpack[CommandOptions],
+    ) -> T:
+        """Run one command within the sequence, see `HeldNode.request`."""
+        return await self._own.followed_request(
+            command,
+            Journey(),
+            touches=touches,
+            stops_seen=stops_seen,
+            stop=stop,
+            client=self.hold,
+            **options,
+        )

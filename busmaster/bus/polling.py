@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from math import inf
@@ -16,10 +16,10 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.samples import Quality, Sample
 from busmaster.bus.shared_line import SharedLine
-from busmaster.bus.snapshots import NO_SAMPLES, GroupStatistics, Snapshot, Stream, Tally
+from busmaster.bus.snapshots import NO_SAMPLES, Cycles, GroupStatistics, Snapshot, Stream, Tally
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Batch
-from busmaster.errors import BusClosed, GarbledReply, InvalidCommand, Refused
+from busmaster.errors import GarbledReply, InvalidCommand, Refused
 from busmaster.planning import PlannedGroup, shape
 from busmaster.planning.merging import WEIGHING, Merge, Served, cheapest
 
@@ -53,7 +53,7 @@ class _Read(NamedTuple):
         return self.guess if wait is None else self.unwaited + self.legs * wait
 
 
-class PollGroup:
+class PollGroup(Cycles):
     """Points that are read once a period. Made by `Bus.poll_group`; iterate it, or look at `latest`."""
 
     def __init__(
@@ -68,9 +68,7 @@ class PollGroup:
         merge: Sequence[Merge],
         on_close: Callable[[PollGroup], None],
     ) -> None:
-        self.name = name
-        self.latest: Snapshot | None = None
-        """That of its last cycle."""
+        super().__init__(name)
         self._line = line
         self._on_close = on_close
         self._priority = priority
@@ -80,7 +78,6 @@ class PollGroup:
         self._poll.group = self
         self._points: dict[Point[Any], Node] = {}
         self._watched: tuple[Point[Any], ...] = ()
-        self._consumers: list[Stream[Snapshot]] = []
         self._tally = Tally(self._poll)
         # the cycle that runs
         self._cycle = 0
@@ -159,23 +156,12 @@ class PollGroup:
             self._line.latest_of.pop(self.name, None)
             self._line.answers_of.pop(self.name, None)
             self._line.remove_poll(self._poll)
-        for consumer in list(self._consumers):
-            consumer.close()
+        self._end()
 
     def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
         """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
         self._line.check_loop()
-        if not self._poll.active:
-            raise BusClosed(f"poll group {self.name!r} is closed")
-        return Stream(self._consumers, buffer)
-
-    async def __aiter__(self) -> AsyncIterator[Snapshot]:
-        consumer = self.subscribe()
-        try:
-            async for snapshot in consumer:
-                yield snapshot
-        finally:
-            consumer.close()
+        return super().subscribe(buffer)
 
     def statistics(self) -> GroupStatistics:
         """Return an immutable snapshot of its counts."""
@@ -236,14 +222,13 @@ class PollGroup:
         started = poll.started if poll.started > -inf else None
         wall = poll.finished + self._wall_offset
         snapshot = Snapshot(self.name, poll.cycles, poll.due, started, poll.finished, poll.missed, wall, self._samples)
-        self.latest = self._line.latest_of[self.name] = snapshot
+        self._line.latest_of[self.name] = snapshot
         self._line.answers_of[self.name] = [
             Answer(done.tag.node, done.tag.served.command, done.tag.points, done.value, done.started)
             for done in poll.results
             if done.error is None
         ]
-        for consumer in self._consumers:
-            consumer.put(snapshot)
+        self._tell(snapshot)
         self._line.alarms.look(self._watched, self._samples)
         # Once: choosing anew whenever a mean moves would make the cycles differ for ever.
         if poll.cycles == WEIGHED_AGAIN:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol, TypedDict, TypeVar, Unpack, cast
 
@@ -181,6 +182,16 @@ class Requester(Protocol):
         marked stale; without it, all of the node's. With `stops_seen` it raises Superseded, and sends nothing, if the
         node was told to stop since `stops` was that. Raises a BusError subclass. Cancelling it frees the caller at once
         and never disturbs the line (R6).
+        """
+        ...
+
+    def exclusive(self, *, max_hold: float = 0.5) -> AbstractAsyncContextManager[Requester]:
+        """Return, for `async with`, this node for a sequence of requests: nothing but what is urgent comes between.
+
+        From when the first of them is sent, the line is held until the block is left, `max_hold` seconds at most (up to
+        5), to the end of the exchange that is on the wire then; what is asked in it later raises HoldEnded, and is not
+        sent. Only what is asked of the node that the block is given is of the sequence: anything else, of this program
+        too, waits.
         """
         ...
 

@@ -10,8 +10,9 @@ from threading import current_thread, get_ident
 from typing import Any
 
 from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.health import NodeRecord
-from busmaster.arbiter.transaction import Poll, Transaction
+from busmaster.arbiter.transaction import Phase, Poll, Priority, Transaction
 from busmaster.bus.alarms import Alarms
 from busmaster.bus.answers import Answer, composed
 from busmaster.bus.limiter import Limiter
@@ -22,6 +23,7 @@ from busmaster.bus.samples import Sample
 from busmaster.bus.snapshots import Snapshot
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusClosed, GarbledReply, InvalidCommand
+from busmaster.planning import Sharing
 from busmaster.transport.pump import Pump
 
 CLOCK_WAS_SET = 0.005
@@ -39,6 +41,8 @@ class SharedLine:
         self.logbook = Logbook(name)
         self.limiter: Limiter | None = None
         """None while nothing is limited."""
+        self.clients = 0
+        """How many other programs share the line."""
         self.closed = False
         self.only_safe = 0
         """How many have said that no write is to be accepted but those of the safe state."""
@@ -47,6 +51,8 @@ class SharedLine:
         self.loop_runs: Callable[[], bool] = lambda: False
         self.on_stop: list[Callable[[NodeRecord], None]] = []
         """Told, at once, when a node is told to stop."""
+        self.on_touched: list[Callable[[NodeRecord, float], None]] = []
+        """Told, at once, of which node a write is over, and when it ended."""
         self.latest_of: dict[str, Snapshot] = {}
         """The latest snapshot of each poll group, by the group's name."""
         self.answers_of: dict[str, list[Answer]] = {}
@@ -156,6 +162,33 @@ class SharedLine:
         for touched in [what for what in self._touched if node in (what if isinstance(what, tuple) else (what,))]:
             del self._touched[touched]
 
+    def add_client(self, share: float) -> LineClient:
+        """Return a client, a program with which this one takes turns from now on; `share` weighs its line time."""
+        self.clients += 1
+        return self.arbiter.add_client(share)
+
+    def remove_client(self, client: LineClient) -> None:
+        """Forget a client: nothing is asked for it any more."""
+        self.clients -= 1
+        self.arbiter.remove_client(client)
+
+    @property
+    def sharing(self) -> Sharing:
+        """Return who shares the line, for the bounds of what a request waits."""
+        return Sharing(self.clients, self.arbiter.longest_hold)
+
+    def ahead(self, priority: Priority) -> int:
+        """Return how many requests of this program wait already that go before another of this class."""
+        dispatcher = self.arbiter.dispatcher
+        queues = dispatcher.writes.queues.values()
+        parked = sum(write.phase is Phase.PARKED and write.client is None for queue in queues for write in queue)
+        return dispatcher.backlog.waiting_of(priority, None) + parked
+
+    def release(self, hold: Hold) -> None:
+        """Hold the line no longer for a sequence of requests."""
+        self.arbiter.release(hold, self.now())
+        self.pump.turn()
+
     def suspend(self, record: NodeRecord, seconds: float) -> None:
         """Do what `Node.suspend` does."""
         self.check_loop()
@@ -171,6 +204,8 @@ class SharedLine:
             # what has another name, or is read in another run, may share a place with it
             for place in write.command.changes(write.node.profile):
                 self._touched[write.touches[0], place] = when
+        for told in self.on_touched:
+            told(write.node, when)
 
     def written_since(self, node: NodeRecord, started: float) -> bool:
         """Return whether a write to this node, or to a point of it, has ended since then."""

@@ -17,6 +17,7 @@ from busmaster.arbiter.transaction import Poll
 from busmaster.bus.points import Point
 from busmaster.bus.samples import Quality, Sample
 from busmaster.contract.arguments import whole_number
+from busmaster.errors import BusClosed
 
 T = TypeVar("T")
 
@@ -179,3 +180,39 @@ class Stream(Generic[T]):
             self.dropped += 1
         self._items.append(item)
         self._arrived.set()
+
+
+class Cycles:
+    """The cycles of a poll group, for whoever reads them: iterate it, or look at `latest`."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.latest: Snapshot | None = None
+        """That of its last cycle."""
+        self._consumers: list[Stream[Snapshot]] = []
+        self._over = False
+
+    def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
+        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
+        if self._over:
+            raise BusClosed(f"poll group {self.name!r} is closed")
+        return Stream(self._consumers, buffer)
+
+    async def __aiter__(self) -> AsyncIterator[Snapshot]:
+        consumer = self.subscribe()
+        try:
+            async for snapshot in consumer:
+                yield snapshot
+        finally:
+            consumer.close()
+
+    def _tell(self, snapshot: Snapshot) -> None:
+        self.latest = snapshot
+        for consumer in self._consumers:
+            consumer.put(snapshot)
+
+    def _end(self) -> None:
+        """End those who read it, after what they hold."""
+        self._over = True
+        for consumer in list(self._consumers):
+            consumer.close()

@@ -9,9 +9,11 @@ from busmaster.transport.pump import Pump
 class Taps:
     """The taps of one line. A line that nobody taps pays nothing for it."""
 
-    def __init__(self, pump: Pump) -> None:
+    def __init__(self, pump: Pump, first: Tap | None = None) -> None:
         self._pump = pump
         self._taps: list[Tap] = []
+        if first is not None:
+            self.add(first)
 
     def add(self, tap: Tap) -> None:
         """Have `tap` told of all that passes from now on; of the exchange that is on the wire, perhaps only the end."""

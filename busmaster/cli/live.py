@@ -146,17 +146,18 @@ class Screen(App[int]):
         self._due = False
         frame = self.picture.frame
         if frame is None:
+            self.head.update(Text(fit(" waiting for the program that owns the line", self.size.width)))
             return
         self._widths = column_widths(self.size.width)
         self._of_node = self.picture.nodes
         groups = self.picture.groups
         self._of_group = {group.name: group for group in groups}
-        self.table.show(self._rows(frame))
+        self.table.show(self._rows())
         self.head.update(self._head(frame, groups))
         self.columns.update(header_line(self._widths))
         self.foot.update(self._foot(frame))
 
-    def _rows(self, frame: Frame) -> list[Row]:
+    def _rows(self) -> list[Row]:
         places = {key: place for place, key in enumerate(self._of_node)}
         rows = sorted(
             matching(self.picture.rows, self._of_node, self.words),
@@ -171,9 +172,10 @@ class Screen(App[int]):
                 rows.sort(key=self._soundness)
         return rows
 
-    def _soundness(self, row: Row) -> tuple[bool, bool, bool]:
+    def _soundness(self, row: Row) -> tuple[bool, bool, bool, bool]:
         node = self._of_node.get((row.protocol, row.address))
-        return not row.error, node is not None and node.health == "up", row.quality not in ("late", "stale")
+        up = node is not None and node.health == "up"
+        return not row.error, up, not row.alarm, row.quality not in ("late", "stale")
 
     def _row_line(self, row: Row, selected: bool) -> Text:
         assert self.picture.frame is not None

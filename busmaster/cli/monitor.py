@@ -72,7 +72,7 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
     """Listen to the line of a file until Ctrl-C. Nothing is ever sent, whoever asks for it."""
     protocol = only_protocol(file)
     kind = find(protocol)
-    line = ConfiguredLine(silent(file), tell=note)  # never entered: its bus opens no port
+    line = ConfiguredLine(silent(file), tell=note, asks=False)  # never entered: its bus opens no port
     points = {point for group in file.groups for point in line.members(group)}
     overheard = Overheard(kind.protocol, points)
 

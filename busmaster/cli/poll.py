@@ -21,7 +21,8 @@ from busmaster.cli.parsing import option_type, parse_items, parse_seconds
 from busmaster.cli.protocols import ItemCommand
 from busmaster.cli.reaching import reach
 from busmaster.cli.watching import Watch, follow, json_cycle, p99_of, plain_cycle, wants_screen
-from busmaster.service.remote import RemoteBus, RemoteGroup
+from busmaster.service.remote import RemoteBus
+from busmaster.service.remote_group import RemoteGroup
 
 KEPT = 1_001
 """Cycles of which the summary tells the periods."""

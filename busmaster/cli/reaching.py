@@ -17,7 +17,7 @@ from busmaster.bus.bus import Bus
 from busmaster.cli.arguments import Connection
 from busmaster.cli.output import note
 from busmaster.contract.arguments import host_and_port
-from busmaster.errors import BusError, InvalidCommand
+from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.service.folder import Owner, owners
 from busmaster.service.remote import RemoteBus
 from busmaster.transport.endpoints import Endpoint, is_served
@@ -69,6 +69,14 @@ def reach(connection: Connection) -> Bus | RemoteBus:
 def tell_owner(owner: Owner) -> None:
     """Say on standard error through whom it goes."""
     note(f"{owner.port} is owned by process {owner.pid}: asking through {owner.address}")
+
+
+def check_no_owner(endpoint: Endpoint) -> None:
+    """Raise LineDown where another program owns the line of a port: a serial server would let in two masters."""
+    owner = owner_of(endpoint)
+    if owner is not None:
+        hint = "end that first: two masters on one line garble each other"
+        raise LineDown(f"{owner.port} is owned by process {owner.pid}", hint=hint)
 
 
 def owner_of(endpoint: Endpoint) -> Owner | None:

@@ -16,6 +16,7 @@ from busmaster.cli.ending import Ending, until_ended
 from busmaster.cli.hangups import Hangups
 from busmaster.cli.lines import file_argument, load, other_port, port_option
 from busmaster.cli.output import Level, note, number_text
+from busmaster.cli.reaching import check_no_owner
 from busmaster.cli.safe import tell_unsafe
 from busmaster.cli.serving import secrets_of, served, service_of
 from busmaster.cli.systemd import ServiceManager
@@ -55,6 +56,7 @@ def run(path: str, port: str | None, capture: str | None, view: View, hangups: H
     file = load(path)
     endpoint = other_port(file, port)
     where = endpoint or file.port
+    check_no_owner(where)
     protocols = {node.protocol for node in file.nodes.values()}
     only = protocols.pop() if len(protocols) == 1 else ""
     usual = sys.getswitchinterval()
@@ -102,15 +104,15 @@ class Running:
         """Run the line until it is told to end, send its safe state, and return the exit status."""
         entered = False
         self.line.outputs.tell = self._tell_of_output
-        service = service_of(self.line, wanted=self._view.silent)  # now: it keeps what happens as the line is opened
+        service = service_of(self.line)  # now: it keeps what happens as the line is opened
         try:
             async with self.line:
                 entered = True
-                async with served(service, tell=self._view.silent) as self.watch.service:
-                    try:
+                try:
+                    async with served(service, tell=self._view.silent) as self.watch.service:
                         return await self._poll()
-                    finally:
-                        await self._leave()
+                finally:
+                    await self._leave()
         finally:
             for counts in self.line.outputs.statistics() if entered else ():
                 note(output_text(counts))
@@ -123,14 +125,14 @@ class Running:
         self._manager.ready()
 
         async def beside() -> None:
-            try:
-                async with anyio.create_task_group() as tasks:
-                    tasks.start_soon(self._manager.show_life, self.line.bus)
-                    while True:
-                        await self._hangups.next()
-                        await self._read_again()
-            finally:
-                await self._leave()  # at once: what is shown may take its time to end
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(self._manager.show_life, self.line.bus)
+                tasks.start_soon(self._hear_hangups)
+                try:
+                    await anyio.sleep_forever()
+                finally:
+                    # at once: what is shown may take its time to end, and so may an output that a new file replaces
+                    await self._leave()
 
         return await follow(self.watch, beside)
 
@@ -142,6 +144,11 @@ class Running:
             note(f"safe state: when this ends, {', '.join(writes)} within {self.line.safe_state.within:g} s")
         else:
             note("no safe state: when this ends, nodes keep what was written to them last (see [safe])")
+
+    async def _hear_hangups(self) -> None:
+        while True:
+            await self._hangups.next()
+            await self._read_again()
 
     async def _read_again(self) -> None:
         """Go on as the file says now, and with whatever device has the port's name.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from importlib.util import find_spec
 
 from busmaster.cli.output import Level, note
 from busmaster.config import ConfiguredLine, LineFile
@@ -19,14 +18,10 @@ def secrets_of(file: LineFile) -> dict[str, bytes]:
     return file.service.secrets() if file.service.enabled else {}
 
 
-def service_of(line: ConfiguredLine, *, wanted: bool) -> Service | None:
-    """Return what is to serve the line to other programs; None where its file does not want that.
-
-    It is not missed either where its extra is not installed, unless the file asks for it, or it is `wanted`.
-    """
+def service_of(line: ConfiguredLine) -> Service | None:
+    """Return what is to serve the line to other programs; None where its file does not want that."""
     section = line.file.service
-    said = bool(section.table.data)
-    if not section.enabled or (find_spec("websockets") is None and not (said or wanted)):
+    if not section.enabled:
         return None
     name = line_name(os.path.basename(line.file.path).removesuffix(".toml"))
     return Service(
@@ -35,6 +30,7 @@ def service_of(line: ConfiguredLine, *, wanted: bool) -> Service | None:
         name=name,
         mode=section.mode,
         group=section.group,
+        share=section.share,
         listen=section.listen,
         title=line.file.title,
     )

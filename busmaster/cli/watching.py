@@ -35,7 +35,7 @@ LINE = ""
 
 
 class Watch:
-    """What a person sees of a bus while its groups are polled. Times are in seconds since it was made.
+    """What is told of a bus while its groups are polled. Times are in seconds since it was made.
 
     `view` says how it is shown, `gate` is what the writes of the screen pass. `steady`: that nobody can print any more
     does not end it. It hears what happens to the bus from the start on, before that is entered too.

@@ -43,7 +43,8 @@ class ConfiguredLine:
     names line and key, for what the protocols or the outputs cannot do. `port` is used instead of the file's. `tap`
     sees every byte. Without `outputs` nothing is recorded or published. `tell` is called, on the loop, with what
     happens to the outputs. `read_only` lets nothing from outside be written: `gate` is what all of that passes. With
-    `wait_for_port` a port that cannot be opened yet is no error.
+    `wait_for_port` a port that cannot be opened yet is no error. One that never `asks` is not entered: its outputs,
+    fed with what another master hears, say nothing of the state of line and nodes.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class ConfiguredLine:
         tell: Callable[[str], None] = lambda _: None,
         read_only: bool = False,
         wait_for_port: bool = False,
+        asks: bool = True,
     ) -> None:
         self.file = file
         self.bus = Bus(port or file.port, tap=tap, strict=file.strict, wait_for_port=wait_for_port)
@@ -67,7 +69,7 @@ class ConfiguredLine:
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         self.gate = Gate(self.bus, read_only=read_only, access=access_of(file.service, self))
         self.gate.safe_state = self.safe_state
-        self.outputs = Distributor(self.bus, tell, gate=self.gate)
+        self.outputs = Distributor(self.bus, tell, gate=self.gate, asks=asks)
         self._kept_times = KeptTimes(self.bus, self._tell)
         self.gate.record = self.outputs.record
         if outputs:

@@ -9,6 +9,7 @@ import stat
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE
 from busmaster.config.names import NODE_NAME
 from busmaster.config.recording import read_mode
 from busmaster.config.table import Table
@@ -41,11 +42,13 @@ class ServiceSection:
 
     `listen` is where programs may come by TCP, None for nowhere; the tokens that they show are in `token_file`. Roles
     are by the numbers of users and groups, and by the names of tokens; they may change while the line runs.
+    `share` weighs the line time of each program, where the owner's is 1.
     """
 
     enabled: bool
     mode: int
     group: int | None
+    share: float
     listen: tuple[str, int] | None
     token_file: str | None
     users: Mapping[int, RoleSection] = field(compare=False)
@@ -71,7 +74,7 @@ class ServiceSection:
 
 def read_service(table: Table) -> ServiceSection:
     """Read `[service]`. Raises FileError, naming line and key, for what is wrong in it."""
-    table.only("enabled", "mode", "group", "listen", "token_file", "users", "groups", "tokens")
+    table.only("enabled", "mode", "group", "listen", "token_file", "users", "groups", "tokens", "share")
     group = table.text("group", None)
     mode = read_mode(table, "mode") if "mode" in table else MODE if group is None else 0o660
     token_file = table.text("token_file", None)
@@ -82,10 +85,14 @@ def read_service(table: Table) -> ServiceSection:
             check_listening(listen, tokens=token_file is not None)
     elif token_file is not None:
         raise table.error('tokens are for TCP: say where, as listen = "127.0.0.1:7420"', "token_file")
+    share = table.number("share", 1.0)
+    if not LEAST_SHARE <= share <= MOST_SHARE:
+        raise table.error(f"must be {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share:g}", "share")
     return ServiceSection(
         enabled=table.flag("enabled", True),
         mode=mode,
         group=None if group is None else _group(table, "group", group),
+        share=share,
         listen=listen,
         token_file=token_file,
         users={_user(each): _role(each, "user") for each in table.tables("users")},

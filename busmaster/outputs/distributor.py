@@ -61,7 +61,7 @@ class Distributor:
     """The outputs of one bus. `tell` is called, on the loop, with what happens to them.
 
     `gate` is what the commands pass that they take in. One that is not `in_charge` of the line says nothing of its
-    state: another process may be.
+    state: another process may be. One that is not of a line that `asks` says only that it listens, and what it hears.
     """
 
     def __init__(
@@ -71,10 +71,12 @@ class Distributor:
         *,
         gate: Gate | None = None,
         in_charge: bool = True,
+        asks: bool = True,
     ) -> None:
         self.tell = tell
         self.gate = gate or Gate(bus)
         self._in_charge = in_charge
+        self._asks = asks
         self._bus = bus
         self._outputs: list[Output] = []
         self._feeding: dict[Source, asyncio.Task[None]] = {}
@@ -212,6 +214,7 @@ class Distributor:
                     commands=commands,
                     gate=self.gate,
                     in_charge=self._in_charge,
+                    asks=self._asks,
                 )
             case MetricsSettings():
                 from busmaster.outputs.metrics import MetricsOutput

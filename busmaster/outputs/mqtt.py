@@ -14,27 +14,25 @@
     PREFIX/audit              each write, by whatever door: who, what, when, what became of it
 
 In names +, # and % are written %2B, %23 and %25. A command is written within a second of its arrival, or by `expires`
-or the message's own expiry where it has one; an older one is refused. Times are seconds since 1970. What was not
-acknowledged when the broker went away is sent again when it is back. With `spill`, what waits for it does so on disk,
-and is sent by the next process if this one ends before.
+or the message's own expiry where it has one; an older one is refused. What is not allowed comes on a connection of its
+own, so that no flood of it holds up what is. Times are seconds since 1970. What was not acknowledged when the broker
+went away is sent again when it is back. With `spill`, what waits for it does so on disk, and is sent by the next
+process if this one ends before.
 """
 
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import json
 import logging
 import socket
-import ssl
-import struct
-import termios
 import threading
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from functools import partial
+from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import anyio
@@ -44,11 +42,12 @@ from busmaster.arbiter.state import LineState
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
 from busmaster.bus.polling import Snapshot
-from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate, Wish
 from busmaster.gate.record import WriteRecord
-from busmaster.outputs.base import PAUSE, TICK, Item, check_extra, reason, size_of
+from busmaster.outputs.base import PAUSE, TICK, Item, check_extra, size_of
 from busmaster.outputs.mqtt_commands import Answer, Commands, Inbox
+from busmaster.outputs.mqtt_connection import secrets, taking_in, topic_part, unread
+from busmaster.outputs.mqtt_forbidden import Forbidden
 from busmaster.outputs.settings import MqttSettings
 from busmaster.outputs.spilling import SpillingOutput
 from busmaster.outputs.spool import Record
@@ -60,13 +59,16 @@ if TYPE_CHECKING:
 AT_ONCE = 100
 """Messages on their way to the broker, not yet acknowledged."""
 UNREAD = 32_768
-"""Bytes that wait in our socket, some: what is more waits at the broker. Behind a flood of refused commands in a socket
-of megabytes, those that are allowed would grow too old."""
+"""Bytes that wait in our socket, some: what is more waits at the broker. Behind many commands in a socket of megabytes,
+the last would grow too old."""
+AHEAD = 2_000
+"""Commands that the broker may send before we have acknowledged the first; its own acknowledgements overtake the rest.
+More than fit in our socket: one that it held back while we stood still would look new when it comes."""
 PIECE = 10
 BREATH = 0.002
 """Seconds for which the interpreter is let go of after so many messages: when a broker returns, thousands may wait."""
 TIMEOUT = 5.0
-"""Seconds in which a broker must answer."""
+"""Seconds in which a broker must answer, or send whatever else."""
 KEEP_ALIVE = 15
 ALARMS = "alarms/"
 COMMANDS = "set/#"
@@ -89,7 +91,8 @@ class Outgoing(NamedTuple):
 class MqttOutput(SpillingOutput):
     """`commands` are the points, by their key, that may be written. Raises InvalidCommand if the extra is missing.
 
-    Without `in_charge` it says nothing of the state of the line and its nodes, nor that it is there.
+    Without `in_charge` it says nothing of the state of the line and its nodes, nor that it is there. Without `asks` it
+    says that it is there, and what it heard; how line and nodes are, nobody knows who does not ask them.
     """
 
     def __init__(
@@ -102,6 +105,7 @@ class MqttOutput(SpillingOutput):
         commands: Mapping[str, Point[Any]] | None = None,
         gate: Gate | None = None,
         in_charge: bool = True,
+        asks: bool = True,
     ) -> None:
         check_extra("aiomqtt", "mqtt")
         super().__init__(kind, settings, say)
@@ -110,6 +114,7 @@ class MqttOutput(SpillingOutput):
         self._bus = bus
         self._gate = gate or Gate(bus)
         self._in_charge = in_charge
+        self._asks = asks
         self._commands = {topic_part(key): point for key, point in (commands or {}).items()}
         self._arriving: Commands
         self._leaving = threading.Event()
@@ -235,6 +240,7 @@ class MqttOutput(SpillingOutput):
             tls_context=tls,
             will=aiomqtt.Will(self._topic("status"), "offline", qos=1, retain=True) if self._in_charge else None,
             keepalive=KEEP_ALIVE,
+            properties=taking_in(AHEAD),
             socket_options=[(socket.SOL_SOCKET, socket.SO_RCVBUF, UNREAD)],
             timeout=TIMEOUT,
             max_inflight_messages=AT_ONCE,
@@ -248,18 +254,32 @@ class MqttOutput(SpillingOutput):
         under_way: deque[asyncio.Task[None]] = deque()
         try:
             for number, (topic, payload, retain) in enumerate(messages, 1):
-                work = client.publish(topic, payload, qos=self._settings.qos, retain=retain)
+                work = client.publish(topic, payload, qos=self._settings.qos, retain=retain, timeout=inf)
                 under_way.append(asyncio.ensure_future(work))
                 if number % PIECE == 0:
                     await anyio.sleep(BREATH)
                 if len(under_way) == AT_ONCE:
-                    await under_way.popleft()
+                    await self._acknowledged(under_way.popleft())
             while under_way:
-                await under_way.popleft()
+                await self._acknowledged(under_way.popleft())
         finally:
             for task in under_way:
                 task.cancel()
             await asyncio.gather(*under_way, return_exceptions=True)
+
+    async def _acknowledged(self, publishing: asyncio.Task[None]) -> None:
+        """Return when it is. Raises ConnectionError where the broker sends nothing at all for too long.
+
+        Commands that come are a life sign, too: an acknowledgement may have to wait behind thousands of them.
+        """
+        done = publishing.done()
+        while not done:
+            heard = self._arriving.bytes_read
+            done = bool((await asyncio.wait({publishing}, timeout=TIMEOUT))[0])
+            if not done and self._arriving.bytes_read == heard:
+                publishing.cancel()
+                raise ConnectionError(f"{self._settings.host}:{self._settings.port} did not answer in {TIMEOUT:g} s")
+        await publishing
 
     def hold(self, most: int) -> bool:
         """Hold up to `most` values, and return whether there are any. What was not acknowledged comes first."""
@@ -291,10 +311,10 @@ class MqttOutput(SpillingOutput):
         """Yield what is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
         if not self._in_charge:
             return
-        now: dict[str, tuple[str, str | None]] = {
-            "line": ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")
-        }
-        for node in self._bus.nodes:
+        now: dict[str, tuple[str, str | None]] = {}
+        if self._asks:
+            now["line"] = ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")
+        for node in self._bus.nodes if self._asks else ():
             now[f"health/{topic_part(node.label.removeprefix('node '))}"] = ("health", node.health.value)
         alarms = self._bus.alarms
         if alarms is not self._alarms:
@@ -321,30 +341,48 @@ class MqttOutput(SpillingOutput):
             async for _ in client.messages:
                 raise AssertionError("messages are taken in as they arrive")
         except aiomqtt.MqttError:
-            raise ConnectionError(f"{self._settings.host}:{self._settings.port} ended the connection") from None
+            raise self._ended() from None
+
+    def _ended(self) -> ConnectionError:
+        return ConnectionError(f"{self._settings.host}:{self._settings.port} ended the connection")
 
     async def _serve(self, client: Client, *, task_status: TaskStatus[None]) -> None:
         """Take in commands until the door is to be closed; it has started when they are listened to."""
         self._door_is_closed.clear()  # before the look: whoever wants it closed looks in the other order
         try:
             if self._commands and not self._leaving.is_set():
-                await client.subscribe(self._topic(COMMANDS), qos=1)
-            task_status.started()
-            if self._commands and not self._leaving.is_set():
-                await self._obey(client)
+                await self._hear(client, task_status)
+            else:
+                task_status.started()
         finally:
             self._arriving.close(self._keep)
             self._door_is_closed.set()
 
-    async def _obey(self, client: Client) -> None:
+    async def _hear(self, client: Client, task_status: TaskStatus[None]) -> None:
+        topics = [self._topic("set", name) for name in self._commands]
+        forbidden = Forbidden(
+            self._settings, self._secrets, self._topic(COMMANDS), frozenset(topics), self._arriving.take
+        )
+        try:
+            await forbidden.begin(KEEP_ALIVE, TIMEOUT)
+            await client.subscribe([(topic, 1) for topic in topics])
+            task_status.started()
+            await self._obey(client, topics, forbidden)
+        finally:
+            forbidden.close()
+
+    async def _obey(self, client: Client, topics: list[str], forbidden: Forbidden) -> None:
         """Have commands written and answered. None is answered any more when this returns."""
         answer = partial(self._answer, client)
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(self._arriving.serve, self._write, self._keep, answer, partial(unread, client))
-            while not self._leaving.is_set():  # noqa: ASYNC110  # another thread sets it
-                await anyio.sleep(TICK)
+            while not self._leaving.is_set():
+                await asyncio.wait({forbidden.lost}, timeout=TICK)
+                if forbidden.lost.done():
+                    raise self._ended()
             with anyio.move_on_after(LAST_ANSWERS):
-                await client.unsubscribe(self._topic(COMMANDS))
+                await client.unsubscribe(topics)
+                await forbidden.end()
                 await self._arriving.answered()
             tasks.cancel_scope.cancel()
 
@@ -362,31 +400,3 @@ class MqttOutput(SpillingOutput):
     async def _answer(self, client: Client, answer: Answer) -> None:
         topic = self._topic("result", answer.name) if answer.name else self._topic("result")
         await self._send(client, [Outgoing(topic, json_line(**answer.fields))])
-
-
-def unread(client: Client) -> int:
-    """Return how many bytes have come from the broker, and are not read yet; what an encryption adds is counted too."""
-    connection = client._client.socket()
-    if connection is None or connection.fileno() < 0:
-        return 0
-    [waiting] = struct.unpack("i", fcntl.ioctl(connection, termios.FIONREAD, bytes(4)))
-    return int(waiting) + (connection.pending() if isinstance(connection, ssl.SSLSocket) else 0)
-
-
-def topic_part(name: str) -> str:
-    """Return the name without what has a meaning in topics. Two names stay two."""
-    return name.replace("%", "%25").replace("+", "%2B").replace("#", "%23")
-
-
-def secrets(settings: MqttSettings) -> tuple[str | None, str | None, ssl.SSLContext | None]:
-    """Return user name, password and TLS context. Raises InvalidCommand for a file that cannot be read."""
-    password = tls = None
-    try:
-        if settings.password_file is not None:
-            with open(settings.password_file, encoding="utf-8") as file:
-                password = file.read().strip()
-        if settings.tls:
-            tls = ssl.create_default_context(cafile=settings.ca_file)
-    except OSError as error:
-        raise InvalidCommand(reason(error)) from None
-    return settings.username, password, tls

@@ -20,6 +20,7 @@ from busmaster.gate.record import WriteRecord
 
 if TYPE_CHECKING:
     from aiomqtt import Message
+    from paho.mqtt.client import MQTTMessage
 
 LOOK = 0.02
 """Seconds between two looks at the clock, and at what has come and is not read yet."""
@@ -83,7 +84,7 @@ class Commands:
         self._now = now
         self._looked = now()
         """What is read next came after this look."""
-        self._bytes_read = 0
+        self.bytes_read = 0
         """Bytes that were read, at least."""
         self._looks: deque[tuple[float, int]] = deque()
         """Later looks, each with what will have been read when all is that lay there then."""
@@ -95,9 +96,13 @@ class Commands:
         self._something = asyncio.Event()
 
     def arrive(self, message: Message) -> None:
-        """Take in one message. Never waits, never raises."""
+        """Take in one message that came in the order of what is unread. Never waits, never raises."""
+        self.bytes_read += LEAST + len(str(message.topic)) + len(message.payload)
+        self.take(message)
+
+    def take(self, message: Message | MQTTMessage) -> None:
+        """Take in one message, wherever it came. Never waits, never raises."""
         topic = str(message.topic)
-        self._bytes_read += LEAST + len(topic) + len(message.payload)
         if self._closed:
             self._count_alone()
             return
@@ -131,7 +136,7 @@ class Commands:
             self.queued.append(wish)
         self._something.set()
 
-    def _read(self, wish: Wish, message: Message) -> Wish:
+    def _read(self, wish: Wish, message: Message | MQTTMessage) -> Wish:
         said = read_payload(message.payload)
         ends = [] if said.expires is None else [said.expires]
         interval = getattr(message.properties, EXPIRY, None)
@@ -171,8 +176,8 @@ class Commands:
         """
         if not unread:
             self._looks.clear()
-        self._looks.append((self._now(), self._bytes_read + unread))
-        while self._looks and self._looks[0][1] <= self._bytes_read:
+        self._looks.append((self._now(), self.bytes_read + unread))
+        while self._looks and self._looks[0][1] <= self.bytes_read:
             self._looked, _ = self._looks.popleft()
 
     async def _keep_looking(self, unread: Callable[[], int]) -> None:
@@ -240,7 +245,7 @@ class Commands:
         await self._something.wait()
 
 
-def _sender(topic: str, message: Message) -> str:
+def _sender(topic: str, message: Message | MQTTMessage) -> str:
     """Return by whom a command is: all that is known is its topic, and what its sender says of itself."""
     said = dict(getattr(message.properties, PROPERTIES, ())).get(SENDER, "")[:LONGEST_SENDER]
     return f"{topic}, says {said!r}" if said else topic

@@ -38,7 +38,7 @@ class Retention:
     def apply(self, database: sqlite3.Connection, tables: tuple[str, ...]) -> None:
         """Delete a piece, if there is anything to be deleted; more of it goes at the next call.
 
-        Each table has a `time`. The first table is the large one: by it the size is brought down.
+        Each table has a `time`.
         """
         clock, now = time.time(), time.monotonic()
         # The size needs no clock: it is held while the clock is not believed, too.
@@ -79,20 +79,21 @@ def delete_older(database: sqlite3.Connection, table: str, moment: float) -> int
 
 
 def forget_oldest(database: sqlite3.Connection, tables: tuple[str, ...]) -> None:
-    """Delete the oldest piece of the first table, which is the large one, and what is older of the others."""
-    first, *others = tables
-    delete_oldest(database, first)
-    [oldest] = database.execute(f"select min(time) from {first}").fetchone()
-    for table in others if oldest is not None else ():
-        delete_older(database, table, oldest)
+    """Delete the oldest tenth of the largest table, and what is older than its rest of the others: a piece of each."""
+    spans = {table: span_of(database, table) for table in tables}
+    largest = max(spans, key=lambda table: len(spans[table]))
+    piece = min(AT_ONCE, (len(spans[largest]) + 9) // 10)
+    database.execute(f"delete from {largest} where rowid < ?", (spans[largest].start + piece,))
+    [oldest] = database.execute(f"select min(time) from {largest}").fetchone()
+    for table in tables if oldest is not None else ():
+        if table != largest:
+            delete_older(database, table, oldest)
 
 
-def delete_oldest(database: sqlite3.Connection, table: str) -> None:
-    """Delete what was written first: a tenth, a piece at most."""
+def span_of(database: sqlite3.Connection, table: str) -> range:
+    """Return the numbers of a table's rows: as the oldest go first, hardly one of them is missing."""
     first, last = database.execute(f"select min(rowid), max(rowid) from {table}").fetchone()
-    if first is not None:
-        piece = min(AT_ONCE, 1 + (last - first) // 10)
-        database.execute(f"delete from {table} where rowid < ?", (first + piece,))
+    return range(0) if first is None else range(first, last + 1)
 
 
 def newest_of(database: sqlite3.Connection, table: str) -> float | None:

@@ -25,7 +25,7 @@ from busmaster.outputs.values import json_value, micros, write_fields
 VERSION = 1
 SCHEMA = """
 create table if not exists points (
-    id integer primary key, node text not null, item text not null, unit text not null, unique (node, item)
+    id integer primary key, node text not null, item text not null, unit text not null, unique (node, item, unit)
 );
 create table if not exists labels (
     point integer not null references points (id), value integer not null, label text not null,
@@ -60,6 +60,19 @@ create view if not exists history as
     select time, node, item, samples.value, unit, quality, error, label
     from samples join points on points.id = samples.point
     left join labels on labels.point = samples.point and labels.value = samples.value;
+"""
+ONE_ROW_A_POINT = "unique (node, item)"
+"""What the points of a database say in which the unit of now was that of all that had been read before, too."""
+REMADE = """
+begin immediate;
+drop view if exists history;
+create table points_of_units (
+    id integer primary key, node text not null, item text not null, unit text not null, unique (node, item, unit)
+);
+insert into points_of_units select id, node, item, unit from points;
+drop table points;
+alter table points_of_units rename to points;
+commit;
 """
 BUSY = 1.0
 """Seconds for which a lock of another program is waited for, before the batch is kept for later."""
@@ -97,7 +110,8 @@ class SqliteOutput(BatchOutput[Rows]):
         self._database: sqlite3.Connection | None = None
         self._file: int | None = None
         """The database's file, to see whether it is still where it was. Closed after it: closing gives up all locks."""
-        self._numbers: dict[str, int] = {}
+        self._numbers: dict[tuple[str, str], int] = {}
+        """Of the rows of points, by the point's key and unit."""
         self._labels: dict[tuple[int, Any], str] = {}
 
     def format(self, item: Item) -> Rows:
@@ -163,9 +177,9 @@ class SqliteOutput(BatchOutput[Rows]):
         numbers = self._numbers
         for rows in batch:
             for moment, key, unit, value, quality, error, label in rows.samples:
-                number = numbers.get(key)
+                number = numbers.get((key, unit))
                 if number is None:
-                    number = numbers[key] = number_of(database, key, unit)
+                    number = numbers[key, unit] = number_of(database, key, unit)
                 if label and self._labels.get((number, value)) != label:
                     self._labels[number, value] = label
                     database.execute("insert or replace into labels values (?, ?, ?)", (number, value, label))
@@ -185,17 +199,20 @@ class SqliteOutput(BatchOutput[Rows]):
             history = database.execute("select sql from sqlite_master where name = 'history'").fetchone()
             if history is not None and "label" not in history[0]:
                 database.execute("drop view history")  # of a version before labels
+            points = database.execute("select sql from sqlite_master where name = 'points'").fetchone()
+            if points is not None and ONE_ROW_A_POINT in points[0]:
+                database.executescript(REMADE)
             database.executescript(SCHEMA)
             database.execute(f"pragma user_version = {VERSION}")
         return self._database
 
 
 def number_of(database: sqlite3.Connection, key: str, unit: str) -> int:
-    """Return the number of a point's row. It is made if there is none, and gets the unit that the point has now."""
+    """Return the number of a point's row, which is made if there is none. With another unit it is another row."""
     node, _, item = key.partition("/")
     row = database.execute(
         "insert into points (node, item, unit) values (?, ?, ?)"
-        " on conflict (node, item) do update set unit = excluded.unit returning id",
+        " on conflict (node, item, unit) do update set unit = excluded.unit returning id",
         (node, item, unit),
     ).fetchone()
     return int(row[0])

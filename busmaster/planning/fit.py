@@ -22,7 +22,7 @@ from busmaster.contract.exchange import Command
 from busmaster.contract.profile import LineSettings
 from busmaster.planning.losses import Losses, LostAttempts, losses
 from busmaster.planning.merging import WEIGHING, Merge, Served, at_once, cheapest
-from busmaster.planning.worst_case import Bounds, PlannedNode, Read, bound_steps, unanswered
+from busmaster.planning.worst_case import ALONE, Bounds, PlannedNode, Read, Sharing, bound_steps, unanswered
 
 COMFORT = 0.9
 """The share of the line that a schedule may take: the rest is for commands, retries and probes."""
@@ -128,14 +128,24 @@ def plan(
     receive_latency: float = 0.0,
     others: Iterable[Read] = (),
     could_merge: Sequence[Merge] = (),
+    sharing: Sharing = ALONE,
 ) -> Plan:
     """Reckon what becomes of these poll groups on this line.
 
     `others` may be asked beside them: the worst case reckons with those, and with every node's probe. `could_merge`
-    are merges to be weighed that no group opts in to. Raises InvalidCommand for a period or phase that cannot be.
+    are merges to be weighed that no group opts in to. `sharing` says who else has the line. Raises InvalidCommand for a
+    period or phase that cannot be.
     """
-    steps = plan_steps(groups, line=line, receive_latency=receive_latency, others=others, could_merge=could_merge)
-    return at_once(steps)
+    return at_once(
+        plan_steps(
+            groups,
+            line=line,
+            receive_latency=receive_latency,
+            others=others,
+            could_merge=could_merge,
+            sharing=sharing,
+        )
+    )
 
 
 def plan_steps(
@@ -145,6 +155,7 @@ def plan_steps(
     receive_latency: float = 0.0,
     others: Iterable[Read] = (),
     could_merge: Sequence[Merge] = (),
+    sharing: Sharing = ALONE,
 ) -> Generator[int, None, Plan]:
     """Do what `plan` does in steps: each yields how many units of work it took, of about a microsecond."""
     drafts: list[_Draft] = []
@@ -154,7 +165,7 @@ def plan_steps(
     asked = [(node, served.command) for draft in drafts for node, served in draft.exchanges]
     low = sum(len(draft.costs) for draft in drafts if draft.group.priority is Priority.BACKGROUND)
     polls = sum(len(draft.costs) for draft in drafts) - low
-    bound = yield from bound_steps((*asked, *others), line.byte_time, receive_latency, polls, low)
+    bound = yield from bound_steps((*asked, *others), line.byte_time, receive_latency, polls, low, sharing)
     utilisation = sum(draft.utilisation for draft in drafts)
     yield from _play(drafts)
     planned = []

@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from math import ceil
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from busmaster.arbiter.backlog import SHARE
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.schedule import Priority, line_time
+from busmaster.arbiter.turns import PASSED_BY_EACH
 from busmaster.arbiter.unasked import NOISY_AFTER, QUIET
 from busmaster.contract.exchange import Command, Exchange
 from busmaster.contract.profile import Profile
@@ -41,6 +42,16 @@ class PlannedNode:
 
 
 Read: TypeAlias = tuple[PlannedNode, Command[Any]]
+
+
+class Sharing(NamedTuple):
+    """Who shares a line: so many other programs, and the longest time, in seconds, for which a sequence holds it."""
+
+    clients: int = 0
+    held: float = 0.0
+
+
+ALONE = Sharing()
 
 
 def shape(exchange: Exchange[Any]) -> tuple[object, ...]:
@@ -88,35 +99,50 @@ class Bounds:
     background: int = 0
     patience: float = 1.0
     """The longest time, in seconds, for which a poll lets later ones with a shorter period pass."""
+    clients: int = 0
+    """How many other programs share the line, and take turns with this one."""
+    held: float = 0.0
+    """The longest time, in seconds, for which the line may be held for one sequence of requests."""
 
     def wait(self, priority: Priority, *, ahead: int = 0, patience: float | None = None) -> float:
         """Return how long, in seconds, a request of this class waits at most until it is sent.
 
-        `ahead` says how many of URGENT or COMMAND wait already. Of URGENT, it is the wait of a write. Before each
-        request, MOST_BEFORE others may go while an answer could be taken for its own (R15); an urgent write is never
-        held back so, an urgent read waits for so many more.
+        `ahead` says how many of URGENT or COMMAND wait already, of this program. Of URGENT, it is the wait of a write.
+        Before each request, MOST_BEFORE others may go while an answer could be taken for its own (R15); an urgent write
+        is never held back so, an urgent read waits for so many more. Each other program may go before it twice, and
+        each exchange may be a sequence for which the line is held; a lower class has a slot behind each of those.
         """
         each = 1 + MOST_BEFORE
+        turn = 1 + PASSED_BY_EACH * self.clients
+        ahead = (ahead + 1) * turn - 1
         if priority is Priority.URGENT:
             return self.urgent_hold * (1 + each * ahead)
+        hold = self.hold + self.held
         if priority is Priority.COMMAND:
-            return self.hold * (1 + each * (ahead + ceil((ahead + 1) / SHARE)) + MOST_BEFORE)
+            lower = ahead + 1 if self.held else ceil((ahead + 1) / SHARE)
+            return hold * (1 + each * (ahead + lower) + MOST_BEFORE)
         turns = SHARE + 1
         if priority is Priority.BACKGROUND or self.background:
             turns *= 2
-        rivals = self.background if priority is Priority.BACKGROUND else self.polls
-        return (self.patience if patience is None else patience) + each * turns * max(1, rivals) * self.hold
+        rivals = turn * max(1, self.background if priority is Priority.BACKGROUND else self.polls)
+        return (self.patience if patience is None else patience) + each * turns * rivals * hold
 
 
 def bounds(
-    reads: Iterable[Read], byte_time: float, receive_latency: float = 0.0, *, polls: int = 0, background: int = 0
+    reads: Iterable[Read],
+    byte_time: float,
+    receive_latency: float = 0.0,
+    *,
+    polls: int = 0,
+    background: int = 0,
+    sharing: Sharing = ALONE,
 ) -> Bounds:
     """Return the bounds for a line on which nothing else is asked than these, and every node's probe."""
-    return at_once(bound_steps(reads, byte_time, receive_latency, polls, background))
+    return at_once(bound_steps(reads, byte_time, receive_latency, polls, background, sharing))
 
 
 def bound_steps(
-    reads: Iterable[Read], byte_time: float, receive_latency: float, polls: int, background: int
+    reads: Iterable[Read], byte_time: float, receive_latency: float, polls: int, background: int, sharing: Sharing
 ) -> Generator[int, None, Bounds]:
     """Do what `bounds` does in steps: each yields how many units of work it took, of about a microsecond."""
     hold = urgent_hold = 0.0
@@ -132,4 +158,4 @@ def bound_steps(
             hold = max(hold, longest + (node.profile.exchange_limit or 0.0))
             urgent_hold = max(urgent_hold, longest)
         yield WEIGHING
-    return Bounds(hold, urgent_hold, polls, background)
+    return Bounds(hold, urgent_hold, polls, background, clients=sharing.clients, held=sharing.held)

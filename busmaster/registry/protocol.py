@@ -7,6 +7,7 @@ import re
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -184,10 +185,10 @@ class Protocol:
         if kind is None:
             raise InvalidCommand(f"{self.name} has no command {name!r}: use {', '.join(self.commands)}")
         arguments = {key: _frozen(value) for key, value in written.items() if key != "command"}
-        for part in dataclasses.fields(kind):  # type: ignore[arg-type]  # every command is a dataclass
+        for part in _options_of(kind):
             # An option has one form: neither a number nor a text stands for true.
-            if isinstance(part.default, bool) and not isinstance(arguments.get(part.name, False), bool):
-                raise InvalidCommand(f"{self.name}: {name}: {part.name} is true or false, not {arguments[part.name]!r}")
+            if not isinstance(arguments.get(part, False), bool):
+                raise InvalidCommand(f"{self.name}: {name}: {part} is true or false, not {arguments[part]!r}")
         try:
             return kind(**arguments)
         except InvalidCommand:
@@ -196,9 +197,21 @@ class Protocol:
             raise InvalidCommand(f"{self.name}: {name}: {error}") from None
 
 
-def _arguments_of(command: Any) -> dict[str, Any]:
-    given = ((part, getattr(command, part.name)) for part in dataclasses.fields(command) if part.init)
-    return {part.name: value for part, value in given if value != part.default}
+def _arguments_of(command: Command[Any]) -> dict[str, Any]:
+    return {name: value for name, default in _parts_of(type(command)) if (value := getattr(command, name)) != default}
+
+
+@cache  # each remote request asks at either end
+def _parts_of(kind: type[Command[Any]]) -> tuple[tuple[str, Any], ...]:
+    """Return the names and defaults of what a command is made of."""
+    fields = dataclasses.fields(kind)  # type: ignore[arg-type]  # every command is a dataclass
+    return tuple((part.name, part.default) for part in fields if part.init)
+
+
+@cache
+def _options_of(kind: type[Command[Any]]) -> tuple[str, ...]:
+    """Return which of them are true or false."""
+    return tuple(name for name, default in _parts_of(kind) if isinstance(default, bool))
 
 
 def _frozen(value: Any) -> Any:

@@ -8,9 +8,11 @@ from collections.abc import Hashable, Mapping
 from functools import partial
 from typing import Any
 
+from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.node import Node
+from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import Requester, checked_priority
 from busmaster.contract.arguments import seconds, whole_number
@@ -20,6 +22,7 @@ from busmaster.service.errands import Errand, Line
 from busmaster.service.failures import said_error
 from busmaster.service.messages import (
     MOST_CHECKED,
+    MOST_HOLDS,
     MOST_NODES,
     MOST_POINTS,
     MOST_REQUESTS,
@@ -54,10 +57,15 @@ class Client:
         """How often each had been told to stop when this client named it: the client counts from there."""
         self._refused: dict[NodeKey, str] = {}
         """Why a node that it named may not be asked as it said; its requests are refused until it names it rightly."""
-        self._running: dict[int, asyncio.Task[None]] = {}
         self._errands: dict[int, Errand] = {}
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
+        self._turn = line.bus.shared.add_client(line.share)
+        """What its requests take turns by, with those of the others."""
+        self._holds: dict[int, Hold] = {}
+        """Its sequences that nobody comes between, by the number that it gave them."""
+        self._gathered: dict[int, list[Point[Any]]] = {}
+        """Points for poll groups that it will make, by the streams of those."""
         self._log = logging.getLogger("busmaster.service")
 
     @property
@@ -92,6 +100,13 @@ class Client:
             params = {"protocol": key[0], "address": key[1], "stops": node.stops - self._stops[key]}
             self.outbox.put_latest(("stops", key), written({"method": "stops", "params": params}))
 
+    def tell_touched(self, node: NodeRecord, when: float) -> None:
+        """Say that a write to a node has ended, if this client has samples of its own poll groups."""
+        if self._groups:
+            key = (node.profile.name, node.address)
+            params = {"protocol": key[0], "address": key[1], "when": when}
+            self.outbox.put_latest(("touched", key), written({"method": "touched", "params": params}))
+
     # what it says
 
     def take(self, said: Mapping[str, Any]) -> None:
@@ -107,7 +122,7 @@ class Client:
             return
         if isinstance(number, bool) or not isinstance(number, int):
             raise Malformed("the id of a request is a whole number")
-        if number in self._running:
+        if number in self._errands:
             raise Malformed(f"request {number} is under way already")
         if method in ("request", "write"):
             self._begin(number, params)
@@ -127,11 +142,15 @@ class Client:
     def _notified(self, method: str, params: Mapping[str, Any]) -> None:
         match method:
             case "cancel":
-                task = self._running.get(params.get("id", -1))
-                if task is not None:
-                    task.cancel()
+                errand = self._errands.get(params.get("id", -1))
+                if errand is not None:
+                    errand.cancel()
             case "end":
                 self._end_stream(params.get("stream", -1))
+            case "hold":
+                self._hold(params)
+            case "release":
+                self._release(params.get("sequence", -1))
             case "stop":
                 node = self._nodes.get((str(params.get("protocol")), params.get("address", -1)))
                 if node is not None and self.permission.reaches(node):
@@ -156,6 +175,8 @@ class Client:
                 return self._follow(params, self._line.broadcast_of(self._line.group(params["group"])))
             case "events":
                 return self._follow(params, self._line.events())
+            case "gather":
+                return self._gather(params)
             case "poll":
                 return self._poll(params)
             case "overview":
@@ -212,9 +233,9 @@ class Client:
         if refused := self._refused.get((name, address)):
             raise InvalidCommand(refused)
         known = self._nodes.get((name, address))
-        protocol = protocol_of(name)
         if known is not None and timings is None and retries is None:
             return known
+        protocol = protocol_of(name)
         if known is None and len(self._nodes) >= MOST_NODES:
             raise InvalidCommand(f"one program names {MOST_NODES} nodes at most")
         bus = self._line.bus
@@ -233,32 +254,32 @@ class Client:
 
     def _begin(self, number: int, params: Mapping[str, Any]) -> None:
         try:
-            priority = checked_priority(params.get("options", {}).get("priority", Priority.COMMAND))
-            if len(self._running) >= MOST_REQUESTS + (MOST_URGENT if priority is Priority.URGENT else 0):
-                raise BacklogFull(f"{len(self._running)} requests of this program are not answered yet")
+            if len(self._errands) >= MOST_REQUESTS + (MOST_URGENT if _is_urgent(params) else 0):
+                raise BacklogFull(f"{len(self._errands)} requests of this program are not answered yet")
             errand = Errand.of(params, self, self._line)
+            errand.begin(partial(self._ended, number, errand))
         except (BusError, InvalidCommand) as error:
             self._refuse(number, error)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             self._refuse(number, InvalidCommand(f"request: {type(error).__name__}: {error}"))
         else:
             self._errands[number] = errand
-            self._running[number] = task = asyncio.ensure_future(self._run(number, errand))
-            task.add_done_callback(partial(self._ended, number, errand))
 
-    async def _run(self, number: int, errand: Errand) -> None:
+    def _ended(self, number: int, errand: Errand, future: asyncio.Future[Any]) -> None:
+        del self._errands[number]
+        errand.give_up()  # a task that is cancelled before its first step runs nothing of it
+        if future.cancelled():
+            return
+        error = future.exception()
         try:
-            value = await errand.run()
-            self._say({"id": number, "result": value})
-        except (BusError, InvalidCommand) as error:
-            self._refuse(number, error)
+            if error is not None:
+                raise error
+            self._say({"id": number, "result": future.result()})
+        except (BusError, InvalidCommand) as refusal:
+            self._refuse(number, refusal)
         except Exception as bug:  # of a protocol: the client is told, and the line goes on
             self._log.exception("a request of %s failed", self.peer)
             self._refuse(number, errand.unforeseen(bug))
-
-    def _ended(self, number: int, errand: Errand, _: object) -> None:
-        del self._running[number], self._errands[number]
-        errand.give_up()  # a task that is cancelled before its first step runs nothing of it
 
     def _begin_safe(self, number: int, params: Mapping[str, Any]) -> None:
         try:
@@ -286,6 +307,33 @@ class Client:
         else:
             self._say({"id": number, "error": said_error(error)})
 
+    # sequences
+
+    def client_of(self, sequence: int | None, node: Node) -> LineClient:
+        """Return whose turn a request takes. Raises InvalidCommand for a sequence that this client does not have."""
+        if sequence is None:
+            return self._turn
+        hold = self._holds.get(sequence)
+        if hold is None or hold.node is not node.record:
+            raise InvalidCommand(f"{node.label}: no sequence {sequence} was begun for it, of {MOST_HOLDS} at most")
+        return hold
+
+    def _hold(self, params: Mapping[str, Any]) -> None:
+        """Begin a sequence; the requests of one that cannot be begun are refused."""
+        number = params.get("sequence")
+        if isinstance(number, int) and number not in self._holds and len(self._holds) < MOST_HOLDS:
+            try:
+                node = self.node(params["protocol"], params["address"])
+                if self.permission.reaches(node):  # who may only read keeps nobody waiting so
+                    self._holds[number] = node.hold(seconds(params["max_hold"], "max_hold"), self._turn)
+            except (InvalidCommand, KeyError):
+                self._log.debug("%s cannot hold the line so: %s", self.peer, params)
+
+    def _release(self, sequence: int) -> None:
+        hold = self._holds.pop(sequence, None)
+        if hold is not None:
+            self._line.bus.shared.release(hold)
+
     # streams
 
     def _follow(self, params: Mapping[str, Any], source: Broadcast) -> dict[str, Any]:
@@ -296,15 +344,25 @@ class Client:
         source.join(self, stream)
         return {"period": source.group.period} if isinstance(source, GroupBroadcast) else {}
 
-    def _poll(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        points = params["points"]
-        if not isinstance(points, list) or len(points) > MOST_POINTS:
-            raise InvalidCommand(f"a poll group of a program has {MOST_POINTS} points at most")
-        if len(self._groups) >= MOST_STREAMS:
+    def _gather(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        """Keep points for a poll group: a message is too short for as many as one may have."""
+        stream, points = whole_number(params["stream"], 0, 2**53, "a stream"), params.get("points", [])
+        if stream not in self._gathered and len(self._gathered) >= MOST_STREAMS:
             raise InvalidCommand(f"one program has {MOST_STREAMS} poll groups at most")
+        known = self._gathered.get(stream, [])
+        if not isinstance(points, list) or len(known) + len(points) > MOST_POINTS:
+            raise InvalidCommand(f"a poll group of a program has {MOST_POINTS} points at most")
         read = [point_of(point, self.node) for point in points]
         if any(point.command.writes for point in read):
             raise InvalidCommand("a poll group reads: it writes nothing")
+        self._gathered[stream] = known + read
+        return {}
+
+    def _poll(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        if len(self._groups) >= MOST_STREAMS:
+            raise InvalidCommand(f"one program has {MOST_STREAMS} poll groups at most")
+        self._gather(params)
+        read = self._gathered.pop(params["stream"])
         phase = params.get("phase")
         group = self._line.bus.poll_group(
             f"{str(params['name'])[:40]} ({self.peer.short}-{self._number})",
@@ -325,6 +383,7 @@ class Client:
         source = self._streams.pop(stream, None)
         if source is not None:
             source.leave(self, stream)
+        self._gathered.pop(stream, None)
         group = self._groups.pop(stream, None)
         if group is not None:
             group.close()
@@ -335,7 +394,7 @@ class Client:
     def release(self) -> None:
         """Tell it truthfully what becomes of all that it asked for: the service ends, and the bus perhaps with it."""
         for number, errand in list(self._errands.items()):
-            self._running[number].cancel()
+            errand.cancel()
             unsure = errand.command.writes and errand.journey.sent
             kind: type[BusError] = WriteUnconfirmed if unsure else BusClosed
             self._refuse(number, kind("the program that owns the line ends", node=errand.node, command=errand.text))
@@ -344,10 +403,17 @@ class Client:
         """End all that it asked for, and give back its nodes."""
         for stream in list(self._streams):
             self._end_stream(stream)
-        tasks = list(self._running.values())
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        for errand in self.errands:
+            errand.cancel()
+        while self._errands:
+            await asyncio.wait([errand.future for errand in self.errands])
+        for sequence in list(self._holds):
+            self._release(sequence)
+        self._line.bus.shared.remove_client(self._turn)
         for node in self._nodes.values():
             self._line.bus.give_back(node)
         self._nodes.clear()
+
+
+def _is_urgent(params: Mapping[str, Any]) -> bool:
+    return bool(params.get("options", {}).get("priority") == Priority.URGENT)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Hashable, Mapping
+from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
+from busmaster.arbiter.clients import LineClient
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Journey, Node
 from busmaster.bus.points import Point
@@ -38,6 +39,11 @@ class Line(Protocol):
 
     @property
     def gate(self) -> Gate: ...
+
+    @property
+    def share(self) -> float:
+        """What weighs the line time of each program: the owner's own share is 1."""
+        ...
 
     @property
     def safe_wishes(self) -> SafeWishes: ...
@@ -89,6 +95,10 @@ class Asker(Protocol):
 
     def node(self, name: str, address: int, /) -> Node:
         """Return a node of the line. Raises InvalidCommand."""
+        ...
+
+    def client_of(self, sequence: int | None, node: Node, /) -> LineClient:
+        """Return whose turn a request takes: the program's, or that of its sequence. Raises InvalidCommand."""
         ...
 
     def stops_before(self, node: Node, /) -> int:
@@ -145,6 +155,7 @@ class Errand:
         *,
         line: Line,
         asker: Asker,
+        client: LineClient,
         stops_seen: int | None,
         stop: bool,
         asked: float,
@@ -156,10 +167,12 @@ class Errand:
         self._options = options
         self._line = line
         self._asker = asker
+        self._client = client
         self._stops_seen = stops_seen
         self._stop = stop
         self._asked = asked
         self._begun = False
+        self.future: asyncio.Future[Any]
 
     @classmethod
     def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
@@ -167,15 +180,17 @@ class Errand:
         task = Task.of_point(params, asker, line) if "key" in params else Task.of_node(params, asker)
         node, command = task.node, task.command
         given = cast("CommandOptions", dict(params.get("options", {})))
-        if not set(given) <= OPTIONS:
-            raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
-        RequestOptions.of(given, node.label)  # checked here, before it may wait
+        if given:
+            if not set(given) <= OPTIONS:
+                raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
+            RequestOptions.of(given, node.label)  # checked here, before it may wait
         now, stops_seen = line.bus.now(), params.get("stops_seen")
         return cls(
             task,
             given,
             line=line,
             asker=asker,
+            client=asker.client_of(params.get("sequence"), node),
             stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
             stop=params.get("stop") is True and _check_stop(node, command),
             asked=min(now, seconds(params.get("asked", now), "asked")),
@@ -196,11 +211,28 @@ class Errand:
             self._line.gate.refuse(wish, str(error))
             raise
 
-    async def run(self) -> Any:
-        """Run it and return its value. Raises BusError or InvalidCommand; every write passes the gate."""
+    def begin(self, done: Callable[[asyncio.Future[Any]], object]) -> None:
+        """Have it done, and then call `done` with the future that has its value, BusError or InvalidCommand.
+
+        Raises them too, where nothing could be begun. Every write passes the gate.
+        """
+        if self.command.writes:
+            self.future = asyncio.ensure_future(self._write())
+        else:
+            self.future = self.node.begin_reading(
+                self.command, self.journey, stops_seen=self._stops_seen, client=self._client, **self._left()
+            )
+        self.future.add_done_callback(done)
+
+    def cancel(self) -> None:
+        """Give it up: what is on the wire runs out unheard."""
+        if not self.future.done():
+            self.future.cancel()
+            if not self.command.writes:
+                self.node.give_up(self.journey)
+
+    async def _write(self) -> Any:
         self._begun = True
-        if not self.command.writes:
-            return await self._request()
         wish = self._wish()
         passage = self._line.gate.begin(wish)
         try:
@@ -208,7 +240,15 @@ class Errand:
                 raise InvalidCommand(f"{self.node.label}: {refusal}")
             if (age := self._line.bus.now() - self._asked) > FRESH:
                 raise NotStarted(f"it came {age:.1f} s after it was asked for", node=self.node, command=self.text)
-            value = await self._request()
+            value = await self.node.followed_request(
+                self.command,
+                self.journey,
+                touches=self._task.touches,
+                stops_seen=self._stops_seen,
+                stop=self._stop,
+                client=self._client,
+                **self._left(),
+            )
         except BaseException as error:
             passage.end(self._truth(error))
             raise
@@ -234,19 +274,11 @@ class Errand:
             return WriteUnconfirmed("its program gave up before it was answered")
         return NotStarted("its program gave up before it was sent")
 
-    async def _request(self) -> Any:
-        return await self.node.followed_request(
-            self.command,
-            self.journey,
-            touches=self._task.touches,
-            stops_seen=self._stops_seen,
-            stop=self._stop,
-            **self._left(),
-        )
-
     def _left(self) -> CommandOptions:
         """Return the options, less the time that the request took to come here."""
         options: dict[str, Any] = dict(self._options)
+        if not options:
+            return {}
         age = self._line.bus.now() - self._asked
         for name in ("start_within", "finish_within"):
             limit = options.get(name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from typing import Any
 
 from busmaster.arbiter.tap import Attempt
@@ -101,7 +101,7 @@ class ExchangesBroadcast(Broadcast):
         super().__init__(on_end)
         self._bus = bus
 
-    async def _bodies(self) -> AsyncIterator[tuple[str, str]]:
+    async def _bodies(self) -> AsyncGenerator[tuple[str, str], None]:
         listener = Listener()
         self._bus.taps.add(listener)
         try:

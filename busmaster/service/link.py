@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from busmaster.contract.arguments import host_and_port
+from busmaster.contract.exchange import Command
 from busmaster.errors import (
     Addressed,
     BusClosed,
     BusError,
-    InvalidCommand,
     LineDown,
     NoReply,
     NotStarted,
     WriteUnconfirmed,
 )
+from busmaster.service.connection import AskingConnection
 from busmaster.service.failures import error_of
 from busmaster.service.folder import socket_path
-from busmaster.service.messages import GOING_AWAY, LONGEST_MESSAGE, VERSIONS, Malformed, read, written
-
-if TYPE_CHECKING:
-    from websockets.asyncio.client import ClientConnection
+from busmaster.service.messages import LONGEST_ANSWER, VERSIONS, read, written
 
 GRACE = 0.25
 """Seconds beyond `finish_within` in which the line's owner, who knows more, may say what became of a request."""
 CONNECT_WITHIN = 10.0
 ENDED = "the program that owns the line has ended"
+READ_AT_ONCE = 1 << 16
 TCP = "tcp://"
 GONE = "the connection to the program that owns the line was lost"
 AGAIN = "see whether it runs, and connect again"
@@ -41,7 +39,12 @@ class Asked:
     __slots__ = ("command", "future", "handed", "node", "number", "writes")
 
     def __init__(
-        self, number: int, future: asyncio.Future[Any], writes: bool, node: Addressed | None, command: str | None
+        self,
+        number: int,
+        future: asyncio.Future[Any],
+        writes: bool,
+        node: Addressed | None,
+        command: Command[Any] | None,
     ) -> None:
         self.number = number
         self.future = future
@@ -54,7 +57,7 @@ class Asked:
     def fail(self, kind: type[BusError], what: str, hint: str | None = None) -> None:
         """End it with an error, unless it has ended."""
         if not self.future.done():
-            self.future.set_exception(kind(what, node=self.node, command=self.command, hint=hint))
+            self.future.set_exception(kind(what, node=self.node, command=_text(self.command), hint=hint))
 
     def lost(self, kind: type[BusError], what: str, hint: str) -> None:
         """End it truthfully, as no answer will come: `kind` is for what changes nothing."""
@@ -64,6 +67,10 @@ class Asked:
             self.fail(WriteUnconfirmed, f"{what}, and the write may have been sent")
         else:
             self.fail(NotStarted, what, hint)
+
+
+def _text(command: Command[Any] | None) -> str | None:
+    return None if command is None else str(command)
 
 
 class Link:
@@ -80,56 +87,42 @@ class Link:
         self._token = token
         self._on_news = on_news
         self._on_lost = on_lost
-        self._connection: ClientConnection | None = None
+        self._connection: AskingConnection | None = None
         self._waiting: deque[tuple[str, Asked | None]] = deque()
-        self._something = asyncio.Event()
+        """What is said once the connection takes it, and with whose question."""
         self._asked: dict[int, Asked] = {}
         self._count = 0
         self._over: tuple[type[BusError], str, str] | None = None
-        self._tasks: list[asyncio.Task[None]] = []
+        self._is_open = False
 
     async def open(self, program: str) -> dict[str, Any]:
         """Connect, agree on a version, and return what the owner says of the line. Raises LineDown."""
-        connect, refused, _ = _websockets()
         where, place = _where(self.address)
-        headers = None if self._token is None else {"Authorization": f"Bearer {self._token}"}
+        loop = asyncio.get_running_loop()
+        self._asked[0] = hello = Asked(0, loop.create_future(), False, None, None)
+        params = {"versions": list(VERSIONS), "program": program}
+        self._waiting.appendleft((written({"id": 0, "method": "hello", "params": params}), hello))
         try:
-            connection = await connect(
-                "ws://busmaster/",
-                **place,
-                additional_headers=headers,
-                compression=None,
-                max_size=LONGEST_MESSAGE,
-                open_timeout=CONNECT_WITHIN,
-                close_timeout=1.0,
-                user_agent_header=None,
-                proxy=None,
-            )
-        except (OSError, TimeoutError, refused) as error:
-            raise _unreachable(where, error, shown=self._token is not None) from error
-        self._connection = connection
-        hello = Asked(0, asyncio.get_running_loop().create_future(), False, None, None)
-        self._asked[0] = hello
-        try:
-            text = written({"id": 0, "method": "hello", "params": {"versions": list(VERSIONS), "program": program}})
-            await connection.send(text)
-            self._tasks = [asyncio.ensure_future(self._receive()), asyncio.ensure_future(self._send())]
-            said: dict[str, Any] = await hello.future
-        except BaseException:
+            async with asyncio.timeout(CONNECT_WITHIN):
+                if place is None:
+                    await loop.create_unix_connection(self._connect, where)
+                else:
+                    await loop.create_connection(self._connect, *place)
+                said: dict[str, Any] = await hello.future
+        except BaseException as error:
+            connection = self._connection
             await self.close()
+            if isinstance(error, OSError) or (connection is not None and connection.complaint is not None):
+                raise _unreachable(where, error, connection, shown=self._token is not None) from error
             raise
         return said
 
     async def close(self) -> None:
         """Let go: whoever still waits is told so."""
         self._end(BusClosed, "the bus was closed", "make a new one: it is opened and closed once")
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
         if self._connection is not None:
-            # Where it was lost while something was sent, the library aborts a transport that asyncio has let go of.
-            with contextlib.suppress(AttributeError):
-                await self._connection.close()
+            self._connection.close()
+            await self._connection.closed()
 
     def tell(self, method: str, params: Mapping[str, Any]) -> None:
         """Say something that is not answered; nothing once the connection is lost."""
@@ -143,7 +136,7 @@ class Link:
         *,
         writes: bool = False,
         node: Addressed | None = None,
-        command: str | None = None,
+        command: Command[Any] | None = None,
     ) -> Asked:
         """Ask something, after all that was said before; its future has the answer. Raises LineDown or BusClosed."""
         self.check(node, command)
@@ -153,11 +146,11 @@ class Link:
         self._put(written({"id": asked.number, "method": method, "params": params}), asked)
         return asked
 
-    def check(self, node: Addressed | None = None, command: str | None = None) -> None:
+    def check(self, node: Addressed | None = None, command: Command[Any] | None = None) -> None:
         """Raise LineDown or BusClosed, saying why, once the connection is over."""
         if self._over is not None:
             kind, what, hint = self._over
-            raise kind(what, node=node, command=command, hint=hint)
+            raise kind(what, node=node, command=_text(command), hint=hint)
 
     async def answer(self, asked: Asked, finish_within: float | None = None) -> Any:
         """Wait for an answer. Cancelling it cancels the request at the line too."""
@@ -174,11 +167,57 @@ class Link:
             if timer is not None:
                 timer.cancel()
 
+    # what the connection tells
+
+    def _connect(self) -> AskingConnection:
+        self._connection = AskingConnection(self, token=self._token, longest=LONGEST_ANSWER, read_at_once=READ_AT_ONCE)
+        return self._connection
+
+    def opened(self) -> None:
+        """Say what has waited for that: hello comes first."""
+        self._is_open = True
+        self.writable()
+
+    def heard(self, message: str | bytes) -> None:
+        """Give an answer to whom it was asked for, and news to whom they concern."""
+        try:
+            self._take(read(message))
+        except Exception as error:  # whatever is said wrongly
+            what = f"the program that owns the line said what is not understood: {type(error).__name__}: {error}"
+            self._end(LineDown, what, AGAIN)
+            assert self._connection is not None
+            self._connection.close()
+
+    def writable(self) -> None:
+        """Say what waits, as far as the connection takes it."""
+        while self._waiting and self._takes_more():
+            text, asked = self._waiting.popleft()
+            self._say(text, asked)
+
+    def lost(self) -> None:
+        """Tell whoever waits that the connection is over."""
+        if self._connection is not None and self._connection.owner_ended:
+            self._end(LineDown, ENDED, "start it, and connect again")
+        self._end(LineDown, GONE, AGAIN)
+
     # inside
 
+    def _takes_more(self) -> bool:
+        return self._is_open and self._connection is not None and not self._connection.full
+
     def _put(self, text: str, asked: Asked | None) -> None:
-        self._waiting.append((text, asked))
-        self._something.set()
+        if self._waiting or not self._takes_more():
+            self._waiting.append((text, asked))
+        else:
+            self._say(text, asked)
+
+    def _say(self, text: str, asked: Asked | None) -> None:
+        if asked is not None:
+            if asked.future.done():
+                return  # nobody waits for it any more: it is not even said
+            asked.handed = True
+        assert self._connection is not None
+        self._connection.say(text)
 
     def _drop(self, asked: Asked) -> None:
         """Wait for it no longer, and have it cancelled there."""
@@ -199,79 +238,42 @@ class Link:
             self._waiting.clear()
             self._on_lost()
 
-    async def _send(self) -> None:
-        assert self._connection is not None
-        _, _, closed = _websockets()
-        with contextlib.suppress(closed):  # `_receive` hears of that too
-            while True:
-                while self._waiting:
-                    text, asked = self._waiting.popleft()
-                    if asked is not None:
-                        if asked.future.done():
-                            continue  # nobody waits for it any more: it is not even said
-                        asked.handed = True
-                    await self._connection.send(text)
-                self._something.clear()
-                await self._something.wait()
-
-    async def _receive(self) -> None:
-        assert self._connection is not None
-        _, _, closed = _websockets()
-        why = GONE
-        try:
-            async for text in self._connection:
-                self._take(read(text))
-        except closed:
-            pass
-        except (Malformed, KeyError, TypeError, ValueError, AttributeError, InvalidCommand) as error:
-            why = f"the program that owns the line said what is not understood: {error}"
-        if self._connection.close_code == GOING_AWAY:
-            self._end(LineDown, ENDED, "start it, and connect again")
-        self._end(LineDown, why, AGAIN)
-
     def _take(self, said: Mapping[str, Any]) -> None:
         if "method" in said:
             self._on_news(said["method"], said["params"])
             return
-        asked = self._asked.pop(said["id"], None) if said.get("id") is not None else None
-        if asked is None or asked.future.done():
+        asked = self._asked.get(said["id"]) if said.get("id") is not None else None
+        if asked is None:
             return
-        if "error" in said:
-            asked.future.set_exception(error_of(said["error"]))
+        # Understood first: whoever asked for what is not understood is told so when the conversation ends for it.
+        error = error_of(said["error"]) if "error" in said else None
+        del self._asked[asked.number]
+        if asked.future.done():
+            return
+        if error is not None:
+            asked.future.set_exception(error)
         else:
             asked.future.set_result(said.get("result"))
 
 
-def _where(address: str) -> tuple[str, dict[str, Any]]:
-    """Return where that is for messages, and for the library. Raises InvalidCommand."""
-    if address.startswith(TCP):
-        text = address.removeprefix(TCP).rstrip("/")
-        host, port = host_and_port(text)
-        return text, {"host": host, "port": port}
-    path = socket_path(address)
-    return path, {"path": path, "unix": True}
+def _where(address: str) -> tuple[str, tuple[str, int] | None]:
+    """Return where that is for messages, and host and port, None of a Unix socket. Raises InvalidCommand."""
+    if not address.startswith(TCP):
+        return socket_path(address), None
+    text = address.removeprefix(TCP).rstrip("/")
+    return text, host_and_port(text)
 
 
-def _unreachable(where: str, error: Exception, *, shown: bool) -> LineDown:
-    response = getattr(error, "response", None)
-    match None if response is None else response.status_code:
+def _unreachable(where: str, error: BaseException, connection: AskingConnection | None, *, shown: bool) -> LineDown:
+    match None if connection is None else connection.status:
         case 401:
             what = "does not know this token" if shown else "wants a token"
             return LineDown(f"{where} {what}", hint="its owner has the tokens in a file, see [service] of LINE.toml")
         case 503:
             return LineDown(f"{where} has too many programs already", hint="end one, see busmaster status")
-    why = getattr(error, "strerror", None) or str(error) or "it does not answer"
+    if isinstance(error, TimeoutError):
+        what = f"the program that serves {where} did not answer in {CONNECT_WITHIN:g} s"
+        return LineDown(what, hint="if it stands still, end it: the line is its own as long as it is there")
+    complaint = None if connection is None else connection.complaint
+    why = complaint or getattr(error, "strerror", None) or str(error) or "it does not answer"
     return LineDown(f"no program serves {where}: {why}", hint="start busmaster run, or see busmaster status")
-
-
-def _websockets() -> tuple[Any, type[Exception], type[Exception]]:
-    """Return what connects, and what it raises when that fails, and when the connection is over.
-
-    Raises InvalidCommand, with what to install, where it is missing.
-    """
-    try:
-        from websockets.asyncio.client import connect
-        from websockets.exceptions import ConnectionClosed, WebSocketException
-    except ImportError:
-        raise InvalidCommand("a line of another program needs websockets: pip install 'busmaster[service]'") from None
-    return connect, WebSocketException, ConnectionClosed

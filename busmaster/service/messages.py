@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import inf, isnan
 from typing import Any
 
@@ -13,13 +13,22 @@ from busmaster.errors import InvalidCommand
 
 VERSIONS = (1,)
 """Of what is said. The first message of a client says which ones it knows, and the highest that both know holds."""
-LONGEST_MESSAGE = 1 << 20
-"""Bytes of one message, either way."""
+LONGEST_REQUEST = 1 << 16
+"""Bytes of one message of a client: what it takes to understand one holds up the line."""
+LONGEST_ANSWER = 1 << 20
+"""Bytes of one message to a client."""
 MOST_CLIENTS = 64
+MOST_STRANGERS = 64
+"""Connections of which no first message has come: one more costs the oldest of them."""
 MOST_REQUESTS = 256
 """Requests of one client that have not been answered."""
 MOST_URGENT = 16
 """Urgent ones that are taken beyond those."""
+MOST_UNDER_WAY = MOST_REQUESTS // 2
+"""Requests of one client, none of them urgent, that it has said and that are not answered: the others wait there. As
+many again may have been given up by it, and be known to the owner still."""
+MOST_HOLDS = 32
+"""Sequences of one client that are not over."""
 MOST_UNREAD = 256
 """Messages of streams that one client has not read: beyond it the oldest is dropped, and counted."""
 MOST_WAITING = MOST_UNREAD + 2 * MOST_REQUESTS
@@ -43,10 +52,6 @@ PARSE_ERROR, INVALID_REQUEST, NO_METHOD, INVALID_PARAMS, INTERNAL, BUS_ERROR = (
     -32603,
     -32000,
 )
-
-
-GOING_AWAY = 1001
-"""With which an owner that ends in good order closes a connection."""
 
 
 class Malformed(Exception):
@@ -74,10 +79,13 @@ def read(text: str | bytes) -> dict[str, Any]:
     """Return a message. Raises Malformed for what is none."""
     if not isinstance(text, str):
         raise Malformed("a message is text")
+    text = text.strip()
     try:
-        said = json.loads(text)
+        said, end = _decode(text)
     except (ValueError, RecursionError) as error:
         raise Malformed(f"this is no JSON: {error}", PARSE_ERROR) from None
+    if end < len(text):
+        raise Malformed("this is no JSON: there is more behind it", PARSE_ERROR)
     if not isinstance(said, dict) or said.get("jsonrpc") != "2.0":
         raise Malformed("this is no message of JSON-RPC 2.0")
     return said
@@ -137,4 +145,16 @@ def _finite(value: Any) -> Any:
     return list(map(_finite, value)) if isinstance(value, list | tuple) else value
 
 
-_encode = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+def _encoder() -> Callable[[Any], str]:
+    """Return what encodes a value: what Python makes anew for each, which takes longer than to use it, made once."""
+    usual = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
+    text = json.encoder.encode_basestring_ascii
+    try:
+        encode = json.encoder.c_make_encoder(None, usual.default, text, None, ":", ",", False, False, False)  # type: ignore[attr-defined]
+    except (AttributeError, TypeError):  # another Python
+        return usual.encode
+    return lambda value: "".join(encode(value, 0))
+
+
+_decode = json.JSONDecoder().raw_decode  # half of what `loads` takes, which looks for other encodings and blanks
+_encode = _encoder()

@@ -25,7 +25,7 @@ from busmaster.contract.places import Placed
 from busmaster.gate.gate import Gate
 from busmaster.outputs.values import event_text, value_text
 from busmaster.service.messages import encoded
-from busmaster.service.streams import Broadcast, Place
+from busmaster.service.streams import READERS_IN_A_TURN, Broadcast, Place
 
 INTERVAL = 0.2
 """Seconds between two pictures."""
@@ -133,11 +133,13 @@ class Overview(Broadcast):
             fresh, self._fresh = self._fresh, []
             await self._tell_points(fresh)
             await self._tell_counts(fresh)
-            self._say("frame", 0, encoded(self._frame()), self.readers)
+            await self._say("frame", 0, encoded(self._frame()), tuple(self.readers))
             await asyncio.sleep(INTERVAL)
 
-    def _say(self, method: str, part: int, body: str, places: Sequence[Place]) -> None:
-        for place in places:
+    async def _say(self, method: str, part: int, body: str, places: Sequence[Place]) -> None:
+        for number, place in enumerate(places):
+            if number and number % READERS_IN_A_TURN == 0:
+                await asyncio.sleep(0)
             if place in self.readers:
                 place[0].tell_surely(place[1], method, body, part)
 
@@ -148,9 +150,9 @@ class Overview(Broadcast):
         for number, part in enumerate(self._parts):
             if new:
                 part.say_rows(self._set)
-            self._say("rows", number, part.rows, tuple(self.readers) if new else fresh)
+            await self._say("rows", number, part.rows, tuple(self.readers) if new else fresh)
             changed = part.say_values(self._set, self._bus.alarms)
-            self._say("values", number, part.values, tuple(self.readers) if changed else fresh)
+            await self._say("values", number, part.values, tuple(self.readers) if changed else fresh)
             if new or changed:
                 await asyncio.sleep(0)
 
@@ -190,7 +192,7 @@ class Overview(Broadcast):
                 text = encoded({"first": first, method: told})
                 self._counts[method, first] = text
                 await asyncio.sleep(0)
-            self._say(method, first, text, tuple(self.readers) if due else fresh)
+            await self._say(method, first, text, tuple(self.readers) if due else fresh)
 
     def _count_keys(self) -> Iterator[tuple[str, int]]:
         for method, number in (("groups", len(self._bus.groups)), ("nodes", len(self._bus.nodes))):

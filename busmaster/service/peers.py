@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import pwd
 import socket
 import struct
@@ -34,6 +35,11 @@ class Peer(Protocol):
         ...
 
 
+_names: dict[int, str] = {}
+"""What users are called, by their numbers: whom to ask may be a server on a network, which a line does not wait for."""
+_asked: dict[int, asyncio.Task[None]] = {}
+
+
 @dataclass(frozen=True, slots=True)
 class Process:
     """A process of this machine, which has connected the Unix socket."""
@@ -41,8 +47,12 @@ class Process:
     pid: int
     uid: int
     gids: tuple[int, ...]
-    user: str
     program: str
+
+    @property
+    def user(self) -> str:
+        """Return the user's name; the number of one without a name, and until the name is found."""
+        return _names.get(self.uid, str(self.uid))
 
     @property
     def short(self) -> str:
@@ -84,9 +94,10 @@ class Holder:
 
 
 def process_of(connected: Any) -> Process:
-    """Return who has connected a Unix socket."""
+    """Return who has connected a Unix socket, and have the user's name found."""
     pid, uid, gid = CREDENTIALS.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
-    return Process(pid, uid, (gid, *_more_groups(connected)), user_name(uid), program_name(pid))
+    find_name(uid)
+    return Process(pid, uid, (gid, *_more_groups(connected)), program_name(pid))
 
 
 def holder_of(connected: Any, token: str) -> Holder:
@@ -104,8 +115,24 @@ def _more_groups(connected: Any) -> tuple[int, ...]:
     return struct.unpack(f"{len(said) // 4}I", said)
 
 
+def find_name(uid: int) -> asyncio.Future[None] | None:
+    """Have the name of a user found, in a thread; return what ends then, or None if it is known."""
+    if uid in _names:
+        return None
+    if uid not in _asked:
+        _asked[uid] = asyncio.ensure_future(_find_name(uid))
+    return _asked[uid]
+
+
+async def _find_name(uid: int) -> None:
+    try:
+        _names[uid] = await asyncio.to_thread(user_name, uid)
+    finally:
+        del _asked[uid]
+
+
 def user_name(uid: int) -> str:
-    """Return a user's name; the number of one without a name."""
+    """Return a user's name; the number of one without a name. It may take long."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:

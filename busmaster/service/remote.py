@@ -5,41 +5,41 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Hashable, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from math import inf
 from types import TracebackType
-from typing import Any, TypeVar, Unpack
+from typing import Any, TypeVar
 
 from busmaster.arbiter.counters import LineStatistics
 from busmaster.bus.alarms import BusEvent
-from busmaster.bus.limits import Limit
 from busmaster.bus.points import Point
-from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, RequestOptions
+from busmaster.bus.requester import Priority
 from busmaster.bus.samples import Sample
-from busmaster.bus.snapshots import Snapshot, Stream
+from busmaster.bus.snapshots import Stream
 from busmaster.contract.exchange import Command
 from busmaster.contract.learning import Learned
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed, BusError, InvalidCommand
-from busmaster.planning.merging import Merge
-from busmaster.service.link import TCP, Asked, Link
-from busmaster.service.messages import MOST_CHECKED, said_timings, value_of
+from busmaster.service.link import TCP, Link
+from busmaster.service.messages import MOST_CHECKED, said_timings
 from busmaster.service.remote_exchanges import RemoteExchanges
+from busmaster.service.remote_group import RemoteGroup
+from busmaster.service.remote_node import RemoteNode
 from busmaster.service.remote_overview import RemoteOverview
 from busmaster.service.safe import outcomes_of
+from busmaster.service.sequences import Room
 from busmaster.service.telling import (
     event_of,
-    point_of,
     protocol_of,
     said_points,
-    snapshot_of,
     statistics_of,
 )
 
 T = TypeVar("T")
 EVENT_BUFFER = 256
+POINTS_IN_A_MESSAGE = 50
 
 
 def connect(address: str, *, token: str | None = None) -> RemoteBus:
@@ -50,187 +50,6 @@ def connect(address: str, *, token: str | None = None) -> RemoteBus:
     is. Raises InvalidCommand for a token anywhere else: there the kernel says who comes.
     """
     return RemoteBus(address, token=token)
-
-
-class RemoteNode:
-    """One node of a line that another program owns. Handles and points work on it as on a node of this process."""
-
-    def __init__(self, bus: RemoteBus, profile: Profile, address: int) -> None:
-        self.stops = 0
-        """How often it was told to stop, by whatever program, since this one named it."""
-        self.label = profile.label(address)
-        self._bus = bus
-        self._profile = profile
-        self._address = address
-        self._protocol = protocol_of(profile.name)
-
-    @property
-    def line(self) -> str:
-        """Return the name of its line's port."""
-        return self._bus.line
-
-    @property
-    def address(self) -> int:
-        return self._address
-
-    @property
-    def profile(self) -> Profile:
-        return self._profile
-
-    def __repr__(self) -> str:
-        return f"<RemoteNode {self.profile.name} {self.address} of {self._bus.address}>"
-
-    def note_stop(self) -> None:
-        """Tell the line that this node is being told to stop, ahead of whatever is asked of it from now on."""
-        self.stops += 1
-        self._bus.link.tell("stop", {"protocol": self.profile.name, "address": self.address})
-
-    def now(self) -> float:
-        """Return the time of the line's clock, in seconds: that of the machine, which is the same for all programs."""
-        return self._bus.now()
-
-    def latest(self, point: Hashable, /) -> Sample[Any] | None:
-        """Return None: only the line knows of every write that makes a sample stale."""
-        return None
-
-    def merge_reads(self, merge: Merge, /) -> None:
-        """Have the profile propose `merge`. What is merged on the line is its owner's affair."""
-        self._profile = replace(self._profile, merge=merge)
-
-    def limit(self, limit: Limit, /) -> None:
-        """Raise InvalidCommand: limits are held by the program that owns the line, for all programs."""
-        raise InvalidCommand(f"{self.label}: limits are held by the program that owns the line: set {limit.name} there")
-
-    def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
-        """Have the line check these writes when the bus is entered: entering raises InvalidCommand for a bad one.
-
-        Later it does nothing: the line checks each write as it comes. Of several, those before a bad one are written.
-        """
-        self._bus.prepare(self, commands, stop is True)
-
-    async def request(
-        self,
-        command: Command[T],
-        /,
-        *,
-        touches: Command[Any] | None = None,
-        stops_seen: int | None = None,
-        stop: bool = False,
-        **options: Unpack[CommandOptions],
-    ) -> T:
-        """Run one command on the line and return its value: as `Requester.request`, with the same errors.
-
-        If the connection is lost meanwhile, a write raises WriteUnconfirmed, or NotStarted where it was not handed over
-        yet, and a read LineDown. Cancelling it cancels it there.
-        """
-        chosen = RequestOptions.of(options, self.label) if options else ORDINARY
-        if chosen.verify:
-            raise InvalidCommand(f"{self.label}: verify is for what writes a value through a handle")
-        if chosen.safe:
-            raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
-        params = self._said(command, options, touches, stops_seen, stop)
-        link = self._bus.opened(self, str(command))
-        asked = link.ask("request", params, writes=command.writes, node=self, command=str(command))
-        value: T = value_of(await link.answer(asked, chosen.finish_within))
-        return value
-
-    def _said(
-        self,
-        command: Command[Any],
-        options: Mapping[str, Any],
-        touches: Command[Any] | None,
-        stops_seen: int | None,
-        stop: bool,
-    ) -> dict[str, Any]:
-        params: dict[str, Any] = {
-            "protocol": self.profile.name,
-            "address": self.address,
-            "command": self._protocol.write_down(command),
-            "asked": self.now(),
-        }
-        if touches is not None:
-            params["touches"] = self._protocol.write_down(touches)
-        if stops_seen is not None:
-            params["stops_seen"] = stops_seen
-        if stop:
-            params["stop"] = True
-        if given := {name: value for name, value in options.items() if value is not None and name not in LEFT_OUT}:
-            params["options"] = given
-        return params
-
-    def said_check(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
-        """Return writes of this node as the line is asked whether it would take them."""
-        said = [self._protocol.write_down(command) for command in commands]
-        return {"protocol": self.profile.name, "address": self.address, "commands": said, "stop": stop}
-
-
-LEFT_OUT = ("verify", "safe")
-
-
-class RemoteGroup:
-    """A poll group of the line. Iterate it, or look at `latest`; close it when it is not read any more."""
-
-    def __init__(self, bus: RemoteBus, name: str, number: int, points: tuple[Point[Any], ...]) -> None:
-        self.name = name
-        self.period = 0.0
-        self.latest: Snapshot | None = None
-        """That of its last cycle."""
-        self.dropped = 0
-        """Cycles that this program was too slow for, counted by the line's owner."""
-        self._bus = bus
-        self._number = number
-        self._own = points
-        self._points = points
-        self._set = -1
-        self._consumers: list[Stream[Snapshot]] = []
-        self._over = False
-
-    @property
-    def points(self) -> tuple[Point[Any], ...]:
-        return self._points
-
-    def subscribe(self, buffer: int = 16) -> Stream[Snapshot]:
-        """Return a consumer with a buffer of so many snapshots. Close it when it is not read any more."""
-        if self._over:
-            raise BusClosed(f"poll group {self.name!r} is closed")
-        return Stream(self._consumers, buffer)
-
-    async def __aiter__(self) -> AsyncIterator[Snapshot]:
-        consumer = self.subscribe()
-        try:
-            async for snapshot in consumer:
-                yield snapshot
-        finally:
-            consumer.close()
-
-    def close(self) -> None:
-        """Read it no more; one that this program made ends."""
-        if not self._over:
-            self._bus.end_stream(self._number)
-
-    def hear(self, method: str, params: Mapping[str, Any]) -> None:
-        """Take what the line's owner says of it."""
-        body = params["body"]
-        for consumer in self._consumers:
-            consumer.dropped += params["dropped"] - self.dropped
-        self.dropped = params["dropped"]
-        if method == "points":
-            self._set = body["set"]
-            # By its own points, a program gets the values that they decode.
-            if not self._own:
-                self._points = tuple(point_of(said, self._bus.find) for said in body["points"])
-        elif method == "snapshot" and body["set"] == self._set:
-            self.latest = snapshot_of(body, self.name, self._points)
-            for consumer in self._consumers:
-                consumer.put(self.latest)
-        elif method == "ended":
-            self._bus.end_stream(self._number)
-
-    def end(self) -> None:
-        """End those who read it, after what they hold."""
-        self._over = True
-        for consumer in list(self._consumers):
-            consumer.close()
 
 
 class RemoteBus:
@@ -255,12 +74,19 @@ class RemoteBus:
         self.about: Mapping[str, Any] = {}
         """What the owner says of the line: its name, settings and process."""
         self._link: Link | None = None
+        self._ahead = 0.0
+        """Seconds by which the clock of the owner's machine is ahead of this one, less what its hello took to come."""
         self._nodes: dict[tuple[str, int], RemoteNode] = {}
         self._named: dict[RemoteNode, tuple[Timings | Learned | None, int | None]] = {}
         self._told: set[RemoteNode] = set()
         """Those of them of which the owner knows."""
         self._streams: dict[int, RemoteGroup | RemoteOverview | RemoteExchanges] = {}
         self._count = 0
+        self._sequences = 0
+        self.room = Room(self.now)
+        """For what is asked: so much of it is under way at a time."""
+        self._touched: dict[tuple[str, int], float] = {}
+        """When the last write to a node ended."""
         self._events: list[Stream[BusEvent]] = []
         self._hears_events = False
         self._prepared: list[tuple[RemoteNode, tuple[Command[Any], ...], bool]] = []
@@ -273,6 +99,8 @@ class RemoteBus:
         self._link = link
         said = await link.open(sys.argv[0])
         self.about, self.line = said, said["line"]
+        if self.address.startswith(TCP):  # another machine, perhaps: its clock began at another moment
+            self._ahead = said["now"] - time.monotonic()
         for known in said["nodes"]:
             node = self._nodes.get((known["protocol"], known["address"]))
             if node is not None:
@@ -301,10 +129,15 @@ class RemoteBus:
             raise BusClosed("the bus is not open")
         return self._link
 
-    def opened(self, node: RemoteNode, command: str) -> Link:
+    def new_sequence(self) -> int:
+        """Return the number of one more sequence of requests."""
+        self._sequences += 1
+        return self._sequences
+
+    def opened(self, node: RemoteNode, command: Command[Any]) -> Link:
         """Return the connection for a request. Raises BusClosed, naming it, before the bus is entered."""
         if self._link is None:
-            raise BusClosed("the bus is not open", node=node, command=command)
+            raise BusClosed("the bus is not open", node=node, command=str(command))
         return self._link
 
     def prepare(self, node: RemoteNode, commands: tuple[Command[Any], ...], stop: bool) -> None:
@@ -313,8 +146,8 @@ class RemoteBus:
             self._prepared.append((node, commands, stop))
 
     def now(self) -> float:
-        """Return the time of the line's clock, in seconds: that of the machine, which is the same for all programs."""
-        return time.monotonic()
+        """Return the time of the line's clock, in seconds: that of its owner's machine."""
+        return time.monotonic() + self._ahead
 
     # nodes
 
@@ -390,10 +223,20 @@ class RemoteBus:
         priority: Priority = Priority.POLL,
     ) -> RemoteGroup:
         """Have `points` read every `period` seconds, as `Bus.poll_group`; it ends with this program."""
-        wanted = tuple(points)
-        params: dict[str, Any] = {"name": name, "period": period, "points": said_points(wanted)}
-        params |= {"phase": phase, "priority": priority}
-        return await self._follow("poll", name, wanted, params)
+        params = {"name": name, "period": period, "phase": phase, "priority": priority}
+        return await self._follow("poll", name, tuple(points), params)
+
+    def latest(self, point: Point[T]) -> Sample[T] | None:
+        """Return the youngest good sample of a point in a poll group of this program, unless a write to its node, by
+        whatever program, has ended since it was read."""
+        node, profile = point.node, point.node.profile
+        addresses = (node.address,) if profile.broadcast is None else (node.address, profile.broadcast)
+        touched = [self._touched.get((profile.name, address), -inf) for address in addresses]
+        groups = [stream for stream in self._streams.values() if isinstance(stream, RemoteGroup)]
+        snapshots = [group.latest for group in groups if group.own and group.latest is not None]
+        samples = [snapshot.samples[point] for snapshot in snapshots if point in snapshot.samples]
+        good = (one for one in samples if one.error is None and one.started is not None and one.started > max(touched))
+        return max(good, key=lambda one: one.finished, default=None)
 
     async def enter_safe_state(self, values: Mapping[str, float]) -> dict[str, BusError | None]:
         """Have the line's owner send its safe state, and return by point why it was not confirmed, None if it was.
@@ -447,10 +290,16 @@ class RemoteBus:
     ) -> RemoteGroup:
         self._count += 1
         number = self._count
-        group = self._streams[number] = RemoteGroup(self, name, number, points)
-        asked: Asked = self.link.ask(method, {**params, "stream": number})
+        group = RemoteGroup(name, points, find=self.find, end=partial(self.end_stream, number))
+        self._streams[number] = group
+        said = said_points(points)
         try:
-            group.period = (await self.link.answer(asked))["period"]
+            while len(said) > POINTS_IN_A_MESSAGE:
+                await self._ask("gather", {"stream": number, "points": said[:POINTS_IN_A_MESSAGE]})
+                del said[:POINTS_IN_A_MESSAGE]
+            if said:
+                params = {**params, "points": said}
+            group.period = (await self._ask(method, {**params, "stream": number}))["period"]
         except BaseException:
             self.end_stream(number)
             raise
@@ -461,6 +310,8 @@ class RemoteBus:
             node = self._nodes.get((params["protocol"], params["address"]))
             if node is not None:
                 node.stops = params["stops"]
+        elif method == "touched":
+            self._touched[params["protocol"], params["address"]] = params["when"]
         elif method == "event":
             event = event_of(params["body"], self.find)
             for stream in self._events:
@@ -472,5 +323,6 @@ class RemoteBus:
     def _lost(self) -> None:
         for listener in list(self._streams.values()):
             listener.end()
+        self._streams.clear()  # what is written from now on is not heard of any more
         for stream in list(self._events):
             stream.close()

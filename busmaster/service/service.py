@@ -6,13 +6,15 @@ import asyncio
 import logging
 import os
 import socket
-from collections.abc import Collection, Hashable
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE
 from busmaster.arbiter.health import NodeRecord
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
@@ -21,40 +23,37 @@ from busmaster.bus.polling import PollGroup
 from busmaster.contract.places import Placed
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
+from busmaster.registry import protocols
 from busmaster.service.client import Client
+from busmaster.service.connection import CLOSE_WITHIN, check_installed
 from busmaster.service.exchanges import ExchangesBroadcast
 from busmaster.service.folder import Owner, ServedSocket, line_name, runtime_folder
 from busmaster.service.messages import (
-    GOING_AWAY,
-    HELLO_WITHIN,
     INVALID_PARAMS,
-    LONGEST_MESSAGE,
     MOST_CLIENTS,
+    MOST_STRANGERS,
     VERSIONS,
     Malformed,
-    read,
     written,
 )
 from busmaster.service.outbox import Outbox
 from busmaster.service.overview import Journal, Overview, state_text
-from busmaster.service.peers import Peer, process_of
+from busmaster.service.peers import Peer, find_name, process_of
 from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
 from busmaster.service.tcp import HostPort, check_listening, holder, is_our_name, listening
+from busmaster.service.visit import Reception, Visit
 
 if TYPE_CHECKING:
-    from websockets.asyncio.server import Server, ServerConnection
-    from websockets.http11 import Request, Response
+    from websockets.datastructures import Headers
+    from websockets.http11 import Request
 
 HOSTS = ("localhost", "busmaster")
 """What a client calls us: a page that was tricked into asking here would say another name."""
-SEND_WITHIN = 20.0
-"""Seconds in which a client has to take a message: one that stands still is let go, with all that it asked for."""
-READ_AT_ONCE = 4096
-"""Bytes of a connection that are taken in one turn of the line's loop: of small messages it holds hundreds."""
-CLOSE_WITHIN = 1.0
-"""Seconds that a client has to hear the last of it."""
-POLICY = 1008
+MOST_WAITING_TO_CONNECT = 100
+NAME_WITHIN = 1.0
+"""Seconds that the first client waits at most for this user's name: records then have his number."""
+TOO_MANY = f"{MOST_CLIENTS} programs are here already"
 
 
 class Service:
@@ -64,8 +63,10 @@ class Service:
     line, by default its port's. Every write passes `gate`, which says who may do what: without one, its own, which
     keeps a record in the log "busmaster.audit", and lets this user write and others read. `mode` and `group`, a number,
     are the socket's. `listen` is a host and a port where programs may come by TCP too: off this machine only where the
-    gate knows tokens. `title` is written over what a person sees of the line. Entering raises InvalidCommand where the
-    socket is served by another process, which it names, or cannot be made.
+    gate knows tokens. Each program takes turns with the others and with this one; `share`, 0.1 to 10, weighs its line
+    time: with 0.5, half as much as this one has, as long as both wait. `title` is written over what a person sees of
+    the line. Entering raises InvalidCommand where the socket is served by another process, which it names, or cannot be
+    made.
     """
 
     def __init__(
@@ -77,10 +78,14 @@ class Service:
         path: Path | str | None = None,
         mode: int = 0o600,
         group: int | None = None,
+        share: float = 1.0,
         listen: HostPort | None = None,
         title: str = "",
     ) -> None:
+        if isinstance(share, bool) or not LEAST_SHARE <= share <= MOST_SHARE:
+            raise InvalidCommand(f"a program's share is a number from {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share!r}")
         self.bus = bus
+        self.share = share
         self.gate = gate or Gate(bus)
         if listen is not None:
             check_listening(listen, tokens=bool(self.gate.access.secrets))
@@ -97,9 +102,13 @@ class Service:
         self._group = group
         self._listen = listen
         self._served: ServedSocket
-        self._servers: list[Server] = []
-        self._clients: dict[Client, ServerConnection] = {}
+        self._servers: list[asyncio.Server] = []
+        self._clients: dict[Client, Visit] = {}
+        self._strangers: dict[Visit, None] = {}
+        """Connections of which no first message has come, the oldest first."""
+        self._leaving: set[asyncio.Task[None]] = set()
         self._count = 0
+        self.reception = Reception()
         self._groups: dict[PollGroup, GroupBroadcast] = {}
         self._events: EventBroadcast | None = None
         self._overview: Overview | None = None
@@ -126,8 +135,16 @@ class Service:
         """Return the programs that are connected."""
         return tuple(self._clients)
 
+    @property
+    def strangers(self) -> int:
+        """Return how many connections there are of which no first message has come."""
+        return len(self._strangers)
+
     async def __aenter__(self) -> Service:
-        _websockets()  # before anything is made
+        check_installed()
+        await asyncio.to_thread(protocols)  # they are imported for this: not when the first client asks
+        if finding := find_name(os.getuid()):
+            await asyncio.wait([finding], timeout=NAME_WITHIN)
         path = self._path or runtime_folder() / f"{self.name}.sock"
         endpoint = self.bus.endpoint
         settings = endpoint.settings
@@ -155,6 +172,7 @@ class Service:
             raise
         self.bus.on_stop.append(self._tell_stop)
         self.journal.begin()
+        self.bus.on_touched.append(self._tell_touched)
         self.gate.on_access.append(self._let_go)
         return self
 
@@ -163,23 +181,25 @@ class Service:
     ) -> None:
         """Let nobody in any more, tell all clients what became of their requests, and let them go."""
         self.bus.on_stop.remove(self._tell_stop)
+        self.bus.on_touched.remove(self._tell_touched)
         self.gate.on_access.remove(self._let_go)
         await self.safe_wishes.close()
         for server in self._servers:
-            server.close(close_connections=False)
-        for client in self.clients:
+            server.close()
+        visits = [*self._clients.values(), *self._strangers]
+        for client in self._clients:
             client.release()
+        for visit in visits:
+            visit.bid_farewell()
         try:
-            async with asyncio.timeout(CLOSE_WITHIN):
-                await asyncio.gather(*(self._bid_farewell(*of) for of in list(self._clients.items())))
-        except TimeoutError:
-            pass  # one that does not listen
+            await _closed(visits)
         finally:
-            for connection in self._clients.values():
-                connection.transport.abort()
+            for visit in visits:
+                visit.connection.abort()
             try:
-                for server in self._servers:
-                    await server.wait_closed()
+                await _closed(visits)
+                while self._leaving:
+                    await asyncio.wait(self._leaving)
             finally:
                 self._served.__exit__(None, None, None)
                 await self.journal.close()
@@ -262,93 +282,68 @@ class Service:
         for client in self._clients:
             client.tell_stops(record)
 
-    # one connection
+    def _tell_touched(self, record: NodeRecord, when: float) -> None:
+        for client in self._clients:
+            client.tell_touched(record, when)
 
-    async def _serve_at(self, opened: socket.socket) -> Server:
-        by_path, by_port = _websockets()
-        serve = by_path if opened.family == socket.AF_UNIX else by_port
-        server: Server = await serve(
-            self._serve,
-            sock=opened,
-            process_request=self._check_request,
-            origins=[None],
-            compression=None,
-            max_size=LONGEST_MESSAGE,
-            close_timeout=CLOSE_WITHIN,
-            server_header=None,
-            logger=_quiet(),
-        )
+    # those who come
+
+    async def _serve_at(self, opened: socket.socket) -> asyncio.Server:
+        """Serve a socket. One connection is taken in a turn of the loop; that others wait is the kernel's affair."""
+        loop = asyncio.get_running_loop()
+        serve: Any = loop.create_unix_server if opened.family == socket.AF_UNIX else loop.create_server
+        server: asyncio.Server = await serve(self._visited, sock=opened, backlog=1)
+        opened.listen(MOST_WAITING_TO_CONNECT)
         return server
 
-    def _check_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Refuse whoever is one too many, or shows no token, and what may be a page's.
+    def _visited(self) -> asyncio.BaseProtocol:
+        """Return the end of a connection that was made just now. Of strangers, the oldest goes for one too many."""
+        if len(self._strangers) >= MOST_STRANGERS:
+            self.refused += 1
+            next(iter(self._strangers)).connection.abort()
+        visit = Visit(self)
+        self._strangers[visit] = None
+        return visit.connection
+
+    def refusal(self, visit: Visit, request: Request, /) -> tuple[int, str] | None:
+        """Note who has come. Refuse what may be a page's, whoever shows no token, and one too many.
 
         An Origin is refused by the library.
         """
-        host = request.headers.get("Host", "")
-        if host.partition(":")[0] not in HOSTS and not (self._listen and is_our_name(host, self._listen)):
+        refusal = self._refusal(visit, request.headers)
+        if refusal is not None:
             self.refused += 1
-            return connection.respond(HTTPStatus.FORBIDDEN, f"no such host: {host[:40]!r}\n")
-        if self._peer(connection, request) is None:
-            self.refused += 1
-            return connection.respond(HTTPStatus.UNAUTHORIZED, "a token that is known here is needed\n")
+        return refusal
+
+    def _refusal(self, visit: Visit, headers: Headers) -> tuple[int, str] | None:
+        hosts, shown = headers.get_all("Host"), headers.get_all("Authorization")
+        if len(hosts) != 1 or not self._is_our_name(hosts[0]):
+            return HTTPStatus.FORBIDDEN, f"no such host: {', '.join(hosts)[:40]!r}\n"
+        peer = self._peer(visit.connection.transport.get_extra_info("socket"), shown)
+        if peer is None:
+            return HTTPStatus.UNAUTHORIZED, "a token that is known here is needed\n"
         if len(self._clients) >= MOST_CLIENTS:
-            self.refused += 1
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_CLIENTS} programs are here already\n")
+            return HTTPStatus.SERVICE_UNAVAILABLE, f"{TOO_MANY}\n"
+        visit.peer = peer
         return None
 
-    def _peer(self, connection: ServerConnection, request: Request) -> Peer | None:
+    def _is_our_name(self, host: str) -> bool:
+        return host.partition(":")[0] in HOSTS or (self._listen is not None and is_our_name(host, self._listen))
+
+    def _peer(self, connected: socket.socket, shown: Sequence[str]) -> Peer | None:
         """Return who has connected; None for whoever shows no token where one is needed."""
-        connected = connection.transport.get_extra_info("socket")
         if connected.family == socket.AF_UNIX:
             return process_of(connected)
-        return holder(connected, request.headers, self.gate.access)
+        return holder(connected, shown, self.gate.access)
 
     def _let_go(self) -> None:
         """Let those go whose token holds no more."""
-        for client, connection in self._clients.items():
+        for client, visit in self._clients.items():
             if not client.peer.may_stay(self.gate.access):
-                connection.transport.abort()
+                visit.connection.abort()
 
-    async def _serve(self, connection: ServerConnection) -> None:
-        assert connection.request is not None
-        peer = self._peer(connection, connection.request)
-        if peer is None:  # its token held as it came, and not any more
-            return
-        connection.transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]  # asyncio's own, not declared
-        self._count += 1
-
-        def drop(stream: object) -> None:
-            client.dropped[stream] = client.dropped.get(stream, 0) + 1
-
-        client = Client(self, peer, self._count, Outbox(partial(_send, connection), drop))
-        self._clients[client] = connection
-        sending = asyncio.ensure_future(client.outbox.run())
-        try:
-            async with asyncio.timeout(HELLO_WITHIN):
-                self._welcome(client, read(await connection.recv()))
-            async for text in connection:
-                client.take(read(text))
-                await client.outbox.room()
-                await asyncio.sleep(0)  # what came together is taken one by one: the line goes between
-        except (Malformed, TimeoutError) as error:
-            self.refused += 1
-            code = error.code if isinstance(error, Malformed) else INVALID_PARAMS
-            what = str(error) or "no hello came"
-            client.outbox.put(written({"id": None, "error": {"code": code, "message": what}}))
-            await self._last_words(client)
-            await connection.close(POLICY, what[:100])
-        except _closed():
-            pass
-        finally:
-            sending.cancel()
-            try:
-                await client.leave()
-                await asyncio.gather(sending, return_exceptions=True)
-            finally:
-                del self._clients[client]
-
-    def _welcome(self, client: Client, said: dict[str, Any]) -> None:
+    def welcome(self, visit: Visit, said: Mapping[str, Any], /) -> Client:
+        """Let a program in by its first message, and answer that. Raises Malformed."""
         params = said.get("params", {})
         wanted = params.get("versions") if isinstance(params, dict) else None
         if said.get("method") != "hello" or not isinstance(wanted, list):
@@ -356,6 +351,41 @@ class Service:
         common = [version for version in VERSIONS if version in wanted]
         if not common:
             raise Malformed(f"versions {wanted} are not spoken here, but {list(VERSIONS)}", INVALID_PARAMS)
+        if len(self._clients) >= MOST_CLIENTS:
+            raise Malformed(TOO_MANY)
+        if not visit.peer.may_stay(self.gate.access):
+            raise Malformed("this token is known no more")
+
+        def drop(stream: object) -> None:
+            client.dropped[stream] = client.dropped.get(stream, 0) + 1
+
+        self._count += 1
+        client = Client(self, visit.peer, self._count, Outbox(visit.connection, drop))
+        del self._strangers[visit]
+        self._clients[client] = visit
+        client.outbox.put(written({"id": said.get("id"), "result": self._about(client, max(common))}))
+        return client
+
+    def send_away(self, visit: Visit, /) -> None:
+        """Count one whose conversation is ended for what it said, or did not say."""
+        self.refused += 1
+
+    def over(self, visit: Visit, /) -> None:
+        """Have a program leave whose connection is over, with all that it asked for."""
+        self._strangers.pop(visit, None)
+        if visit.client is not None:
+            leaving = asyncio.ensure_future(self._see_off(visit.client))
+            self._leaving.add(leaving)
+            leaving.add_done_callback(self._leaving.discard)
+
+    async def _see_off(self, client: Client) -> None:
+        try:
+            await client.leave()
+        finally:
+            del self._clients[client]
+
+    def _about(self, client: Client, version: int) -> dict[str, Any]:
+        """Return what a program is told of the line."""
         owner = self._served.owner
         nodes = [
             {
@@ -366,8 +396,9 @@ class Service:
             }
             for node in self.bus.nodes
         ]
-        result = {
-            "version": max(common),
+        return {
+            "version": version,
+            "now": self.bus.now(),
             "name": owner.name,
             "line": owner.port,
             "baudrate": owner.baudrate,
@@ -380,47 +411,11 @@ class Service:
             "state": state_text(self.bus),
             "nodes": nodes,
         }
-        client.outbox.put(written({"id": said.get("id"), "result": result}))
-
-    async def _bid_farewell(self, client: Client, connection: ServerConnection) -> None:
-        await self._last_words(client)
-        await connection.close(GOING_AWAY, "the program that owns the line ends")
-
-    async def _last_words(self, client: Client) -> None:
-        try:
-            async with asyncio.timeout(CLOSE_WITHIN):
-                await client.outbox.flushed()
-        except TimeoutError:
-            pass
 
 
-async def _send(connection: ServerConnection, text: str) -> None:
-    try:
-        async with asyncio.timeout(SEND_WITHIN):
-            await connection.send(text)
-    except TimeoutError:
-        connection.transport.abort()  # the library's pings wait behind what is not taken, and find nothing out
-        raise
-
-
-def _websockets() -> tuple[Any, Any]:
-    """Return what serves a Unix socket, and a port. Raises InvalidCommand where it is not installed."""
-    try:
-        from websockets.asyncio.server import serve, unix_serve
-    except ImportError:
-        raise InvalidCommand("the service needs websockets: pip install 'busmaster[service]'") from None
-    return unix_serve, serve
-
-
-def _closed() -> type[Exception]:
-    from websockets.exceptions import ConnectionClosed
-
-    return ConnectionClosed
-
-
-def _quiet() -> logging.Logger:
-    """Return a log for what the library says of connections that come and go: it is no news of the line's."""
-    log = logging.getLogger("busmaster.service.connections")
-    log.addHandler(logging.NullHandler())
-    log.propagate = False
-    return log
+async def _closed(visits: Iterable[Visit]) -> None:
+    """Wait until connections are over, for CLOSE_WITHIN: there may be one that does not listen."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(CLOSE_WITHIN):
+            for visit in visits:
+                await visit.connection.closed()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import socket
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Access
@@ -53,11 +53,13 @@ def is_our_name(host: str, listen: HostPort) -> bool:
     return True
 
 
-def holder(connected: socket.socket, headers: Mapping[str, str], access: Access) -> Holder | None:
-    """Return who has connected, None for whoever shows no token that is known. None is needed where there are none."""
-    shown = headers.get("Authorization", "")
+def holder(connected: socket.socket, shown: Sequence[str], access: Access) -> Holder | None:
+    """Return who has connected, by the Authorization headers that he shows; None where a token that is known is needed,
+    and he shows none, or something else. None is needed where there are none."""
     if not shown and not access.secrets:
         return holder_of(connected, "")
-    kind, _, secret = shown.partition(" ")
+    if len(shown) != 1:
+        return None
+    kind, _, secret = shown[0].partition(" ")
     name = access.token_name(secret.strip()) if kind.lower() == "bearer" else None
     return None if name is None else holder_of(connected, name)

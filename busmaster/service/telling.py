@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import Any, Protocol, cast
 
 from busmaster.arbiter.counters import DriverErrors, LineStatistics, Quantiles
@@ -35,7 +36,8 @@ class FindNode(Protocol):
     def __call__(self, protocol: str, address: int, /) -> Requester: ...
 
 
-def protocol_of(name: Any) -> BusProtocol:
+@cache  # each request of a client asks
+def protocol_of(name: str) -> BusProtocol:
     """Return the protocol of a name. Raises InvalidCommand if there is none."""
     for protocol in protocols():
         if protocol.name == name:
@@ -70,21 +72,19 @@ def point_of(said: Mapping[str, Any], find: FindNode) -> Point[Any]:
 
 
 def said_snapshot(snapshot: Snapshot) -> dict[str, Any]:
-    """Return a cycle as it is said; its samples are in the order of its points."""
-    names = ("cycle", "due", "started", "finished", "missed", "wall")
-    said = {name: getattr(snapshot, name) for name in names}
-    said["samples"] = [_said_sample(sample) for sample in snapshot.samples.values()]
-    return said
+    """Return a cycle as it is said, without its samples."""
+    return {name: getattr(snapshot, name) for name in ("cycle", "due", "started", "finished", "missed", "wall")}
 
 
 def snapshot_of(said: Mapping[str, Any], group: str, points: Sequence[Point[Any]]) -> Snapshot:
-    """Return the cycle that was said."""
+    """Return the cycle that was said; its samples are in the order of its points."""
     names = ("cycle", "due", "started", "finished", "missed", "wall")
     samples = {point: _sample_of(one, point) for point, one in zip(points, said["samples"], strict=True)}
     return Snapshot(group=group, samples=samples, **{name: said[name] for name in names})
 
 
-def _said_sample(sample: Sample[Any]) -> list[Any]:
+def said_sample(sample: Sample[Any]) -> list[Any]:
+    """Return a sample as it is said."""
     error = None if sample.error is None else error_data(sample.error)
     times = (sample.due, sample.started, sample.finished, sample.wall)
     return [sample.value, error, *times, sample.quality.value, sample.timeline]

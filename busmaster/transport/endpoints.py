@@ -83,7 +83,8 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
         raise InvalidCommand(f"a port is named by text, such as '/dev/ttyUSB0?baudrate=57600', not {url!r}")
     if is_served(url):
         raise InvalidCommand(
-            f"{url} is a line that a busmaster serves, which read, write, poll and scan take: here a port is needed"
+            f"{url} is a line that a busmaster serves, which read, write, poll and scan take: here a port is needed, "
+            "and a serial device server is written socket://HOST:PORT"
         )
     if "://" not in url:
         path, _, query = url.partition("?")

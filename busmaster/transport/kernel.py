@@ -73,7 +73,8 @@ class _Descriptor(OpenPort):
         self._input.register(descriptor, select.POLLIN)
 
     def unread(self) -> bool:
-        return any(events & select.POLLIN for _, events in self._input.poll(0))
+        found = self._input.poll(0)
+        return bool(found) and found[0][1] & select.POLLIN > 0
 
     def _count(self, request: int) -> int:
         """Return a number that an ioctl tells; 0 where it tells nothing."""

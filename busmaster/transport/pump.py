@@ -64,6 +64,8 @@ class Pump(asyncio.Protocol):
         self._name = name
         self._port: OpenPort | None = None
         self._written = -inf
+        self._all_has_left = False
+        """The port was asked already: it holds nothing of what was written."""
         self._paused = False
         self._may_hold = False
         self._look: asyncio.TimerHandle | None = None
@@ -101,6 +103,7 @@ class Pump(asyncio.Protocol):
         data = arbiter.poll_transmit()
         if data is not None and self._transport is not None:
             self._transport.write(data)
+            self._all_has_left = False
             self._written = now = self.clock()  # again: the process may have stood still before it got here
             arbiter.transmitted(now)
             if self.tap is not None:
@@ -171,7 +174,7 @@ class Pump(asyncio.Protocol):
         self._transport = cast("asyncio.Transport", transport)
         self._port = open_port(self._transport)
         self._may_hold = self._may_hold or self._port.flow_controlled
-        self._paused = False
+        self._paused = self._all_has_left = False
         self._held_since = inf
         self.arbiter.line_up(self.clock(), paced=self._paced(transport))
         self.turn()
@@ -227,7 +230,11 @@ class Pump(asyncio.Protocol):
     def _arm(self, due: float) -> None:
         if self._alarm is not None:
             self._armed = due
-            self._alarm.set(due - self.clock())
+            self._alarm.set(due)
+        if self.arbiter.state is LineState.HOLDOFF and self._port is not None and not self._all_has_left:
+            # It would be asked when the hold is over, when the next request waits for that. `inf`: nothing may be under
+            # way either, however short a time ago it was said, or it is asked again then.
+            self._all_has_left = self._port.unsent(inf) == 0
 
     def _on_time(self) -> None:
         self._armed = inf
@@ -238,7 +245,7 @@ class Pump(asyncio.Protocol):
             line_due = self.arbiter.line_due(now)
             if line_due or self.arbiter.answer_counts(now):
                 unread = self._port.unread()
-            if line_due:
+            if line_due and not self._all_has_left:
                 self._check_output(now)
         self.arbiter.handle_timeout(now, unread=unread)
         self.turn()

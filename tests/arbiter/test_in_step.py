@@ -9,6 +9,7 @@ from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import GarbledReply, NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import ACK, NAK, TAU, WRITE_5, Bench, lost, reply_of, request_of, right_answer, up
 
 REQUEST = 8 * TAU
@@ -468,3 +469,24 @@ def test_r15_what_a_node_owed_that_was_removed_is_not_believed_of_it_once_it_is_
     assert owed.clashes((b"\x02reply",), 5.0, again)
     owed.answered(again, 6.0, 6.1, 0.0)
     assert not owed.debts, "a node answers in the order in which it was asked"
+
+
+@pytest.mark.parametrize("idempotent", [False, True])
+def test_r7_a_write_is_not_said_again_for_a_nak_that_may_be_anothers(idempotent: bool) -> None:
+    bench = Bench()
+    node = bench.node(1, msc.PROFILE)
+    bench.wait(2.0)
+    bench.ask(node, msc.DataRead(2008))
+    bench.sent()
+    bench.hear(f"{ACK} 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D", after=0.1)
+    bench.sent()
+    bench.ask(node, msc.DataRead(2008), retries=0)
+    bench.until_sent()
+    bench.sent()  # and lost: its ACK, or its NAK, may still come
+    urgent = bench.ask(node, msc.DataWrite(2024, 5), priority=Priority.URGENT, idempotent=idempotent)
+    bench.until_sent()
+    bench.sent()
+    bench.hear(NAK, after=0.010)
+    assert bool(bench.sent()) is idempotent
+    if not idempotent:
+        assert isinstance(urgent.error, WriteUnconfirmed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.events import LatenessRaised
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.learned import (
@@ -20,7 +21,7 @@ from busmaster.arbiter.learned import (
     Learning,
     LegTimes,
 )
-from busmaster.arbiter.transaction import Priority
+from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.learning import LEARNED, Learned
 from busmaster.errors import NoReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -35,14 +36,23 @@ TIMINGS = hcp2.PROFILE.timings
 WRITE_7 = hcp2.Write(1, (7,)).open(1, TIMINGS).request.hex(" ").upper()
 
 
-def trained(bench: Bench, address: int = 1, replies: int = TRUSTED_AFTER + 1) -> NodeRecord:
+def trained(bench: Bench, address: int = 1, replies: int = TRUSTED_AFTER + 1, took: float = TOOK) -> NodeRecord:
     """A node whose times have been learned; its last read was of an element of its own."""
     node = bench.arbiter.add_node(hcp2.PROFILE, address, bench.now, LEARNED)
     for number in range(replies):
-        bench.served(bench.ask(node, hcp2.Read(10 + number % 2)), after=REQUEST + TOOK)
+        bench.served(bench.ask(node, hcp2.Read(10 + number % 2)), after=REQUEST + took)
     bench.until_ready()
     assert node.health is Health.UP
     return node
+
+
+def requests_before(bench: Bench, held: Transaction) -> list[tuple[str, float]]:
+    """What is sent until this is, its own request too, and when. Nothing is answered."""
+    sent: list[tuple[str, float]] = []
+    while not held.attempts:
+        bench.until_sent()
+        sent.append((bench.sent(), bench.now))
+    return sent
 
 
 def learning(node: NodeRecord) -> Learning:
@@ -232,13 +242,96 @@ def test_r15_where_checks_are_in_vain_a_write_waits_for_the_documents_lateness()
     bench = Bench()
     node, other = trained(bench, 1), trained(bench, 2)
     bench.ask(node, retries=1)
+    asked = requests_before(bench, bench.ask(other, hcp2.Write(1, (7,))))
+    checks = [request_of(element) for element in (10, 11, 2, 3)]
+    assert [request for request, _ in asked[:5]] == [request_of(1), *checks], "then it is taken to be silent"
+    assert asked[5][1] - (asked[4][1] + REQUEST) >= LATENESS - 1e-9
+
+
+def test_r15_all_that_owe_are_asked_before_a_write_waits_for_a_lateness() -> None:
+    bench = Bench()
+    other = trained(bench, 9)
+    nodes = [trained(bench, address) for address in (1, 2, 3)]
+    for element, node in enumerate(nodes, 4):
+        bench.ask(node, hcp2.Read(element), retries=1)
     write = bench.ask(other, hcp2.Write(1, (7,)))
-    asked: list[tuple[str, float]] = []
+    for element, node in enumerate(nodes, 4):
+        bench.until_sent()
+        assert bench.sent() == request_of(element, node.address), "lost"
+    held_at = bench.now + REQUEST + WINDOW
     while not write.attempts:
         bench.until_sent()
-        asked.append((bench.sent(), bench.now))
-    assert [request for request, _ in asked[:3]] == [request_of(1), request_of(10), request_of(11)]
-    assert asked[3][1] - (asked[2][1] + REQUEST) >= LATENESS - 1e-9
+        if not write.attempts:
+            bench.answer(after=REQUEST + TOOK)
+    assert write.started - held_at == pytest.approx(3 * (REQUEST + TOOK))
+
+
+def test_r15_who_has_lost_two_replies_is_asked_for_a_check_before_an_answer_that_would_not_be_believed() -> None:
+    bench = Bench()
+    node, other = trained(bench, 1), trained(bench, 2)
+    lost = [bench.ask(node, hcp2.Read(element)) for element in (1, 3)]
+    for number in range(40):  # until the lateness of both is over, and the other has answered since
+        bench.ask(other, hcp2.Read(20 + number))
+    to_node = []
+    while not all(bench.ended(read) for read in lost):
+        bench.until_sent()
+        request = bench.sent()
+        if request[3:8] == request_of(1)[3:8]:
+            to_node.append(request)
+        if request[3:8] != request_of(1)[3:8] or len(to_node) > 2:
+            bench.answer(after=REQUEST + TOOK)
+    assert to_node == [request_of(1), request_of(3), request_of(10), request_of(1), request_of(3)]
+
+
+def test_r15_a_node_that_was_heard_late_is_asked_for_a_check_before_its_last_attempt() -> None:
+    bench = Bench()
+    node = trained(bench)
+    read = bench.ask(node, retries=1)
+    for request in (request_of(element) for element in (1, 10, 11, 2, 3)):
+        bench.until_sent()
+        assert bench.sent() == request
+    bench.hear(reply_of(10, 5), after=0.020)
+    bench.until_sent()
+    assert bench.sent() != request_of(1), "its answer could be the first attempt's"
+    bench.answer(after=REQUEST + TOOK)
+    bench.served(read, after=REQUEST + TOOK)
+    assert (read.error, read.attempts) == (None, 2)
+
+
+def test_r15_a_late_reply_pays_nothing_while_somebody_else_owes_one_that_it_could_be() -> None:
+    """A drive that answers with another element than it was asked for: the check of its reply is right."""
+    bench = Bench()
+    node, other = trained(bench, 1), trained(bench, 2)
+    read = bench.ask(node)
+    bench.ask(other, hcp2.Read(3))
+    for request in (request_of(1), request_of(3, 2)):
+        bench.until_sent()
+        assert bench.sent() == request
+    bench.hear(reply_of(1, 77), after=REQUEST + TOOK)  # the other's, for another element
+    bench.until_sent()
+    assert bench.sent() != request_of(1), "what it was asked for first may still come"
+    assert read.value is None
+
+
+def test_r9_what_goes_before_a_write_takes_no_longer_than_three_exchanges_that_nobody_answers() -> None:
+    bench = Bench()
+    other = trained(bench, 9)
+    nodes = [trained(bench, address, took=0.030) for address in range(1, 8)]
+    for element, node in enumerate(nodes, 20):
+        bench.ask(node, hcp2.Read(element), retries=1)
+    asked = requests_before(bench, bench.ask(other, hcp2.Write(1, (7,))))
+    held_at = asked[len(nodes)][1]
+    assert len(asked) > len(nodes) + MOST_BEFORE + 1, "more checks than that went, each in vain"
+    assert asked[-1][1] - held_at <= MOST_BEFORE * (REQUEST + LATENESS)
+
+
+def test_r9_three_exchanges_at_most_go_before_an_urgent_read() -> None:
+    bench = Bench()
+    node = trained(bench)
+    bench.ask(node, retries=1)
+    bench.sent()
+    urgent = bench.ask(node, priority=Priority.URGENT, retries=0)
+    assert len(requests_before(bench, urgent)) == MOST_BEFORE + 1
 
 
 def test_r9_an_urgent_write_is_never_held_back_and_its_ack_is_not_believed() -> None:
@@ -276,12 +369,12 @@ def test_a_straggler_brings_the_documents_times_back_until_enough_replies_have_c
     bench.sent()
     bench.until_sent()
     bench.sent()
-    bench.hear(reply_of(1, 5), after=0.030)
+    bench.hear(reply_of(1, 5), after=REQUEST + TOOK)  # in place of the answer to the check
     bench.served(asked, after=REQUEST + TOOK)
     assert learning(node).returns == 1
     assert not trusted(node)
     bench.until_ready()
-    for _ in range(TRUSTED_AGAIN_AFTER - 1):  # one reply has come since
+    for _ in range(TRUSTED_AGAIN_AFTER - 2):  # two replies have come since: a check's, and its own
         assert not trusted(node)
         bench.served(bench.ask(node, hcp2.Read(12)), after=REQUEST + TOOK)
     assert trusted(node)

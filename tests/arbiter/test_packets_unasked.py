@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import GarbledReply, NoReply, Refused
@@ -16,6 +17,8 @@ REPLY_1234 = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"
 BAD_REPLY = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D3 02 6D"
 ACK, NAK = "06", "15"
 TAU = 10 / 9600
+SILENCE = pytest.approx(TAU + 0.100 + TAU)
+"""Behind the host's ACK: a byte gap, in which nothing may have come."""
 
 
 def bench(*, strict: bool = False) -> Bench:
@@ -170,6 +173,69 @@ def test_r3_a_late_ack_is_followed_by_its_packet_and_both_are_waited_for() -> No
     assert line.sent() == ""
     line.hear(REPLY_1234)
     assert line.sent() == ACK, "it is ACKed and dropped"
+    assert line.until_sent() == SILENCE, "it came whole, so that nothing is still to come"
+
+
+def unanswered(*, strict: bool = False) -> tuple[Bench, NodeRecord]:
+    """A read of unit 1 was not answered within its window, and something waits."""
+    line = bench(strict=strict)
+    node = line.node(1, msc.PROFILE)
+    line.wait(1.0)
+    read = line.ask(node, msc.DataRead(2008), retries=0)
+    line.ask(line.node(2, msc.PROFILE), msc.DataRead(2008))
+    line.sent()
+    line.wait(0.6)
+    assert isinstance(read.error, NoReply)
+    return line, node
+
+
+@pytest.mark.parametrize("chunk", [1, 10, 100])
+def test_r3_a_late_reply_that_came_whole_is_acked_at_once_and_ends_the_wait(chunk: int) -> None:
+    line, _ = unanswered()
+    late = (ACK + " " + REPLY_1234).split()
+    for start in range(0, len(late), chunk):
+        line.hear(" ".join(late[start : start + chunk]), after=TAU)
+    assert line.sent() == ACK
+    assert line.until_sent() == SILENCE
+    assert line.sent().startswith("02 02"), "the next request"
+
+
+@pytest.mark.parametrize(
+    "heard",
+    [
+        ACK,
+        REPLY_1234,
+        ACK + BAD_REPLY,
+        ACK + REPLY_1234 + "06",
+        "FF" + ACK + REPLY_1234,
+        ACK + ACK + REPLY_1234,
+        REPLY_1234 + ACK + REPLY_1234,
+        ACK + "02 02 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6E",  # unit 2
+        ACK + "02 01 00 08 00 00 52 46 4C 41 47 2C 00 01 01 A2",  # RFLAG
+    ],
+)
+def test_r3_what_is_not_the_late_reply_and_nothing_else_ends_no_wait(heard: str) -> None:
+    line, _ = unanswered()
+    line.hear(heard, after=0.1)
+    assert line.until_sent() >= 1.0 or (line.sent() == ACK and line.until_sent() >= 0.9)
+
+
+def test_r3_a_byte_behind_the_late_reply_has_the_line_wait_after_all() -> None:
+    line, _ = unanswered()
+    line.hear(ACK + REPLY_1234, after=0.1)
+    assert line.sent() == ACK
+    line.hear("FF", after=0.05)
+    assert line.until_sent() >= 1.0
+
+
+def test_r15_a_late_reply_that_may_be_an_earlier_requests_ends_no_wait() -> None:
+    line, node = unanswered()
+    again = line.ask(node, msc.DataRead(2012), retries=0, priority=Priority.URGENT)
+    while again.error is None:
+        line.wait(0.1)
+    line.sent()
+    line.hear(ACK + REPLY_1234, after=0.1)
+    assert line.sent() == ACK
     assert line.until_sent() >= 1.0
 
 

@@ -13,11 +13,11 @@ from benchmarks import codecs, modbus_masters
 from benchmarks.harness import Claim, Options, Table, Timings, quantile
 from benchmarks.late_replies import LATE
 from benchmarks.lines import Kind, Lines
-from benchmarks.loop_stalls import Hold, Watch
 from benchmarks.masters import Bare, Master, Ours, Question, Streams
 from benchmarks.questions import hcp2_questions, msc_questions, wire_time
 from benchmarks.simulation import Simulation
 from benchmarks.trials import ours_in_virtual_time
+from benchmarks.watch import Hold, Watch
 from busmaster.contract.exchange import Done
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.emulator.faults import Faults

@@ -13,6 +13,7 @@ from random import Random
 from typing import Any
 
 from busmaster.arbiter import learned as learning
+from busmaster.arbiter.clients import Hold
 from busmaster.arbiter.events import Event, LatenessRaised, NodeChanged, Polled
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import line_time, set_members
@@ -30,12 +31,15 @@ from tests.campaigns.judge import Asked, BrokenRuleError, Judge, Totals
 from tests.campaigns.kinds import KINDS, elements_of
 from tests.campaigns.ledger import Ledger
 from tests.campaigns.mixes import MIXES, PROMPT, Mix
+from tests.campaigns.sharing import FLOOD, Sharing
 from tests.campaigns.standing import StandingLine, StandingWorld
 
 LONGEST = 1800.0
 """Virtual seconds after which the faults heal, however few transactions there were."""
 RECOVERY = 240.0
 """Likewise in which everything must go well again (R11: probes are up to 36 s apart, and paid for)."""
+SOON = 1e-6
+"""Seconds: the line does what is due before."""
 PAUSE = 0.05
 """Seconds after which a client whose request failed at once asks again."""
 PERIODS = (0.1, 0.25, 0.5, 1.0)
@@ -84,6 +88,7 @@ class Hunt:
         ledger.now = lambda: self.world.now
         self.judge = Judge(self.kind, self.mix, ledger, self.line, self.world.arbiter)
         self.ledger = ledger
+        self.sharing = Sharing(self.name, self.world.arbiter, self.judge.problem) if self.mix.shared else None
         timings = LEARNED if learned else None
         if learned:
             be_hasty()
@@ -193,6 +198,10 @@ class Hunt:
             self._add_poll()
         for client in range(self.random.randrange(1, 6)):
             self.world.at(self.random.uniform(0.0, 1.0), partial(self._ask, client))
+        if self.sharing is not None:
+            for _ in range(FLOOD):
+                self.world.at(self.sharing.random.uniform(0.0, 1.0), partial(self._ask, self.sharing.flood))
+            self._again(0.5, self._hold_the_line)
         self._again(20.0, self._change_polls)
         if mix.reconnects:
             self._again(mix.reconnects, self._lose_the_port)
@@ -282,7 +291,10 @@ class Hunt:
         if self.everybody is not None and chance.random() < 0.1:
             node = self.everybody
         asked.written = self.ledger.sending(
-            number, None if node is self.everybody else node.address, elements_of(command)
+            number,
+            None if node is self.everybody else node.address,
+            elements_of(command),
+            None if self.sharing is None else asked.then or self.sharing.client_of(asked.client),
         )
         return command, node
 
@@ -291,6 +303,8 @@ class Hunt:
     ) -> Transaction:
         asked.elements = elements_of(command)
         asked.urgent_ahead = self.world.arbiter.dispatcher.backlog.waiting(Priority.URGENT)
+        if self.sharing is not None:
+            options.setdefault("client", self.sharing.client_of(asked.client))
         transaction = Transaction(node, command, priority=priority, tag=asked, **options)
         self.open[transaction] = None
         if self._record is not None:
@@ -298,13 +312,58 @@ class Hunt:
         self.world.arbiter.submit(transaction, self.world.now)
         return transaction
 
+    def _hold_the_line(self) -> None:
+        """A program writes and reads back, perhaps again, with pauses; it may go away in the middle of it."""
+        assert self.sharing is not None
+        own, node = self.sharing.random, self.sharing.random.choice(self.nodes)
+        hold = self.sharing.hold(node)
+        steps = own.randrange(2, 5)
+
+        def step(left: int) -> None:
+            if not left or hold.over or self._healed:
+                self.sharing_ends(hold)
+                return
+            asked = Asked(then=lambda ended: ends(ended, left))
+            options: dict[str, Any] = {"client": hold}
+            if left % 2 == steps % 2:
+                command, to = self._write(node, asked, options)
+            else:
+                command, to = own.choice(self.reads), node
+            if to is not node:
+                self.sharing_ends(hold)
+                return
+            transaction = self._submit(node, command, asked, Priority.COMMAND, **options)
+            if own.random() < 0.05:
+                self.world.at(self.world.now + own.uniform(0.0, 0.2), partial(leave, transaction))
+
+        def ends(ended: Transaction, left: int) -> None:
+            if ended.error is not None:
+                self.sharing_ends(hold)
+            else:
+                pause = own.choice((0.0, 0.0, own.uniform(0.0, 0.2)))
+                self.world.at(self.world.now + pause, partial(step, left - 1))
+
+        def leave(transaction: Transaction) -> None:
+            if transaction in self.open:
+                self._leave(transaction)
+                self.sharing_ends(hold)
+
+        step(steps)
+
+    def sharing_ends(self, hold: Hold) -> None:
+        """A sequence lets go of the line."""
+        assert self.sharing is not None
+        self.sharing.released(hold)
+        self.world.arbiter.release(hold, self.world.now)
+
     def _leave(self, transaction: Transaction) -> None:
         if transaction in self.open:
             del self.open[transaction]
             self.note(f"cancelled: {transaction.node.label}: {transaction.command}")
             self.judge.left(transaction)
             self.world.arbiter.cancel(transaction, self.world.now)
-            self._ask(transaction.tag.client)
+            if transaction.tag.client >= 0:
+                self._ask(transaction.tag.client)
 
     # what the master says
 
@@ -328,6 +387,8 @@ class Hunt:
             return
         del self.open[transaction]
         client = transaction.tag.client
+        if transaction.tag.then is not None:
+            transaction.tag.then(transaction)
         if client < 0:
             return
         if transaction.attempts:
@@ -386,8 +447,10 @@ class Hunt:
         world.at(world.now + self.random.uniform(0.001, 1.0), world.plug)
 
     def _check_nothing_is_open(self) -> None:
-        """R13: whatever waited has failed."""
-        if self.open:
+        """R13: whatever waited has failed, so many at once."""
+        if self.world.arbiter.failing:
+            self.world.at(self.world.now + SOON, self._check_nothing_is_open)
+        elif self.open:
             self.judge.problem(f"R13: {len(self.open)} requests are still open on a port that is gone")
 
     def _kill(self) -> None:

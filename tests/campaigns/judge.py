@@ -7,6 +7,7 @@ an EOT, a read of HCP or Mentor II); else it is *confused*: the master took one 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
 from typing import Any
@@ -36,6 +37,8 @@ class Asked:
     elements: tuple[int, ...] = ()
     written: Written | None = None
     urgent_ahead: int = 0
+    then: Callable[[Transaction], None] | None = None
+    """What its caller does when it has ended."""
 
 
 @dataclass

@@ -54,6 +54,8 @@ class Written:
     node: int | None
     elements: tuple[int, ...]
     order: int
+    by: object = None
+    """Whose write it is."""
     taken: int = 0
     taken_at: float = -inf
 
@@ -96,7 +98,7 @@ class Ledger:
     _frames: deque[Frame] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     _damage: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     _unasked_at: float = -inf
-    _orders: dict[int, int] = field(default_factory=dict)
+    _orders: dict[tuple[int, object], int] = field(default_factory=dict)
 
     def number(self) -> int:
         """One that was not used for long."""
@@ -128,9 +130,9 @@ class Ledger:
         self._answers[number] = Answer(node, element, self.now())
         return number
 
-    def sending(self, number: int, node: int | None, elements: tuple[int, ...]) -> Written:
+    def sending(self, number: int, node: int | None, elements: tuple[int, ...], by: object = None) -> Written:
         """It is going to be written. Must be told in the order in which the writes are submitted."""
-        written = self._written[number] = Written(node, elements, self._given)
+        written = self._written[number] = Written(node, elements, self._given, by)
         return written
 
     def take(self, node: int, element: int, number: int) -> None:
@@ -148,9 +150,9 @@ class Ledger:
         written.taken += 1
         written.taken_at = now
         if written.node is not None:
-            if written.order < self._orders.get(node, 0):
+            if written.order < self._orders.get((node, written.by), 0):
                 self.problem(f"R7: device {node} took the write of {number} after a later one")
-            self._orders[node] = written.order
+            self._orders[node, written.by] = written.order
 
     def said(self, start: float, end: float, asked: bool) -> None:
         """A device is going to say something; `asked`: the last request was for it."""

@@ -61,7 +61,8 @@ class Mix:
     beyond R3's assumption for what its faults do not say. `in_step`: yet one request causes one reply at most, and the
     channel keeps order, so that R15 still allows no wrong value. `equal`: all reads are of one element, so that every
     answer can be taken for a neighbour's. `writes`: the share of requests that write. `doubled`: mean seconds between
-    single replies that are said twice; each may bring AT_MOST wrong values.
+    single replies that are said twice; each may bring AT_MOST wrong values. `shared`: several programs share the line,
+    one asks far more than the others, and they hold it for sequences.
     """
 
     name: str
@@ -84,6 +85,7 @@ class Mix:
     doubled: float = 0.0
     stands: Standstill | None = None
     edges: Edges | None = None
+    shared: bool = False
 
     @property
     def beyond(self) -> bool:
@@ -156,6 +158,25 @@ WITHIN = (
     ),
     Mix("reconnects", "the port is lost and found", {"lost": 0.02}, slow=0.2, reconnects=2.0, runs=True),
     Mix("everything", "all of it", EVERYTHING, {"flip": 0.01, "lost": 0.01}, latency=0.0, reconnects=20.0, deaths=20.0),
+    Mix("shared", "programs take turns, and hold the line", shared=True, runs=True),
+    Mix(
+        "shared, lost",
+        "likewise, what is said is lost or late",
+        {"lost": 0.05, "deaf": 0.05, "late": 0.1},
+        shared=True,
+        cancel=0.3,
+        writes=0.4,
+    ),
+    Mix(
+        "shared, everything",
+        "likewise, all of it",
+        EVERYTHING,
+        {"flip": 0.01, "lost": 0.01},
+        latency=0.0,
+        reconnects=20.0,
+        deaths=20.0,
+        shared=True,
+    ),
     Mix("edges", "replies at the last moment", edges=Edges(), latency=0.0, writes=0.4, runs=True),
     Mix("edges, held back", "likewise, behind an adapter of 16 ms", edges=Edges(), latency=0.016, writes=0.4),
     Mix("edges, echo", "likewise, the adapter echoes", edges=Edges(), echo=Echo(0.001), writes=0.4, runs=True),
@@ -209,6 +230,7 @@ IN_STEP = (
         reconnects=2.0,
         writes=0.1,
     ),
+    Mix("network, shared", "likewise, programs take turns", stands=EITHER_WAY, in_step=True, shared=True, writes=0.3),
     Mix("network, runs", "likewise, short commands", stands=EITHER_WAY, in_step=True, runs=True),
     Mix(
         "network, within",

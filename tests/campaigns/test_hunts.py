@@ -48,7 +48,7 @@ def test_what_the_faults_do_shows(protocol: str) -> None:
         )  # one fault in a hundred
     calm = found.pop("calm")
     assert calm.bad_attempts == calm.unasked_bytes == calm.unseen == 0
-    del found["bytewise"]
+    del found["bytewise"], found["shared"]  # nothing is wrong on those lines
     quiet = [name for name, totals in found.items() if totals.bad_attempts + totals.unasked_bytes < 10]
     assert quiet == ["refusals"] or not quiet
     assert found["cancelled"].cancelled > found["late"].cancelled

@@ -8,6 +8,9 @@ from typing import Any
 import pytest
 
 from busmaster.arbiter.in_step import InStep
+from busmaster.arbiter.shared_backlog import SharedBacklog
+from busmaster.arbiter.turns import Turns
+from busmaster.arbiter.writes import Writes
 from busmaster.contract.exchange import FrameError
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.msc import exchange as msc_exchange
@@ -142,3 +145,30 @@ def test_an_adapter_left_out_of_the_silence_is_caught(protocol: str, monkeypatch
     monkeypatch.undo()
     without_the_adapter_in_the_silence(monkeypatch)
     assert "adapter" in broken(protocol, "edges, pushed")
+
+
+def first_problem(mix: str) -> str:
+    """What the first hunt found that found a broken rule."""
+    for seed in SEEDS:
+        totals = Hunt("hcp2", mix, seed).run(EACH)
+        if totals.problems:
+            return totals.problems[0]
+    pytest.fail(f"{len(SEEDS)} hunts found no broken rule")
+
+
+def test_r9_a_line_that_is_not_held_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SharedBacklog, "_hold_for", lambda backlog, hold, priority: None)
+    assert "comes between the requests of a sequence" in first_problem("shared")
+
+
+def test_r9_programs_that_go_first_come_first_served_are_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    def longest(turns: Turns) -> object:
+        return max(turns._waiting(), key=lambda turn: turn.queue.live)
+
+    monkeypatch.setattr(Turns, "_chosen", longest)
+    assert "went before a command of another program" in first_problem("shared")
+
+
+def test_r7_writes_of_a_program_out_of_order_are_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Writes, "is_first", lambda writes, write: True)
+    assert "after a later one" in first_problem("shared, lost")

@@ -178,10 +178,10 @@ def test_safe_says_why_the_port_is_refused_and_names_each_point(
     assert [line.partition(" is not")[0] for line in rest] == ["busmaster: the safe state of winder/force"]
 
 
-def test_safe_says_who_has_the_port(busmaster: Command, path: Path) -> None:
+def test_safe_says_who_has_the_port_and_serves_it_to_nobody(busmaster: Command, path: Path) -> None:
     with serve_pty(Line(find("hcp2").profile.line, [make_device("hcp2", 1)], paced=False)) as served:
-        text = (TEXT + SAFE).replace("PORT", served.path).replace("within = 1.0", "within = 0.2")
-        path.write_text(f"{text}[service]\nenabled = false\n")  # else its owner would send it
+        text = f"{TEXT}{SAFE}[service]\nenabled = false\n".replace("PORT", served.path)
+        path.write_text(text.replace("within = 1.0", "within = 0.2"))
         with started("run", str(path), "--plain") as process:
             polls(process)
             outcome = busmaster("safe", str(path))

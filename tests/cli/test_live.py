@@ -168,9 +168,10 @@ async def test_rows_are_filtered_by_words_and_ordered_by_trouble() -> None:
         assert [words[1] for words in table(screen)] == ["9"]
         assert "filter: down axis0" in lines(screen)[-1]
         await pilot.press("slash", *(["backspace"] * 10), "enter")
+        tell(screen.picture, *three_drives(), row(10, "inputs", alarm="high"), nodes=(*nodes, node(10)), set=2)
         await pilot.press("o", "o", "o")
         await pilot.pause()
-        assert [words[1] for words in table(screen)] == ["9", "1", "2"]
+        assert [words[1] for words in table(screen)] == ["9", "10", "1", "2"]
         assert "trouble" in lines(screen)[-1]
 
 
@@ -325,6 +326,16 @@ async def test_silence_of_the_owner_is_told(monkeypatch: pytest.MonkeyPatch) -> 
         screen.take_picture()
         await pilot.pause()
         assert "no news" not in lines(screen)[0]
+
+
+@pytest.mark.asyncio
+async def test_keys_do_nothing_before_there_is_a_picture() -> None:
+    async with drawn(Picture()) as (screen, line, pilot):
+        assert "waiting for the program that owns the line" in lines(screen)[0]
+        await pilot.press("p", "P", "d", "s", "w", "enter", "o", "up", "down", "end")
+        await pilot.pause()
+        assert len(screen.screen_stack) == 1
+    assert line.said == []
 
 
 @pytest.mark.asyncio

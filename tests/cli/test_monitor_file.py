@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import signal
 import sqlite3
@@ -23,7 +24,11 @@ from busmaster.cli.overheard import HeardGroup, Overheard
 from busmaster.config import ConfiguredLine, load
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import find
+from tests.cli.conftest import started
+from tests.outputs.brokers import needs_mosquitto, running
 from tests.outputs.cycles import until
+from tests.outputs.test_mqtt import heard as heard_of
+from tests.outputs.test_mqtt import listening
 from tests.patience import PATIENCE
 
 FILE = """
@@ -120,6 +125,24 @@ def test_points_and_outputs_are_fed_and_not_a_byte_is_sent(tmp_path: Path) -> No
     assert said.count(f"busmaster: {alarm}\n") == 1
     assert rows(tmp_path / "line.sqlite", "select node, text from events") == [("winder", alarm)]
     assert process.returncode == 130
+
+
+@needs_mosquitto
+@pytest.mark.asyncio
+async def test_mqtt_says_that_it_listens_and_of_the_state_of_a_line_that_nobody_asks_it_says_nothing(
+    tmp_path: Path,
+) -> None:
+    with running(tmp_path) as broker, tapped() as line:
+        path = written(tmp_path, line.port)
+        path.write_text(path.read_text() + f'[outputs.mqtt]\nport = {broker.port}\nprefix = "line"\n')
+        async with listening(broker, "line/#") as messages:
+            with started("monitor", str(path)) as process:
+                found = await heard_of(messages, 8)
+                process.send_signal(signal.SIGINT)
+                await asyncio.to_thread(process.communicate)
+    topics = {topic for topic, *_ in found}
+    assert {"line/status", "line/values/winder/tension", "line/alarms/winder/tension"} <= topics
+    assert topics <= {"line/status", "line/values/winder/tension", "line/alarms/winder/tension", "line/events"}
 
 
 def heard(folder: Path, *pieces: bytes, apart: float = 0.03) -> list[object]:

@@ -159,10 +159,26 @@ def test_a_line_whose_file_says_so_is_served_to_nobody(busmaster: Command, file:
         process.communicate(timeout=PATIENCE)
 
 
-def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_same(file: Path) -> None:
+@pytest.mark.parametrize("command", ["run", "serve"])
+def test_a_second_master_on_a_line_that_is_owned_is_refused(file: Path, command: str) -> None:
     with owner("serve", str(file)) as (process, _):
         ran = subprocess.run(
-            [sys.executable, "-m", "busmaster", "serve", str(file), "--seconds", "0.1"],
+            [sys.executable, "-m", "busmaster", command, str(file)],
+            check=False,
+            cwd=ROOT,
+            env=ENVIRONMENT,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+        )
+    assert ran.returncode == 1
+    assert f"is owned by process {process.pid}; end that first: two masters on one line garble each other" in ran.stderr
+
+
+def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_same(file: Path) -> None:
+    with owner("serve", str(file)) as (process, _), serve("hcp2", 1) as other:
+        ran = subprocess.run(
+            [sys.executable, "-m", "busmaster", "serve", str(file), "--port", other.path, "--seconds", "0.1"],
             check=True,
             cwd=ROOT,
             env=ENVIRONMENT,
@@ -172,6 +188,23 @@ def test_a_second_process_for_the_same_name_says_whose_it_is_and_runs_all_the_sa
         )
     assert "no other program can use this line: " in ran.stderr
     assert f"is served already by process {process.pid}" in ran.stderr
+
+
+def test_where_the_extra_is_not_installed_a_line_runs_and_says_what_it_takes_to_share_it(
+    file: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "websockets.py").write_text("raise ImportError")
+    ran = subprocess.run(
+        [sys.executable, "-m", "busmaster", "run", str(file), "--plain", "--seconds", "0.1"],
+        check=True,
+        cwd=ROOT,
+        env={**ENVIRONMENT, "PYTHONPATH": f"{tmp_path}:{ROOT}"},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert ran.stderr.count("no other program can use this line: ") == 1
+    assert "pip install 'busmaster[service]'" in ran.stderr
 
 
 def test_an_owner_that_was_killed_leaves_nothing_in_the_way(file: Path, controllers: TcpServer) -> None:
@@ -228,6 +261,7 @@ def test_the_section_of_the_service_is_checked_with_its_line(busmaster: Command,
         ('group = "no-such-group"', "there is no group 'no-such-group' on this machine"),
         ('mode = "rw"', "a mode is octal"),
         ("port = 5020", "port"),
+        ("share = 0.01", "must be 0.1 to 10, not 0.01"),
     ):
         file.write_text(f"{text}[service]\n{said}\n")
         ran = busmaster("plan", str(file))
@@ -268,7 +302,7 @@ def test_a_poll_whose_owner_ends_says_so(file: Path, controllers: TcpServer) -> 
         process.terminate()
         _, err = polling.communicate(timeout=PATIENCE)
         assert polling.returncode == 1
-        assert "the connection to the program that owns the line was lost" in err
+        assert "the program that owns the line has ended" in err
 
 
 def test_nothing_is_written_through_an_owner_unless_all_may_be(

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from busmaster.arbiter.clients import LineClient
 from busmaster.bus.node import Node
 from busmaster.bus.requester import Priority
 from busmaster.cli.write import pass_on, prepare
@@ -174,11 +175,14 @@ def by_mqtt(name: str) -> Callable[[Plant, int], Awaitable[None]]:
 class Person:
     """Who looks at the line, and writes by a key."""
 
-    peer = Process(1, 0, (), "operator", "busmaster")
+    peer = Process(1, 0, (), "busmaster")
     permission = EVERYTHING
 
     def node(self, name: str, address: int, /) -> Node:
         raise AssertionError("a person names points")
+
+    def client_of(self, sequence: int | None, node: Node, /) -> LineClient:
+        return node.shared.add_client(1.0)
 
     def stops_before(self, node: Node, /) -> int:
         return 0
@@ -187,7 +191,9 @@ class Person:
 def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
         params = {"group": "all", "key": f"drive/{name}", "value": value}
-        await Errand.of(params, Person(), Service(plant.line.bus, gate=plant.line.gate)).run()
+        errand = Errand.of(params, Person(), Service(plant.line.bus, gate=plant.line.gate))
+        errand.begin(lambda _: None)
+        await errand.future
 
     return write
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from typing import Any, Unpack
 
@@ -49,6 +50,10 @@ class FakeNode:
 
     def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
         """Nothing is limited."""
+
+    @asynccontextmanager
+    async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[FakeNode]:
+        yield self
 
     async def request(
         self,

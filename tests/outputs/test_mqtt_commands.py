@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
+import threading
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -18,13 +20,16 @@ from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BusError
 from busmaster.gate.gate import MOST_AT_ONCE, Gate, Wish
 from busmaster.gate.record import Outcome, WriteRecord
-from busmaster.outputs import mqtt_commands
+from busmaster.outputs import mqtt, mqtt_commands, mqtt_forbidden
 from busmaster.outputs.mqtt import MqttOutput
 from busmaster.outputs.mqtt_commands import LEAST, MOST_WAITING, Commands
+from busmaster.outputs.mqtt_connection import unread
+from busmaster.outputs.mqtt_forbidden import Forbidden
 from busmaster.outputs.settings import MqttSettings
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.registry import make_device
 from tests.outputs.brokers import Broker, needs_mosquitto
+from tests.outputs.cycles import until as outside_until
 from tests.patience import PATIENCE
 
 if TYPE_CHECKING:
@@ -209,18 +214,111 @@ async def test_by_whom_a_command_is_says_its_topic_and_what_its_sender_says_of_i
 
 
 @pytest.mark.asyncio
-async def test_refused_commands_do_not_starve_those_that_are_allowed(
+async def test_commands_that_are_not_allowed_do_not_hold_up_those_that_are(
     broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mqtt_commands, "BREATH", PATIENCE)  # from the first refusal that is answered to the next
+    monkeypatch.setattr(mqtt_forbidden, "REST", PATIENCE)  # after the first of them, nothing of the others is read
+    monkeypatch.setattr(mqtt, "LAST_ANSWERS", 0.0)
     async with plant(broker, "line/result/5/1") as there:
-        for number in range(1000):
-            await there.client.publish("line/set/5/2", str(number), qos=0)
+        for qos in (0, 1):
+            for number in range(500):
+                await there.client.publish("line/set/5/2", str(number), qos=qos)
         answer = await there.ask('{"value": 8, "expires": %f}' % (time.time() + PATIENCE))
         assert answer["ok"]
-        assert there.output._arriving.refused == 1000
+        assert there.output._arriving.refused <= 1
+
+
+@pytest.mark.asyncio
+async def test_a_flood_of_commands_that_are_not_allowed_is_refused_to_the_last(
+    broker: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mqtt_forbidden, "REST", 0.0)
+    monkeypatch.setattr(mqtt_commands, "BREATH", PATIENCE)  # from the first refusal that is answered to the next
+    monkeypatch.setattr(mqtt, "LAST_ANSWERS", 0.0)
+    async with plant(broker) as there:
+        for number in range(1000):
+            await there.client.publish("line/set/5/2", str(number), qos=0)
+        await asyncio.to_thread(outside_until, lambda: there.output._arriving.refused == 1000)
         assert there.output._arriving.unanswered > 500
         assert len(there.records) < 500
+
+
+@pytest.mark.asyncio
+async def test_what_came_while_we_stood_still_is_too_old_to_the_last_however_much_it_is(
+    broker: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """This broker sends no more than 20 ahead to whom asks for nothing else, and would send the rest afterwards."""
+    asked, go = threading.Event(), threading.Event()
+    stands: list[Client] = []
+
+    def unread_then(client: Client) -> int:
+        if asked.is_set():
+            stands.append(client)
+            go.wait(PATIENCE)
+        return unread(client)
+
+    monkeypatch.setattr(mqtt, "unread", unread_then)
+    monkeypatch.setattr(mqtt_commands, "LOOK", 0.0)
+    async with plant(broker) as there:
+        asked.set()
+        await asyncio.to_thread(outside_until, lambda: bool(stands))
+        for number in range(10, 70):
+            await there.send(str(number))
+        size = 7 + len("line/set/5/1" + "10")
+        await asyncio.to_thread(outside_until, lambda: unread(stands[0]) >= 60 * size)
+        there.output._arriving._looked -= PATIENCE + 1
+        go.set()
+        answers = await there.answers(60)
+        assert [answer["error"] for _, answer in answers] == ["it is too old: nothing was sent"] * 60
+        assert await there.controller.read(1) == 0
+
+
+@pytest.mark.asyncio
+async def test_commands_that_come_are_a_life_sign_of_a_broker_that_does_not_acknowledge(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(mqtt, "TIMEOUT", 0.001)
+    output = MqttOutput("mqtt", MqttSettings(), Bus(MemoryPort(Line(Hcp2Controller.profile.line))))
+    acknowledged = asyncio.get_running_loop().create_future()
+
+    class Commanded:
+        looks = 0
+
+        @property
+        def bytes_read(self) -> int:
+            self.looks += 1
+            if self.looks == 20:
+                acknowledged.set_result(None)
+            return self.looks
+
+    async def publishing() -> None:
+        await acknowledged
+
+    output._arriving = cast("Commands", Commanded())
+    await output._acknowledged(asyncio.ensure_future(publishing()))
+    acknowledged = asyncio.get_running_loop().create_future()
+    output._arriving = Commands("line", output._gate, {}, lambda: 0.0)
+    with pytest.raises(ConnectionError, match=r"did not answer in 0.001 s"):
+        await output._acknowledged(asyncio.ensure_future(publishing()))
+
+
+@pytest.mark.asyncio
+async def test_that_commands_are_not_heard_any_more_is_noticed_on_their_own_connection(broker: Broker) -> None:
+    heard: asyncio.Queue[str] = asyncio.Queue()
+    forbidden = Forbidden(
+        MqttSettings(port=broker.port), (None, None, None), "line/set/#", frozenset({"line/set/5/1"}),
+        lambda message: heard.put_nowait(message.topic),
+    )  # fmt: skip
+    async with asyncio.timeout(PATIENCE):
+        await forbidden.begin(60, PATIENCE)
+        for name in ("5/1", "5/2", "5/1", "5/3"):
+            forbidden._client.publish(f"line/set/{name}", "1", qos=1)
+        assert [await heard.get(), await heard.get()] == ["line/set/5/2", "line/set/5/3"]
+        connection = forbidden._client.socket()
+        assert isinstance(connection, socket.socket)
+        connection.shutdown(socket.SHUT_RDWR)
+        await forbidden.lost
+    forbidden.close()
 
 
 @pytest.mark.asyncio

@@ -6,12 +6,15 @@ import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from busmaster.bus.snapshots import Snapshot
 from busmaster.errors import NoReply
+from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.outputs import retention, sqlite
 from busmaster.outputs.base import Happening
 from busmaster.outputs.retention import DAY, Retention
@@ -20,6 +23,8 @@ from busmaster.outputs.sqlite import DATED, SqliteOutput, column
 from busmaster.protocols.msc.status import ProgramStatus
 from tests.outputs.cycles import cycle, settled, until
 from tests.patience import PATIENCE
+
+REFUSED = WriteRecord(0.0, "mqtt", "line/set/x", "op", 17, "x", None, 2, Outcome.REFUSED, 900 * "x", 0.0, "")
 
 
 def test_a_column_holds_whatever_a_value_is() -> None:
@@ -195,7 +200,7 @@ def test_at_once_a_tenth_is_forgotten_and_never_more_than_a_piece(
 ) -> None:
     monkeypatch.setattr(retention, "AT_ONCE", 200)
     database = database_of(*range(rows))
-    retention.delete_oldest(database, "samples")
+    retention.forget_oldest(database, DATED)
     assert left_in(database) == rows - gone
     assert database.execute("select min(time) from samples").fetchone() == (gone,)
 
@@ -214,6 +219,53 @@ def test_a_limit_in_megabytes_forgets_the_oldest_and_the_events_of_that_time(tmp
     assert abs(last - time.time()) < 60
     assert first > time.time() - 990
     assert query(path, "select count(*) from events") == [(0,)]
+
+
+def test_a_limit_in_megabytes_holds_where_hardly_anything_but_refused_commands_comes(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    with recording(path, keep_mb=0.5) as output:
+        output.offer(cycle(1, 1.0))
+        for number in range(5_000):
+            output.offer(REFUSED._replace(id=str(number), time=time.time()))
+            if number % 100 == 0:
+                until(lambda: settled(output))
+        until(lambda: settled(output))
+        output.offer(cycle(2, 2.0))
+    assert path.stat().st_size < 3_000_000
+    [(kept, last)] = query(path, "select count(*), max(cast(id as integer)) from audit")
+    assert kept > 50
+    assert last == 4_999
+    assert query(path, "select value from samples") == [(2,)]
+
+
+def in_unit(value: float, unit: str) -> Snapshot:
+    """A cycle of one point, as its unit is now."""
+    snapshot = cycle(1, value)
+    return replace(snapshot, samples={replace(point, unit=unit): sample for point, sample in snapshot.samples.items()})
+
+
+def test_what_was_read_keeps_the_unit_that_it_was_read_in(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    for value, unit in ((1500, "mm"), (1.5, "m"), (1600, "mm")):
+        with recording(path) as output:
+            output.offer(in_unit(value, unit))
+    assert query(path, "select value, unit from history order by time") == [(1500, "mm"), (1.5, "m"), (1600, "mm")]
+
+
+def test_a_database_in_which_a_point_had_one_unit_goes_on_with_what_it_holds(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    old = sqlite.SCHEMA.replace("unique (node, item, unit)", sqlite.ONE_ROW_A_POINT)
+    with closing(sqlite3.connect(path)) as database:
+        database.executescript(old)
+        database.execute("pragma user_version = 1")
+        database.execute("insert into points values (7, '5', '1', 'mm')")
+        database.execute("insert into samples values (1, 7, 1500, 'good', null)")
+        database.commit()
+    with recording(path) as output:
+        output.offer(in_unit(1.5, "m"))
+        output.offer(in_unit(1600, "mm"))
+    assert query(path, "select value, unit from history order by time") == [(1500, "mm"), (1.5, "m"), (1600, "mm")]
+    assert query(path, "select count(*) from points") == [(2,)]
 
 
 def test_a_new_file_is_for_its_owner_and_group(tmp_path: Path) -> None:

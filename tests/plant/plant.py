@@ -226,9 +226,9 @@ class Plant:
         self.statuses.append(status)
         return status
 
-    def beside(self, *arguments: str) -> Program:
+    def beside(self, *arguments: str, environment: Mapping[str, str] | None = None) -> Program:
         """Start another command of busmaster; it is ended with all the others."""
-        program = Program("busmaster", *arguments, cwd=self.folder)
+        program = Program("busmaster", *arguments, cwd=self.folder, environment=environment)
         self._others.append(program)
         return program
 

@@ -9,7 +9,7 @@ from busmaster.arbiter.state import OFFLINE
 from tests.proof import setups
 from tests.proof.instants import Instant
 from tests.proof.msc_world import MscWorld
-from tests.proof.shipped import AnyTime, Asker, Decided
+from tests.proof.shipped import AnyTime, Asker, Decided, Ranks
 from tests.proof.wire import SCRIPT, STRAY, Owed, Time
 from tests.proof.world import Action, World
 
@@ -26,6 +26,9 @@ def actions(world: World) -> list[Action]:
         possible.append(("timer", "line"))
     if arbiter._deadlines.health != inf:
         possible.append(("timer", "health"))
+    if arbiter._deadlines.hold != inf:
+        possible.append(("timer", "hold"))
+    possible += world.own_actions()
     possible += _bytes(world)
     possible += _strays(world)
     if world.unread:
@@ -106,7 +109,7 @@ def window(world: World, action: Action) -> tuple[list[Time], list[Time], list[T
     what = action[0]
     if not world.frozen:
         slack = setup.stall if setup.may(setups.STALLS) else 0.0
-        latest = [due + slack for due in (deadlines.line, deadlines.health) if due != inf]
+        latest = [due + slack for due in (deadlines.line, deadlines.health, deadlines.hold) if due != inf]
         if world.unread:
             latest.append(world.unread_by)
     if what == "timer":
@@ -128,6 +131,7 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
     Decided.by_answer[0] = AnyTime.chosen[0] = False
     Asker.ask[0] = world.ask_one
     Asker.saturated[0] = world.is_saturated
+    Ranks.of = world.ranks
     AnyTime.at[0] = cast("float", later)
     world.now = now
     world.said = b""
@@ -176,6 +180,8 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
         world.go_down()
     elif what == "up":
         world.come_up()
+    else:
+        world.do(action)
     if not world.frozen:
         world.pump()
 

@@ -11,6 +11,7 @@ from tests.proof.instants import Bound, Instant, begin_run, instant, noted, set_
 from tests.proof.key import restore, save, share, simplify
 from tests.proof.msc_world import MscWorld
 from tests.proof.setups import Setup
+from tests.proof.sharing_world import SharingWorld
 from tests.proof.shipped import AnyTime, set_aside
 from tests.proof.wire import SCRIPT, Outside, Violation
 from tests.proof.world import Action, World
@@ -172,6 +173,8 @@ def prepare(setup: Setup) -> None:
 
 
 def world_of(setup: Setup) -> type[World]:
+    if setup.clients or setup.longest_hold:
+        return SharingWorld
     return MscWorld if setup.kind.startswith("msc") else World
 
 

@@ -8,23 +8,28 @@ from __future__ import annotations
 
 import io
 import pickle
-from collections import defaultdict, deque
+from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable
 from itertools import count
 from math import inf
 from typing import Any
 
 from busmaster.arbiter import in_step
+from busmaster.arbiter.clients import OWN, Hold, LineClient
 from busmaster.arbiter.health import SILENT, Health, NodeRecord
+from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo, Queue
 from busmaster.arbiter.schedule import Schedule
+from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.state import EXCHANGE, SETTLING, LineState
 from busmaster.arbiter.transaction import BACKGROUND, COMMAND, Phase, Priority, Transaction
+from busmaster.arbiter.turns import Turns
 from busmaster.arbiter.unasked import QUIET, STRAGGLER_MEMORY
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import LineNoisy
 from tests.proof import setups
 from tests.proof.instants import Instant, Past, instant, past, ticks
+from tests.proof.sharing_world import SharingWorld
 from tests.proof.wire import OLD, STRAY, Time
 from tests.proof.world import World
 from tests.proof.zones import FREE, Zone, widened
@@ -106,6 +111,7 @@ def past_legs(view: View) -> None:
         elif view.past(leg._follows_until) and arbiter.state is SETTLING:
             pass  # a stray would start it anew
     else:
+        leg.reply_came = False  # it is not while something is asked
         leg._follows = None  # by `begin`
         leg._follows_until = -inf
     if not world.setup.may(setups.HELD) and view.past(leg.out, longest_quiet(world), strictly=True):
@@ -133,8 +139,11 @@ def past_silences(view: View) -> None:
 def past_stragglers(view: View) -> None:
     """Who was not answered is blamed within STRAGGLER_MEMORY; where nobody's lateness is raised, never."""
     strays = view.world.arbiter._unasked
-    if not view.world.setup.in_step:
-        strays.run.clear()  # `InStep.heard` alone reads it
+    trust, leg = view.world.arbiter._trust, view.world.arbiter._leg
+    if not leg.goes_on:
+        trust._unheard = None  # what comes is not asked whether it is that reply
+    if not view.world.setup.in_step and trust._unheard is None:
+        strays.run.clear()  # else `InStep.heard` alone reads it
     one = strays.unanswered_one
     if one is not None and not (view.world.setup.may(setups.RAISED) and not view.past(one[1], STRAGGLER_MEMORY, True)):
         strays.unanswered_one = None
@@ -145,13 +154,14 @@ def past_stragglers(view: View) -> None:
 
 def past_requests(view: View) -> None:
     """Of a request's times only `started` is read, on the wire: where something is owed, or exchanges have a limit.
-    `deadline` orders polls and probes alone, `queued` counts where there is a `start_by`. Of attempts, whether there
-    were any."""
+    `deadline` orders polls and probes alone, `queued` counts where there is a `start_by`, and its order where a
+    sequence may wait for a write that was asked before. Of attempts, whether there were any."""
     world = view.world
     owed = world.setup.in_step and bool(world.arbiter._in_step.debts)
     limited = world.kind.profile.exchange_limit is not None or owed
+    ranks = _ranks_of_queued(view) if world.setup.longest_hold else {}
     for transaction in transactions(world):
-        transaction.queued = 0.0
+        transaction.queued = ranks.get(transaction, 0.0)
         transaction.first_byte = transaction.last_byte = transaction.ended_at = transaction.refused_until = -inf
         transaction.exchanges_ahead = 0
         transaction.settling_ahead = 0.0
@@ -162,6 +172,14 @@ def past_requests(view: View) -> None:
             transaction.deadline = inf
         if not (limited and transaction is world.arbiter._wire.transaction) and not world.frozen:
             transaction.started = -inf
+
+
+def _ranks_of_queued(view: View) -> dict[Transaction, Time]:
+    """In what order they were asked; times, where that is not known."""
+    waiting = list(dict.fromkeys(transactions(view.world)))
+    if not all(_ordered(view, a.queued, b.queued) for a in waiting for b in waiting):
+        return {one: one.queued for one in waiting}
+    return {one: past(sum(not view.before(one.queued, other.queued) for other in waiting), 0) for one in waiting}
 
 
 def past_nodes(view: View) -> None:
@@ -222,17 +240,38 @@ def past_waiting(view: View) -> None:
     dispatcher.writes.queues = defaultdict(deque, {node: queues[node] for node in world.nodes})
     if arbiter.noisy:
         dispatcher.fault = noisy
-    urgent, command, *by_deadline = dispatcher.backlog.queues
-    for first in (urgent, command):
-        first._entries = deque(first)
-    for other in by_deadline:
-        if not other.live:
-            other._entries = []
-            other._order = count()
+    for queue in dispatcher.backlog.queues:
+        _past_queue(queue)
     backlog = dispatcher.backlog
     if not world.setup.may(setups.HEALTH):
         backlog._streak = 0
     backlog._streak_before, backlog._rotated_before = 0, BACKGROUND
+    if isinstance(backlog, SharedBacklog) and isinstance(world, SharingWorld):
+        _past_turns(backlog, world.ranks)
+
+
+def _past_queue(queue: Queue) -> None:
+    if isinstance(queue, Turns):
+        for turn in queue._turns.values():
+            _past_queue(turn.queue)
+    elif isinstance(queue, Fifo):
+        queue._entries = deque(queue)
+    elif isinstance(queue, EarliestDeadlineFirst) and not queue.live:
+        queue._entries = []
+        queue._order = count()
+
+
+def _past_turns(backlog: SharedBacklog, ranks: dict[LineClient, int]) -> None:
+    """What turns cost is counted by nobody, in what order they were had neither. Of what was taken out last it is asked
+    whether a sequence begins with it, and since when."""
+    backlog._payer = None
+    last = backlog._last
+    hold = None if last is None else last.client
+    if not isinstance(hold, Hold) or hold.holds or hold.over:
+        backlog._last, backlog._attempts, backlog._since = None, 0, -inf
+    for turns in backlog._turns:
+        kept = [turn for turn in turns._turns.values() if turn.queue.live or turn is turns._next or turn.client is OWN]
+        turns._turns = OrderedDict((turn.client, turn) for turn in sorted(kept, key=lambda turn: ranks[turn.client]))
 
 
 def past_wire(view: View) -> None:
@@ -251,6 +290,8 @@ def past_wire(view: View) -> None:
         world.said_by = -inf
     if view.past(world.hold_until):
         world.hold_until = -inf
+    if isinstance(world, SharingWorld) and view.past(world.held_until, strictly=True):
+        world.held_until = past(0, 0)
     on_wire = world.arbiter._wire.transaction
     if on_wire is None and not world.frozen:
         world.by = None
@@ -362,7 +403,12 @@ def _reduce_member(member: Any) -> str:
     return str(member.name)
 
 
+def _reduce_client(client: LineClient) -> Any:
+    return "OWN" if client is OWN else object.__reduce_ex__(client, 5)
+
+
 _TABLE: dict[type, Callable[[Any], Any]] = {
+    LineClient: _reduce_client,
     Instant: _reduce_instant,
     Profile: _reduce_shared,
     ReplyTiming: _reduce_shared,

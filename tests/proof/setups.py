@@ -90,6 +90,10 @@ class Setup:
     retries: int = 0
     depth: int = 0
     """Requests that wait; 0 if one is asked whenever the line is free, which is the same where only one would."""
+    clients: int = 0
+    """Programs that share the line with its owner, in any order of their turns."""
+    longest_hold: float = 0.0
+    """Seconds for which the line may be held for a sequence of requests; 0 if nobody holds it."""
     second_timing: bool = False
     """The second node has times of its own, shorter ones, and a turnaround."""
     in_step: bool = False
@@ -132,6 +136,9 @@ class Setup:
         if self.second_timing:
             parts.append("two timings")
         parts += [f"{name} {value}" for name, value in (("retries", self.retries),) if value]
+        parts += [f"{name} {value}" for name, value in (("clients", self.clients),) if value]
+        if self.longest_hold:
+            parts.append("sequences")
         if self.depth:
             parts.append(f"depth {self.depth}")
         if not (self.assumptions.edge and self.assumptions.gap_edge):

@@ -8,6 +8,7 @@
 - What is owed (R15), unless the world is `in_step`: whatever is asked of it, the answer may be yes or no; and what goes
   next may be the first that waits, another, a check, or nothing until any time. So whatever R15 does is among what is
   explored. Checks are one read of each node.
+- Whose turn it is, of those who wait in a class: anybody's may be next. What a turn costs is counted by nobody.
 - Whether the line has been noisy for too long: with NOISE it may be or not, at each stray byte; without, it never is.
 - Where R15 is not set aside, its spans are what the world says. They are shorter: fewer debts at a time.
 """
@@ -21,9 +22,12 @@ from typing import Any, ClassVar
 
 from busmaster.arbiter import alike, health, in_step
 from busmaster.arbiter.choice import Choice, Chosen
+from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import DOWN, SUSPECT, UP, NodeRecord
+from busmaster.arbiter.shared_backlog import URGENT_RUN
 from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.turns import Turns
 from busmaster.arbiter.unasked import LONGEST_LATENESS, STRAGGLER_MEMORY, STRAGGLER_SHARE, UnaskedBytes
 from busmaster.contract.exchange import Command
 from tests.proof.setups import HEALTH, HOLDS, NOISE, RAISED, Setup
@@ -124,7 +128,7 @@ class AnyStep:
 
     owe = lapse = forgive = answered = said = said_twice = heard = nothing
 
-    def perhaps(self, *arguments: Any) -> bool:
+    def perhaps(self, *arguments: Any, **named: Any) -> bool:
         return bool(choose(2))
 
     clashes = doubts = perhaps
@@ -173,6 +177,12 @@ def set_aside(setup: Setup) -> Iterator[None]:
         put(Choice, "next", _any_of_all)
         put(UnaskedBytes, "babbling", _may_be_noisy if setup.may(NOISE) else _is_never_noisy)
         AnyStep.holds[0] = setup.may(HOLDS)
+    put(Turns, "_waiting", _in_their_order)
+    put(Turns, "_chosen", _anybodys)
+    put(Turns, "charge", _counts_nothing)
+    put(Turns, "count_run", _counts_nothing)
+    put(Turns, "begin_runs", _counts_nothing)
+    put(Turns, "shortest_run", _any_run)
     put(in_step, "LAPSE", setup.lapse)
     put(in_step, "DOUBT_PERIOD", setup.doubt)
     put(in_step, "SAID_MEMORY", setup.said_memory)
@@ -258,6 +268,34 @@ def _any_of_all(self: Choice, now: float, last_byte: float) -> Chosen | float | 
             dispatcher.backlog.restore(transaction)
             return other
     return first
+
+
+class Ranks:
+    """The order in which those who wait are told: turns that were had make none."""
+
+    of: ClassVar[dict[LineClient, int]] = {}
+
+
+def _in_their_order(turns: Turns) -> list[Any]:
+    waiting = [turn for turn in turns._turns.values() if turn.queue.live]
+    return sorted(waiting, key=lambda turn: Ranks.of.get(turn.client, 0))
+
+
+def _anybodys(turns: Turns) -> Any:
+    """What was given back is the next all the same."""
+    given_back, turns._next = turns._next, None
+    if given_back is not None and given_back.queue.live:
+        return given_back
+    waiting = turns._waiting()
+    return waiting[choose(len(waiting))]
+
+
+def _counts_nothing(*arguments: Any) -> None:
+    pass
+
+
+def _any_run(turns: Turns) -> int:
+    return choose(2) * URGENT_RUN
 
 
 def _may_be_untimely(*arguments: Any) -> bool:

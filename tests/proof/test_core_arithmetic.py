@@ -14,10 +14,8 @@ import pytest
 CORE = Path(__file__).parent.parent.parent / "busmaster"
 ROOMS = (
     *(f"arbiter/{name}.py" for name in ("arbiter", "backlog", "choice", "deadlines", "dispatcher", "echo", "in_step")),
-    *(
-        f"arbiter/{name}.py"
-        for name in ("leg", "line_machine", "on_wire", "output", "probes", "trust", "unasked", "writes")
-    ),
+    *(f"arbiter/{name}.py" for name in ("leg", "line_machine", "node_watch", "on_wire", "output", "probes", "queues")),
+    *(f"arbiter/{name}.py" for name in ("shared_backlog", "trust", "turns", "unasked", "writes")),
     "contract/driver.py",
 )
 """What runs as it ships. Not here: counters and their histograms, the budget of probes and what is learned of a node
@@ -30,6 +28,9 @@ ALLOWED = {
     "-next(self._order)": COUNT,
     "key * len(run)": COUNT,
     "run[:1] * len(more)": COUNT,
+    "PASSED_BY_EACH * (len(waiting) - 1)": COUNT,
+    "turn.passed * turn.client.share": COUNT,
+    "seconds / client.share": "what a turn costs: set aside, anybody's may be next",
     "count * self.byte_time": BYTES,
     "said * self.byte_time": BYTES,
     "TAINT_SHARE * said * self.byte_time": BYTES,

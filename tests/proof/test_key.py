@@ -8,6 +8,7 @@ from math import inf
 
 import pytest
 
+from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.state import EXCHANGE
 from tests.proof.key import FORGOTTEN, View, transactions
 from tests.proof.kinds import READ, WRITE, WRITE_THERE
@@ -37,7 +38,10 @@ QUEUES = replace(HCP2, commands=(READ, WRITE, WRITE_THERE), depth=2, adversary=(
 HOLDS = replace(HCP2, adversary=(HELD,))
 MSC = replace(HCP2, kind="msc", lapse=2.5, adversary=(STRAYS, FLIPS), lost_acknowledgements=1)
 OWES = replace(HCP2, in_step=True, adversary=(BEYOND, NAKS), beyond=0.3)
+SHARED = replace(QUEUES, clients=1, adversary=(URGENT, CANCELS, LOST))
+SEQUENCES = replace(HCP2, clients=1, longest_hold=0.3, adversary=(URGENT, CANCELS, LOST), retries=1)
 EVERY = {"hcp2": HCP2, "paced": PACED, "echo": ECHOES, "late": LATE, "queues": QUEUES, "held": HOLDS, "msc": MSC}
+EVERY |= {"shared": SHARED, "sequences": SEQUENCES}
 WALKS = 40
 pytestmark = pytest.mark.timeout(300)
 
@@ -118,6 +122,12 @@ def without_what_is_being_said(view: View) -> None:
     view.world.arbiter._leg.out = -inf
 
 
+def without_what_began(view: View) -> None:
+    backlog = view.world.arbiter.dispatcher.backlog
+    if isinstance(backlog, SharedBacklog):
+        backlog._last = None
+
+
 @pytest.mark.parametrize(
     ("forget", "setup"),
     [
@@ -137,6 +147,7 @@ def without_what_is_being_said(view: View) -> None:
         (without_lapse, OWES),
         (without_what_is_held, HOLDS),
         (without_what_is_being_said, MSC),
+        (without_what_began, SEQUENCES),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )

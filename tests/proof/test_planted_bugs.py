@@ -15,9 +15,13 @@ from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.output import Output
+from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.transaction import Transaction
+from busmaster.arbiter.trust import Trust
 from busmaster.contract.exchange import FrameError
+from busmaster.protocols.msc.exchange import is_sound
 from busmaster.wire import readers
+from busmaster.wire.readers import ACK, STX
 from tests.planted import (
     with_a_cancellation_that_clears_the_exchange,
     without_lateness,
@@ -28,7 +32,7 @@ from tests.planted import (
 from tests.proof.explore import Explorer
 from tests.proof.history import as_test, retell, told
 from tests.proof.instants import seconds, set_unit
-from tests.proof.kinds import KINDS, READ, WRITE, WRITE_THERE
+from tests.proof.kinds import KINDS, READ, READ_THERE, WRITE, WRITE_THERE
 from tests.proof.setups import (
     CANCELS,
     FLIPS,
@@ -49,6 +53,7 @@ pytestmark = pytest.mark.timeout(LIMIT + 30)
 LINE = Setup(commands=(READ, WRITE))
 MSC = Setup(kind="msc", commands=(READ,), lapse=2.5)
 LATE = replace(LINE, receive_latency=0.016)
+SEQUENCES = replace(LINE, commands=(READ,), longest_hold=0.3)
 TURNS = replace(LINE, commands=(READ, WRITE_THERE), second_timing=True)
 
 
@@ -130,6 +135,15 @@ def with_a_damaged_ack_that_is_none(patch: Any) -> None:
 
     patch.setattr(Leg, "came_unasked", lambda leg, now: None)
     patch.setattr(LineMachine, "_take_unasked", in_settling)
+
+
+def with_any_late_packet_for_the_reply(patch: Any) -> None:
+    """Whatever packet ends what came: also one before the ACK."""
+    patch.setattr(Trust, "is_late_reply", lambda trust, run, now: is_sound(run[run.find(STX) :]))
+
+
+def with_a_late_ack_for_the_reply(patch: Any) -> None:
+    patch.setattr(Trust, "is_late_reply", lambda trust, run, now: run == ACK)
 
 
 def with_an_end_that_any_answer_moves(patch: Any) -> None:
@@ -221,6 +235,33 @@ def with_two_said_at_once(patch: Any) -> None:
     patch.setattr(Output, "unsent", lambda output, count, now: None)
 
 
+def without_sequences(patch: Any) -> None:
+    """Whoever waits goes next, though the line is held."""
+    patch.setattr(SharedBacklog, "_hold_for", lambda backlog, hold, priority: None)
+
+
+def with_a_sequence_that_never_ends(patch: Any) -> None:
+    right = SharedBacklog._hold_for
+
+    def hold_for(backlog: SharedBacklog, *arguments: Any) -> None:
+        right(backlog, *arguments)
+        backlog._deadlines.hold = inf
+
+    patch.setattr(SharedBacklog, "_hold_for", hold_for)
+
+
+def with_what_a_sequence_leaves_behind(patch: Any) -> None:
+    """As it was: what waits of a sequence that is left is taken out, and told to nobody."""
+
+    def end_hold(dispatcher: Dispatcher, now: float, hold: Any = None) -> None:
+        backlog = dispatcher.share()
+        hold = hold or backlog.hold
+        if hold is not None:
+            backlog.end_hold(hold, now)
+
+    patch.setattr(Dispatcher, "end_hold", end_hold)
+
+
 @pytest.mark.parametrize(
     ("plant", "setup", "rule"),
     [
@@ -238,6 +279,8 @@ def with_two_said_at_once(patch: Any) -> None:
         (with_a_stray_that_uses_up_the_packet, replace(MSC, adversary=(STRAYS,)), "R1"),
         (without_the_packet_behind_an_ack, MSC, "R1"),
         (with_a_damaged_ack_that_is_none, replace(MSC, adversary=(FLIPS,)), "R1"),
+        (with_any_late_packet_for_the_reply, replace(MSC, commands=(READ, READ_THERE), lost_acknowledgements=1), "R1"),
+        (with_a_late_ack_for_the_reply, MSC, "R1"),
         (with_an_end_that_any_answer_moves, replace(LINE, adversary=(STRAYS,)), "R1"),
         (without_the_turnaround, TURNS, "R1"),
         (without_the_time_of_the_write, replace(LINE, adversary=(FROZEN,)), "R1"),
@@ -248,6 +291,9 @@ def with_two_said_at_once(patch: Any) -> None:
         (with_no_deadline_behind_a_first_byte, LINE, "progress"),
         (with_damage_that_completes, replace(LINE, adversary=(FLIPS,)), "R5"),
         (with_two_said_at_once, replace(LINE, adversary=(HELD,)), "R1"),
+        (without_sequences, SEQUENCES, "R9"),
+        (with_a_sequence_that_never_ends, SEQUENCES, "progress"),
+        (with_what_a_sequence_leaves_behind, SEQUENCES, "R8"),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from math import inf
 from typing import Any, Final, TypeAlias
 
+from busmaster.arbiter.clients import LineClient
+
 Time: TypeAlias = Any
 """An Instant, or one of the infinities."""
 
@@ -27,9 +29,10 @@ class Outside(Exception):
 class Ticket:
     """One request as its caller knows it: what would be true of its outcome."""
 
-    __slots__ = ("before", "may_be_done", "node", "place", "sent", "writes")
+    __slots__ = ("before", "client", "may_be_done", "node", "place", "sent", "writes")
 
-    def __init__(self, node: int, writes: bool) -> None:
+    def __init__(self, node: int, writes: bool, client: LineClient | None = None) -> None:
+        self.client = client
         self.node = node
         self.writes = writes
         self.place = -1

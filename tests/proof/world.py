@@ -7,6 +7,7 @@ from math import inf
 from typing import Any, ClassVar, TypeAlias
 
 from busmaster.arbiter.arbiter import Arbiter
+from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import EXCHANGE, OFFLINE
 from busmaster.arbiter.transaction import PARKED, URGENT, Transaction
@@ -103,6 +104,14 @@ class World:
         """Until then the host speaks."""
         arbiter.line_up(now, paced=setup.paced)
 
+    def own_actions(self) -> list[Action]:
+        """What may happen in a world of this kind alone."""
+        return []
+
+    def do(self, action: Action) -> None:
+        """Let such a thing happen."""
+        raise AssertionError(action)
+
     def note(self, what: str, detail: Any = None) -> None:
         if self.calls is not None:
             self.calls.append((self.now, what, detail))
@@ -112,13 +121,26 @@ class World:
     def ask(self, place: int, urgent: bool = False) -> None:
         """A caller submits one of the commands."""
         self.note("asks urgently" if urgent else "asks", place)
-        node, command = self.kind.commands[place]
-        ticket = Ticket(node, command.writes)
-        transaction = Transaction(self.nodes[node], command, tag=ticket)
+        transaction = self.made(place, self.whose())
         if urgent:
             transaction.priority = URGENT
-        self.live.append(ticket)
         self.arbiter.submit(transaction, self.now)
+
+    def made(self, place: int, client: LineClient | None) -> Transaction:
+        """A new request of somebody, who waits for it from now on."""
+        node, command = self.kind.commands[place]
+        ticket = Ticket(node, command.writes, client)
+        self.live.append(ticket)
+        return Transaction(self.nodes[node], command, tag=ticket, client=client)
+
+    @property
+    def ranks(self) -> dict[LineClient, int]:
+        """The order in which those who take turns are told."""
+        return {}
+
+    def whose(self) -> LineClient | None:
+        """Who asks: here the program that owns the line alone."""
+        return None
 
     @property
     def is_saturated(self) -> bool:
@@ -131,9 +153,7 @@ class World:
             commands = self.setup.commands
             place = commands[choose(len(commands))]
             self.note("asks", place)
-            node, command = self.kind.commands[place]
-            self.live.append(Ticket(node, command.writes))
-            self.arbiter.dispatcher.submit(Transaction(self.nodes[node], command, tag=self.live[-1]), self.now)
+            self.arbiter.dispatcher.submit(self.made(place, self.whose()), self.now)
 
     def pump(self) -> None:
         """Hand over what is to be sent, hear what has happened, ask anew: until nothing is left."""
@@ -184,8 +204,12 @@ class World:
                 raise Violation(f"progress: {arbiter.state.name} has no end")
             if due > self.now + self._longest_deadline():
                 raise Violation(f"progress: {arbiter.state.name} ends later than it may")
-        elif arbiter.state.name == "READY" and len(arbiter.dispatcher.backlog):
+        elif arbiter.state.name == "READY" and len(arbiter.dispatcher.backlog) and not self.is_held():
             raise Violation("progress: the line is READY while something waits")
+
+    def is_held(self) -> bool:
+        """The line waits for what a sequence asks next, and not for ever."""
+        return False
 
     def _longest_deadline(self) -> float:
         """No deadline of the line is further away: a lateness, or a window with its bytes, behind all that is being
@@ -246,12 +270,16 @@ class World:
         if any(origin != STRAY for _, origin in self.unread):
             raise Violation("R1: bytes of an earlier reply lie unread as the next request leaves")
 
+    def _judge_turn(self, transaction: Transaction) -> None:
+        """R9, as a request leaves: here nobody holds the line."""
+
     def _judge_order(self, ticket: Ticket) -> None:
-        """R7: no write overtakes an earlier one to its node."""
+        """R7: no write overtakes an earlier one of its client to its node."""
         for other in self.live:
             if other is ticket:
                 return
-            if other.writes and ticket.writes and other.node == ticket.node and not other.sent and not ticket.sent:
+            alike = other.node == ticket.node and other.client is ticket.client
+            if other.writes and ticket.writes and alike and not other.sent and not ticket.sent:
                 raise Violation("R7: a write overtakes an earlier one to its node")
 
     # what is said
@@ -262,6 +290,8 @@ class World:
         transaction = self.arbiter._wire.transaction
         ticket = None if transaction is None else transaction.tag
         if ticket is not None and self.is_request(out):
+            assert transaction is not None
+            self._judge_turn(transaction)
             self._judge_order(ticket)
             ticket.sent = True
             ticket.before = ticket.may_be_done

@@ -57,6 +57,8 @@ def quick() -> Iterator[Setup]:
     yield replace(_line("hcp2", ECHO_FAULTS), echo=True)
     yield replace(_line("hcp2", STRAYS, commands=(WRITE,)), paced=True)
     yield replace(_line("msc"), lost_acknowledgements=1)
+    yield replace(_line(commands=(WRITE,)), clients=1, depth=1)
+    yield replace(_line("hcp2", LOST, commands=(WRITE,)), clients=1, depth=1, retries=1)
 
 
 def lines() -> Iterator[Setup]:
@@ -84,6 +86,20 @@ def lines() -> Iterator[Setup]:
     yield replace(_line("hcp2", LOST, commands=(READ, WRITE_THERE)), second_timing=True)
     yield replace(_line("hcp2", NAKS, commands=(READ, WRITE, READ_UNLIKE)), retries=1)
     yield replace(_line("hcp2", IDLE), depth=2)
+
+
+def shared() -> Iterator[Setup]:
+    """Lines that programs share, and hold for sequences of requests."""
+    one = replace(_line(commands=(WRITE,)), clients=1, depth=1)
+    for feature in (NAKS, CANCELS, URGENT, LOSS, FLIPS):
+        yield replace(one, adversary=(feature,))
+    yield replace(one, commands=(READ, WRITE), depth=2)
+    for commands in ((READ,), (WRITE,)):
+        held = replace(_line(commands=commands), longest_hold=0.3)
+        for adversary in ((), (LOST,), (NAKS,), (CANCELS,), (URGENT,), (LOSS,)):
+            yield replace(held, adversary=adversary)
+    yield replace(held, clients=1)
+    yield replace(held, retries=1, adversary=(LOST,))
 
 
 def packets() -> Iterator[Setup]:
@@ -121,6 +137,7 @@ def in_step() -> Iterator[Setup]:
 GROUPS = {
     "quick": quick,
     "lines": lines,
+    "shared": shared,
     "packets": packets,
     "pairs": pairs,
     "msc pairs": msc_pairs,
@@ -137,4 +154,5 @@ def worlds(groups: list[str]) -> list[Setup]:
 
 
 def _size(setup: Setup) -> float:
-    return sum(map(setup.may, LARGE)) + 0.5 * len(setup.adversary) + 2 * (setup.receive_latency > 0) + 4 * setup.in_step
+    large = sum(map(setup.may, LARGE)) + 2 * (setup.receive_latency > 0) + 4 * setup.in_step
+    return large + 0.5 * len(setup.adversary) + 3 * (setup.longest_hold > 0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import pytest
 
 from busmaster.contract.exchange import MORE, Done, Expect, FrameError, Refused
@@ -319,7 +321,31 @@ def test_a_stale_packet_is_acked_and_dropped_in_any_chunks() -> None:
     for _ in range(2):
         assert listener.feed(b"") is MORE
         assert all(listener.feed(bytes((byte,))) is MORE for byte in STALE[:-1])
-        assert listener.feed(STALE[-1:] + b"\x02") == Done(None, send=ACK, rest=b"\x02")
+        assert listener.feed(STALE[-1:]) == Done(None, send=ACK)
+
+
+@pytest.mark.parametrize("chunk", [1, 2, 7, 100])
+@pytest.mark.parametrize("before", [ACK, ACK + ACK, STALE, ACK + STALE, STALE + ACK])
+def test_an_ack_or_a_packet_in_front_does_not_hide_a_stale_packet(before: bytes, chunk: int) -> None:
+    listener = StalePacketListener()
+    heard = before + REPLY
+    said = []
+    for start in range(0, len(heard), chunk):
+        with suppress(FrameError):
+            said.append(listener.feed(heard[start : start + chunk]))
+    assert said[-1] == Done(None, send=ACK)
+
+
+def test_the_ack_of_a_stale_packet_is_not_said_into_the_next_one() -> None:
+    listener = StalePacketListener()
+    assert listener.feed(STALE + REPLY[:5]) is MORE
+    assert listener.feed(REPLY[5:]) == Done(None, send=ACK), "one for both"
+
+
+def test_a_stale_packet_with_noise_behind_it_is_acked_all_the_same() -> None:
+    with pytest.raises(FrameError, match="unasked") as error:
+        StalePacketListener().feed(STALE + b"\xff")
+    assert error.value.send == ACK
 
 
 def test_a_damaged_stale_packet_is_acked_when_the_line_pauses() -> None:
@@ -336,6 +362,27 @@ def test_what_is_no_stale_packet_is_not_answered(unasked: bytes) -> None:
         listener.feed(unasked)
     assert error.value.send == b""
     assert listener.feed(STALE) == Done(None, send=ACK)
+
+
+def test_the_end_of_a_packet_that_was_asked_for_again_is_passed_over_and_not_asked_for_twice() -> None:
+    """A noise byte before the checksum pushes its last byte out; a unit says its packet once for each NAK."""
+    exchange = acked()
+    pushed = REPLY[:-2] + b"\x23" + REPLY[-2:]
+    assert says(exchange.feed(pushed[: len(REPLY)])) == NAK
+    assert exchange.feed(pushed[len(REPLY) :]) is MORE
+    assert says(exchange.expired(True)) == b""
+    assert exchange.feed(REPLY) == Done(1234, send=ACK)
+
+
+def test_what_never_becomes_a_packet_is_passed_over_a_few_times_and_no_more() -> None:
+    exchange = acked()
+    assert says(exchange.feed(BAD)) == NAK
+    for _ in range(4):
+        exchange.feed(b"\x55")
+        assert says(exchange.expired(True)) == b""
+    exchange.feed(b"\x55")
+    with pytest.raises(FrameError, match="no packet"):
+        exchange.expired(True)
 
 
 def test_a_bad_unit_byte_with_the_right_length_is_no_exemption_from_settling() -> None:

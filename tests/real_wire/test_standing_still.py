@@ -11,7 +11,7 @@ STANDSTILLS = 3
 LONGEST = 0.8
 """Seconds. Beyond a second, a node may be taken for dead, and is probed when the line can afford it (R11)."""
 WITHIN = 1.0
-"""Seconds until all nodes give good values again; besides, the line may have to settle for a lateness (MSC: 1 s)."""
+"""Seconds until all nodes give good values again; besides, the node that does not exist takes a lateness (MSC: 1 s)."""
 
 
 def check(protocol: str, verdict: Verdict) -> None:

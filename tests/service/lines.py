@@ -54,6 +54,17 @@ class Served:
         return [(record.point, record.outcome.value) for record in self.records]
 
 
+class SlowWay:
+    """Takes messages while it is not full."""
+
+    def __init__(self) -> None:
+        self.full = False
+        self.said: list[str] = []
+
+    def say(self, text: str, /) -> None:
+        self.said.append(text)
+
+
 async def until(fact: Callable[[], object]) -> None:
     """Wait for a fact of this process: its loop turns until it is one."""
     while not fact():  # noqa: ASYNC110  nobody tells it
@@ -82,6 +93,14 @@ def on_a_served_line(
             connect(line.address) as remote,
         ):
             await story(line, remote)
+
+    asyncio.run(run())
+
+
+def on_a_line(folder: Path, story: Callable[[Served], Awaitable[None]], *, read_only: bool = False) -> None:
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE), served(folder, read_only=read_only) as line:
+            await story(line)
 
     asyncio.run(run())
 
@@ -117,4 +136,16 @@ async def raw(line: Served, *, hello: bool = True, **options: Any) -> AsyncItera
         yield client
 
 
-__all__ = ["ABSENT", "PATIENT", "MicroFlexDrive", "Raw", "Served", "on_a_served_line", "raw", "served", "until"]
+__all__ = [
+    "ABSENT",
+    "PATIENT",
+    "MicroFlexDrive",
+    "Raw",
+    "Served",
+    "SlowWay",
+    "on_a_line",
+    "on_a_served_line",
+    "raw",
+    "served",
+    "until",
+]

@@ -6,37 +6,32 @@ import asyncio
 import contextlib
 import os
 import socket
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from busmaster import Hcp2Controller, RemoteBus
+from busmaster import Hcp2Controller, RemoteBus, connect
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
 from busmaster.service import messages
 from busmaster.service.client import Client
 from busmaster.service.folder import Owner, ServedSocket
 from busmaster.service.outbox import Outbox
-from busmaster.service.service import READ_AT_ONCE
-from tests.service.lines import ABSENT, Served, on_a_served_line, raw, until
+from busmaster.service.visit import READ_AT_ONCE, Reception, Visit
+from tests.patience import PATIENCE
+from tests.service.lines import ABSENT, Served, SlowWay, on_a_line, on_a_served_line, raw, served, until
 
 
 def test_news_that_were_dropped_take_no_memory() -> None:
-    async def run() -> None:
-        async def send(_: str) -> None:
-            await asyncio.Event().wait()
-
-        outbox = Outbox(send, lambda _: None)
-        running = asyncio.ensure_future(outbox.run())
-        outbox.put("an answer that is not read")
-        await asyncio.sleep(0)
-        for number in range(10 * messages.MOST_UNREAD):
-            outbox.put_news(7, f"news {number}")
-        assert outbox.waiting == messages.MOST_UNREAD + 1
-        running.cancel()
-
-    asyncio.run(run())
+    way = SlowWay()
+    outbox = Outbox(way, lambda _: None)
+    way.full = True
+    outbox.put("an answer that is not read")
+    for number in range(10 * messages.MOST_UNREAD):
+        outbox.put_news(7, f"news {number}")
+    assert outbox.waiting == messages.MOST_UNREAD + 1
 
 
 def test_a_write_that_is_given_up_before_its_first_step_is_on_record_and_leaves_nothing(tmp_path: Path) -> None:
@@ -56,10 +51,15 @@ def test_what_is_cancelled_before_it_was_handed_over_is_never_said(tmp_path: Pat
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(remote, 5)
         await controller.read(1)
+        connection = remote.link._connection
+        assert connection is not None
+        connection.full = True
         writing = asyncio.ensure_future(controller.write(1, 7))
         await asyncio.sleep(0)
         writing.cancel()
         await asyncio.gather(writing, return_exceptions=True)
+        connection.full = False
+        remote.link.writable()
         assert await controller.read(1) == 0
         assert line.records == []
 
@@ -132,15 +132,15 @@ def test_messages_that_come_together_are_taken_one_in_a_turn(tmp_path: Path, mon
         count()
         await remote.groups()
         taken.clear()
-        [connection] = line.service._clients.values()
+        [visit] = line.service._clients.values()
         sizes: list[int] = []
-        receive = connection.data_received
+        receive = visit.connection.buffer_updated
 
-        def received(data: bytes) -> None:
-            sizes.append(len(data))
-            receive(data)
+        def received(count: int) -> None:
+            sizes.append(count)
+            receive(count)
 
-        monkeypatch.setattr(connection, "data_received", received)
+        monkeypatch.setattr(visit.connection, "buffer_updated", received)
         for _ in range(1000):
             remote.link.tell("end", {"stream": 7})
         await until(lambda: len(taken) >= 1000)
@@ -151,7 +151,7 @@ def test_messages_that_come_together_are_taken_one_in_a_turn(tmp_path: Path, mon
 
 
 def test_a_program_that_stands_still_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("busmaster.service.service.SEND_WITHIN", 0.05)
+    monkeypatch.setattr("busmaster.service.connection.SEND_WITHIN", 0.05)
 
     async def story(line: Served, remote: RemoteBus) -> None:
         async with raw(line, max_queue=1) as client:
@@ -165,3 +165,123 @@ def test_a_program_that_stands_still_is_let_go(tmp_path: Path, monkeypatch: pyte
         assert await Hcp2Controller(remote, 5).read(1) == 0
 
     on_a_served_line(tmp_path, story)
+
+
+def test_a_poll_group_of_a_thousand_points_comes_in_messages_that_hold_up_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lengths: list[int] = []
+    heard = Visit.heard
+
+    def note(visit: Visit, message: str | bytes) -> None:
+        lengths.append(len(message))
+        heard(visit, message)
+
+    monkeypatch.setattr(Visit, "heard", note)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        handles = [Hcp2Controller(remote, 5 + number % 2) for number in range(10)]
+        points = [handles[n % 10].point(f"{n % 99 + 1}") for n in range(198)]
+        scaled = [replace(point, item=f"{point.item} {n}") for n in range(6) for point in points]
+        cycles = (await remote.poll_group("many", period=60, points=scaled[: messages.MOST_POINTS])).subscribe()
+        line.bus.groups[0].demand()
+        snapshot = await anext(cycles)
+        assert len(snapshot) == messages.MOST_POINTS
+        assert all(sample.value == 0 for sample in snapshot.samples.values())
+        assert max(lengths) < messages.LONGEST_REQUEST / 2
+        with pytest.raises(InvalidCommand, match="1000 points at most"):
+            await remote.poll_group("more", period=60, points=scaled[: messages.MOST_POINTS + 1])
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_of_those_who_never_say_hello_the_oldest_goes_for_one_too_many(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.service.service.MOST_STRANGERS", 3)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        path = line.address.removeprefix("unix:")
+        first, *others = [await asyncio.open_unix_connection(path) for _ in range(3)]
+        await until(lambda: line.service.strangers == 3)
+        async with connect(line.address) as another:
+            assert await first[0].read() == b""
+            assert await Hcp2Controller(another, 5).read(1) == 0
+        assert line.service.refused == 1
+        assert await Hcp2Controller(remote, 5).read(1) == 0
+        for _, writer in (first, *others):
+            writer.transport.abort()
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_one_that_says_nothing_for_ten_seconds_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.service.visit.HELLO_WITHIN", 0.05)
+
+    async def story(line: Served) -> None:
+        async with raw(line, hello=False) as client:
+            assert (await client.hear())["error"]["message"] == "no hello came"
+        reader, writer = await asyncio.open_unix_connection(line.address.removeprefix("unix:"))
+        assert await reader.read() == b""
+        writer.transport.abort()
+        await until(lambda: not line.service.strangers)
+
+    on_a_line(tmp_path, story)
+
+
+def test_one_message_of_each_program_is_taken_before_the_second_of_any() -> None:
+    class Queue:
+        """Some messages of one program."""
+
+        def __init__(self, name: str, count: int) -> None:
+            self.name = name
+            self.count = count
+
+        def take(self) -> None:
+            taken.append((self.name, turn))
+            self.count -= 1
+            if self.count:
+                reception.ask(self)  # type: ignore[arg-type]  # all of a visit that it asks for
+
+    taken: list[tuple[str, int]] = []
+    turn, reception = 0, Reception()
+
+    async def run() -> None:
+        nonlocal turn
+        for name, count in (("first", 1), ("much", 4), ("some", 2), ("one", 1)):
+            reception.ask(Queue(name, count))  # type: ignore[arg-type]
+        for turn in range(1, 9):  # noqa: B007  it is looked at in `take`
+            await asyncio.sleep(0)
+
+    asyncio.run(run())
+    assert [name for name, _ in taken] == ["first", "much", "some", "one", "much", "some", "much", "much"]
+    assert len({turn for _, turn in taken}) == len(taken)
+
+
+def test_a_service_ends_though_a_connection_has_only_just_been_taken(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE):
+            async with served(tmp_path) as line:
+                with socket.socket(socket.AF_UNIX) as stranger:
+                    stranger.connect(line.address.removeprefix("unix:"))
+                    await until(lambda: line.service.strangers)  # its end is there, and not connected to it yet
+            assert line.service.strangers == 0
+
+    asyncio.run(run())
+
+
+def test_it_runs_on_uvloop_too(tmp_path: Path) -> None:
+    uvloop = pytest.importorskip("uvloop")
+
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE), served(tmp_path) as line, connect(line.address) as remote:
+            controller = Hcp2Controller(remote, 5)
+            await controller.write(1, 1.5)
+            assert await asyncio.gather(*(controller.read(number) for number in (1, 2))) == [1.5, 0]
+            async with raw(line) as client:
+                await client.connection.send("[" * (messages.LONGEST_REQUEST + 100))
+                with pytest.raises(ConnectionClosed, match="1009"):
+                    await client.hear()
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        runner.run(run())

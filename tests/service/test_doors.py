@@ -7,8 +7,10 @@ import dataclasses
 import logging
 import os
 import socket
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -255,3 +257,23 @@ def test_what_a_command_does_not_say_it_changes_is_allowed_with_its_whole_node_a
     assert Permission("x", True, {("hcp2", 5): frozenset({1})}).refusal(node, odd)
     assert not Permission("x", True, {("hcp2", 5): None}).refusal(node, odd)
     assert Permission("x", True, {("hcp2", 6): None}).refusal(node, odd)
+
+
+@pytest.mark.parametrize("ahead", [-50_000.0, 50_000.0])
+def test_a_program_of_a_machine_with_another_clock_reads_and_writes_by_the_owners(
+    ahead: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + ahead)
+    monkeypatch.setattr("busmaster.service.remote.time", clock)
+
+    async def story(line: Served, address: str) -> None:
+        async with connect(address, token=SECRETS["hmi"]) as remote:
+            point = Hcp2Controller(remote, 5).point("1")
+            await point.write(3, start_within=PATIENCE, finish_within=PATIENCE)
+            cycles = (await remote.poll_group("mine", period=60, points=[point])).subscribe()
+            line.bus.groups[0].demand()
+            await anext(cycles)
+            assert abs(remote.now() - line.bus.now()) < PATIENCE
+            assert await point.read(max_age=PATIENCE) == 3
+
+    on_a_port(tmp_path, story)

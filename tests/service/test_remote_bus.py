@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 from pathlib import Path
 
 import pytest
@@ -34,7 +35,10 @@ from busmaster.errors import (
 )
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.service.failures import error_of, said_error
+from busmaster.service.link import Link
 from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, served, until
+
+TAKE = Link._take
 
 
 def test_a_handle_reads_and_writes_on_another_programs_line(tmp_path: Path) -> None:
@@ -296,8 +300,8 @@ def test_a_lost_connection_ends_each_request_truthfully(tmp_path: Path) -> None:
         writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
         reading = asyncio.ensure_future(Hcp2Controller(remote, 5).read(1))
         await line.sent()
-        [connection] = line.service._clients.values()
-        connection.transport.abort()
+        [visit] = line.service._clients.values()
+        visit.connection.abort()
         with pytest.raises(WriteUnconfirmed, match="the write may have been sent"):
             await writing
         with pytest.raises(LineDown, match="node 5: the connection to the program that owns the line was lost"):
@@ -316,6 +320,8 @@ def test_what_was_not_handed_over_when_the_connection_was_lost_was_not_started(t
         await asyncio.sleep(0)
         remote2 = connect(line.address)
         async with remote2:
+            assert remote2.link._connection is not None
+            remote2.link._connection.full = True
             waiting = asyncio.ensure_future(Hcp2Controller(remote2, 5).write(1, 1))
             await asyncio.sleep(0)
             remote2.link._end(LineDown, "it is lost", "connect again")
@@ -360,6 +366,23 @@ def test_nobody_there_is_said_with_what_to_do(tmp_path: Path) -> None:
     asyncio.run(run())
 
 
+def test_a_program_that_has_the_line_and_stands_still_is_told_from_one_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.service.link.CONNECT_WITHIN", 0.05)
+    path = tmp_path / "line.sock"
+
+    async def run() -> None:
+        with pytest.raises(LineDown, match=r"that serves .*line.sock did not answer in 0.05 s; if it stands still"):
+            async with connect(f"unix:{path}"):
+                pass
+
+    with socket.socket(socket.AF_UNIX) as stopped:
+        stopped.bind(str(path))
+        stopped.listen()  # the system lets others in, and nobody looks
+        asyncio.run(run())
+
+
 def test_limits_and_the_safe_state_stay_with_the_owner(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         Hcp2Controller(line.bus, 5).point("1").limit(maximum=10)
@@ -375,5 +398,51 @@ def test_limits_and_the_safe_state_stay_with_the_owner(tmp_path: Path) -> None:
         with pytest.raises(Superseded):
             await controller.write(1, 8)
         assert [outcome for _, outcome in line.audit()] == ["refused", "written", "not started"]
+
+    on_a_served_line(tmp_path, story)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        '{"jsonrpc": "2.0", "id": 1, "error": 3}',
+        '{"jsonrpc": "2.0", "id": 1, "error": {"data": {"label": 3}}}',
+        "[]",
+        "{",
+    ],
+)
+def test_an_answer_that_is_not_understood_leaves_nobody_waiting(
+    said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Link, "_take", TAKE)  # it is not held against the schema
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        writing = asyncio.ensure_future(Hcp2Controller(remote, ABSENT, timings=PATIENT).write(1, 1))
+        await line.sent()
+        remote.link.heard(said.replace('"id": 1', f'"id": {remote.link._count}'))
+        with pytest.raises(WriteUnconfirmed, match="what is not understood"):
+            await writing
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_sample_of_a_program_serves_until_a_write_by_whatever_program_has_made_it_stale(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        mine, theirs = Hcp2Controller(remote, 5).point("1"), Hcp2Controller(line.bus, 5).point("1")
+        assert await mine.read(max_age=60) == 0
+        group = await remote.poll_group("mine", period=60, points=[mine])
+        cycles = group.subscribe()
+        line.bus.groups[0].demand()
+        snapshot = await anext(cycles)
+        exchanges = line.bus.statistics().exchanges
+        assert mine.node.latest(mine) is snapshot[mine]
+        assert await mine.read(max_age=60) == 0
+        assert line.bus.statistics().exchanges == exchanges
+        await theirs.write(7)
+        assert await Hcp2Controller(remote, 6).read(1) == 0
+        assert mine.node.latest(mine) is None
+        assert await mine.read(max_age=60) == 7
+        group.close()
+        assert remote.latest(mine) is None
 
     on_a_served_line(tmp_path, story)

@@ -6,6 +6,7 @@ import asyncio
 import socket
 import termios
 from collections.abc import Iterator
+from math import inf
 from random import Random
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 from busmaster import Bus, Hcp2Controller, LineDown, MemoryPort, NoReply, SerialPort, TcpPort, WriteUnconfirmed
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import LineChange, LineChanged
+from busmaster.arbiter.state import LineState
 from busmaster.bus.node import Node
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
@@ -55,6 +57,7 @@ class Ledger:
         self.has = 0
         self.is_due = False
         self.is_over = False
+        self.due = inf
 
     # the port
 
@@ -77,7 +80,7 @@ class Ledger:
     # the arbiter
 
     out: bytes | None = None
-    state = None
+    state: LineState | None = None
 
     def poll_transmit(self) -> bytes | None:
         data, self.out = self.out, None
@@ -87,7 +90,7 @@ class Ledger:
         return None
 
     def poll_timeout(self) -> float:
-        return float("inf")
+        return self.due
 
     def line_up(self, now: float, *, paced: bool) -> None: ...
 
@@ -140,6 +143,20 @@ def test_what_has_not_left_is_asked_for_only_when_a_deadline_of_the_line_is_due(
     pump._on_time()
     timeout = ("timeout", 0.0, False)
     assert ledger.notes == [timeout, ("unsent", 2, 0.0), timeout, ("unsent", 0, 0.0), timeout]
+
+
+def test_what_has_left_when_a_hold_begins_is_not_asked_for_when_it_is_over(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    for held in (0, 2, 0):
+        ledger.out, ledger.state, ledger.has, ledger.is_due = b"05\x05", None, 0, False
+        pump.turn()
+        ledger.state, ledger.has, ledger.due = LineState.HOLDOFF, held, ledger.time + 1.0
+        pump.turn()
+        ledger.notes.clear()
+        ledger.time, ledger.is_due, ledger.due = ledger.time + 1.0, True, inf
+        pump._on_time()
+        asked = [("unsent", held, ledger.time)] * (held > 0)
+        assert ledger.notes == [*asked, ("timeout", ledger.time, False)]
 
 
 def test_what_lies_unread_is_looked_for_when_a_callers_time_is_over(ledger: Ledger) -> None:

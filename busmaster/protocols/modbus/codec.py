@@ -15,6 +15,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, ClassVar, Generic, TypeVar
 
 from busmaster.contract.arguments import whole_number
@@ -75,40 +76,44 @@ def with_crc(body: bytes) -> bytes:
     return body + crc.to_bytes(2, "little")
 
 
-class Conversation(Generic[T]):
-    """One attempt: the reply begins with `header`, then come `payload` bytes of which `decode` makes the value."""
+class Frames:
+    """What is said in a conversation, and what its reply looks like: `header`, then `payload` bytes and the CRC.
 
-    __slots__ = (
-        "_buffer",
-        "_decode",
-        "_header",
-        "_refusal",
-        "_size",
-        "answered",
-        "answers",
-        "request",
-        "sizes",
-        "starts",
-        "timing",
-    )
+    Those of a read are kept: to put a request together takes longer than all else that is done between the end of a
+    silence and the write.
+    """
+
+    __slots__ = ("answered", "answers", "header", "refusal", "request", "size", "sizes", "starts")
+
+    def __init__(self, body: bytes, header: bytes, payload: int) -> None:
+        self.request = with_crc(body)
+        self.header = header
+        self.answered = body[0] != BROADCAST
+        # it names no register: of two like reads only R15 tells the answers apart
+        self.answers = (header,) if self.answered else ()
+        self.starts = header[:1] if self.answered else b""
+        self.refusal = bytes((body[0], body[1] | REFUSED))
+        self.size = len(header) + payload + 2
+        self.sizes = Sizes(self.size, self.size) if self.answered else Sizes(0, 0)
+
+
+class Conversation(Generic[T]):
+    """One attempt. `decode` makes the value of the reply's payload."""
+
+    __slots__ = ("_buffer", "_decode", "_frames", "answered", "answers", "request", "sizes", "starts", "timing")
 
     later: ClassVar[Sequence[LaterLeg]] = ()
     closing: ClassVar[int] = 0
 
-    def __init__(
-        self, body: bytes, header: bytes, payload: int, timing: ReplyTiming, decode: Callable[[bytes], T]
-    ) -> None:
-        self.request = with_crc(body)
-        self.answered = body[0] != BROADCAST
+    def __init__(self, frames: Frames, timing: ReplyTiming, decode: Callable[[bytes], T]) -> None:
+        self._frames = frames
+        self.request = frames.request
+        self.answered = frames.answered
         # nobody answers a write to all: the units are left as long as an answer would take
         self.timing = timing if self.answered else replace(timing, turnaround=max(timing.turnaround, timing.nominal))
-        # it names no register: of two like reads only R15 tells the answers apart
-        self.answers = (header,) if self.answered else ()
-        self.starts = header[:1] if self.answered else b""
-        self._header = header
-        self._refusal = bytes((body[0], body[1] | REFUSED))
-        self._size = len(header) + payload + 2
-        self.sizes = Sizes(self._size, self._size) if self.answered else Sizes(0, 0)
+        self.answers = frames.answers
+        self.starts = frames.starts
+        self.sizes = frames.sizes
         self._decode = decode
         self._buffer = b""
 
@@ -118,8 +123,8 @@ class Conversation(Generic[T]):
 
     def feed(self, data: bytes, /) -> Step[T]:
         buffer = self._buffer = self._buffer + data
-        header, size = self._header, self._size
-        if buffer.startswith(self._refusal):
+        header, size = self._frames.header, self._frames.size
+        if buffer.startswith(self._frames.refusal):
             return self._refused(buffer)
         if not buffer.startswith(header) and not header.startswith(buffer):
             raise FrameError(
@@ -188,8 +193,8 @@ class ReadRegisters(_Read):
 
     def open(self, address: int, timings: Timings, /) -> Conversation[tuple[int, ...]]:
         """Begin the read. Raises InvalidCommand for the broadcast address: nobody would answer."""
-        decode = struct.Struct(f">{self.count}H").unpack
-        return _ask(address, READS[self.table], self.first, self.count, 2 * self.count, timings, decode)
+        frames = _read_frames(address, READS[self.table], self.first, self.count, 2 * self.count)
+        return Conversation(frames, timings.read, _registers(self.count))
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +213,8 @@ class ReadBits(_Read):
             states = int.from_bytes(payload, "little")  # the first is bit 0 of the first byte
             return tuple(bool(states >> place & 1) for place in range(self.count))
 
-        return _ask(address, READS[self.table], self.first, self.count, (self.count + 7) // 8, timings, decode)
+        frames = _read_frames(address, READS[self.table], self.first, self.count, (self.count + 7) // 8)
+        return Conversation(frames, timings.read, decode)
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,18 +282,23 @@ class WriteCoils:
         return _tell(header, timings, bytes((size,)) + states.to_bytes(size, "little"))
 
 
-def _ask(
-    unit: int, function: int, first: int, count: int, size: int, timings: Timings, decode: Callable[[bytes], T]
-) -> Conversation[T]:
+@lru_cache(maxsize=4096)
+def _read_frames(unit: int, function: int, first: int, count: int, size: int) -> Frames:
+    """Return the frames of a read that is answered by `size` bytes. Raises InvalidCommand for the broadcast address."""
     if unit == BROADCAST:
         raise InvalidCommand("nobody answers a read that goes to all: read one unit at a time")
-    body = struct.pack(">BBHH", unit, function, first, count)
-    return Conversation(body, bytes((unit, function, size)), size, timings.read, decode)
+    return Frames(struct.pack(">BBHH", unit, function, first, count), bytes((unit, function, size)), size)
+
+
+@lru_cache(maxsize=MOST_READ)
+def _registers(count: int) -> Callable[[bytes], tuple[int, ...]]:
+    """Return what makes numbers of so many registers."""
+    return struct.Struct(f">{count}H").unpack
 
 
 def _tell(header: bytes, timings: Timings, data: bytes = b"") -> Conversation[None]:
     """Begin a write: the unit says the first six bytes of it again."""
-    return Conversation(header + data, header, 0, timings.write, _nothing)
+    return Conversation(Frames(header + data, header, 0), timings.write, _nothing)
 
 
 def _places(table: str, first: int, count: int) -> tuple[Hashable, ...]:

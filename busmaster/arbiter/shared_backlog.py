@@ -1,0 +1,202 @@
+"""The backlog of a line that several programs share, and that is held for sequences of requests (R9)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from math import inf
+
+from busmaster.arbiter.backlog import SHARE, Backlog, new_queues
+from busmaster.arbiter.clients import OWN, Hold, LineClient, turn_of
+from busmaster.arbiter.deadlines import Deadlines
+from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo
+from busmaster.arbiter.transaction import COMMAND, FAILING, QUEUED, URGENT, Priority, Transaction
+from busmaster.arbiter.turns import Turns
+from busmaster.arbiter.writes import Writes
+
+URGENT_RUN = 16
+"""Urgent exchanges of one program in a row after which a waiting lower class gets one slot. The line's owner has no
+such limit."""
+
+
+class SharedBacklog(Backlog):
+    """A backlog in each of whose classes clients take turns. `hold` is for whom the line is held."""
+
+    __slots__ = ("_attempts", "_deadlines", "_last", "_payer", "_since", "_turns", "_writes", "hold")
+
+    def __init__(self, before: Backlog, writes: Writes, deadlines: Deadlines) -> None:
+        """Take over what waits in the backlog that a line had as long as it was its owner's alone."""
+        super().__init__()
+        self.hold: Hold | None = None
+        self._writes = writes
+        self._deadlines = deadlines
+        self._streak, self._rotated = before._streak, before._rotated
+        self._begin(before)
+        self._last: Transaction | None = None
+        """What was taken out last, when it had been sent so often:"""
+        self._attempts = 0
+        self._payer: tuple[Turns, LineClient] | None = None
+        """Who pays for the time of the line, and in which class, ever since:"""
+        self._since = -inf
+
+    def _begin(self, before: Backlog) -> None:
+        urgent, command, poll, background = before.queues
+        self._turns = (
+            Turns(urgent, Fifo),
+            Turns(command, Fifo),
+            Turns(poll, EarliestDeadlineFirst),
+            Turns(background, EarliestDeadlineFirst),
+        )
+        self.queues = self._turns
+
+    def waiting_of(self, priority: Priority, client: LineClient | None) -> int:
+        """Return how many transactions of this class wait that are this client's."""
+        return self._turns[priority].waiting_of(turn_of(client))
+
+    # what goes next
+
+    def pop(self, now: float) -> Transaction | None:
+        """Take out the next to go at the time `now`, or return None: of those of a hold alone, as long as one lasts."""
+        self.note_time(now)
+        urgent = self._turns[URGENT]
+        self._urgent_yields = urgent.live > 0 and len(self) > urgent.live and urgent.shortest_run() >= URGENT_RUN
+        transaction = super().pop(now) if self.hold is None else self._pop_within(self.hold, now)
+        while transaction is not None and (write := self._write_before(transaction)) is not None:
+            self.restore(transaction)
+            self.promote(write, transaction.priority)
+            transaction = super().pop(now)
+        return self._taken(transaction, now)
+
+    def _pop_within(self, hold: Hold, now: float) -> Transaction | None:
+        urgent, *lower = self._turns
+        if urgent.live and not self._urgent_yields:
+            return urgent.pop()
+        if now >= self._deadlines.hold:  # it ends next
+            return None
+        of_hold = (turns.pop_of(hold) for turns in lower)
+        return next((transaction for transaction in of_hold if transaction is not None), None)
+
+    def _write_before(self, transaction: Transaction) -> Transaction | None:
+        """Return a write that has to go before a read with which a sequence begins: once it has begun, it could not."""
+        hold = transaction.client
+        if not isinstance(hold, Hold) or hold.holds or transaction.writes:
+            return None
+        write = self._writes.first_of(transaction.node, hold.client)
+        if write is None or write.client is hold or write.phase is not QUEUED or write.queued > transaction.queued:
+            return None
+        return write
+
+    def _taken(self, transaction: Transaction | None, now: float) -> Transaction | None:
+        """Note what goes next, and who pays for it."""
+        if transaction is None:
+            self._last = None
+            hold = self.hold
+            self._payer = None if hold is None else (self._turns[hold.priority], hold.client)
+        else:
+            self._last, self._attempts = transaction, transaction.attempts
+            client = turn_of(transaction.client)
+            payer = client.client if isinstance(client, Hold) else client
+            self._payer = self._turns[transaction.priority], payer
+            self._count_run(transaction.priority, client)
+        self._since = now
+        return transaction
+
+    def _count_run(self, priority: Priority, client: LineClient) -> None:
+        urgent = self._turns[URGENT]
+        if priority is not URGENT:
+            urgent.begin_runs()
+        elif client is not OWN:
+            urgent.count_run(client)
+
+    def restore(self, transaction: Transaction) -> None:
+        """Put back what was popped last: it is the next to be popped, and its class keeps its turn."""
+        self._streak, self._rotated = self._streak_before, self._rotated_before
+        transaction.phase = QUEUED
+        self._turns[transaction.priority].give_back(transaction)
+
+    def pick(self, priority: Priority, suits: Callable[[Transaction], bool]) -> Transaction | None:
+        """Take out the first of the first few of a class that suits, or return None; the others keep their places."""
+        turns, hold = self._turns[priority], self.hold
+        if hold is None or priority is URGENT:
+            found = turns.pick(lambda one: self._write_before(one) is None and suits(one))
+        else:
+            found = turns.pick_of(hold, suits)
+        return found and self._taken(found, self._since)
+
+    def take(self, suits: Callable[[Transaction], bool]) -> Transaction | None:
+        """Take out one that suits, of whatever class, or return None: for what has to be asked now in any case."""
+        hold = self.hold
+
+        def may(one: Transaction) -> bool:
+            return hold is None or turn_of(one.client) is hold
+
+        found = super().take(lambda one: may(one) and self._write_before(one) is None and suits(one))
+        return found and self._taken(found, self._since)
+
+    # holds
+
+    def note_time(self, now: float) -> None:
+        """Have whoever had the line until now pay for it; a sequence of which a request was sent has begun."""
+        if self._payer is not None:
+            turns, client = self._payer
+            turns.charge(client, now - self._since)
+        last = self._last
+        if last is not None and last.attempts > self._attempts:
+            hold = last.client
+            if isinstance(hold, Hold) and not (hold.holds or hold.over):
+                self._hold_for(hold, last.priority)
+        self._since = now
+
+    def _hold_for(self, hold: Hold, priority: Priority) -> None:
+        hold.priority = priority
+        waiting = [transaction for turns in self._turns for transaction in turns if transaction.client is hold]
+        for transaction in waiting:
+            self._turns[transaction.priority].remove(transaction)
+        hold.holds = True
+        for transaction in waiting:
+            self._turns[transaction.priority].push(transaction)
+        self.hold = hold
+        self._deadlines.hold = self._since + hold.longest
+
+    def end_hold(self, hold: Hold, now: float) -> list[Transaction]:
+        """Hold the line no longer for a sequence. Returns what of it waits, which is not sent any more.
+
+        One lower exchange goes next, if any waits: sequences one after the other leave nobody out.
+        """
+        self.note_time(now)
+        left = list(self._left(hold))
+        for transaction in left:
+            if transaction.phase is QUEUED:
+                self.discard(transaction, FAILING)
+            else:
+                transaction.phase = FAILING
+        if hold.holds:
+            self.hold = None
+            self._deadlines.hold = inf
+            if hold.priority <= COMMAND:
+                self._streak = SHARE
+            if hold.priority == URGENT and hold.client is not OWN:
+                self._turns[URGENT].count_run(hold.client, URGENT_RUN)
+            self._payer = None if self._last is None else self._payer
+        for turns in self._turns:
+            turns.forget(hold)
+        hold.holds, hold.over = False, True
+        return left
+
+    def _left(self, hold: Hold) -> Iterator[Transaction]:
+        for turns in self._turns:
+            yield from (transaction for transaction in turns if transaction.client is hold)
+        yield from self._writes.parked_of(hold.node, hold)
+
+    def forget(self, client: LineClient) -> None:
+        """Keep nothing of a client that has gone, and has nothing waiting."""
+        for turns in self._turns:
+            turns.forget(client)
+
+    def drain(self) -> list[Transaction]:
+        """Take out everything that waits, in order of class; the backlog is empty afterwards."""
+        drained = [transaction for turns in self._turns for transaction in turns]
+        empty = Backlog()
+        empty.queues = new_queues()
+        self._begin(empty)
+        self._payer = self._last = None
+        return drained

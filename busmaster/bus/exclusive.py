@@ -1,0 +1,100 @@
+"""A node for one sequence of requests: nothing but what is urgent comes between them on its line."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Hashable
+from contextlib import AbstractAsyncContextManager
+from typing import Any, TypeVar, Unpack
+
+from busmaster.bus.limits import Limit
+from busmaster.bus.requester import CommandOptions, Requester
+from busmaster.bus.samples import Sample
+from busmaster.contract.arguments import seconds
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
+from busmaster.errors import Addressed, HoldEnded, InvalidCommand
+from busmaster.planning.merging import Merge
+
+T = TypeVar("T")
+LONGEST_HOLD = 5.0
+"""Seconds for which a line may be held for one sequence: nobody else is asked anything meanwhile."""
+
+
+def checked_hold(max_hold: float, label: str) -> float:
+    """Return `max_hold`, in seconds. Raises InvalidCommand, naming the node, unless it is above 0, and 5 at most."""
+    if not 0 < seconds(max_hold, f"{label}: max_hold") <= LONGEST_HOLD:
+        raise InvalidCommand(f"{label}: a line is held for {LONGEST_HOLD:g} s at most (max_hold), not {max_hold!r}")
+    return max_hold
+
+
+class HeldNode(ABC):
+    """A node as it is asked within one sequence: it is its node in all, but for `request`."""
+
+    def __init__(self, node: Requester) -> None:
+        self._node = node
+
+    @property
+    def line(self) -> str:
+        return self._node.line
+
+    @property
+    def label(self) -> str:
+        return self._node.label
+
+    @property
+    def address(self) -> int:
+        return self._node.address
+
+    @property
+    def profile(self) -> Profile:
+        return self._node.profile
+
+    @property
+    def stops(self) -> int:
+        return self._node.stops
+
+    def note_stop(self) -> None:
+        self._node.note_stop()
+
+    def now(self) -> float:
+        return self._node.now()
+
+    def latest(self, point: Hashable, /) -> Sample[Any] | None:
+        return self._node.latest(point)
+
+    def merge_reads(self, merge: Merge, /) -> None:
+        self._node.merge_reads(merge)
+
+    def limit(self, limit: Limit, /) -> None:
+        self._node.limit(limit)
+
+    def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
+        self._node.check(*commands, stop=stop)
+
+    def exclusive(self, *, max_hold: float = 0.5) -> AbstractAsyncContextManager[Requester]:
+        """Raise InvalidCommand: a sequence is no part of another."""
+        raise InvalidCommand(f"{self.label}: its line is held already: ask within the sequence that has begun")
+
+    @abstractmethod
+    async def request(
+        self,
+        command: Command[T],
+        /,
+        *,
+        touches: Command[Any] | None = None,
+        stops_seen: int | None = None,
+        stop: bool = False,
+        **options: Unpack[CommandOptions],
+    ) -> T:
+        """Run one command within the sequence, as `Requester.request`.
+
+        Raises HoldEnded once the line is no longer held, and sends nothing.
+        """
+        ...
+
+
+def hold_ended(node: Addressed, longest: float, command: Command[Any]) -> HoldEnded:
+    """Return the error for what is asked when the `longest` seconds for which the line was held at most are over."""
+    what = f"the {longest:g} s for which the line was held for it are over, or its block was left"
+    return HoldEnded(what, node=node, command=str(command))

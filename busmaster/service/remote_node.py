@@ -1,0 +1,196 @@
+"""One node of a line that another program owns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractAsyncContextManager
+from dataclasses import replace
+from typing import Any, Protocol, TypeVar, Unpack
+
+from busmaster.bus.exclusive import checked_hold
+from busmaster.bus.limits import Limit
+from busmaster.bus.points import Point
+from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, Requester, RequestOptions
+from busmaster.bus.samples import Sample
+from busmaster.contract.exchange import Command
+from busmaster.contract.profile import Profile
+from busmaster.errors import InvalidCommand
+from busmaster.planning.merging import Merge
+from busmaster.service.link import Link
+from busmaster.service.messages import value_of
+from busmaster.service.sequences import HoldsLine, Room, held_remotely, shortened
+from busmaster.service.telling import protocol_of
+
+T = TypeVar("T")
+LEFT_OUT = ("verify", "safe")
+"""Options that are of no use on another's line: where they are said, they are false."""
+
+
+class Home(HoldsLine, Protocol):
+    """The line of a remote node."""
+
+    @property
+    def address(self) -> str: ...
+
+    @property
+    def line(self) -> str: ...
+
+    @property
+    def room(self) -> Room: ...
+
+    def opened(self, node: RemoteNode, command: Command[Any], /) -> Link:
+        """Return the connection for a request. Raises BusClosed, naming it, before the line is entered."""
+        ...
+
+    def prepare(self, node: RemoteNode, commands: tuple[Command[Any], ...], stop: bool, /) -> None:
+        """Have these writes checked when the line is entered, if it is not yet."""
+        ...
+
+    def now(self) -> float: ...
+
+    def latest(self, point: Point[T], /) -> Sample[T] | None: ...
+
+
+class RemoteNode:
+    """One node of a line that another program owns. Handles and points work on it as on a node of this process."""
+
+    def __init__(self, bus: Home, profile: Profile, address: int) -> None:
+        self.stops = 0
+        """How often it was told to stop, by whatever program, since this one named it."""
+        self.label = profile.label(address)
+        self._bus = bus
+        self._profile = profile
+        self._address = address
+        self._protocol = protocol_of(profile.name)
+
+    @property
+    def line(self) -> str:
+        """Return the name of its line's port."""
+        return self._bus.line
+
+    @property
+    def address(self) -> int:
+        return self._address
+
+    @property
+    def profile(self) -> Profile:
+        return self._profile
+
+    def __repr__(self) -> str:
+        return f"<RemoteNode {self.profile.name} {self.address} of {self._bus.address}>"
+
+    def note_stop(self) -> None:
+        """Tell the line that this node is being told to stop, ahead of whatever is asked of it from now on."""
+        self.stops += 1
+        self._bus.link.tell("stop", {"protocol": self.profile.name, "address": self.address})
+
+    def now(self) -> float:
+        """Return the time of the line's clock, in seconds: that of its owner's machine."""
+        return self._bus.now()
+
+    def latest(self, point: Any, /) -> Sample[Any] | None:
+        """Return the youngest good sample of a point in this program's poll groups, unless a write, by whatever
+        program, has made it stale: any write to the node does."""
+        return self._bus.latest(point)
+
+    def merge_reads(self, merge: Merge, /) -> None:
+        """Have the profile propose `merge`. What is merged on the line is its owner's affair."""
+        self._profile = replace(self._profile, merge=merge)
+
+    def limit(self, limit: Limit, /) -> None:
+        """Raise InvalidCommand: limits are held by the program that owns the line, for all programs."""
+        raise InvalidCommand(f"{self.label}: limits are held by the program that owns the line: set {limit.name} there")
+
+    def check(self, *commands: Command[Any], stop: bool | None = None) -> None:
+        """Have the line check these writes when the bus is entered: entering raises InvalidCommand for a bad one.
+
+        Later it does nothing: the line checks each write as it comes. Of several, those before a bad one are written.
+        """
+        self._bus.prepare(self, commands, stop is True)
+
+    async def request(
+        self,
+        command: Command[T],
+        /,
+        *,
+        touches: Command[Any] | None = None,
+        stops_seen: int | None = None,
+        stop: bool = False,
+        **options: Unpack[CommandOptions],
+    ) -> T:
+        """Run one command on the line and return its value: as `Requester.request`, with the same errors.
+
+        If the connection is lost meanwhile, a write raises WriteUnconfirmed, or NotStarted where it was not handed over
+        yet, and a read LineDown. Cancelling it cancels it there.
+        """
+        return await self.ask(command, None, touches=touches, stops_seen=stops_seen, stop=stop, **options)
+
+    async def ask(
+        self,
+        command: Command[T],
+        sequence: int | None,
+        /,
+        *,
+        touches: Command[Any] | None,
+        stops_seen: int | None,
+        stop: bool,
+        **options: Unpack[CommandOptions],
+    ) -> T:
+        """Do what `request` does, within a sequence of this program, if it is given the number of one."""
+        chosen = RequestOptions.of(options, self.label) if options else ORDINARY
+        if chosen.verify:
+            raise InvalidCommand(f"{self.label}: verify is for what writes a value through a handle")
+        if chosen.safe:
+            raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
+        link, room = self._bus.opened(self, command), self._bus.room
+        # What is of a sequence waits for nothing else of this program, which waits for the sequence.
+        waits = sequence is None and chosen.priority is not Priority.URGENT
+        waited = await room.take(chosen, self, command) if waits else 0.0
+        try:
+            left: Mapping[str, Any] = {**options, **shortened(chosen, waited)} if waited else options
+            params = self._said(command, left, touches, stops_seen, stop)
+            if sequence is not None:
+                params["sequence"] = sequence
+            asked = link.ask("request", params, writes=command.writes, node=self, command=command)
+            value: T = value_of(await link.answer(asked, left.get("finish_within")))
+            return value
+        finally:
+            if waits:
+                room.give_back()
+
+    def exclusive(self, *, max_hold: float = 0.5) -> AbstractAsyncContextManager[Requester]:
+        """Return, for `async with`, this node for one sequence of requests: see `Requester.exclusive`.
+
+        The line is held no longer than the connection lasts.
+        """
+        return held_remotely(self, self._bus, checked_hold(max_hold, self.label))
+
+    def _said(
+        self,
+        command: Command[Any],
+        options: Mapping[str, Any],
+        touches: Command[Any] | None,
+        stops_seen: int | None,
+        stop: bool,
+    ) -> dict[str, Any]:
+        params: dict[str, Any] = {
+            "protocol": self._profile.name,
+            "address": self._address,
+            "command": self._protocol.write_down(command),
+            "asked": self._bus.now(),
+        }
+        if touches is not None:
+            params["touches"] = self._protocol.write_down(touches)
+        if stops_seen is not None:
+            params["stops_seen"] = stops_seen
+        if stop:
+            params["stop"] = True
+        if options:
+            given = {name: value for name, value in options.items() if value is not None}
+            params["options"] = {name: given[name] for name in given if name not in LEFT_OUT}
+        return params
+
+    def said_check(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
+        """Return writes of this node as the line is asked whether it would take them."""
+        said = [self._protocol.write_down(command) for command in commands]
+        return {"protocol": self.profile.name, "address": self.address, "commands": said, "stop": stop}

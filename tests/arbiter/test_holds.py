@@ -1,0 +1,333 @@
+"""A sequence of requests that the line is held for: nothing but URGENT comes between (R9)."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.arbiter.clients import Hold, LineClient
+from busmaster.arbiter.state import LineState
+from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.errors import HoldEnded, LineDown, NoReply, Superseded, WriteUnconfirmed
+from busmaster.protocols.hcp2 import codec as hcp2
+from tests.arbiter.bench import Bench, lost, request_of, up
+
+WRITE = hcp2.Write(1, (5.0,))
+LONGEST = 0.5
+URGENT, COMMAND, POLL, BACKGROUND = Priority
+
+
+class Table:
+    """A line with two nodes that are up; the first may be held."""
+
+    def __init__(self) -> None:
+        self.bench = bench = Bench()
+        self.arbiter = bench.arbiter
+        self.node, self.there = up(bench), up(bench, 2)
+        self.answered: list[Transaction] = []
+
+    def hold(self, client: LineClient | None = None, longest: float = LONGEST) -> Hold:
+        return self.arbiter.exclusive(self.node, client, longest)
+
+    def release(self, hold: Hold) -> None:
+        self.arbiter.release(hold, self.bench.now)
+        self.bench.listen()
+
+    def ask_one_of_each(self, client: LineClient | None = None) -> list[Transaction]:
+        """What is not to come between, of each class below URGENT."""
+        asked = [
+            self.bench.ask(node, hcp2.Read(20 + priority), priority=priority, client=client)
+            for node in (self.node, self.there)
+            for priority in (COMMAND, POLL, BACKGROUND)
+        ]
+        return [*asked, self.bench.ask(self.node, hcp2.Write(9, (1.0,)), client=client)]
+
+    def is_silent(self, seconds: float = 0.1) -> bool:
+        """Nothing is said for so long."""
+        self.bench.wait(seconds)
+        return not self.bench.sent()
+
+
+@pytest.mark.parametrize("client", [None, LineClient()])
+@pytest.mark.parametrize("other", [None, LineClient()])
+def test_r9_nothing_comes_between_a_write_and_the_read_that_confirms_it(
+    client: LineClient | None, other: LineClient | None
+) -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(client)
+    write = bench.ask(table.node, WRITE, client=hold)
+    others = table.ask_one_of_each(other)
+    bench.served(write)
+    assert table.is_silent(), "the line waits for what the program asks next"
+    assert table.arbiter.state is LineState.READY
+    read = bench.ask(table.node, hcp2.Read(1), client=hold)
+    bench.served(read)
+    assert read.started > write.ended_at
+    assert table.is_silent()
+    assert not any(other.attempts for other in others)
+    table.release(hold)
+    for one in others:
+        bench.served(one)
+        assert one.error is None
+
+
+def test_r9_an_urgent_request_comes_between() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    bench.served(bench.ask(table.node, WRITE, client=hold))
+    stop = bench.ask(table.there, hcp2.Write(2, (0.0,)), priority=URGENT, client=LineClient())
+    bench.served(stop)
+    assert stop.error is None
+    held = bench.ask(table.node, hcp2.Read(1), client=hold)
+    assert bench.served(held).error is None
+
+
+def test_r7_an_urgent_write_supersedes_those_of_a_sequence_too() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    bench.ask(table.there)
+    write = bench.ask(table.node, WRITE, client=hold)
+    stop = bench.ask(table.node, hcp2.Write(2, (0.0,)), priority=URGENT)
+    assert isinstance(write.error, Superseded)
+    bench.served(stop)
+    table.release(hold)
+    assert table.arbiter.dispatcher.backlog.waiting(COMMAND) == 0
+
+
+def test_a_sequence_begins_in_its_turn_with_the_first_request_that_is_sent() -> None:
+    table = Table()
+    bench = table.bench
+    before = [bench.ask(table.there, hcp2.Read(n + 1)) for n in range(3)]
+    hold = table.hold()
+    held = bench.ask(table.node, WRITE, client=hold)
+    behind = bench.ask(table.there, hcp2.Read(9))
+    for one in before:
+        bench.served(one)
+        assert not hold.holds
+    bench.served(held)
+    assert hold.holds
+    assert table.is_silent()
+    assert not behind.attempts
+
+
+def test_a_sequence_ends_when_its_time_is_over_and_what_it_asks_then_is_not_sent() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    bench.served(bench.ask(table.node, WRITE, client=hold))
+    other = bench.ask(table.there)
+    assert table.is_silent(LONGEST / 2)
+    bench.wait(LONGEST / 2)
+    assert other.attempts == 1
+    assert hold.over
+    bench.served(other)
+
+
+def test_a_sequence_that_goes_on_asking_ends_all_the_same() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    began = bench.now
+    other = bench.ask(table.there, hcp2.Read(30), priority=BACKGROUND)
+    while not other.attempts:
+        if hold.over:
+            bench.until_sent()
+            break
+        read = bench.ask(table.node, hcp2.Read(1 + bench.checks), client=hold)
+        bench.served(read)
+        bench.wait(0.03)
+    bench.served(other)
+    assert other.started - began <= LONGEST + 0.2
+
+
+def test_what_waits_of_a_sequence_whose_time_is_over_ends_truthfully() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(longest=0.1)
+    bench.served(bench.ask(table.node, WRITE, client=hold))
+    unanswered = bench.ask(table.node, WRITE, client=hold, idempotent=True, retries=5)
+    waits = bench.ask(table.node, hcp2.Read(1), client=hold)
+    parked = bench.ask(table.node, WRITE, client=hold)
+    bench.until_sent()
+    bench.sent()
+    bench.wait(0.3)
+    assert isinstance(unanswered.error, WriteUnconfirmed)
+    assert unanswered.attempts == 1, "not repeated when others may have come between"
+    assert isinstance(waits.error, HoldEnded)
+    assert isinstance(parked.error, HoldEnded)
+    assert "node 1" in str(waits.error)
+    assert "0.1 s" in str(waits.error)
+    assert "max_hold" in str(waits.error)
+    assert not table.arbiter.dispatcher.writes.queues[table.node]
+
+
+def test_what_fails_within_a_sequence_is_repeated_within_it() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(longest=5.0)
+    read = bench.ask(table.node, hcp2.Read(1), client=hold)
+    others = table.ask_one_of_each()
+    bench.until_sent()
+    bench.sent()
+    bench.until_sent()  # settled; a check, or again
+    bench.served(read)
+    assert read.error is None
+    assert read.attempts == 2
+    assert not any(other.attempts for other in others)
+
+
+def test_r15_only_what_proves_that_the_line_is_in_step_comes_between() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(longest=5.0)
+    lost(bench, table.there, hcp2.Read(1))
+    others = table.ask_one_of_each()
+    bench.served(others[0])
+    first = bench.ask(table.node, hcp2.Read(1), client=hold)
+    bench.served(first)
+    checks = table.arbiter.statistics(bench.now).checks
+    gone = [one.attempts for one in others]
+    for n in range(3):
+        bench.served(bench.ask(table.node, hcp2.Read(n + 1), client=hold))
+    assert [one.attempts for one in others] == gone
+    assert table.arbiter.statistics(bench.now).checks >= checks
+
+
+def test_r9_sequences_of_one_program_in_a_row_alternate_with_the_requests_of_all_others() -> None:
+    table = Table()
+    bench = table.bench
+    one, other = table.arbiter.add_client(), table.arbiter.add_client()
+    own = [bench.ask(table.there, hcp2.Read(n + 1)) for n in range(20)]
+    theirs = [bench.ask(table.there, hcp2.Read(n + 1), client=other) for n in range(20)]
+    polled = [bench.ask(table.there, hcp2.Read(n + 1), priority=POLL) for n in range(20)]
+    for n in range(1, 4):
+        hold = table.hold(one)
+        bench.served(bench.ask(table.node, WRITE, client=hold))
+        bench.wait(0.2)
+        bench.served(bench.ask(table.node, hcp2.Read(1), client=hold))
+        table.release(hold)
+        for queue in (own, theirs, polled):
+            assert sum(transaction.attempts for transaction in queue) >= n - 1
+    for queue in (own, theirs, polled):
+        assert any(bench.ended(transaction) for transaction in queue)
+
+
+def test_r10_polls_that_were_due_meanwhile_are_counted_as_missed() -> None:
+    table = Table()
+    bench = table.bench
+    poll = bench.poll(table.there, 0.05, 7)
+    hold = table.hold()
+    bench.served(bench.ask(table.node, WRITE, client=hold))
+    assert table.is_silent(0.3)
+    assert poll.missed >= 4
+    table.release(hold)
+    cycles = len(bench.cycles)
+    bench.until_sent()
+    bench.answer()
+    assert len(bench.cycles) == cycles + 1
+
+
+def test_r6_a_caller_of_a_sequence_may_go() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    write = bench.ask(table.node, WRITE, client=hold)
+    other = bench.ask(table.there)
+    table.arbiter.cancel(write, bench.now)
+    table.release(hold)
+    bench.answer()
+    bench.served(other)
+    assert other.error is None
+
+
+def test_r8_what_waits_of_a_sequence_that_is_left_before_it_began_ends_once() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    other = bench.ask(table.there)
+    waiting = [bench.ask(table.node, command, client=hold) for command in (WRITE, hcp2.Read(1), WRITE)]
+    table.release(hold)
+    bench.served(other)
+    assert table.is_silent()
+    for transaction in waiting:
+        assert bench.ended(transaction) == 1
+        assert isinstance(transaction.error, HoldEnded)
+    assert bench.served(bench.ask(table.node, WRITE)).error is None
+
+
+def test_a_sequence_that_never_sent_anything_held_nothing() -> None:
+    table = Table()
+    hold = table.hold()
+    table.release(hold)
+    assert table.bench.served(table.bench.ask(table.node)).error is None
+
+
+def test_r8_a_lost_line_ends_what_waits_of_a_sequence_and_what_waits_for_it() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    bench.served(bench.ask(table.node, WRITE, client=hold))
+    others = table.ask_one_of_each()
+    held = bench.ask(table.node, hcp2.Read(1), client=hold)
+    more = bench.ask(table.node, WRITE, client=hold)
+    table.arbiter.line_down("pulled out", bench.now)
+    bench.listen()
+    for transaction in (*others, held, more):
+        assert bench.ended(transaction) == 1
+        assert isinstance(transaction.error, LineDown)
+    table.arbiter.line_up(bench.now)
+    table.release(hold)
+    bench.until_ready()
+    assert bench.served(bench.ask(table.there)).error is None
+
+
+@pytest.mark.parametrize("begins_with", [WRITE, hcp2.Read(1)])
+def test_r7_a_sequence_does_not_overtake_an_earlier_write_of_its_program_to_the_node(
+    begins_with: hcp2.Write | hcp2.Read,
+) -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(longest=5.0)
+    earlier = bench.ask(table.node, hcp2.Write(3, (7.0,)), idempotent=True, retries=3)
+    first = bench.ask(table.node, begins_with, client=hold)
+    second = bench.ask(table.node, WRITE, client=hold)
+    bench.until_sent()
+    bench.sent()  # the earlier one is lost, and is to be repeated behind the others of its class
+    bench.served(second)
+    assert bench.ended(earlier) == 1
+    assert earlier.error is None
+    assert earlier.attempts == 2
+    assert earlier.started < first.started < second.started
+
+
+def test_r7_a_write_of_the_program_that_waited_for_a_sequence_goes_when_it_is_over() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    bench.ask(table.there)
+    held = bench.ask(table.node, WRITE, client=hold)
+    waits = bench.ask(table.node, hcp2.Write(2, (3.0,)), idempotent=True)
+    bench.served(held)
+    assert table.is_silent()
+    table.release(hold)
+    bench.served(waits)
+    assert waits.error is None
+
+
+def test_a_dead_node_is_not_held() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    table.arbiter.dispatcher.suspend(table.node, bench.now + 60.0)
+    held = bench.ask(table.node, WRITE, client=hold)
+    other = bench.ask(table.there)
+    assert bench.ended(held) == 1
+    bench.served(other)
+    assert not hold.holds
+
+
+def test_a_read_that_is_never_answered_within_a_sequence_ends_as_ever() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(longest=5.0)
+    read = bench.ask(table.node, hcp2.Read(1), client=hold, retries=0)
+    bench.until_sent()
+    bench.sent()
+    bench.wait(0.3)
+    assert isinstance(read.error, NoReply)
+    table.release(hold)
+    assert bench.served(bench.ask(table.there, hcp2.Read(5))).phase is Phase.ENDED
+
+
+def test_the_request_of_a_sequence_is_that_of_its_node() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    bench.ask(table.node, hcp2.Read(3), client=hold)
+    assert bench.sent() == request_of(3)
