@@ -9,7 +9,7 @@ import click
 from busmaster.cli.app import OK
 from busmaster.cli.doors import door_options, following, place_of
 from busmaster.cli.ending import until_ended
-from busmaster.cli.output import Level, note
+from busmaster.cli.output import note
 from busmaster.config.service import read_tokens
 from busmaster.service.tcp import is_loopback
 
@@ -66,8 +66,5 @@ def command(
     def opened(url: str) -> None:
         note(f"OPC UA clients find it at {url}")
 
-    def tell(text: str) -> None:
-        note(text, Level.WARNING)
-
-    until_ended(serve, followed, rules, listen, opened, tell, pair)
+    until_ended(serve, followed, rules, listen, opened, note, pair)
     return OK

@@ -53,13 +53,14 @@ class Shown:
 
     row: Row
     variable: Variable
+    writable: bool = False
     read: float = -inf
 
 
 class LineServer:
     """Shows a line that another program owns to OPC UA clients, and hands on what they write.
 
-    `tell` is called with a sentence for each write that was not confirmed.
+    `tell` is called with a line for each write: who asked for it, and what became of it.
     """
 
     def __init__(self, server: Server, line: Following, rules: Rules, tell: Callable[[str], None]) -> None:
@@ -121,6 +122,7 @@ class LineServer:
                 await self._health.show_objects()
         except (BusError, InvalidCommand) as error:  # the line's program goes away at this moment, and says so next
             logging.getLogger("busmaster.opcua").info("%s", error)
+            self._new_rows = True
         await self._health.show()
 
     async def _show_points(self, remote: RemoteBus) -> None:
@@ -155,15 +157,19 @@ class LineServer:
         if shown is None:
             if len(self._points) >= MOST_POINTS:
                 return
-            holder = self._keys.setdefault(row.key, identity)
-            # two protocols may speak to one address
-            key = row.key if holder == identity else f"{row.protocol}:{row.key}"
+            key = self._key_of(row, identity)
             node = await self._health.node(row.protocol, row.address, row.node)
             variable = await self._space.point(key, row.item, node, f"{row.name} ({details['command']})")
             shown = self._points[identity] = self._by_id[variable.place] = Shown(row, variable)
         shown.row = row
-        writable = row.writable and self._rules.may_be_written(row.key)
-        await shown.variable.describe(unit=row.unit, range_=range_of(details, row.item), writable=writable)
+        named = self._keys[row.key] == identity  # what has the name of another would be written there
+        shown.writable = named and row.writable and self._rules.may_be_written(row.key)
+        await shown.variable.describe(unit=row.unit, range_=range_of(details, row.item), writable=shown.writable)
+
+    def _key_of(self, row: Row, identity: Identity) -> str:
+        """Return what a point is found by: its key, unless another has that, for two protocols may share an address."""
+        holder = self._keys.setdefault(row.key, identity)
+        return row.key if holder == identity else f"{row.protocol}:{row.key}"
 
     # values
 
@@ -182,10 +188,13 @@ class LineServer:
 
     async def _take(self, name: str, snapshot: Snapshot) -> None:
         self._heard[name] = snapshot.finished
+        taken: set[Identity] = set()
         for count, (point, sample) in enumerate(snapshot.items(), 1):
-            shown = self._points.get((point.node.profile.name, point.node.address, point.item))
-            if shown is None or shown.row.group != name:
+            identity = point.node.profile.name, point.node.address, point.item
+            shown = self._points.get(identity)
+            if shown is None or shown.row.group != name or identity in taken:
                 continue
+            taken.add(identity)
             shown.read = sample.finished
             try:
                 await shown.variable.put(sample.value, status_of_sample(sample), sample.wall)
@@ -235,10 +244,11 @@ class LineServer:
         told, row = wanted.Value, shown.row
         if wanted.IndexRange or (told.StatusCode is not None and told.StatusCode.value != GOOD):
             return NO_SUCH_WRITE
-        if not row.writable or not self._rules.may_be_written(row.key) or self._line.read_only:
+        if not shown.writable or self._line.read_only:
             return NOT_WRITABLE
+        who = f"user {user.name}" if user.name else "an anonymous user"
         if refusal := self._rules.refusal(user):
-            self._tell(f"{row.key} was not written: {refusal}")
+            self._tell(f"{who}: {row.key} was not written: {refusal}")
             return ACCESS_DENIED
         value = _value(told.Value)
         if not _fits(told.Value, value, shown.variable.kind):
@@ -246,8 +256,9 @@ class LineServer:
         try:
             await self._line.write(row.group, row.key, value)
         except (BusError, InvalidCommand) as error:
-            self._tell(f"{row.key} = {value}: {error}")
+            self._tell(f"{who}: {row.key} = {value}: {error}")
             return status_of_write(error)
+        self._tell(f"{who}: {row.key} = {value}: written")
         return status_of_write(None)
 
 

@@ -41,7 +41,7 @@ TOKEN = "0123456789abcdef"
 
 
 def sample(error: BusError | None, quality: Quality) -> Sample[Any]:
-    timeline = Timeline(*(0.0 for _ in Timeline._fields))
+    timeline = Timeline(*[0] * len(Timeline._fields))
     return Sample(None if error else 1.0, error, 0.0, 0.0, 0.0, quality, timeline, 0.0)
 
 
@@ -96,7 +96,8 @@ def test_a_quantity_that_was_whole_by_chance_stays_a_double() -> None:
     assert widened(KINDS.Double, 7) is KINDS.Double
     assert widened(KINDS.Double, "x") is KINDS.String
     assert variant_of(7, KINDS.Double).Value == 7.0
-    for nothing in (None, (), {}, (1, "x")):
+    nothings: tuple[Any, ...] = (None, (), {}, (1, "x"))
+    for nothing in nothings:
         with pytest.raises(TypeError):
             type_of(nothing)
 
