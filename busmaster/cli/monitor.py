@@ -77,7 +77,8 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
     overheard = Overheard(kind.protocol, points)
 
     def show(snapshot: Snapshot) -> None:
-        emit_all([json_line(**cycle_fields(snapshot, snapshot.wall_at))] if as_json else plain_values(snapshot))
+        fields = {**cycle_fields(snapshot, snapshot.wall_at), "time": utc(snapshot.wall_at(snapshot.finished))}
+        emit_all([json_line(**fields)] if as_json else plain_values(snapshot))
 
     async def tell(events: Stream[BusEvent]) -> None:
         async for event in events:

@@ -11,12 +11,13 @@ from typing import Any
 import anyio
 import click
 
+from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.snapshots import Snapshot
-from busmaster.cli.app import OK
+from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import Connection, View, connected, nodes_option, viewed
 from busmaster.cli.ending import until_ended
-from busmaster.cli.output import emit_all, note
+from busmaster.cli.output import Level, emit_all, note
 from busmaster.cli.parsing import option_type, parse_items, parse_seconds
 from busmaster.cli.protocols import ItemCommand
 from busmaster.cli.reaching import reach
@@ -59,7 +60,15 @@ async def poll(
     async with bus:
         watch = Watch(bus, "busmaster poll", view)
         watch.add(bus.poll_group("poll", period=period, points=points))
-        return await follow(watch)
+        status = await follow(watch)
+        return status or ended(any(handle.node.statistics().ok for handle in handles if isinstance(handle.node, Node)))
+
+
+def ended(values: bool) -> int:
+    """Return the exit status of a poll that came to its end, and say so if it was in vain."""
+    if not values:
+        note("no value came", Level.ERROR)
+    return OK if values else FAILED
 
 
 class Cycles:
@@ -69,6 +78,8 @@ class Cycles:
         self.start = remote.now()
         self._view = view
         self._last: Snapshot | None = None
+        self.values = False
+        """Whether there were any."""
         self._started: deque[float] = deque(maxlen=KEPT)
 
     def since(self, time: float) -> float:
@@ -79,9 +90,10 @@ class Cycles:
         """Print every cycle, in a thread: a reader that is slow loses cycles of its own."""
         async for snapshot in group:
             self._last = snapshot
+            self.values = self.values or any(sample.error is None for sample in snapshot.samples.values())
             if snapshot.started is not None:
                 self._started.append(snapshot.started)
-            lines = [json_cycle(self, snapshot)] if self._view.as_json else list(plain_cycle(self, snapshot))
+            lines = [json_cycle(self, snapshot)] if self._view.as_json else list(plain_cycle(snapshot))
             await anyio.to_thread.run_sync(emit_all, lines, abandon_on_cancel=True)
 
     def summarise(self) -> None:
@@ -108,4 +120,4 @@ async def poll_served(remote: RemoteBus, points: Sequence[Point[Any]], period: f
                 await remote.groups()  # it ended without us: this says why
     finally:
         cycles.summarise()
-    return OK
+    return ended(cycles.values)

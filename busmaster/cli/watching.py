@@ -27,7 +27,7 @@ from busmaster.cli.top import what_is_missing
 from busmaster.doctor import uart
 from busmaster.errors import BusError, InvalidCommand
 from busmaster.gate.gate import Gate
-from busmaster.outputs.values import cycle_fields, event_text
+from busmaster.outputs.values import cycle_fields, event_text, utc
 from busmaster.service.service import Service
 
 LINE = ""
@@ -186,15 +186,16 @@ class Clock(Protocol):
 
 
 def json_cycle(watch: Clock, snapshot: Snapshot) -> str:
-    """Return a cycle as one JSON object."""
-    return json_line(**cycle_fields(snapshot, watch.since))
+    """Return a cycle as one JSON object: its times are in seconds since the start, but for `time`, when it was over."""
+    return json_line(**cycle_fields(snapshot, watch.since), time=utc(snapshot.wall_at(snapshot.finished)))
 
 
-def plain_cycle(watch: Clock, snapshot: Snapshot) -> Iterator[str]:
-    """Yield a line a sample: seconds since the start, node and item, the value, or what went wrong."""
+def plain_cycle(snapshot: Snapshot) -> Iterator[str]:
+    """Yield a line a sample: the time of day at the end of its cycle, node and item, the value, or what went wrong."""
+    time = utc(snapshot.wall_at(snapshot.finished))
     for point, sample in snapshot.samples.items():
         value = error_text(sample.error) if sample.error else value_text(sample.value, point.meaning.precision)
-        yield f"{snapshot.finished - watch.start:.3f} {point.key} {value}"
+        yield f"{time} {point.key} {value}"
 
 
 def error_text(error: BusError) -> str:
@@ -204,7 +205,7 @@ def error_text(error: BusError) -> str:
 
 def print_cycle(watch: Watch, snapshot: Snapshot) -> None:
     """Print one cycle, as JSON or as plain lines."""
-    lines = [json_cycle(watch, snapshot)] if watch.view.as_json else plain_cycle(watch, snapshot)
+    lines = [json_cycle(watch, snapshot)] if watch.view.as_json else plain_cycle(snapshot)
     emit_all(lines) if watch.output is None else watch.output.print(lines)
 
 

@@ -302,9 +302,13 @@ class Hunt:
         self, node: NodeRecord, command: Command[Any], asked: Asked, priority: Priority, **options: Any
     ) -> Transaction:
         asked.elements = elements_of(command)
-        asked.urgent_ahead = self.world.arbiter.dispatcher.backlog.waiting(Priority.URGENT)
-        if self.sharing is not None:
-            options.setdefault("client", self.sharing.client_of(asked.client))
+        backlog = self.world.arbiter.dispatcher.backlog
+        if self.sharing is None:
+            asked.urgent_ahead = backlog.waiting(Priority.URGENT)
+        else:
+            client = options.setdefault("client", self.sharing.client_of(asked.client))
+            asked.urgent_ahead = backlog.waiting_of(Priority.URGENT, client)
+            asked.rivals = len(self.sharing.clients) - 1
         transaction = Transaction(node, command, priority=priority, tag=asked, **options)
         self.open[transaction] = None
         if self._record is not None:

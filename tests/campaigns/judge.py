@@ -17,6 +17,7 @@ from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.events import NodeChanged
 from busmaster.arbiter.health import DOWN_AFTER_FAILURES, Health
 from busmaster.arbiter.transaction import Phase, Poll, Priority, Transaction
+from busmaster.arbiter.turns import PASSED_BY_EACH
 from busmaster.contract.exchange import Command
 from busmaster.errors import BacklogFull, NotStarted, Refused, WriteUnconfirmed
 from busmaster.protocols.msc import codec as msc
@@ -37,6 +38,9 @@ class Asked:
     elements: tuple[int, ...] = ()
     written: Written | None = None
     urgent_ahead: int = 0
+    """Of its own program."""
+    rivals: int = 0
+    """Other programs on the line."""
     then: Callable[[Transaction], None] | None = None
     """What its caller does when it has ended."""
 
@@ -283,10 +287,11 @@ class Judge:
             self.count_problem(f"WRONG: {what}")
 
     def _check_wait(self, transaction: Transaction, asked: Asked) -> None:
-        """R9: an urgent read waits for the exchange on the wire, for what is ahead in its class, and for the few that
-        may go before each of those (R15)."""
+        """R9: an urgent read waits for the exchange on the wire, for what is ahead in its class, for the turns of other
+        programs before each of those and itself, and for the few that may go before any of them (R15)."""
         ahead = transaction.exchanges_ahead
-        most = 1 + MOST_BEFORE + (1 + MOST_BEFORE) * asked.urgent_ahead
+        turn = 1 + PASSED_BY_EACH * asked.rivals
+        most = 1 + MOST_BEFORE + (1 + MOST_BEFORE) * ((asked.urgent_ahead + 1) * turn - 1)
         if transaction.priority is Priority.URGENT and not transaction.writes and ahead > most:
             self.problem(f"R9: {ahead} exchanges went before an urgent one")
         late = self.mix.stands is not None and self.mix.stands.process  # it was told in time, and then stood still

@@ -95,6 +95,7 @@ class Ledger:
     _answers: dict[int, Answer] = field(default_factory=dict)
     _written: dict[int, Written] = field(default_factory=dict)
     _old: deque[int] = field(default_factory=deque)
+    _old_writes: deque[tuple[int, Written]] = field(default_factory=deque)
     _frames: deque[Frame] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     _damage: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     _unasked_at: float = -inf
@@ -113,7 +114,6 @@ class Ledger:
         if len(self._old) > REMEMBERED:
             old = self._old.popleft()
             self._answers.pop(old, None)
-            self._written.pop(old, None)
         return number
 
     def said_for(self, number: int) -> Answer | None:
@@ -131,8 +131,16 @@ class Ledger:
         return number
 
     def sending(self, number: int, node: int | None, elements: tuple[int, ...], by: object = None) -> Written:
-        """It is going to be written. Must be told in the order in which the writes are submitted."""
+        """It is going to be written. Must be told in the order in which the writes are submitted.
+
+        Writes are remembered longer than what was read: one of a program that asks much may wait for minutes.
+        """
         written = self._written[number] = Written(node, elements, self._given, by)
+        self._old_writes.append((number, written))
+        if len(self._old_writes) > REMEMBERED:
+            old, before = self._old_writes.popleft()
+            if self._written.get(old) is before:  # a short number may have been used again
+                del self._written[old]
         return written
 
     def take(self, node: int, element: int, number: int) -> None:

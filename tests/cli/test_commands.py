@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -170,12 +171,12 @@ def test_a_tcp_port_that_is_taken_is_said_so(busmaster: Command) -> None:
 
 def test_poll_prints_a_line_a_value_and_a_summary_on_standard_error(controllers: TcpServer) -> None:
     options = ("--nodes", "1-2", "--items", "1,axis0.idle", "--period", "0.02")
-    began = time.monotonic()
+    began = datetime.now(UTC)
     polled = ended_once(lambda lines: len(lines) == 12, "poll", controllers.path, *HCP2, *options)
     assert polled.status == 130
-    seconds, key, value = polled.lines[3].split()
+    moment, key, value = polled.lines[3].split()
     assert (key, value) == ("2/axis0.idle", "1")
-    assert 0 < float(seconds) < time.monotonic() - began
+    assert began < datetime.fromisoformat(moment) < datetime.now(UTC)
     summary = polled.err.splitlines()
     assert "cycles" in summary[0]
     assert "p99" in summary[0]
@@ -189,11 +190,19 @@ def test_poll_in_json_has_a_line_a_cycle_with_times_since_the_start(controllers:
     cycles = [json.loads(line) for line in polled.lines]
     assert [cycle["cycle"] for cycle in cycles] == list(range(1, len(cycles) + 1))
     last = cycles[-1]
-    assert list(last) == ["group", "cycle", "due", "started", "finished", "missed", "samples"]
+    assert list(last) == ["group", "cycle", "due", "started", "finished", "missed", "samples", "time"]
+    assert abs(datetime.now(UTC) - datetime.fromisoformat(last["time"])).days == 0
     assert 0 <= last["due"] <= last["started"] <= last["finished"] < time.monotonic() - began
     assert last["samples"]["1/outputs"] == {"value": 0, "error": None, "late": False}
     assert last["samples"]["99/outputs"]["value"] is None
     assert last["samples"]["99/outputs"]["error"]
+
+
+def test_poll_that_ends_without_a_value_ends_with_1(busmaster: Command, controllers: TcpServer) -> None:
+    options = ("--nodes", "99", "--items", "1", "--period", "0.05", "--seconds", "0.2", "--json")
+    polled = busmaster("poll", controllers.path, *HCP2, *options)
+    assert polled.status == 1
+    assert "no value came" in polled.err
 
 
 def test_scan_prints_a_line_for_each_node_that_answers(busmaster: Command, controllers: TcpServer) -> None:

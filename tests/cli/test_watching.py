@@ -57,7 +57,7 @@ async def test_people_are_shown_digits_and_names_and_programs_all_digits_and_num
         async for snapshot in group:
             if all(sample.error is None for sample in snapshot.values()):
                 break
-        plain = [text.split(" ", 1)[1] for text in plain_cycle(watch, snapshot)]
+        plain = [text.split(" ", 1)[1] for text in plain_cycle(snapshot)]
         assert plain == ["1/10 1.250", "1/11 1 on"]
         samples = json.loads(json_cycle(watch, snapshot))["samples"]
         assert (samples["1/10"]["value"], samples["1/11"]["value"], samples["1/11"]["label"]) == (1.25, 1, "on")
