@@ -34,6 +34,7 @@ COMMANDS = (
     "status",
     "top",
     "web",
+    "opcua",
     "safe",
     "plan",
     "points",

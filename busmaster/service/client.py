@@ -25,6 +25,7 @@ from busmaster.service.messages import (
     MOST_HOLDS,
     MOST_NODES,
     MOST_POINTS,
+    MOST_POLLED,
     MOST_REQUESTS,
     MOST_STREAMS,
     MOST_URGENT,
@@ -359,8 +360,8 @@ class Client:
     def _gather(self, params: Mapping[str, Any]) -> dict[str, Any]:
         """Keep points for a poll group: a message is too short for as many as one may have."""
         stream, points = whole_number(params["stream"], 0, 2**53, "a stream"), params.get("points", [])
-        if stream not in self._gathered and len(self._gathered) >= MOST_STREAMS:
-            raise InvalidCommand(f"one program has {MOST_STREAMS} poll groups at most")
+        if stream not in self._gathered and len(self._gathered) >= MOST_POLLED:
+            raise InvalidCommand(f"one program has {MOST_POLLED} poll groups at most")
         known = self._gathered.get(stream, [])
         if not isinstance(points, list) or len(known) + len(points) > MOST_POINTS:
             raise InvalidCommand(f"a poll group of a program has {MOST_POINTS} points at most")
@@ -371,8 +372,8 @@ class Client:
         return {}
 
     def _poll(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        if len(self._groups) >= MOST_STREAMS:
-            raise InvalidCommand(f"one program has {MOST_STREAMS} poll groups at most")
+        if len(self._groups) >= MOST_POLLED:
+            raise InvalidCommand(f"one program has {MOST_POLLED} poll groups at most")
         self._gather(params)
         read = self._gathered.pop(params["stream"])
         phase = params.get("phase")

@@ -36,7 +36,10 @@ MOST_WAITING = MOST_UNREAD + 2 * MOST_REQUESTS
 MOST_CHECKED = 64
 """Writes of one question whether the line would take them."""
 MOST_NODES = 1024
-MOST_STREAMS = 32
+MOST_STREAMS = 256
+"""Streams of one client: a door follows all groups of a line, each by its own."""
+MOST_POLLED = 32
+"""Poll groups of one client."""
 MOST_POINTS = 1000
 HELLO_WITHIN = 10.0
 """Seconds in which a client's first message has to come."""
