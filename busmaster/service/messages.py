@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from collections.abc import Set as AbstractSet
 from math import inf, isnan
 from typing import Any
 
@@ -95,12 +96,14 @@ def read(text: str | bytes) -> dict[str, Any]:
 
 
 def value_of(said: Any) -> Any:
-    """Return a value as it was before it was said: a list was a tuple."""
+    """Return a value as it was before it was said: a list was a tuple, {"set": [...]} a frozenset."""
     if isinstance(said, list):
         return tuple(map(value_of, said))
     if isinstance(said, dict):
         if set(said) == {"float"}:
             return float(said["float"])
+        if set(said) == {"set"}:
+            return frozenset(said["set"])
         return {name: value_of(part) for name, part in said.items()}
     return said
 
@@ -148,9 +151,16 @@ def _finite(value: Any) -> Any:
     return list(map(_finite, value)) if isinstance(value, list | tuple) else value
 
 
+def _said_set(value: Any) -> dict[str, list[Any]]:
+    """Return a set (flags that are on) as it is said: JSON has none. Raises TypeError for anything else."""
+    if isinstance(value, AbstractSet):
+        return {"set": sorted(value)}
+    raise TypeError(f"a {type(value).__name__} cannot be said")
+
+
 def _encoder() -> Callable[[Any], str]:
     """Return what encodes a value: what Python makes anew for each, which takes longer than to use it, made once."""
-    usual = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
+    usual = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_said_set)
     text = json.encoder.encode_basestring_ascii
     try:
         encode = json.encoder.c_make_encoder(None, usual.default, text, None, ":", ",", False, False, False)  # type: ignore[attr-defined]
