@@ -96,14 +96,14 @@ def read(text: str | bytes) -> dict[str, Any]:
 
 
 def value_of(said: Any) -> Any:
-    """Return a value as it was before it was said: a list was a tuple, {"set": [...]} a frozenset."""
+    """Return a value as it was before it was said: a list was a tuple, {"members": [...]} a frozenset."""
     if isinstance(said, list):
         return tuple(map(value_of, said))
     if isinstance(said, dict):
         if set(said) == {"float"}:
             return float(said["float"])
-        if set(said) == {"set"}:
-            return frozenset(said["set"])
+        if set(said) == {"members"} and isinstance(said["members"], list):
+            return frozenset(said["members"])
         return {name: value_of(part) for name, part in said.items()}
     return said
 
@@ -154,7 +154,7 @@ def _finite(value: Any) -> Any:
 def _said_set(value: Any) -> dict[str, list[Any]]:
     """Return a set (flags that are on) as it is said: JSON has none. Raises TypeError for anything else."""
     if isinstance(value, AbstractSet):
-        return {"set": sorted(value)}
+        return {"members": sorted(value)}
     raise TypeError(f"a {type(value).__name__} cannot be said")
 
 
