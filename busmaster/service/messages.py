@@ -163,7 +163,8 @@ def _encoder() -> Callable[[Any], str]:
     usual = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_said_set)
     text = json.encoder.encode_basestring_ascii
     try:
-        encode = json.encoder.c_make_encoder(None, usual.default, text, None, ":", ",", False, False, False)  # type: ignore[attr-defined]
+        make = json.encoder.c_make_encoder  # type: ignore[attr-defined]  # undocumented
+        encode = make(None, usual.default, text, None, ":", ",", False, False, False)
     except (AttributeError, TypeError):  # another Python
         return usual.encode
     return lambda value: "".join(encode(value, 0))

@@ -75,7 +75,7 @@ async def test_an_alarm_is_a_warning_to_who_does_not_look(
         watch.groups[0].add(replace(controller.point("10"), meaning=Meaning(high=5, hysteresis=1)))
         for value in (6, 4):
             await controller.write(10, value)
-            while f"1/10 {'is back at 4' if value == 4 else '= 6'}" not in (said[-1][0] if said else ""):  # noqa: ASYNC110
+            while f"1/10 {'is back at 4' if value == 4 else '= 6'}" not in (said[-1][0] if said else ""):  # noqa: ASYNC110  # another task makes it true
                 await asyncio.sleep(0.01)
     alarms = [(text, level) for text, level in said if text.startswith("1/10")]
     assert alarms[:2] == [

@@ -201,6 +201,12 @@ def test_two_protocols_that_may_share_a_line_are_both_found() -> None:
     assert {(node.protocol.name, node.address) for node in discovery.found} == {("hcp", 1), ("hcp2", 2)}
 
 
+def test_where_nodes_are_found_nothing_is_tried_that_cannot_share_their_line() -> None:
+    line = line_of(LineSettings(57600), make_device("hcp2", 2))
+    looked(line, steps(protocols(), None, None))
+    assert line.host is None, "the port is as the nodes have it"
+
+
 def test_a_unit_that_refuses_is_found_too() -> None:
     line = line_of(LineSettings(19200, 8, "E"), make_device("modbus", 4, size=0))
     [node] = looked(line, steps(protocols(), None, None)).found

@@ -54,7 +54,7 @@ async def says(browser: Browser, selector: str, text: str) -> None:
 @contextlib.asynccontextmanager
 async def shown(browser: Browser, folder: Path, **options: object) -> AsyncIterator[tuple[Served, Page]]:
     """A line of one node with its page, which the browser has opened and which shows values."""
-    async with served(folder) as line, page(folder, **options) as of:  # type: ignore[arg-type]
+    async with served(folder) as line, page(folder, **options) as of:  # type: ignore[arg-type]  # the page's own
         poll(line)
         await shows(of.line)
         await asyncio.to_thread(browser.open, of.url)

@@ -211,7 +211,7 @@ def test_two_outputs_with_one_file_are_refused(tmp_path: Path) -> None:
 async def test_another_output_of_the_kind_finds_the_spool_of_the_one_before_and_counts_it_once(
     tmp_path: Path, other_file: bool
 ) -> None:
-    pytest.importorskip("aiomqtt")
+    pytest.importorskip("aiomqtt", reason="the extra mqtt is not installed")
     told: list[str] = []
     before = MqttSettings(port=free_port(), prefix="a", spill=str(tmp_path / "spool"), buffer=100)
     outputs = Distributor(BUS, told.append)

@@ -249,7 +249,7 @@ def test_one_message_of_each_program_is_taken_before_the_second_of_any() -> None
     async def run() -> None:
         nonlocal turn
         for name, count in (("first", 1), ("much", 4), ("some", 2), ("one", 1)):
-            reception.ask(Queue(name, count))  # type: ignore[arg-type]
+            reception.ask(Queue(name, count))  # type: ignore[arg-type]  # all of a client that is asked of it
         for turn in range(1, 9):  # noqa: B007  it is looked at in `take`
             await asyncio.sleep(0)
 
@@ -271,7 +271,7 @@ def test_a_service_ends_though_a_connection_has_only_just_been_taken(tmp_path: P
 
 
 def test_it_runs_on_uvloop_too(tmp_path: Path) -> None:
-    uvloop = pytest.importorskip("uvloop")
+    uvloop = pytest.importorskip("uvloop", reason="uvloop is not installed")
 
     async def run() -> None:
         async with asyncio.timeout(PATIENCE), served(tmp_path) as line, connect(line.address) as remote:

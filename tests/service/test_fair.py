@@ -31,7 +31,7 @@ def watched(line: Served) -> list[Transaction]:
         asked.append(transaction)
         return transact(transaction)
 
-    line.bus.pump.transact = watch  # type: ignore[method-assign]
+    line.bus.pump.transact = watch  # type: ignore[method-assign]  # what goes out is seen here
     return asked
 
 
@@ -182,7 +182,7 @@ def test_a_sequence_ends_with_its_program(tmp_path: Path) -> None:
             waits = asyncio.ensure_future(Hcp2Controller(remote, 6).read(1))
             await until(lambda: len(asked) == 2)
             assert not held_no_longer(hold)
-            other.link._connection.transport.abort()  # type: ignore[union-attr]
+            other.link._connection.transport.abort()  # type: ignore[union-attr]  # it is connected
             await waits
             assert held_no_longer(hold)
             with pytest.raises(BusError):

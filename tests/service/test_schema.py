@@ -89,7 +89,7 @@ def test_what_an_owner_says_is_one_of_its_messages(said: dict[str, Any], right: 
 def test_the_page_has_the_commands_of_every_protocol_with_their_arguments(protocol: Protocol) -> None:
     said = []
     for name, kind in protocol.commands.items():
-        arguments = [part for part in dataclasses.fields(kind) if part.init]  # type: ignore[arg-type]
+        arguments = [part for part in dataclasses.fields(kind) if part.init]  # type: ignore[arg-type]  # every command is a dataclass
         needless = [part.default is not dataclasses.MISSING for part in arguments]
         shown = [f"[{part.name}]" if left else part.name for part, left in zip(arguments, needless, strict=True)]
         said.append(f"`{' '.join([name, *shown])}`")
