@@ -65,7 +65,8 @@ class Owner:
         return True
 
     def _polled(self) -> PollGroup:
-        points = [Point(self._node, str(number), ReadRegisters(number, 1)) for number in range(POINTS)]
+        numbers = range(POINTS)
+        points: list[Point[Any]] = [Point(self._node, str(number), ReadRegisters(number, 1)) for number in numbers]
         return self._bus.poll_group(GROUP, period=PERIOD, points=points)
 
     async def _saturate(self, seconds: float) -> dict[str, Any]:
@@ -78,7 +79,8 @@ class Owner:
                 count += 1
             return count
 
-        self._watch.each = holds = []
+        holds: list[float] = []
+        self._watch.each = holds
         before = self._bus.statistics().exchanges
         begun = time.monotonic()
         await asyncio.gather(*(ask() for _ in range(CALLERS)))
