@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Collection, Hashable, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 from busmaster.arbiter.clients import LineClient
 from busmaster.bus.bus import Bus
@@ -106,8 +105,7 @@ class Asker(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
+class Task(NamedTuple):
     """What is asked for: a command for a node, and what reads what it writes (`touches`); perhaps its point."""
 
     node: Node
@@ -122,7 +120,8 @@ class Task:
         """Return a command that a client names. Raises InvalidCommand for what the protocol does not have."""
         node, protocol = asker.node(params["protocol"], params["address"]), protocol_of(params["protocol"])
         command, touches = protocol.read_back(params["command"]), params.get("touches")
-        return cls(node, command, None if touches is None else protocol.read_back(touches), str(command))
+        value = str(command) if command.writes else None
+        return cls(node, command, None if touches is None else protocol.read_back(touches), value)
 
     @classmethod
     def of_point(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Task:
@@ -145,8 +144,14 @@ class Task:
             raise InvalidCommand(refusal) from None
 
 
+Told: TypeAlias = Callable[["Errand", Any, BaseException | None], object]
+"""Hears the end of an errand: its value, or its error; neither of one that was given up, see there."""
+
+
 class Errand:
-    """One command with its options, for one client."""
+    """One command with its options, for one client. Of a read it is told itself what became of that: at once, for the
+    turn of the loop that a future takes is a part of what a program waits beyond what the line takes.
+    """
 
     def __init__(
         self,
@@ -172,7 +177,11 @@ class Errand:
         self._stop = stop
         self._asked = asked
         self._begun = False
-        self.future: asyncio.Future[Any]
+        self._told: Told
+        self._over = False
+        self.given_up = False
+        self.writing: asyncio.Task[Any] | None = None
+        """What is done for a write, once it is begun."""
 
     @classmethod
     def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
@@ -211,25 +220,55 @@ class Errand:
             self._line.gate.refuse(wish, str(error))
             raise
 
-    def begin(self, done: Callable[[asyncio.Future[Any]], object]) -> None:
-        """Have it done, and then call `done` with the future that has its value, BusError or InvalidCommand.
+    def begin(self, told: Told) -> None:
+        """Have it done; `told` hears its end once, perhaps before this returns. Every write passes the gate.
 
-        Raises them too, where nothing could be begun. Every write passes the gate.
+        Raises BusError or InvalidCommand where nothing could be begun.
         """
+        self._told = told
         if self.command.writes:
-            self.future = asyncio.ensure_future(self._write())
+            self.writing = asyncio.ensure_future(self._write())
+            self.writing.add_done_callback(self._written)
         else:
-            self.future = self.node.begin_reading(
-                self.command, self.journey, stops_seen=self._stops_seen, client=self._client, **self._left()
+            self.node.begin_reading(
+                self.command, self.journey, self, stops_seen=self._stops_seen, client=self._client, **self._left()
             )
-        self.future.add_done_callback(done)
 
     def cancel(self) -> None:
         """Give it up: what is on the wire runs out unheard."""
-        if not self.future.done():
-            self.future.cancel()
-            if not self.command.writes:
-                self.node.give_up(self.journey)
+        if self.writing is not None:
+            self.writing.cancel()
+        elif not self._over:
+            self.node.give_up(self.journey)
+            self.given_up = True
+            self._end(None, None)
+
+    # what the line tells of a read
+
+    def done(self) -> bool:
+        """Return whether nobody waits for it any more."""
+        return self._over
+
+    def set_result(self, value: Any, /) -> None:
+        """Hear what was read."""
+        self._end(value, None)
+
+    def set_exception(self, error: BaseException, /) -> None:
+        """Hear why nothing was."""
+        self._end(None, error)
+
+    # inside
+
+    def _end(self, value: Any, error: BaseException | None) -> None:
+        self._over = True
+        self._told(self, value, error)
+
+    def _written(self, writing: asyncio.Task[Any]) -> None:
+        if not self._begun:  # a task that is cancelled before its first step runs nothing of it
+            self._line.gate.begin(self._wish()).end(self._truth(asyncio.CancelledError()))
+        self.given_up = writing.cancelled()
+        error = None if self.given_up else writing.exception()
+        self._end(None if self.given_up or error is not None else writing.result(), error)
 
     async def _write(self) -> Any:
         self._begun = True
@@ -259,11 +298,6 @@ class Errand:
             raise
         passage.end(None)
         return value
-
-    def give_up(self) -> None:
-        """Keep the record of a write that was given up before it was run."""
-        if self.command.writes and not self._begun:
-            self._line.gate.begin(self._wish()).end(self._truth(asyncio.CancelledError()))
 
     def unforeseen(self, bug: Exception) -> BusError:
         """Return the error for a request that failed by a mistake in the program."""
