@@ -188,7 +188,7 @@ class Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
         task = Task.of_point(params, asker, line) if "key" in params else Task.of_node(params, asker)
         node, command = task.node, task.command
-        given = cast("CommandOptions", dict(params.get("options", {})))
+        given = cast("CommandOptions", params.get("options", {}))
         if given:
             if not set(given) <= OPTIONS:
                 raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
@@ -315,9 +315,9 @@ class Errand:
 
     def _left(self) -> CommandOptions:
         """Return the options, less the time that the request took to come here."""
-        options: dict[str, Any] = dict(self._options)
-        if not options:
+        if not self._options:
             return {}
+        options: dict[str, Any] = dict(self._options)
         age = self._line.bus.now() - self._asked
         for name in ("start_within", "finish_within"):
             limit = options.get(name)

@@ -145,7 +145,7 @@ class RemoteNode:
         link, room = self._bus.opened(self, command), self._bus.room
         # What is of a sequence waits for nothing else of this program, which waits for the sequence.
         waits = sequence is None and chosen.priority is not Priority.URGENT
-        waited = await room.take(chosen, self, command) if waits else 0.0
+        waited = await room.wait(chosen, self, command) if waits and not room.take() else 0.0
         try:
             left: Mapping[str, Any] = {**options, **shortened(chosen, waited)} if waited else options
             params = self._said(command, left, touches, stops_seen, stop)

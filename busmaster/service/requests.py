@@ -46,7 +46,7 @@ class Requests:
     def begin(self, number: int, params: Mapping[str, Any]) -> None:
         """Have a command carried out."""
         try:
-            self._check_room(MOST_URGENT if _is_urgent(params) else 0)
+            self._check_room(params)
             errand = Errand.of(params, self._asker, self._line)
             self._errands[number] = errand
             errand.begin(partial(self._ended, number))
@@ -57,7 +57,7 @@ class Requests:
     def begin_safe(self, number: int, params: Mapping[str, Any]) -> None:
         """Have the safe state sent."""
         try:
-            self._check_room(0)
+            self._check_room({})
             sending = self._line.safe_wishes.begin(params["writes"], self._asker.peer)
         except REFUSED as error:
             self._refuse(number, refusal_of("safe", error))
@@ -88,9 +88,9 @@ class Requests:
 
     # inside
 
-    def _check_room(self, more: int) -> None:
+    def _check_room(self, params: Mapping[str, Any]) -> None:
         waiting = len(self._errands) + len(self._safe)
-        if waiting >= MOST_REQUESTS + more:
+        if waiting >= MOST_REQUESTS and not (_is_urgent(params) and waiting < MOST_REQUESTS + MOST_URGENT):
             raise BacklogFull(f"{waiting} requests of this program are not answered yet")
 
     def _ended(self, number: int, errand: Errand, value: Any, error: BaseException | None) -> None:

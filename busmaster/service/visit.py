@@ -39,8 +39,10 @@ class Reception:
 
     def _take(self, visit: Visit) -> None:
         self._taken = True
-        asyncio.get_running_loop().call_soon(self._next)
-        visit.take()
+        try:
+            visit.take()
+        finally:  # and not before: what is asked for is not to wait for this
+            asyncio.get_running_loop().call_soon(self._next)
 
     def _next(self) -> None:
         self._taken = False
