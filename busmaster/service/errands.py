@@ -188,7 +188,7 @@ class Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
         task = Task.of_point(params, asker, line) if "key" in params else Task.of_node(params, asker)
         node, command = task.node, task.command
-        given = cast("CommandOptions", params.get("options", {}))
+        given: CommandOptions = params.get("options", {})
         if given:
             if not set(given) <= OPTIONS:
                 raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
@@ -240,8 +240,8 @@ class Errand:
             self.writing.cancel()
         elif not self._over:
             self.node.give_up(self.journey)
-            self.given_up = True
-            self._end(None, None)
+            self._over = self.given_up = True
+            self._told(self, None, None)
 
     # what the line tells of a read
 
@@ -251,24 +251,22 @@ class Errand:
 
     def set_result(self, value: Any, /) -> None:
         """Hear what was read."""
-        self._end(value, None)
+        self._over = True
+        self._told(self, value, None)
 
     def set_exception(self, error: BaseException, /) -> None:
         """Hear why nothing was."""
-        self._end(None, error)
+        self._over = True
+        self._told(self, None, error)
 
     # inside
-
-    def _end(self, value: Any, error: BaseException | None) -> None:
-        self._over = True
-        self._told(self, value, error)
 
     def _written(self, writing: asyncio.Task[Any]) -> None:
         if not self._begun:  # a task that is cancelled before its first step runs nothing of it
             self._line.gate.begin(self._wish()).end(self._truth(asyncio.CancelledError()))
         self.given_up = writing.cancelled()
         error = None if self.given_up else writing.exception()
-        self._end(None if self.given_up or error is not None else writing.result(), error)
+        self._told(self, None if self.given_up or error is not None else writing.result(), error)
 
     async def _write(self) -> Any:
         self._begun = True

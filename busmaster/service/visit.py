@@ -34,10 +34,7 @@ class Reception:
         """Have a message of this program taken: at once, or when it is its turn."""
         if self._taken:
             self._waiting.append(visit)
-        else:
-            self._take(visit)
-
-    def _take(self, visit: Visit) -> None:
+            return
         self._taken = True
         try:
             visit.take()
@@ -47,7 +44,7 @@ class Reception:
     def _next(self) -> None:
         self._taken = False
         if self._waiting:
-            self._take(self._waiting.popleft())
+            self.ask(self._waiting.popleft())
 
 
 class Host(Protocol):
