@@ -15,8 +15,9 @@ from busmaster.bus.requester import Requester, checked_priority
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Permission
-from busmaster.service.errands import Errand, Line
+from busmaster.service.errands import Errand
 from busmaster.service.failures import REFUSED, refusal_of, said_error
+from busmaster.service.line import ServedLine
 from busmaster.service.messages import (
     MOST_CHECKED,
     MOST_HOLDS,
@@ -42,7 +43,7 @@ NodeKey = tuple[str, int]
 class Client:
     """One program with a connection. `take` takes its messages, in their order; `leave` ends all that it asked for."""
 
-    def __init__(self, line: Line, peer: Peer, number: int, outbox: Outbox) -> None:
+    def __init__(self, line: ServedLine, peer: Peer, number: int, outbox: Outbox) -> None:
         self.peer = peer
         self.dropped: dict[Hashable, int] = {}
         """Of each stream, how many messages the client was too slow for."""

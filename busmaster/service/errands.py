@@ -3,84 +3,27 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 from busmaster.arbiter.clients import LineClient
-from busmaster.bus.bus import Bus
 from busmaster.bus.node import Journey, Node
 from busmaster.bus.points import Point
-from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import CommandOptions, RequestOptions
 from busmaster.contract.arguments import seconds
 from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
-from busmaster.gate.gate import FRESH, NEVER_SENT, Gate, Wish, outcome_of
+from busmaster.gate.gate import FRESH, NEVER_SENT, Wish, outcome_of
 from busmaster.gate.permission import Permission
+from busmaster.service.line import ServedLine
 from busmaster.service.messages import value_of
-from busmaster.service.overview import Journal
 from busmaster.service.peers import Peer
-from busmaster.service.safe import SafeWishes
-from busmaster.service.streams import Broadcast
 from busmaster.service.telling import protocol_of
 
 OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
 """Of a request, those that a client may say."""
 DOOR = "service"
-
-
-class Line(Protocol):
-    """What clients share."""
-
-    @property
-    def bus(self) -> Bus: ...
-
-    @property
-    def gate(self) -> Gate: ...
-
-    @property
-    def share(self) -> float:
-        """What weighs the line time of each program: the owner's own share is 1."""
-        ...
-
-    @property
-    def safe_wishes(self) -> SafeWishes: ...
-
-    def broadcast_of(self, group: PollGroup, /) -> Broadcast:
-        """Return what tells the cycles of a poll group."""
-        ...
-
-    def events(self) -> Broadcast:
-        """Return what tells of line and nodes."""
-        ...
-
-    def overview(self) -> Broadcast:
-        """Return what tells what a person sees of it."""
-        ...
-
-    def exchanges(self) -> Broadcast:
-        """Return what tells what passes on it."""
-        ...
-
-    @property
-    def journal(self) -> Journal: ...
-
-    def group(self, name: str, /) -> PollGroup:
-        """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
-        ...
-
-    def point(self, group: str, key: str, /) -> tuple[PollGroup, Point[Any]]:
-        """Return a point of a poll group, and the group. Raises InvalidCommand if there is none."""
-        ...
-
-    def node(self, protocol: str, address: int, /) -> Node:
-        """Return a node that is on the line. Raises InvalidCommand if there is none."""
-        ...
-
-    def named(self, node: Node, places: Collection[Hashable], /) -> Point[Any] | None:
-        """Return the point of a poll group that reads these places of a node."""
-        ...
 
 
 class Asker(Protocol):
@@ -124,7 +67,7 @@ class Task(NamedTuple):
         return cls(node, command, None if touches is None else protocol.read_back(touches), value)
 
     @classmethod
-    def of_point(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Task:
+    def of_point(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Task:
         """Return the write of a value to a point of a poll group.
 
         Raises InvalidCommand, and keeps a record of it, for what cannot be written.
@@ -158,7 +101,7 @@ class Errand:
         task: Task,
         options: CommandOptions,
         *,
-        line: Line,
+        line: ServedLine,
         asker: Asker,
         client: LineClient,
         stops_seen: int | None,
@@ -184,7 +127,7 @@ class Errand:
         """What is done for a write, once it is begun."""
 
     @classmethod
-    def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
+    def of(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
         task = Task.of_point(params, asker, line) if "key" in params else Task.of_node(params, asker)
         node, command = task.node, task.command

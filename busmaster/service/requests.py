@@ -10,8 +10,9 @@ from typing import Any
 
 from busmaster.bus.requester import Priority
 from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
-from busmaster.service.errands import Asker, Errand, Line
+from busmaster.service.errands import Asker, Errand
 from busmaster.service.failures import REFUSED, refusal_of
+from busmaster.service.line import ServedLine
 from busmaster.service.messages import MOST_REQUESTS, MOST_URGENT
 
 
@@ -21,7 +22,7 @@ class Requests:
     def __init__(
         self,
         asker: Asker,
-        line: Line,
+        line: ServedLine,
         answer: Callable[[int, Any], object],
         refuse: Callable[[int, Exception], object],
     ) -> None:
