@@ -104,7 +104,7 @@ def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, con
         process.terminate()
         assert process.wait(PATIENCE) == 0
     assert audit(file.parent) == [
-        ("service", "2/write element 1 = 123.456", "'write element 1 = 123.456'", "written"),
+        ("service", "2/raw command", "'write element 1 = 123.456'", "written"),
         ("service", "winder/force", 3.0, "written"),
         ("service", "winder/force", 50.1, "refused"),
     ]
@@ -317,11 +317,11 @@ def test_nothing_is_written_through_an_owner_unless_all_may_be(
         assert ran.lines == ["1 ok", "10 ok", "2 ok"]
         process.terminate()
         process.wait(PATIENCE)
-    assert [(row[1], row[3]) for row in audit(file.parent)] == [
-        ("winder/force", "refused"),
-        ("1/write element 1 = 5", "written"),
-        ("winder/force", "written"),
-        ("1/write element 2 = 6", "written"),
+    assert [row[1:] for row in audit(file.parent)] == [
+        ("winder/force", 50.1, "refused"),
+        ("1/raw command", "'write element 1 = 5'", "written"),
+        ("winder/force", 50.0, "written"),
+        ("1/raw command", "'write element 2 = 6'", "written"),
     ]
 
 
