@@ -84,7 +84,9 @@ async def ask(node: Requester) -> tuple[object, str] | None:
     outcome = await ask_once(node)
     if isinstance(outcome, GarbledReply):
         outcome = await ask_once(node)
-    return (None, f"{node.profile.probe}: {outcome.what}") if isinstance(outcome, GarbledReply) else outcome
+    if isinstance(outcome, GarbledReply):
+        return None, f"{node.profile.probe}: {outcome.what}; {outcome.hint}"
+    return outcome
 
 
 async def ask_once(node: Requester) -> tuple[object, str] | GarbledReply | None:
