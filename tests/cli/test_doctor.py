@@ -7,7 +7,6 @@ number, and is deaf while it is another than its own.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import random
 import socket
