@@ -134,7 +134,7 @@ def test_a_rate_that_no_device_of_the_protocol_has_is_a_note_and_nothing_to_mend
     line = Line(LineSettings(19200), [EmulatedMsc(3)], chance=random.Random(1))
     findings = examined(line, (3,), "msc")
     assert findings.wrong == set()
-    assert findings.on("open").advice == "MSC devices speak at 9600 baud alone, not at 19200"
+    assert findings.on("open").advice == "MSC nodes speak at 9600 baud alone, not at 19200"
 
 
 def test_a_node_is_left_with_nothing_unacknowledged() -> None:
