@@ -112,9 +112,9 @@ def micros(moment: float) -> float:
     return round(moment, 6)
 
 
-def utc(moment: float) -> str:
-    """Return a time in seconds since 1970 as UTC text, to the millisecond."""
-    return datetime.fromtimestamp(moment, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+def utc(moment: float, digits: str = "milliseconds") -> str:
+    """Return a time in seconds since 1970 as UTC text, to the millisecond or to the `digits` that `isoformat` knows."""
+    return datetime.fromtimestamp(moment, UTC).isoformat(timespec=digits).replace("+00:00", "Z")
 
 
 def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[str, Any]:
