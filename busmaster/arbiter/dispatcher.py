@@ -153,12 +153,11 @@ class Dispatcher:
         return self.backlog.waiting(URGENT) > 0
 
     def may_go(self, transaction: Transaction, now: float) -> bool:
-        """Return whether a transaction that waits may be sent before the first one; nothing is changed."""
+        """Return whether a read that waits may be sent before the first transaction; nothing is changed."""
         node = transaction.node
         if node.health is DOWN or node.holds or node.suspended_until > now:
             return False
-        in_time = transaction.start_by >= now or (transaction.attempts > 0 and transaction.finish_by > now)
-        return in_time and not (transaction.writes and not self.writes.is_first(transaction))
+        return transaction.start_by >= now or (transaction.attempts > 0 and transaction.finish_by > now)
 
     def started(self, transaction: Transaction, now: float) -> None:
         """Note that the next attempt of a transaction goes out now."""

@@ -147,7 +147,7 @@ class Conversation(Generic[T]):
     def _refused(self, buffer: bytes) -> Step[T]:
         if len(buffer) < 5:
             return MORE
-        if not is_sound(buffer):
+        if with_crc(buffer[:3]) != buffer:  # to the byte: a sound frame and the byte 00 have a right CRC, too
             raise FrameError("bad CRC")  # or a damaged function code before a longer reply: not whole
         code = buffer[2]
         name = EXCEPTIONS.get(code, f"exception {code}")
