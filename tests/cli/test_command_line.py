@@ -56,7 +56,7 @@ BESIDE = {
     "discover": f"{CAPTURE} [--protocol P] [--nodes N-M,K]",
 }
 """What a line, a node, a recording or a door takes besides."""
-PROTOCOLS = {"hcp", "hcp2", "microflex", "msc", "mentor", "dc104", "modbus", "ct-ansi"}
+SPOKEN = {"hcp", "hcp2", "microflex", "msc", "mentor", "dc104", "modbus", "ct-ansi"}
 
 
 def promised(name: str) -> set[str]:
@@ -83,7 +83,7 @@ def found(name: str) -> Iterator[str]:
 
 def test_the_commands_are_those_that_are_promised() -> None:
     assert set(cli.list_commands(click.Context(cli))) == set(PROMISED)
-    assert set(kinds()) >= PROTOCOLS
+    assert set(kinds()) >= SPOKEN
 
 
 @pytest.mark.parametrize("name", PROMISED)
