@@ -150,10 +150,10 @@ class Watch:
             note(f"{text}, line {counts.utilisation:.1%} busy")
         for node in self.bus.nodes:
             of_node = node.statistics()
-            note(
-                f"{node.label}: {of_node.attempts} requests, {of_node.fruitless} failed, "
-                f"p50 {of_node.latency.p50 * 1000:.2f} ms, p99 {of_node.latency.p99 * 1000:.2f} ms"
-            )
+            text = f"{node.label}: {of_node.attempts} requests, {of_node.fruitless} failed"
+            if of_node.ok:
+                text += f", p50 {of_node.latency.p50 * 1000:.2f} ms, p99 {of_node.latency.p99 * 1000:.2f} ms"
+            note(text)
         for bus_node in self.bus.nodes:
             if text := learned_text(bus_node.statistics().learned):
                 note(f"{bus_node.label}: {text}")
