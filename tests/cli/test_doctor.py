@@ -261,7 +261,7 @@ def test_where_nobody_answers_that_is_one_finding() -> None:
 
 def test_what_learned_windows_would_come_to_is_said() -> None:
     findings = examined(line_of("hcp2", [hcp2(5, Delay(0.020))]), (5,))
-    assert findings.on("learning").what.startswith("learned windows would be 42 ms at most: a lost reply would hold up")
+    assert findings.on("learning").what.startswith("learned windows would be 32 ms at most: a lost reply would hold up")
     assert "in place of 150 ms" in findings.on("learning").what
     findings = examined(line_of("hcp2", [hcp2(5, Delay(0.080))]), (5,))
     assert "no shorter than the one that is set" in findings.on("learning").what
