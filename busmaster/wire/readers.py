@@ -146,7 +146,7 @@ class TelegramReader(SingleLeg, Generic[T]):
         try:
             value = self.parse(buffer[len(header) : etx])
         except FrameError as error:
-            raise other_format(end, error.what) from None
+            raise other_format(end, error.what, send=error.send, heard=error.heard) from None
         return Done(value) if len(buffer) == end else Done(value, buffer[end:])
 
     def expired(self, started: bool) -> NoReturn:
