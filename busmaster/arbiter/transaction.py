@@ -137,9 +137,9 @@ class Transaction:
         probe: bool = False,
         finish_by: float = inf,
         touches: object = None,
+        client: LineClient | None = None,
         tag: Any = None,
         poll: Poll | None = None,
-        client: LineClient | None = None,
     ) -> None:
         self.node = node
         self.command = command
