@@ -42,7 +42,7 @@ from busmaster.arbiter.transaction import (
     Transaction,
 )
 from busmaster.arbiter.writes import Writes
-from busmaster.contract.exchange import Command
+from busmaster.contract.exchange import Command, FrameError
 from busmaster.errors import (
     BacklogFull,
     BusError,
@@ -154,12 +154,11 @@ class Dispatcher:
         return self.backlog.waiting(URGENT) > 0
 
     def may_go(self, transaction: Transaction, now: float) -> bool:
-        """Return whether a transaction that waits may be sent before the first one; nothing is changed."""
+        """Return whether a read that waits may be sent before the first transaction; nothing is changed."""
         node = transaction.node
         if node.health is DOWN or node.holds or node.suspended_until > now:
             return False
-        in_time = transaction.start_by >= now or (transaction.attempts > 0 and transaction.finish_by > now)
-        return in_time and not (transaction.writes and not self.writes.is_first(transaction))
+        return transaction.start_by >= now or (transaction.attempts > 0 and transaction.finish_by > now)
 
     def started(self, transaction: Transaction, now: float) -> None:
         """Note that the next attempt of a transaction goes out now."""
@@ -215,7 +214,7 @@ class Dispatcher:
         self._end(transaction, now)
 
     def attempt_failed(
-        self, transaction: Transaction, no_reply: bool, what: str, now: float, doubted: bool = False
+        self, transaction: Transaction, no_reply: bool, failure: FrameError, now: float, doubted: bool = False
     ) -> None:
         """Ask again or fail. A `doubted` answer came and was not believed, which says nothing of the node (R15)."""
         node = transaction.node
@@ -234,8 +233,8 @@ class Dispatcher:
             self._watch.failed(node, now)
         kind: type[BusError] = NoReply if no_reply else GarbledReply
         if transaction.writes:
-            kind = WriteUnconfirmed
-        self._end(transaction, now, make_error(kind, what, transaction))
+            kind, failure.hint = WriteUnconfirmed, None  # whatever came: what to do about the write comes first
+        self._end(transaction, now, make_error(kind, failure.what, transaction, failure.hint))
 
     def broken(self, transaction: Transaction, bug: Exception, now: float) -> None:
         """Fail a transaction over which the protocol's reader failed: a bug there. To ask again would meet it again."""

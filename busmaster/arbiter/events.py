@@ -48,7 +48,7 @@ class NodeChanged:
     node: NodeRecord
     before: Health
     after: Health
-    returning: bool = False
+    returning: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -221,10 +221,10 @@ class ProbeBudget:
         self._earn(now)
         self._generous_until = now + BUDGET_RETURN_PERIOD
 
-    def take(self, cost: float, now: float) -> bool:
-        """Pay for a probe, if the bucket holds it (a full bucket pays for anything). Returns whether it did."""
+    def take(self, cost: float, now: float, beside: float = 0.0) -> bool:
+        """Pay for a probe and return True, if the bucket holds it `beside` so much (a full one pays for anything)."""
         self._earn(now)
-        if self.tokens < min(cost, BUDGET_CAPACITY):
+        if self.tokens < min(cost + beside, BUDGET_CAPACITY):
             return False
         self.tokens -= cost
         return True

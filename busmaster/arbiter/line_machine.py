@@ -324,18 +324,17 @@ class LineMachine:
     ) -> None:
         transaction, leg, unasked = self._wire.transaction, self._leg, self._unasked
         assert transaction is not None
-        what = error.what
         if no_reply:
             unasked.unanswered(transaction.node, leg.end, leg.timing.lateness)
-            if what == NO_REPLY:
-                what = f"no reply within {leg.timing.window * 1000:g} ms"
+            if error.what == NO_REPLY:
+                error.what = f"no reply within {leg.timing.window * 1000:g} ms"
             if self._echo.owed:
-                what += ", and no echo of the request: if the adapter has none, leave echo out"
+                error.what += ", and no echo of the request: if the adapter has none, leave echo out"
         elif error.heard:
             unasked.blame(now)
             unasked.run[:] = error.heard
         spared = error.whole and not self._in_step.debts  # its reply has begun: the silence alone is waited for (R3)
-        both = what is TWO_ANSWERS
+        both = error.what is TWO_ANSWERS
         if both:
             self._in_step.said_twice(now)
         self._trust.owe(self._wire, heard=not no_reply, whole=error.whole or both)
@@ -343,7 +342,7 @@ class LineMachine:
             self._wire.say(error.send, now)
         self._end_exchange(failed=True)
         if bug is None:
-            self.dispatcher.attempt_failed(transaction, no_reply, what, now, doubted)
+            self.dispatcher.attempt_failed(transaction, no_reply, error, now, doubted)
         else:
             self.dispatcher.broken(transaction, bug, now)
         self._settle(now, begun=spared)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf
 
 from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.health import BUDGET_CAPACITY, DOWN, LONGEST_BUDGET_WAIT, NodeRecord, ProbeBudget
+from busmaster.arbiter.health import DOWN, LONGEST_BUDGET_WAIT, NodeRecord, ProbeBudget
 from busmaster.arbiter.transaction import BACKGROUND, Transaction
 
 IDLE_PROBE_EVERY = 0.8
@@ -62,9 +62,7 @@ class Probes:
         # The probe that is due keeps its share: else a caller that asks a dead node again and again would spend all
         # there is, and the other dead ones would never be found to be back.
         due = max((n.lateness for n in self.nodes if n.health is DOWN and n.probe_at <= now), default=0.0)
-        if self.budget.tokens < min(cost + due, BUDGET_CAPACITY):
-            return False
-        return self.budget.take(cost, now)
+        return self.budget.take(cost, now, due)
 
     def alive(self, node: NodeRecord, now: float) -> None:
         """Note that a dead node was heard: it will answer its probe, which therefore costs nothing."""

@@ -83,7 +83,7 @@ def fit(text: str, width: int) -> str:
 
 
 def fit_value(value: float | str | None, width: int, precision: int | None = None) -> str:
-    """Return a value in at most `width` columns: digits behind the point are left out, or an exponent is written.
+    """Return a value in at most `width` columns: decimals are left out, or an exponent is written.
 
     Of several values those at the end are left out.
     """

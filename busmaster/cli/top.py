@@ -1,4 +1,4 @@
-"""`busmaster top`: the live view of a line that another process owns."""
+"""`busmaster top`: the live view of a line that another program owns."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TERMINAL_LOOKED_AT = 1.0
 """Seconds between two looks at whether the terminal is still there."""
 
 
-@click.command(short_help="Show a line that another process owns, live.")
+@click.command(short_help="Show a line that another program owns, live.")
 @click.argument("line", required=False, metavar="[LINE|unix:PATH|PORT]")
 @click.option("--read-only", is_flag=True, help="No key writes to a node.")
 @click.option("--of-owner", is_flag=True, hidden=True, help="It is the view of the program that owns the line.")

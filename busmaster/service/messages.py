@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Set as AbstractSet
+from functools import partial
 from math import inf, isnan
 from typing import Any
 
@@ -74,9 +75,9 @@ def written(message: Mapping[str, Any]) -> str:
 def encoded(value: Any) -> str:
     """Return a value as JSON. Raises TypeError for what it cannot say."""
     try:
-        return _encode(value)
+        return "".join(_encode(value))
     except ValueError:  # a number that JSON does not have
-        return _encode(_finite(value))
+        return "".join(_encode(_finite(value)))
 
 
 def read(text: str | bytes) -> dict[str, Any]:
@@ -158,16 +159,18 @@ def _said_set(value: Any) -> dict[str, list[Any]]:
     raise TypeError(f"a {type(value).__name__} cannot be said")
 
 
-def _encoder() -> Callable[[Any], str]:
-    """Return what encodes a value: what Python makes anew for each, which takes longer than to use it, made once."""
+def _encoder() -> Callable[[Any], Iterable[str]]:
+    """Return what makes the parts of a value's text. It is made once: Python does so anew for each value, which takes
+    longer than to use it.
+    """
     usual = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_said_set)
     text = json.encoder.encode_basestring_ascii
     try:
         make = json.encoder.c_make_encoder  # type: ignore[attr-defined]  # undocumented
         encode = make(None, usual.default, text, None, ":", ",", False, False, False)
     except (AttributeError, TypeError):  # another Python
-        return usual.encode
-    return lambda value: "".join(encode(value, 0))
+        return usual.iterencode
+    return partial(encode, _current_indent_level=0)
 
 
 _decode = json.JSONDecoder().raw_decode  # half of what `loads` takes, which looks for other encodings and blanks

@@ -34,18 +34,17 @@ class Reception:
         """Have a message of this program taken: at once, or when it is its turn."""
         if self._taken:
             self._waiting.append(visit)
-        else:
-            self._take(visit)
-
-    def _take(self, visit: Visit) -> None:
+            return
         self._taken = True
-        asyncio.get_running_loop().call_soon(self._next)
-        visit.take()
+        try:
+            visit.take()
+        finally:  # and not before: what is asked for is not to wait for this
+            asyncio.get_running_loop().call_soon(self._next)
 
     def _next(self) -> None:
         self._taken = False
         if self._waiting:
-            self._take(self._waiting.popleft())
+            self.ask(self._waiting.popleft())
 
 
 class Host(Protocol):

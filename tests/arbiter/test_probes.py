@@ -277,6 +277,13 @@ def test_r11_a_request_to_a_dead_node_leaves_what_the_probe_that_is_due_costs() 
     assert probes.budget.tokens == pytest.approx(0.9 * PROBE_COST)
 
 
+def test_r11_a_request_to_a_dead_node_may_spend_what_the_line_has_earned_until_now() -> None:
+    probes = Probes(Deadlines(), [node()], 0.0)
+    probes.budget.tokens = 0.0
+    assert not probes.spare(0.1, 4.9)
+    assert probes.spare(0.1, 5.1)
+
+
 def test_r11_an_owner_may_probe_at_any_time() -> None:
     bench = Bench()
     record = dead(bench)

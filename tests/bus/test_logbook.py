@@ -27,7 +27,7 @@ def lines(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
 
 
 def test_r14_a_node_that_goes_down_is_a_warning_with_its_port(lines: pytest.LogCaptureFixture) -> None:
-    Logbook("/dev/line").note(NodeChanged(Bench().node(5), Health.SUSPECT, Health.DOWN), 0.0)
+    Logbook("/dev/line").note(NodeChanged(Bench().node(5), Health.SUSPECT, Health.DOWN, False), 0.0)
     assert [(r.levelname, r.message) for r in lines.records] == [("WARNING", "/dev/line: node 5 is down (was suspect)")]
 
 
@@ -42,7 +42,7 @@ def test_r14_what_happens_again_and_again_is_one_line_with_a_count(lines: pytest
 def test_r14_each_node_is_limited_by_itself(lines: pytest.LogCaptureFixture) -> None:
     logbook, bench = Logbook("line"), Bench()
     for address in (1, 2, 3):
-        logbook.note(NodeChanged(bench.node(address), Health.UP, Health.DOWN), 0.0)
+        logbook.note(NodeChanged(bench.node(address), Health.UP, Health.DOWN, False), 0.0)
     assert len(lines.messages) == 3
 
 

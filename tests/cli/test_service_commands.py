@@ -93,7 +93,8 @@ def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, con
                 controller = Hcp2Controller(remote, 1)
                 await controller.point("10").write(30)
                 async for snapshot in await remote.group("fast"):
-                    [sample] = snapshot.samples.values()
+                    [(point, sample)] = snapshot.items()
+                    assert point.key == "winder/force"  # as the owner's file calls it
                     if sample.value == 3.0:
                         break
 
