@@ -21,6 +21,16 @@ from busmaster.contract.arguments import meant
 from busmaster.errors import BusError, InvalidCommand, NoReply
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+STATUSES = {
+    str(OK): "All is good.",
+    str(
+        FAILED
+    ): "An error came from the line, a port or a file; one line on standard error says what, and what to try.",
+    str(WRONG_USAGE): "The usage or a value is wrong, and nothing was sent.",
+    str(INTERRUPTED): "Ctrl-C ended it.",
+    "128 + N": "Signal N ended it; of `run` and `serve` SIGTERM is no error, and ends with 0.",
+}
+"""With what a command ends; where one means more by it, its help says so."""
 COMMANDS = (
     "demo",
     "read",

@@ -48,7 +48,7 @@ KEYS = (
         "Whether an answer that could be another request's is held until it is certain (R15).",
         "false",
     ),
-    Key("timing", "timing", 'Only `timing = "learned"`: the windows of all nodes are learned from their replies.'),
+    Key("timing", "text", "The windows of all nodes are learned from their replies.", choices=(LEARNED_WORD,)),
     Key("learned", "text", "The file in which learned windows are kept from one run to the next."),
     Key("protocols", "table", "A table for each protocol, of what holds for its nodes: `[protocols.NAME]`."),
     Key("nodes", "table", "A table for each node: `[nodes.NAME]`.", REQUIRED),
