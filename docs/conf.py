@@ -28,8 +28,11 @@ html_theme = "furo"
 root_doc = "docs/README"
 include_patterns = ["docs/**.md", "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md"]
 exclude_patterns = [".*", "build", "dist", "busmaster", "examples", "tests"]  # not walked through at all
-extensions = ["myst_parser"]
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
 myst_heading_anchors = 4  # a heading is linked to as on a code host
+autodoc_member_order = "bysource"
+toc_object_entries = False  # else every page would have the whole API beside it
+default_role = "py:obj"  # what docstrings have in `backquotes`, linked to where it is on a page
 
 
 def add_contents(_app: Sphinx, name: str, text: list[str]) -> None:
@@ -47,6 +50,16 @@ def add_contents(_app: Sphinx, name: str, text: list[str]) -> None:
         text[0] += f"\n\n```{{toctree}}\n:hidden:\n{heading}\n" + "\n".join(own) + "\n```\n"
 
 
+def show_programs(_app: Sphinx, what: str, _name: str, _thing: object, _options: object, lines: list[str]) -> None:
+    """Have what a docstring indents shown as the program that it is; leave out a module's own, which explains code."""
+    if what == "module":
+        lines.clear()
+    for number in range(len(lines) - 1, 0, -1):
+        above = next((line for line in reversed(lines[:number]) if line), "")
+        if lines[number].startswith("    ") and not lines[number - 1] and not above.startswith("    "):
+            lines[number:number] = ["::", ""]
+
+
 def send_to_contents(app: Sphinx, error: Exception | None) -> None:
     """Have the top of a site that is served lead to its first page."""
     if error is None and app.builder.format == "html":
@@ -59,4 +72,5 @@ def setup(app: Sphinx) -> None:
     """Add what is above to Sphinx, which calls this."""
     app.add_lexer("telegrams", TextLexer)
     app.connect("source-read", add_contents)
+    app.connect("autodoc-process-docstring", show_programs)
     app.connect("build-finished", send_to_contents)
