@@ -10,13 +10,19 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
+from importlib import import_module
 from pathlib import Path
 
 from pygments.lexers.special import TextLexer
 from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+from sphinx.util import logging
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))  # the reference is of this very tree
+busmaster = import_module("busmaster")
+for public in busmaster.__all__:
+    setattr(busmaster, public, getattr(busmaster, public))  # imported when asked for: autodoc does not ask
 
 project = "busmaster"
 release = version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
@@ -60,6 +66,14 @@ def show_programs(_app: Sphinx, what: str, _name: str, _thing: object, _options:
             lines[number:number] = ["::", ""]
 
 
+def check_names(_app: Sphinx, environment: BuildEnvironment) -> None:
+    """Hold that every public name is on the page, constants where they are made."""
+    known = environment.domains.python_domain.objects
+    for name in busmaster.__all__:
+        if callable(getattr(busmaster, name)) and f"busmaster.{name}" not in known:
+            logging.getLogger(__name__).warning("the public name %s is not on the page of the API", name)
+
+
 def send_to_contents(app: Sphinx, error: Exception | None) -> None:
     """Have the top of a site that is served lead to its first page."""
     if error is None and app.builder.format == "html":
@@ -73,4 +87,5 @@ def setup(app: Sphinx) -> None:
     app.add_lexer("telegrams", TextLexer)
     app.connect("source-read", add_contents)
     app.connect("autodoc-process-docstring", show_programs)
+    app.connect("env-check-consistency", check_names)
     app.connect("build-finished", send_to_contents)
