@@ -13,11 +13,14 @@ import tomllib
 from importlib import import_module
 from pathlib import Path
 
+from docutils import nodes
 from pygments.lexers.special import TextLexer
+from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from sphinx.util import logging
 
+LONGEST_VALUE = 60
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))  # the reference is of this very tree
 busmaster = import_module("busmaster")
@@ -66,6 +69,13 @@ def show_programs(_app: Sphinx, what: str, _name: str, _thing: object, _options:
             lines[number:number] = ["::", ""]
 
 
+def leave_out_long_values(_app: Sphinx, tree: nodes.document) -> None:
+    """Leave out values of attributes that nobody would read: a profile, or all elements of a drive."""
+    for annotation in list(tree.findall(addnodes.desc_annotation)):
+        if annotation.astext().lstrip().startswith("=") and len(annotation.astext()) > LONGEST_VALUE:
+            annotation.parent.remove(annotation)
+
+
 def check_names(_app: Sphinx, environment: BuildEnvironment) -> None:
     """Hold that every public name is on the page, constants where they are made."""
     known = environment.domains.python_domain.objects
@@ -87,5 +97,6 @@ def setup(app: Sphinx) -> None:
     app.add_lexer("telegrams", TextLexer)
     app.connect("source-read", add_contents)
     app.connect("autodoc-process-docstring", show_programs)
+    app.connect("doctree-read", leave_out_long_values)
     app.connect("env-check-consistency", check_names)
     app.connect("build-finished", send_to_contents)
