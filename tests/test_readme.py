@@ -29,7 +29,7 @@ def two_lines() -> list[str]:
 def test_the_first_block_is_two_lines_that_set_up_and_show_and_set_up_and_test() -> None:
     demo, tests = two_lines()
     assert demo.endswith("busmaster demo")
-    assert tests.endswith("python -m pytest")
+    assert tests.endswith("python -m pytest -n auto")
     for line in (demo, tests):
         steps = line.split(" && ")
         assert steps[0] == "python3 -m venv .venv"

@@ -203,6 +203,7 @@ def test_poll_that_ends_without_a_value_ends_with_1(busmaster: Command, controll
     polled = busmaster("poll", controllers.path, *HCP2, *options)
     assert polled.status == 1
     assert "no value came" in polled.err
+    assert "p50" not in polled.err, "there is no latency of a node that never answered"
 
 
 def test_scan_prints_a_line_for_each_node_that_answers(busmaster: Command, controllers: TcpServer) -> None:
