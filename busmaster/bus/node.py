@@ -393,8 +393,6 @@ class Node:
             probe,
             inf if options.finish_within is None else line.now() + options.finish_within,
             self if touches is None else (self, touches),
-            None,
-            None,
             client,
         )
 
