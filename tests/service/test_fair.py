@@ -18,7 +18,6 @@ from busmaster.errors import BusError, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.service.messages import MOST_HOLDS, MOST_REQUESTS, MOST_UNDER_WAY
 from busmaster.transport.pump import Waiter
-from tests.patience import PATIENCE
 from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until
 
 MANY = MOST_REQUESTS + MOST_REQUESTS // 2
@@ -101,13 +100,6 @@ def test_r12_what_waits_in_its_own_program_for_too_long_was_not_started(tmp_path
     on_a_served_line(tmp_path, story)
 
 
-@pytest.fixture
-def _unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A busy machine may take longer over so many requests than a write is fresh: that is not what is asked here."""
-    monkeypatch.setattr("busmaster.service.errands.FRESH", PATIENCE)
-
-
-@pytest.mark.usefixtures("_unhurried")
 def test_r9_an_urgent_request_waits_for_nothing_else_of_its_program(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         controller = Hcp2Controller(remote, 5)
