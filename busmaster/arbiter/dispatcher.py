@@ -94,7 +94,8 @@ class Dispatcher:
     def submit(self, transaction: Transaction, now: float) -> bool:
         """Queue a transaction, or end it at once with the reason why not. Returns False if nothing else has changed."""
         node, counters = transaction.node, self.counters
-        transaction.queued, transaction.deadline = now, now + RETRY_PATIENCE
+        transaction.queued = now
+        transaction.deadline = now + RETRY_PATIENCE
         transaction.exchanges_ahead = counters.exchanges  # as _waits does: this is done for every request
         transaction.settling_ahead = counters.spent[SETTLING]
         if self.fault is not None:

@@ -140,10 +140,10 @@ class LineMachine:
 
     def transmitted(self, now: float) -> None:
         """Note that the port took what `poll_transmit` gave only now: whoever held the process up meanwhile."""
-        wire, output = self._wire, self._wire.output
+        output = self._wire.output
         said_at = output.said_at
         late = now - said_at
-        if late > 0:
+        if late > 0.0:
             output.said_at = now
             leg = self._leg  # as leg.shift does: this is done for every request
             leg.end += late
@@ -153,8 +153,8 @@ class LineMachine:
             self._deadlines.line += late
             if self.state is SETTLING:
                 self._silent_at += late
-            if late > LOOK_SLACK and wire.transaction is not None and wire.transaction.started == said_at:
-                wire.transaction.started = now
+            if late > LOOK_SLACK and (asked := self._wire.transaction) is not None and asked.started == said_at:
+                asked.started = now
 
     def line_due(self, now: float) -> bool:
         """Return whether a deadline of the line falls due: `unsent` is to be told first, where it is known."""
@@ -269,7 +269,7 @@ class LineMachine:
             if type(step) is Done:
                 self._complete(step, now)
             elif self._leg.begun:
-                self._deadlines.line = self._leg.gap_over(now)
+                self._deadlines.line = self._wire.gap_over(now)
 
     def _complete(self, step: Done[Any], now: float) -> None:
         """Deliver a value: the line is free when the closing ACK has left and the node has let go of the line."""
@@ -298,9 +298,9 @@ class LineMachine:
         wire.transaction = wire.exchange = None  # and nothing is held: what was has been weighed again
         self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, step.value, now)
-        if rest:
-            self._unasked.note(rest, now, leg.quiet())
         if rest or wire.came_unasked or (self._echo.owed and not answered):  # a broadcast's echo may never come
+            if rest:
+                self._unasked.note(rest, now, leg.quiet())
             self._settle(now)
             return
         self._unasked.unanswered_one = None
@@ -484,8 +484,11 @@ class LineMachine:
             self.dispatcher.cut_off(transaction, self._offline(), now)
 
     def _enter(self, state: LineState, now: float) -> None:
-        spent = self._counters.spend(self.state, now)
-        if self.state is READY:
+        counters, before = self._counters, self.state
+        spent = now - counters.entered
+        counters.spent[before] += spent
+        counters.entered = now
+        if before is READY:
             self.dispatcher.probes.budget.idle(spent, state is not READY)
         self.state = state
 

@@ -28,7 +28,7 @@ USUAL = LineSettings(9600)
 """What a port is opened with where neither a protocol nor the user says."""
 
 
-@click.command(short_help="What is wrong with this port, adapter or line?")
+@click.command(short_help="Find out what is wrong with a port, an adapter or a line.")
 @click.argument("port")
 @protocol_option(required=False)
 @nodes_option

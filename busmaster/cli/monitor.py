@@ -35,7 +35,7 @@ from busmaster.transport.endpoints import Endpoint
 ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 
 
-@click.command(short_help="Listen only; decode what passes.")
+@click.command(short_help="Listen to a line, and decode what passes.")
 @click.argument("port", metavar="PORT|LINE.toml")
 @protocol_option(required=False)
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")

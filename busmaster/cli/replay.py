@@ -18,7 +18,7 @@ CHANGED = 1
 COUNTED = ("same", "changed", "unjudged")
 
 
-@click.command(short_help="Run a recorded exchange list against the decoders.")
+@click.command(short_help="Read a capture again, by the readers of today.")
 @click.argument("capture", type=click.Path(exists=True, dir_okay=False))
 @json_option
 def command(capture: str, as_json: bool) -> int:

@@ -125,7 +125,7 @@ class Watch:
     def tell(self, text: str) -> None:
         """Add to what the screen shows of the last events."""
         if self.service is not None:
-            self.service.journal.note(text)
+            self.service.line.journal.note(text)
 
     def announce(self, text: str, level: Level = Level.NOTICE) -> None:
         """Add to the last events; print a line on standard error, unless the screen that shows them is there."""

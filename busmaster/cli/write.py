@@ -41,7 +41,7 @@ Pairs = Sequence[tuple[str, tuple[float, ...]]]
     "--decimals",
     type=Whole(min=0),
     metavar="N",
-    help="How many of the last digits on the line are behind the point, where it carries none: 1 for 1.17=-47.6.",
+    help="How many of the last digits on the line are decimals, where it carries no decimal point: 1 for 1.17=-47.6.",
 )
 @json_option
 def command(
@@ -64,7 +64,7 @@ def command(
     pairs = [parsed(parse_assignment, text) for text in assignments]
     if not is_line_file(connection.port):
         if decimals is not None and not find(connection.protocol).takes_decimals:
-            raise click.UsageError(f"{connection.protocol} carries the point of a number itself: leave --decimals out")
+            raise click.UsageError(f"{connection.protocol} carries the decimal point itself: leave --decimals out")
         until_ended(write, connection, connection.one_address(node), pairs, verify, as_json, decimals)
         return
     file = load(connection.port)

@@ -8,7 +8,6 @@ byte. The first byte tells the two apart, and every request has one legal set of
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
 from typing import ClassVar, Generic, NoReturn, TypeVar
 
 from busmaster.contract.exchange import MORE, Done, Expect, FrameError, LaterLeg, Need, Sizes, no_reply, other_format
@@ -99,14 +98,8 @@ class SingleLeg:
         raise FrameError(f"a reply cannot begin with {heard[0]:02x}", heard=heard)
 
 
-@lru_cache(maxsize=4096)
-def answers_to(echo: bytes) -> tuple[bytes, ...]:
-    """Return what a telegram with this echo begins with, as the `answers` of an exchange."""
-    return (STX + echo,)
-
-
 class TelegramReader(SingleLeg, Generic[T]):
-    """One read: a telegram, or a refusal.
+    """One read: a telegram, or a refusal. `header` is what the telegram begins with: STX and the echo.
 
     A protocol sets the class attributes. `parse` makes the value of the data field, or raises FrameError.
     """
@@ -118,10 +111,10 @@ class TelegramReader(SingleLeg, Generic[T]):
     sizes: ClassVar[Sizes]
     starts: ClassVar[bytes] = STX + NAK
 
-    def __init__(self, request: bytes, echo: bytes, timing: ReplyTiming) -> None:
+    def __init__(self, request: bytes, header: bytes, timing: ReplyTiming) -> None:
         self.request = request
         self.timing = timing
-        self.answers = answers_to(echo)
+        self.answers: tuple[bytes, ...] = (header,)
         self._buffer = b""
 
     @property

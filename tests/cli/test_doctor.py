@@ -134,7 +134,7 @@ def test_a_rate_that_no_device_of_the_protocol_has_is_a_note_and_nothing_to_mend
     line = Line(LineSettings(19200), [EmulatedMsc(3)], chance=random.Random(1))
     findings = examined(line, (3,), "msc")
     assert findings.wrong == set()
-    assert findings.on("open").advice == "MSC devices speak at 9600 baud alone, not at 19200"
+    assert findings.on("open").advice == "MSC nodes speak at 9600 baud alone, not at 19200"
 
 
 def test_a_node_is_left_with_nothing_unacknowledged() -> None:
@@ -261,7 +261,7 @@ def test_where_nobody_answers_that_is_one_finding() -> None:
 
 def test_what_learned_windows_would_come_to_is_said() -> None:
     findings = examined(line_of("hcp2", [hcp2(5, Delay(0.020))]), (5,))
-    assert findings.on("learning").what.startswith("learned windows would be 42 ms at most: a lost reply would hold up")
+    assert findings.on("learning").what.startswith("learned windows would be 32 ms at most: a lost reply would hold up")
     assert "in place of 150 ms" in findings.on("learning").what
     findings = examined(line_of("hcp2", [hcp2(5, Delay(0.080))]), (5,))
     assert "no shorter than the one that is set" in findings.on("learning").what

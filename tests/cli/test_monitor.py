@@ -112,7 +112,7 @@ async def test_whoever_reads_the_output_may_leave() -> None:
 
 @contextmanager
 def line_that_says(data: bytes) -> Iterator[str]:
-    """A serial device server behind which a line carries these bytes, then goes away."""
+    """A serial server behind which a line carries these bytes, then goes away."""
     with create_server(("127.0.0.1", 0)) as server:
 
         def serve() -> None:
@@ -159,4 +159,4 @@ def test_a_rate_that_no_device_of_the_protocol_has_is_said() -> None:
             check=False,
         )
     assert "flags" in done.stdout
-    assert done.stderr.splitlines()[0].endswith("MSC devices speak at 9600 baud alone, not at 4800")
+    assert done.stderr.splitlines()[0].endswith("MSC nodes speak at 9600 baud alone, not at 4800")

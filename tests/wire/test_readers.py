@@ -28,7 +28,7 @@ class Text(TelegramReader[bytes]):
 
 
 def reader() -> Text:
-    return Text(b"request", b"01", TIMING)
+    return Text(b"request", HEADER, TIMING)
 
 
 def test_the_data_lies_between_the_echo_and_etx() -> None:
