@@ -1,4 +1,7 @@
-"""Every message that programs and owners exchange in these tests is one of docs/service.schema.json."""
+"""Every message that programs and owners exchange in these tests is one of docs/service.schema.json.
+
+Writes do not grow old while a busy machine turns.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,17 @@ from typing import Any
 
 import pytest
 
-from busmaster.service import link
+from busmaster.service import errands, link
 from busmaster.service.messages import written
+from tests.patience import PATIENCE
 from tests.service import schema
 
 HELLO = 0
+
+
+@pytest.fixture(autouse=True)
+def _writes_stay_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(errands, "FRESH", PATIENCE)
 
 
 @pytest.fixture(autouse=True)
