@@ -90,7 +90,7 @@ def test_a_write_that_took_long_to_come_is_not_sent(tmp_path: Path) -> None:
             write = {"command": "write", "element": 1, "values": [1]}
             said = await client.ask("request", **{**READ, "command": write}, asked=line.bus.now() - 2 * PATIENCE)
             assert said["error"]["data"]["error"] == "NotStarted"
-            assert re.search(r"it came 20\d\.\d s after it was asked for", said["error"]["message"])
+            assert re.search(r"it came \d+\.\d s after it was asked for", said["error"]["message"])
             assert "the line is busy" not in said["error"]["message"]
         assert [outcome for _, outcome in line.audit()] == ["not started"]
 
