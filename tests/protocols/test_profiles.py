@@ -51,6 +51,16 @@ def test_the_line_is_the_documents(profile: Profile, title: str, line: LineSetti
     assert profile.wrong_rate(line.baudrate) == ""
 
 
+RATES = {1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200}
+
+
+@pytest.mark.parametrize("kind", kinds().values(), ids=kinds())
+def test_other_settings_that_are_tried_have_usual_rates_and_are_tried_once(kind: NodeKind) -> None:
+    tried = [kind.profile.line, *kind.profile.other_lines]
+    assert {line.baudrate for line in tried} <= RATES
+    assert len(set(tried)) == len(tried)
+
+
 @pytest.mark.parametrize(
     ("profile", "addresses", "broadcast"),
     [
