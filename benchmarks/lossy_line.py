@@ -3,8 +3,9 @@
 First ours in virtual time: a saturated HCP2 line of 32 nodes, with the documents' times and with times that it has
 learned from 200 replies of each node before the first frame is spoilt. All nodes are asked for the same element, so
 that every answer could be taken for another node's, or for different ones, or are polled, too; they answer after 2 ms,
-or after 2, 20 and 90 ms; or the adapter hands over what has come every 16 ms. Then ours and the others on a real pty,
-with Modbus frames and the same window and retries, and ours by TCP.
+or after 2, 20 and 90 ms; or the adapter hands over what has come every 16 ms. A line that polls alone tells how many
+cycles it misses. Then ours and the others on a real pty, with Modbus frames and the same window and retries, and ours
+by TCP.
 """
 
 from __future__ import annotations
@@ -50,6 +51,10 @@ SPOILT: dict[str, dict[str, float]] = {
 }
 """What is spoilt, of each frame either way."""
 LOST = tuple(SPOILT)[:4]
+CYCLES_SPOILT = "1 % lost"
+CYCLES_FOR, QUICK_CYCLES_FOR = 480.0, 5.0
+"""Seconds: 1,920 cycles of 0.25 s, 480 of 1 s."""
+MOST_MISSED = 3
 COLUMNS = ("spoilt", "line", "wrong", "documents' times /s", "%", "learned /s", "%")
 UNITS = 4
 CALLERS = 4
@@ -98,6 +103,7 @@ def run(options: Options) -> Outcome:
     for kind in KINDS:
         _keep(kind, options, table, outcome)
     outcome.tables.append(table)
+    outcome.tables.append(_cycles(options, outcome))
     outcome.tables.append(_compared(options, outcome))
     return outcome
 
@@ -118,6 +124,24 @@ def _keep(kind: Kind, options: Options, table: Table, outcome: Outcome) -> None:
         if what in kind.claimed and not options.quick:
             text = f"% kept with learned times, {what}, {kind.name}"
             outcome.claims.append(Claim(text, shares[True], kind.claimed[what], at_most=False))
+
+
+def _cycles(options: Options, outcome: Outcome) -> Table:
+    """Count the cycles that a line misses which does nothing but poll its nodes, at 79 % of what it can."""
+    table = Table(f"Cycles of 32 nodes every 0.25 s and every 1 s, {CYCLES_SPOILT}", ("times", "cycles", "missed"))
+    for learned in (False, True):
+        line = LossyLine(learned, Kind("polls alone", polled=True, same=True))
+        line.learn(options)
+        line.spoil(SPOILT[CYCLES_SPOILT])
+        before = line.cycles()
+        line.world.run(line.world.now + options.pick(CYCLES_FOR, QUICK_CYCLES_FOR))
+        cycles, missed = (now - then for now, then in zip(line.cycles(), before, strict=True))
+        table.row("learned" if learned else "the documents'", cycles + missed, missed)
+        outcome.wrong += line.wrong
+    if not options.quick:
+        text = f"of {cycles + missed} cycles missed with learned times, {CYCLES_SPOILT}"
+        outcome.claims.append(Claim(text, missed, MOST_MISSED))
+    return table
 
 
 class BatchingLine(Line):
@@ -145,8 +169,8 @@ class LossyLine:
         self._same = kind.same
         timings = LEARNED if learned else None
         self._nodes = [self.world.node(hcp2.PROFILE, node, timings=timings) for node in NODES]
-        for period in PERIODS if kind.polled else ():
-            poll = Poll(f"every {period:g} s", period, phase=0.0)
+        self._polls = [Poll(f"every {period:g} s", period, phase=0.0) for period in PERIODS if kind.polled]
+        for poll in self._polls:
             set_members(poll, [Transaction(node, hcp2.Read(1)) for node in self._nodes])
             self.world.arbiter.add_poll(poll, self.world.now)
 
@@ -156,15 +180,26 @@ class LossyLine:
         world.run(1.0)
         for _ in range(IN_FLIGHT):
             self._ask()
-        while not options.quick and min(node.counters.ok for node in self._nodes) <= TRUSTED_AFTER:
-            world.run(world.now + 1.0)
-        for name, share in faults.items():
-            setattr(self.line.faults, name, share)
+        self.learn(options)
+        self.spoil(faults)
         before, begun = self.right, world.now
         wanted = options.pick(VALUES, QUICK_VALUES)
         while self.right < before + wanted:
             world.run(world.now + 1.0)
         return (self.right - before) / (world.now - begun)
+
+    def learn(self, options: Options) -> None:
+        """Go on until each node has answered so often that its times are trusted."""
+        while not options.quick and min(node.counters.ok for node in self._nodes) <= TRUSTED_AFTER:
+            self.world.run(self.world.now + 1.0)
+
+    def spoil(self, faults: dict[str, float]) -> None:
+        for name, share in faults.items():
+            setattr(self.line.faults, name, share)
+
+    def cycles(self) -> tuple[int, int]:
+        """Cycles that were run, and that were missed."""
+        return sum(poll.cycles for poll in self._polls), sum(poll.missed for poll in self._polls)
 
     def _ask(self) -> None:
         number = self._asked

@@ -1,6 +1,7 @@
 """A line that is owned and served by a process of its own: what others pay for asking through its socket.
 
-`python -m benchmarks.owned_line` is told the port in a line of JSON, and prints the socket's address. Each further line
+`python -m benchmarks.owned_line` is told the port in a line of JSON, and prints the socket's address, and the path of a
+bare one, where whatever comes is answered, after the same read, with as many bytes as an answer has. Each further line
 is an order: {"reads": 100} has it read so often itself, one after the other, and print the seconds that each took;
 {"polls": true} has it read a poll group ten times a second, until {"polls": false}; {"saturate": 2.5} has several
 callers read for so many seconds, and prints how often they did, and each hold of its loop in milliseconds.
@@ -15,16 +16,18 @@ import tempfile
 import time
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from benchmarks.watch import Watch, watched
 from busmaster import Bus, PollGroup, Requester, SerialPort, Service
-from busmaster.bus.node import Node
+from busmaster.bus.node import Journey, Node
 from busmaster.bus.points import Point
 from busmaster.protocols.modbus.codec import PROFILE, ReadRegisters
 
 READ = ReadRegisters(7, 1)
 UNIT = 1
+BARE_REQUEST, BARE_ANSWER = bytes(190), bytes(45)
+"""As long as those of the service."""
 PAUSE = 0.01
 """Seconds between two reads: the line is idle when one is asked for, and what it costs hides behind no silence."""
 CALLERS = 4
@@ -44,19 +47,49 @@ async def read(node: Requester, count: int) -> list[float]:
     return took
 
 
+class Bare(asyncio.BufferedProtocol):
+    """One end of a bare socket: one read for whatever comes, without words, and nothing checked. It cannot cost less.
+
+    It is itself what is told of the read.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._buffer = memoryview(bytearray(512))
+        self._transport: asyncio.Transport
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.Transport", transport)
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        return self._buffer
+
+    def buffer_updated(self, count: int) -> None:
+        self._node.begin_reading(READ, Journey(), self)
+
+    def done(self) -> bool:
+        return False
+
+    def set_result(self, value: object, /) -> None:
+        self._transport.write(BARE_ANSWER)
+
+    def set_exception(self, error: BaseException, /) -> None:
+        raise error
+
+
 class Owner:
     """What the process does with its line."""
 
     def __init__(self, bus: Bus, watch: Watch) -> None:
         self._bus = bus
         self._watch = watch
-        self._node: Node = bus.node(PROFILE, UNIT)
+        self.node: Node = bus.node(PROFILE, UNIT)
         self._group: PollGroup | None = None
 
     async def obey(self, order: dict[str, Any]) -> Any:
         """Return the answer to an order."""
         if "reads" in order:
-            return await read(self._node, order["reads"])
+            return await read(self.node, order["reads"])
         if "saturate" in order:
             return await self._saturate(order["saturate"])
         if self._group is not None:
@@ -66,7 +99,7 @@ class Owner:
 
     def _polled(self) -> PollGroup:
         numbers = range(POINTS)
-        points: list[Point[Any]] = [Point(self._node, str(number), ReadRegisters(number, 1)) for number in numbers]
+        points: list[Point[Any]] = [Point(self.node, str(number), ReadRegisters(number, 1)) for number in numbers]
         return self._bus.poll_group(GROUP, period=PERIOD, points=points)
 
     async def _saturate(self, seconds: float) -> dict[str, Any]:
@@ -75,7 +108,7 @@ class Owner:
         async def ask() -> int:
             count = 0
             while time.monotonic() < until:
-                await self._node.request(READ)
+                await self.node.request(READ)
                 count += 1
             return count
 
@@ -98,9 +131,12 @@ async def serve(watch: Watch) -> int:
         ):
             warnings.simplefilter("ignore")  # a pty refuses Modbus's parity
             owner = Owner(bus, watch)
-            print(json.dumps(service.address), flush=True)
+            bare = f"{folder}/bare.sock"
+            server = await asyncio.get_running_loop().create_unix_server(lambda: Bare(owner.node), bare)
+            print(json.dumps((service.address, bare)), flush=True)
             while said := await asyncio.to_thread(sys.stdin.readline):
                 print(json.dumps(await owner.obey(json.loads(said))), flush=True)
+            server.close()
     return 0
 
 

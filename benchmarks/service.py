@@ -1,6 +1,7 @@
 """What a program pays for asking through the socket of the process that owns the line, and what it costs the others.
 
-The line is idle but for one reader: the owner itself, and a program that is connected to it, in turn, round by round.
+The line is idle but for one reader: the owner itself, a program that is connected to it, and one that has a bare socket
+and no words, which is the least that it can take, in turn, round by round.
 Then seven programs saturate it, each with one command after the other, without and with an eighth that has ten thousand
 waiting; a ninth writes urgently. Then the owner alone saturates it, and polls a group, without and with twenty programs
 that read that group; a hold is what the owner's loop does between two looks at its ports, as in `loop_stalls`.
@@ -13,11 +14,11 @@ import time
 from collections.abc import AsyncIterator, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from statistics import median
-from typing import Any
+from typing import Any, cast
 
 from benchmarks.apart import Apart
 from benchmarks.harness import Claim, Options, Outcome, Table, quantile
-from benchmarks.owned_line import GROUP, READ, UNIT, read
+from benchmarks.owned_line import BARE_REQUEST, GROUP, PAUSE, READ, UNIT, read
 from benchmarks.served_line import ServedLine
 from busmaster import Priority, RemoteBus, connect
 from busmaster.protocols.modbus.codec import PROFILE, WriteRegisters
@@ -44,8 +45,8 @@ def run(options: Options) -> Outcome:
     with ServedLine(UNIT, delay={"low": DELAY}) as line:
         owner = Apart("benchmarks.owned_line", paced=False)
         try:
-            address = owner.ask({"port": line.path})
-            asyncio.run(_idle(owner, address, options, outcome))
+            address, bare = owner.ask({"port": line.path})
+            asyncio.run(_idle(owner, address, bare, options, outcome))
             asyncio.run(_crowd(address, options, outcome))
             asyncio.run(_audience(owner, address, options, outcome))
         finally:
@@ -56,22 +57,52 @@ def run(options: Options) -> Outcome:
 # an idle line
 
 
-async def _idle(owner: Apart, address: str, options: Options, outcome: Outcome) -> None:
+async def _idle(owner: Apart, address: str, bare: str, options: Options, outcome: Outcome) -> None:
     local: list[float] = []
     remote: list[float] = []
+    least: list[float] = []
+    _, asking = await asyncio.get_running_loop().create_unix_connection(BareAsking, bare)
     async with connect(address) as bus:
         node = bus.node(PROFILE, UNIT)
         await read(node, WARM_UP)
         for _ in range(options.pick(40, 2)):
             local += await asyncio.to_thread(owner.ask, {"reads": 25})
             remote += await read(node, 25)
+            least += await asking.read(25)
+    asking.transport.close()
     table = Table("A read on an idle line, ms", ("who reads", "reads", "p50", "p99"))
-    for who, took in (("the owner", local), ("a program, by its socket", remote)):
+    rows = (("the owner", local), ("a program, by its socket", remote), ("the same, by a bare one", least))
+    for who, took in rows:
         table.row(who, len(took), quantile(took, 0.5) * 1000, quantile(took, 0.99) * 1000)
     outcome.tables.append(table)
     more = (quantile(remote, 0.5) - quantile(local, 0.5)) * 1000
     outcome.claims.append(Claim("what a remote read takes more than a local one, p50, ms", more, MOST))
-    outcome.series = {"local": local, "remote": remote}
+    outcome.series = {"local": local, "remote": remote, "by a bare socket": least}
+
+
+class BareAsking(asyncio.Protocol):
+    """The asking end of a bare socket."""
+
+    transport: asyncio.Transport
+    _answered: asyncio.Future[None]
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast("asyncio.Transport", transport)
+
+    def data_received(self, data: bytes) -> None:
+        self._answered.set_result(None)
+
+    async def read(self, count: int) -> list[float]:
+        """Have something read so often, as `owned_line.read` does."""
+        took = []
+        for _ in range(count):
+            await asyncio.sleep(PAUSE)
+            begun = time.perf_counter()
+            self._answered = asyncio.get_running_loop().create_future()
+            self.transport.write(BARE_REQUEST)
+            await self._answered
+            took.append(time.perf_counter() - begun)
+        return took
 
 
 # a line that programs saturate

@@ -1,6 +1,6 @@
 """What can go wrong, and nothing else.
 
-Every transaction that fails raises one fresh instance of a `BusError` subclass. It carries the line, the node, the
+Every request that fails raises one fresh instance of a `BusError` subclass. It carries the line, the node, the
 command and the number of attempts, and its text says in one sentence what happened, where, and what to try. It may be
 sent to another process: it pickles.
 A wrong argument is not a bus error: it raises `InvalidCommand` when the command is built, or when it is asked for.
@@ -30,7 +30,7 @@ class InvalidCommand(ValueError):
 
 
 class BusError(Exception):
-    """A transaction did not end with a value.
+    """A request did not end with a value.
 
     `what` is the happening ("no reply within 100 ms"), `hint` what to try, `command` the command as text, `attempts`
     how often it was on the wire. `line` is the name of the line's port, `label` and `address` are the node's ("node

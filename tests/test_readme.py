@@ -1,4 +1,4 @@
-"""The README's two lines name what exists; its programs compile and use public names; the examples run."""
+"""The README's two lines name what exists, its programs use public names; the examples run."""
 
 from __future__ import annotations
 
@@ -14,24 +14,22 @@ from pathlib import Path
 import pytest
 
 import busmaster
+from tests.docs.pages import ROOT, Block, blocks
 from tests.patience import PATIENCE
 
-ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text()
-BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
+README = ROOT / "README.md"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXAMPLES = sorted(path for path in (ROOT / "examples").glob("*.py") if path.name[0] != "_")
 
 
 def two_lines() -> list[str]:
-    lines: list[str] = BLOCKS[0][1].splitlines()
-    return lines
+    return blocks(README)[0].text.splitlines()
 
 
 def test_the_first_block_is_two_lines_that_set_up_and_show_and_set_up_and_test() -> None:
     demo, tests = two_lines()
     assert demo.endswith("busmaster demo")
-    assert tests.endswith("python -m pytest")
+    assert tests.endswith("python -m pytest -n auto")
     for line in (demo, tests):
         steps = line.split(" && ")
         assert steps[0] == "python3 -m venv .venv"
@@ -49,21 +47,11 @@ def test_the_console_script_is_there() -> None:
     assert callable(getattr(__import__(module, fromlist=[name]), name))
 
 
-@pytest.mark.parametrize("source", [text for language, text in BLOCKS if language == "python"])
-def test_a_program_in_the_readme_runs_and_imports_public_names_alone(source: str) -> None:
-    """Run as a module, so that what stands under `if __name__ == "__main__"` (a real port) does not."""
-    for node in ast.walk(ast.parse(source)):
+@pytest.mark.parametrize("block", blocks(README, "python"), ids=lambda block: str(block.place))
+def test_a_program_in_the_readme_imports_public_names_alone(block: Block) -> None:
+    for node in ast.walk(ast.parse(block.text)):
         if isinstance(node, ast.ImportFrom) and node.module == "busmaster":
             assert {alias.name for alias in node.names} <= set(busmaster.__all__)
-    exec(compile(source, "README.md", "exec"), {"__name__": "readme"})
-
-
-@pytest.mark.parametrize("line", re.findall(r"^busmaster .*$", README, flags=re.MULTILINE))
-def test_a_command_in_the_readme_has_options_that_exist(line: str) -> None:
-    words = shlex.split(line.partition("#")[0])
-    done = run([sys.executable, "-m", "busmaster", words[1], "--help"])
-    assert done.returncode == 0, done.stderr
-    assert {word for word in words if word.startswith("--")} <= set(re.findall(r"--[a-z-]+", done.stdout))
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: str(path.name))

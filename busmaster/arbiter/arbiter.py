@@ -193,8 +193,11 @@ class Arbiter(LineMachine):
     def poll_transmit(self) -> bytes | None:
         """Return the bytes that are to be sent now, which are handed over once, or None."""
         output = self._wire.output
-        data, output.waiting = output.waiting, b""
-        return data or None
+        data = output.waiting
+        if not data:
+            return None
+        output.waiting = b""
+        return data
 
     @property
     def said_until(self) -> float:

@@ -45,7 +45,7 @@ class Choice:
 
         `last_byte` is when the last byte came, in seconds.
         """
-        dispatcher, in_step, alike = self._dispatcher, self._in_step, self._alike
+        dispatcher = self._dispatcher
         while (transaction := dispatcher.next(now)) is not None:
             node = transaction.node
             try:
@@ -58,7 +58,9 @@ class Choice:
                 break
         else:
             return None
-        if answers == in_step.last and not exchange.later:
+        in_step, alike = self._in_step, self._alike
+        last = in_step.last
+        if answers == last and not exchange.later:
             too_many = alike.another(exchange, last_byte, now)
             if too_many or in_step.alert:
                 return self._carefully((transaction, exchange), now, last_byte, too_many)
@@ -67,7 +69,7 @@ class Choice:
         else:
             alike.count = 0
         alike.node = node
-        in_step.before, in_step.last = in_step.last, answers
+        in_step.before, in_step.last = last, answers
         return transaction, exchange
 
     def _carefully(self, first: Chosen, now: float, last_byte: float, too_many: bool = False) -> Chosen | float:

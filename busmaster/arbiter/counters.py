@@ -151,7 +151,6 @@ class NodeCounters:
 class LineCounters:
     __slots__ = (
         "_before",
-        "_entered",
         "breaks",
         "cancelled",
         "checks",
@@ -159,6 +158,7 @@ class LineCounters:
         "completed",
         "damaged",
         "doubted",
+        "entered",
         "exchanges",
         "losses",
         "noise_bytes",
@@ -174,7 +174,8 @@ class LineCounters:
     def __init__(self, since: float) -> None:
         self.exchanges = 0
         """Ever: what a request waited for is counted across a reset."""
-        self._entered = since
+        self.entered = since
+        """When the line entered its state, or `spent` was brought up to date."""
         self.spent = [0.0] * len(LineState)
         """Seconds in each state, ever, up to the last change."""
         self.reset(OFFLINE, since)
@@ -195,17 +196,10 @@ class LineCounters:
         else:
             self.damaged += 1
 
-    def spend(self, state: LineState, now: float) -> float:
-        """Count the time since the last call as spent in this state, and return it, in seconds."""
-        spent = now - self._entered
-        self.spent[state] += spent
-        self._entered = now
-        return spent
-
     def _times(self, state: LineState, now: float) -> list[float]:
         """Return the seconds ever spent in each state, up to now."""
         times = self.spent.copy()
-        times[state] += now - self._entered
+        times[state] += now - self.entered
         return times
 
     def snapshot(self, state: LineState, now: float, backlog: int) -> LineStatistics:

@@ -42,7 +42,7 @@ from busmaster.arbiter.transaction import (
     Transaction,
 )
 from busmaster.arbiter.writes import Writes
-from busmaster.contract.exchange import Command
+from busmaster.contract.exchange import Command, FrameError
 from busmaster.errors import (
     BacklogFull,
     BusError,
@@ -94,7 +94,8 @@ class Dispatcher:
     def submit(self, transaction: Transaction, now: float) -> bool:
         """Queue a transaction, or end it at once with the reason why not. Returns False if nothing else has changed."""
         node, counters = transaction.node, self.counters
-        transaction.queued, transaction.deadline = now, now + RETRY_PATIENCE
+        transaction.queued = now
+        transaction.deadline = now + RETRY_PATIENCE
         transaction.exchanges_ahead = counters.exchanges  # as _waits does: this is done for every request
         transaction.settling_ahead = counters.spent[SETTLING]
         if self.fault is not None:
@@ -213,7 +214,7 @@ class Dispatcher:
         self._end(transaction, now)
 
     def attempt_failed(
-        self, transaction: Transaction, no_reply: bool, what: str, now: float, doubted: bool = False
+        self, transaction: Transaction, no_reply: bool, failure: FrameError, now: float, doubted: bool = False
     ) -> None:
         """Ask again or fail. A `doubted` answer came and was not believed, which says nothing of the node (R15)."""
         node = transaction.node
@@ -232,8 +233,8 @@ class Dispatcher:
             self._watch.failed(node, now)
         kind: type[BusError] = NoReply if no_reply else GarbledReply
         if transaction.writes:
-            kind = WriteUnconfirmed
-        self._end(transaction, now, make_error(kind, what, transaction))
+            kind, failure.hint = WriteUnconfirmed, None  # whatever came: what to do about the write comes first
+        self._end(transaction, now, make_error(kind, failure.what, transaction, failure.hint))
 
     def broken(self, transaction: Transaction, bug: Exception, now: float) -> None:
         """Fail a transaction over which the protocol's reader failed: a bug there. To ask again would meet it again."""

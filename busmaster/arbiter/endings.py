@@ -9,9 +9,9 @@ from busmaster.errors import BusError, HoldEnded, NoReply, NotStarted, WriteUnco
 TOO_LATE = "allow more time, or see bus.statistics(), or busmaster plan, for what holds it up"
 
 
-def make_error(kind: type[BusError], what: str, transaction: Transaction) -> BusError:
-    """Return the error of this kind for a transaction."""
-    return name_error(kind(what), transaction)
+def make_error(kind: type[BusError], what: str, transaction: Transaction, hint: str | None = None) -> BusError:
+    """Return the error of this kind for a transaction, with the hint of the kind if none is given."""
+    return name_error(kind(what, hint=hint), transaction)
 
 
 def name_error(error: BusError, transaction: Transaction) -> BusError:

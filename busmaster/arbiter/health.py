@@ -209,7 +209,7 @@ class ProbeBudget:
         """
         before, probe = self._pause, self.probe
         pause = before + seconds
-        if pause > probe and self.tokens < BUDGET_CAPACITY:
+        if self.tokens < BUDGET_CAPACITY and pause > probe:
             # only what is longer than a probe, and only what was not counted when the same pause was looked at before
             earned = BUDGET_IDLE_SHARE * (pause - max(probe, before))
             self.tokens = min(BUDGET_CAPACITY, self.tokens + earned)

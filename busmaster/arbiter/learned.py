@@ -11,9 +11,9 @@ of a read have the document's window, and go only when nothing is awaited any mo
 node that has failed, and not answered since, have the document's times altogether.
 
 The rule, for each kind of command (its type) and each of the node's two legs (the answer; MSC's packet after its
-ACK) on its own: the window is twice the largest reply time of the last 500 to 1000 replies, or the largest until the
-first bytes were handed over if that is more (an adapter may hand over a whole reply at once), plus 2 ms; at least 5 ms,
-at most the document's. It is trusted after 200 replies.
+ACK) on its own: the window is one and a half times the largest reply time of the last 500 to 1000 replies, or the
+largest until the first bytes were handed over if that is more (an adapter may hand over a whole reply at once), plus
+2 ms; at least 5 ms, at most the document's. It is trusted after 200 replies.
 The second attempt of a read has twice that. The silence after which a reply is over is twice the longest pause
 within one of those replies, but 17 bytes at least. (A smoothed mean and deviation, as TCP has it, follows the usual
 reply too closely: of 76,000 replies it missed 1236, the largest none.)
@@ -41,8 +41,9 @@ EPOCH = 500
 """Replies after which an epoch ends: the largest of this one and the last count."""
 MARGIN = 0.002
 """Seconds added to what was ever needed."""
-SLOWER = 2
-"""How many times its slowest reply is awaited of a node."""
+SLOWER = 1.5
+"""How many times its slowest reply is awaited of a node: more costs each lost frame the difference, and less would call
+replies lost that only came a little later than any before."""
 LEAST = 0.005
 """The shortest window, in seconds: less than a process is held up for."""
 AT_FIRST, AGAIN, AT_LAST, NEVER = 1, 2, 10**9, 0

@@ -52,7 +52,6 @@ class Leg:
         "end",
         "first_bytes",
         "latency",
-        "learns",
         "longest",
         "out",
         "paced",
@@ -70,8 +69,6 @@ class Leg:
         """When the first byte of its reply was received."""
         self.first_bytes = b""
         """What came then, at once."""
-        self.learns = False
-        """Its node's times are learned: how the reply's bytes came is noted."""
         self.pause = 0.0
         """The longest pause, in seconds, between two arrivals of its bytes."""
         self.went_on_at = -inf
@@ -113,13 +110,15 @@ class Leg:
     def gap_over(self, now: float) -> float:
         """Return when the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
         timing, latency, byte_time = self.timing, self.latency, self.byte_time
-        if self.learns:
-            if self.went_on_at >= self.begun_at and now - self.went_on_at > self.pause:
-                self.pause = now - self.went_on_at
-            self.went_on_at = now
         due = now + timing.byte_gap + latency + byte_time
         limit = self.end + timing.window + latency + self.longest * byte_time + timing.byte_gap
         return due if due < limit else limit
+
+    def note_pause(self, now: float) -> None:
+        """Note that bytes of the reply came now, which do not complete it, where its node's times are learned."""
+        if self.went_on_at >= self.begun_at and now - self.went_on_at > self.pause:
+            self.pause = now - self.went_on_at
+        self.went_on_at = now
 
     def echoed(self, now: float) -> float:
         """Start the leg's times here, where the last byte of its echo came. Returns when its reply must begin."""

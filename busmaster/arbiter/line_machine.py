@@ -140,10 +140,10 @@ class LineMachine:
 
     def transmitted(self, now: float) -> None:
         """Note that the port took what `poll_transmit` gave only now: whoever held the process up meanwhile."""
-        wire, output = self._wire, self._wire.output
+        output = self._wire.output
         said_at = output.said_at
         late = now - said_at
-        if late > 0:
+        if late > 0.0:
             output.said_at = now
             leg = self._leg  # as leg.shift does: this is done for every request
             leg.end += late
@@ -153,8 +153,8 @@ class LineMachine:
             self._deadlines.line += late
             if self.state is SETTLING:
                 self._silent_at += late
-            if late > LOOK_SLACK and wire.transaction is not None and wire.transaction.started == said_at:
-                wire.transaction.started = now
+            if late > LOOK_SLACK and (asked := self._wire.transaction) is not None and asked.started == said_at:
+                asked.started = now
 
     def line_due(self, now: float) -> bool:
         """Return whether a deadline of the line falls due: `unsent` is to be told first, where it is known."""
@@ -269,7 +269,7 @@ class LineMachine:
             if type(step) is Done:
                 self._complete(step, now)
             elif self._leg.begun:
-                self._deadlines.line = self._leg.gap_over(now)
+                self._deadlines.line = self._wire.gap_over(now)
 
     def _complete(self, step: Done[Any], now: float) -> None:
         """Deliver a value: the line is free when the closing ACK has left and the node has let go of the line."""
@@ -298,9 +298,9 @@ class LineMachine:
         wire.transaction = wire.exchange = None  # and nothing is held: what was has been weighed again
         self._counters.exchanges += 1
         self.dispatcher.succeeded(transaction, step.value, now)
-        if rest:
-            self._unasked.note(rest, now, leg.quiet())
         if rest or wire.came_unasked or (self._echo.owed and not answered):  # a broadcast's echo may never come
+            if rest:
+                self._unasked.note(rest, now, leg.quiet())
             self._settle(now)
             return
         self._unasked.unanswered_one = None
@@ -324,18 +324,17 @@ class LineMachine:
     ) -> None:
         transaction, leg, unasked = self._wire.transaction, self._leg, self._unasked
         assert transaction is not None
-        what = error.what
         if no_reply:
             unasked.unanswered(transaction.node, leg.end, leg.timing.lateness)
-            if what == NO_REPLY:
-                what = f"no reply within {leg.timing.window * 1000:g} ms"
+            if error.what == NO_REPLY:
+                error.what = f"no reply within {leg.timing.window * 1000:g} ms"
             if self._echo.owed:
-                what += ", and no echo of the request: if the adapter has none, leave echo out"
+                error.what += ", and no echo of the request: if the adapter has none, leave echo out"
         elif error.heard:
             unasked.blame(now)
             unasked.run[:] = error.heard
         spared = error.whole and not self._in_step.debts  # its reply has begun: the silence alone is waited for (R3)
-        both = what is TWO_ANSWERS
+        both = error.what is TWO_ANSWERS
         if both:
             self._in_step.said_twice(now)
         self._trust.owe(self._wire, heard=not no_reply, whole=error.whole or both)
@@ -343,7 +342,7 @@ class LineMachine:
             self._wire.say(error.send, now)
         self._end_exchange(failed=True)
         if bug is None:
-            self.dispatcher.attempt_failed(transaction, no_reply, what, now, doubted)
+            self.dispatcher.attempt_failed(transaction, no_reply, error, now, doubted)
         else:
             self.dispatcher.broken(transaction, bug, now)
         self._settle(now, begun=spared)
@@ -485,8 +484,11 @@ class LineMachine:
             self.dispatcher.cut_off(transaction, self._offline(), now)
 
     def _enter(self, state: LineState, now: float) -> None:
-        spent = self._counters.spend(self.state, now)
-        if self.state is READY:
+        counters, before = self._counters, self.state
+        spent = now - counters.entered
+        counters.spent[before] += spent
+        counters.entered = now
+        if before is READY:
             self.dispatcher.probes.budget.idle(spent, state is not READY)
         self.state = state
 

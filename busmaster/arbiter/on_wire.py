@@ -55,7 +55,6 @@ class OnWire:
         self.answered = answered = exchange.answered
         self.came_unasked = False
         leg = self.leg
-        leg.learns = transaction.node.learning is not None
         request, timing = exchange.request, exchange.timing
         due = leg.begin(timing, len(request), exchange.sizes.longest, now)
         self._deadlines.line = due if answered else leg.end + timing.turnaround
@@ -65,6 +64,13 @@ class OnWire:
         output.said_at = now
         if self._echo.declared:
             self._echo.sent(request)
+
+    def gap_over(self, now: float) -> float:
+        """Return when the reply, of which a byte came now, must go on."""
+        assert self.transaction is not None
+        if self.transaction.node.learning is not None:
+            self.leg.note_pause(now)
+        return self.leg.gap_over(now)
 
     def learn(self, now: float) -> None:
         """Let its node's times be learned from the reply to this leg, which is over."""
@@ -106,7 +112,7 @@ class OnWire:
         """Return the deadline of the leg, where what was said has left only now."""
         leg = self.leg
         if leg.begun:
-            return leg.gap_over(now)
+            return self.gap_over(now)
         return now + (leg.timing.window + leg.latency if self.answered else leg.timing.turnaround)
 
     def _next_leg(self, step: Expect, now: float) -> None:

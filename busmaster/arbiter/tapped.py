@@ -11,6 +11,7 @@ from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.arbiter.transaction import Transaction
 from busmaster.arbiter.trust import SPOILING
+from busmaster.contract.exchange import FrameError
 from busmaster.errors import BusError, Refused
 
 
@@ -48,12 +49,13 @@ class TappedDispatcher(Dispatcher):
         super().succeeded(transaction, value, now)
 
     def attempt_failed(
-        self, transaction: Transaction, no_reply: bool, what: str, now: float, doubted: bool = False
+        self, transaction: Transaction, no_reply: bool, failure: FrameError, now: float, doubted: bool = False
     ) -> None:
         """Tell that the attempt failed, and how."""
+        what = failure.what
         verdict = Verdict.NO_REPLY if no_reply else Verdict.SPOILT if what in SPOILING else Verdict.GARBLED
         self._over(transaction, Verdict.DOUBTED if doubted else verdict, what, now)
-        super().attempt_failed(transaction, no_reply, what, now, doubted)
+        super().attempt_failed(transaction, no_reply, failure, now, doubted)
 
     def broken(self, transaction: Transaction, bug: Exception, now: float) -> None:
         """Tell that the protocol's reader failed on what came."""

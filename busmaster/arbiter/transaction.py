@@ -113,7 +113,18 @@ class Transaction:
     settling_ahead: float
     late: bool
     """The reply to its last attempt began after the nominal time."""
-    # These are set when it is queued, or sent, and not before: each costs, and this is done for every request.
+    # Those above are set when it is queued, or sent, and not before; and a string behind a statement of a function is
+    # an instruction that does nothing. Each costs, and this is done for every request.
+    finish_by: float
+    """Its caller waits no longer, and nothing is sent from then on."""
+    client: LineClient | None
+    """Whose request it is; None is the program that owns the line."""
+    check: bool
+    """It is asked for the sake of its answer's likeness alone (R15): nobody waits for it, nothing counts it."""
+    touches: object
+    """What a write changes, for its owner to know."""
+    unsure: bool
+    """An attempt was sent whose outcome is not known: it may have been carried out (R7)."""
 
     def __init__(
         self,
@@ -126,9 +137,9 @@ class Transaction:
         probe: bool = False,
         finish_by: float = inf,
         touches: object = None,
+        client: LineClient | None = None,
         tag: Any = None,
         poll: Poll | None = None,
-        client: LineClient | None = None,
     ) -> None:
         self.node = node
         self.command = command
@@ -141,19 +152,15 @@ class Transaction:
             self.retries = node.retries if retries is None else retries
         self.start_by = start_by
         self.finish_by = finish_by
-        """Its caller waits no longer, and nothing is sent from then on."""
         if finish_by < inf:
             # a start_by is met by what starts right at it, but at finish_by nothing is sent any more
             self.start_by = min(start_by, nextafter(finish_by, -inf))
         self.tag = tag
         self.poll = poll
         self.client = client
-        """Whose request it is; None is the program that owns the line."""
         self.probe = probe
         self.check = False
-        """It is asked for the sake of its answer's likeness alone (R15): nobody waits for it, nothing counts it."""
         self.touches = touches
-        """What a write changes, for its owner to know."""
         self.refused_until = -inf
         self.refused_cycles = 0
         self.reset()
@@ -168,7 +175,6 @@ class Transaction:
         self.wanted = True
         self.superseded = False
         self.unsure = False
-        """An attempt was sent whose outcome is not known: it may have been carried out (R7)."""
         self.value: Any = None
         self.error: BusError | None = None
         self.started = self.first_byte = self.last_byte = self.ended_at = -inf

@@ -57,7 +57,7 @@ class Meaning:
         status = replace(drive.point("11"), meaning=Meaning(bits={"READY": 0, "FAULT": 3}))
         group.add(status, *status.bits)
 
-    `precision` is how many digits behind the point are shown to people, 0 to 15; what is computed with and stored is
+    `precision` is how many decimals are shown to people, 0 to 15; what is computed with and stored is
     not rounded. `bits` names bits of a word, 0 the lowest, each of which is a point of its own; `labels` names whole
     numbers. With `deadband` outputs are told a value only where it is further than that from what they were told
     last, 0 for every change; with `heartbeat` at the latest after so many seconds. A value above `high` or below
@@ -86,7 +86,7 @@ class Meaning:
             if value is not None and (isinstance(value, bool) or not isfinite(value)):
                 yield name, f"must be a finite number, not {value}"
         if self.precision is not None and not 0 <= self.precision <= MOST_DIGITS:
-            yield "precision", f"is 0 to {MOST_DIGITS} digits behind the point, not {self.precision}"
+            yield "precision", f"is 0 to {MOST_DIGITS} decimals, not {self.precision}"
         if self.deadband is not None and not self.deadband >= 0:
             yield "deadband", f"is 0 or more, not {self.deadband}"
         if self.heartbeat is not None and not self.heartbeat > 0:

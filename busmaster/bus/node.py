@@ -29,6 +29,7 @@ from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, InvalidCommand, Refused, Superseded
 from busmaster.planning import PlannedNode
 from busmaster.planning.merging import Merge
+from busmaster.transport.pump import Waiter
 
 T = TypeVar("T")
 PROBE = RequestOptions(retries=0)
@@ -243,7 +244,8 @@ class Node:
         if limiter is not None and getattr(command, "writes", False):
             async with limiter.passing(self, command, chosen, stop or chosen.safe) as left:
                 return (await self._timed(command, left, touches, stops_seen))[0]
-        transaction, future = self._start(command, chosen, False, touches, stops_seen)
+        transaction = self._prepared(command, chosen, False, touches, stops_seen)
+        future = self.shared.pump.transact(transaction)
         try:
             value: T = await future
         except asyncio.CancelledError:
@@ -306,21 +308,23 @@ class Node:
 
     def begin_reading(
         self,
-        command: Command[T],
+        command: Command[Any],
         journey: Journey,
+        reader: Waiter,
         *,
         stops_seen: int | None = None,
         client: LineClient | None = None,
         **options: Unpack[CommandOptions],
-    ) -> asyncio.Future[T]:
-        """Begin a request of what writes nothing, and return its future: who cancels that calls `give_up` too.
+    ) -> None:
+        """Begin a request of what writes nothing; `reader` is told what became of it, perhaps before this returns, and
+        calls `give_up` when it waits no longer.
 
         Raises what `request` raises before anything is sent, and HoldEnded as `followed_request`.
         """
         self._within(client, command)
         chosen = self._options(options) if options else ORDINARY
-        journey.transaction, future = self._start(command, chosen, stops_seen=stops_seen, client=client)
-        return future
+        journey.transaction = self._prepared(command, chosen, stops_seen=stops_seen, client=client)
+        self.shared.pump.begin(journey.transaction, reader)
 
     def give_up(self, journey: Journey) -> None:
         """Cancel what nobody waits for any more."""
@@ -336,9 +340,10 @@ class Node:
         journey: Journey | None = None,
         client: LineClient | None = None,
     ) -> tuple[T, Timeline]:
-        transaction, future = self._start(command, options, False, touches, stops_seen, client)
+        transaction = self._prepared(command, options, False, touches, stops_seen, client)
         if journey is not None:
             journey.transaction = transaction
+        future = self.shared.pump.transact(transaction)
         try:
             return await future, transaction.timeline()
         except asyncio.CancelledError:
@@ -351,7 +356,7 @@ class Node:
             raise InvalidCommand(f"{self.label}: verify is for what writes a value through a handle")
         return options
 
-    def _start(
+    def _prepared(
         self,
         command: Command[Any],
         options: RequestOptions,
@@ -359,7 +364,8 @@ class Node:
         touches: Command[Any] | None = None,
         stops_seen: int | None = None,
         client: LineClient | None = None,
-    ) -> tuple[Transaction, asyncio.Future[Any]]:
+    ) -> Transaction:
+        """Return the transaction of a request. Raises what says that it cannot be begun."""
         record, line = self.record, self.shared
         if self._to_all and not command.writes:
             raise InvalidCommand(
@@ -377,7 +383,7 @@ class Node:
             raise Superseded("the node was told to stop since this was decided", node=record, command=str(command))
         if line.only_safe and command.writes and not options.safe:
             raise Superseded(LEFT, node=record, command=str(command), hint="")
-        transaction = Transaction(  # by position: keywords cost more, and this is done for every request
+        return Transaction(  # by position: keywords cost more, and this is done for every request
             record,
             command,
             options.priority,
@@ -387,11 +393,8 @@ class Node:
             probe,
             inf if options.finish_within is None else line.now() + options.finish_within,
             self if touches is None else (self, touches),
-            None,
-            None,
             client,
         )
-        return transaction, line.pump.transact(transaction)
 
     def _give_up(self, transaction: Transaction) -> None:
         """Cancel what nobody waits for any more. A write that is on the wire ends before anything else can be read."""
@@ -404,7 +407,8 @@ class Node:
     async def probe(self) -> bool:
         """Ask the node's cheapest read now, once. Return True if it answered (a refusal is an answer), False if not, or
         if it could not be asked."""
-        transaction, future = self._start(self.profile.probe, PROBE, probe=True)
+        transaction = self._prepared(self.profile.probe, PROBE, probe=True)
+        future = self.shared.pump.transact(transaction)
         try:
             await future
         except asyncio.CancelledError:

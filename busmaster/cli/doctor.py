@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 
@@ -17,6 +18,7 @@ from busmaster.contract.learning import documented
 from busmaster.contract.profile import LineSettings
 from busmaster.doctor.adapters import Finding
 from busmaster.doctor.examination import Patient, examine
+from busmaster.outputs.values import utc
 from busmaster.transport.endpoints import endpoint
 
 FAILED = 1
@@ -26,7 +28,7 @@ USUAL = LineSettings(9600)
 """What a port is opened with where neither a protocol nor the user says."""
 
 
-@click.command(short_help="What is wrong with this port, adapter or line?")
+@click.command(short_help="Find out what is wrong with a port, an adapter or a line.")
 @click.argument("port")
 @protocol_option(required=False)
 @nodes_option
@@ -56,7 +58,7 @@ def command(
     def tell(finding: Finding) -> None:
         nonlocal wrong
         wrong += not finding.ok
-        emit_all([json_line(**asdict(finding))] if as_json else lines_of(finding))
+        emit_all([json_line(**asdict(finding), time=utc(time.time()))] if as_json else lines_of(finding))
 
     name = patient.endpoint.name
     with capturing(capture, port=name, protocol=protocol or "", echo=patient.endpoint.echo) as recorder:

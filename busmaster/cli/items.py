@@ -18,7 +18,7 @@ from busmaster.registry import NodeKind, find
 HEAD = ("ITEM", "NUMBER", "UNIT", "ACCESS", "MEANING")
 
 
-@click.command(short_help="What a protocol's documents name.")
+@click.command(short_help="List what a protocol's documents name.")
 @click.argument("protocol", type=option_type(parse_protocol))
 @click.argument("words", nargs=-1, metavar="[WORD]...")
 @json_option

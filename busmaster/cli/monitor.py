@@ -6,7 +6,6 @@ import asyncio
 import json
 import time
 from collections.abc import Callable, Mapping
-from datetime import datetime
 from typing import Any
 
 import anyio
@@ -36,7 +35,7 @@ from busmaster.transport.endpoints import Endpoint
 ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 
 
-@click.command(short_help="Listen only; decode what passes.")
+@click.command(short_help="Listen to a line, and decode what passes.")
 @click.argument("port", metavar="PORT|LINE.toml")
 @protocol_option(required=False)
 @click.option("--baud", type=Whole(min=1), metavar="N", help="Baud rate; the protocol's by default.")
@@ -168,14 +167,13 @@ async def listen(
 def plain_text(frame: Frame, names: Mapping[str, str]) -> str:
     """Return a frame as one line; the bytes too, if something is wrong.
 
-    It reads `14:02:11.485012 <- node 5   100 (axis0.position) = 12.5  2.9 ms`.
+    It reads `2026-11-22T14:02:11.485012Z <- node 5   100 (axis0.position) = 12.5  2.9 ms`.
     """
-    moment = datetime.fromtimestamp(frame.time).astimezone().strftime("%H:%M:%S.%f")
     node = "" if frame.node is None else f"node {frame.node}"
     text = frame.text
     if frame.item in names:
         text = text.replace(frame.item, f"{frame.item} ({names[frame.item]})", 1)
-    parts = [f"{moment} {ARROWS[frame.sender]} {node:8} {text}"]
+    parts = [f"{utc(frame.time, 'microseconds')} {ARROWS[frame.sender]} {node:8} {text}"]
     if frame.delay is not None:
         parts.append(f"{frame.delay * 1000:.1f} ms")
     if frame.fault:
@@ -187,7 +185,7 @@ def json_text(frame: Frame, names: Mapping[str, str]) -> str:
     """Return a frame as one JSON object; null for what it does not say."""
     sender = None if frame.sender is Direction.UNKNOWN else frame.sender.name.lower()
     fields = {
-        "time": round(frame.time, 6),
+        "time": utc(frame.time, "microseconds"),
         "from": sender,
         "node": frame.node,
         "kind": frame.kind.value,

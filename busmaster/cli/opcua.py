@@ -1,4 +1,4 @@
-"""`busmaster opcua`: a line that another process owns, as an OPC UA server."""
+"""`busmaster opcua`: a line that another program owns, as an OPC UA server."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FILE = click.Path(exists=True, dir_okay=False)
 FOLDER = click.Path(exists=True, file_okay=False)
 
 
-@click.command(short_help="Serve a line that another process owns by OPC UA.")
+@click.command(short_help="Serve a line that another program owns by OPC UA.")
 @door_options(BIND)
 @click.option("--allow", multiple=True, metavar="POINT", help="May be written, as winder/force or 'drive*/speed'.")
 @click.option("--token-file", metavar="FILE", help="Who writes is a user of this file: a name and its token a line.")

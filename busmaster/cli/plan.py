@@ -25,7 +25,7 @@ SOME = 8
 HEAD = ("GROUP", "PERIOD", "VALUES", "EXCHANGES", "LINE", "CYCLE", "LONGEST", "MISSED")
 
 
-@click.command(short_help="Does the schedule of a file fit its line?")
+@click.command(short_help="Reckon whether the polls of a file fit its line.")
 @file_argument()
 @json_option
 def command(path: str, as_json: bool) -> int:

@@ -16,7 +16,7 @@ from busmaster.config.points_table import COLUMNS, ITEM, LIMITED_BY, NODE, ORIGI
 from busmaster.config.points_taking import BadRows, taken, write_beside
 
 
-@click.command(short_help="The points of a file as a table, out and in.")
+@click.command(short_help="Show the points of a file as a table, or take them from one.")
 @file_argument()
 @click.option("--csv", "as_csv", is_flag=True, help="Print them as CSV.")
 @click.option(

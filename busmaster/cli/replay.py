@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from datetime import datetime
 from typing import Any, BinaryIO
 
 import click
@@ -19,7 +18,7 @@ CHANGED = 1
 COUNTED = ("same", "changed", "unjudged")
 
 
-@click.command(short_help="Run a recorded exchange list against the decoders.")
+@click.command(short_help="Read a capture again, by the readers of today.")
 @click.argument("capture", type=click.Path(exists=True, dir_okay=False))
 @json_option
 def command(capture: str, as_json: bool) -> int:
@@ -64,7 +63,7 @@ def fields(one: Replayed) -> dict[str, Any]:
     """Return an exchange as a JSON object: what was recorded, and what comes out now."""
     return {
         "packet": one.packet,
-        "time": utc(one.micros / 1e6),
+        "time": utc(one.micros / 1e6, "microseconds"),
         "node": one.node,
         "command": one.command,
         "recorded": str(one.recorded),
@@ -76,7 +75,7 @@ def fields(one: Replayed) -> dict[str, Any]:
 
 def changed_text(one: Replayed) -> str:
     """Return the line of an exchange that has changed: what was recorded, and what comes out now."""
-    moment = datetime.fromtimestamp(one.micros / 1e6).astimezone().strftime("%H:%M:%S.%f")
+    moment = utc(one.micros / 1e6, "microseconds")
     node = "" if one.node is None else f"node {one.node}: "
     return f"packet {one.packet}, {moment}, {node}{one.command}: was {one.recorded}, is {one.now}"
 

@@ -165,7 +165,7 @@ class Running:
             note(f"the file was read again, and nothing of it taken: {error}", Level.ERROR)
         else:
             if self.watch.service is not None:
-                self.watch.service.title = file.title
+                self.watch.service.line.title = file.title
             self.watch.replace_groups(self.line.groups.values())
             note(f"{self._path} was read again", Level.NOTICE)
             self._say_what_is_polled()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 
 import anyio
 import click
@@ -10,7 +11,9 @@ import click
 from busmaster.arbiter.events import PortFailed
 from busmaster.bus.alarms import BusEvent
 from busmaster.bus.polling import Stream
+from busmaster.capture.recorder import Recorder
 from busmaster.cli.app import FAILED, OK
+from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import file_argument, keep, load, other_port, port_option
 from busmaster.cli.output import Level, emit, note
@@ -20,29 +23,48 @@ from busmaster.errors import BusError, InvalidCommand
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.values import event_text
 from busmaster.service.remote import RemoteBus, connect
+from busmaster.transport.endpoints import Endpoint
 
 
 @click.command(short_help="Send the safe state of a file, and verify it.")
 @file_argument()
 @port_option
-def command(path: str, port: str | None) -> int:
+@capture_option
+def command(path: str, port: str | None, capture: str | None) -> int:
     """Send the writes that [safe] in LINE.toml lists, urgently, read each back, and print `POINT ok`.
 
     Nothing is polled. The outputs keep a record of the writes, once those are over. What was not confirmed in the
     file's time is named on standard error, and the exit status is 1. A port that cannot be opened is waited for in that
-    time, and named with the reason.
+    time, and named with the reason. The writes are sent even where --capture cannot record them.
 
     Where another busmaster owns the line, that sends them, if its file says the same; the line goes on afterwards.
     """
     file = load(path)
-    line = ConfiguredLine(file, port=other_port(file, port), outputs=False, wait_for_port=True)
-    if not line.safe_state:
+    if not file.safe.writes:
         raise click.UsageError(f"{path} has no safe state: its writes stand in [safe]")
-    owner = owner_of(line.bus.endpoint)
-    if owner is not None:
+    endpoint = other_port(file, port)
+    where = endpoint or file.port
+    owner = owner_of(where)
+    with recorded(None if owner else capture, where) as recorder:
+        line = ConfiguredLine(file, port=endpoint, outputs=False, tap=recorder, wait_for_port=True)
+        if owner is None:
+            return until_ended(leave, line)
+        if capture is not None:
+            note(f"{owner.port} is a line of another program: it is recorded there, not by --capture", Level.WARNING)
         tell_owner(owner)
         return until_ended(leave_through, connect(owner.address), line.safe_state.values)
-    return until_ended(leave, line)
+
+
+@contextmanager
+def recorded(capture: str | None, endpoint: Endpoint) -> Iterator[Recorder | None]:
+    """Yield what records the line, as `capturing` does; None, having said why, where that cannot be: a stop goes on."""
+    with ExitStack() as recording:
+        recorder = None
+        try:
+            recorder = recording.enter_context(capturing(capture, port=endpoint.name, echo=endpoint.echo))
+        except click.UsageError as error:
+            note(error.format_message(), Level.WARNING)
+        yield recorder
 
 
 async def leave_through(remote: RemoteBus, values: Mapping[str, float]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import AsyncIterator, Sequence
 
 import anyio
@@ -17,6 +18,7 @@ from busmaster.cli.protocols import NodeCommand
 from busmaster.cli.reaching import reach
 from busmaster.contract.profile import Profile
 from busmaster.errors import GarbledReply, NodeDown, NoReply, Refused
+from busmaster.outputs.values import utc
 from busmaster.registry import protocols
 from busmaster.service.remote import RemoteBus
 
@@ -53,7 +55,7 @@ async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool
                 else:
                     value, outcome = answer
                     number = connection.node_number(node.address)
-                    found = json_line(node=number, value=json_value(value), answer=outcome)
+                    found = json_line(node=number, value=json_value(value), answer=outcome, time=utc(time.time()))
                     with bar.hidden():
                         emit(found if as_json else f"{node.address} {outcome}")
                 bar.advance()
@@ -84,7 +86,9 @@ async def ask(node: Requester) -> tuple[object, str] | None:
     outcome = await ask_once(node)
     if isinstance(outcome, GarbledReply):
         outcome = await ask_once(node)
-    return (None, f"{node.profile.probe}: {outcome.what}") if isinstance(outcome, GarbledReply) else outcome
+    if isinstance(outcome, GarbledReply):
+        return None, f"{node.profile.probe}: {outcome.what}; {outcome.hint}"
+    return outcome
 
 
 async def ask_once(node: Requester) -> tuple[object, str] | GarbledReply | None:

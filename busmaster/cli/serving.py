@@ -54,7 +54,7 @@ async def served(service: Service | None, *, tell: bool) -> AsyncIterator[Servic
     try:
         if tell:
             by_tcp = "" if service.tcp_address is None else f" and {service.tcp_address}"
-            note(f"{service.title} is served at {service.address}{by_tcp}", Level.NOTICE)
+            note(f"{service.line.title} is served at {service.address}{by_tcp}", Level.NOTICE)
         yield service
     finally:
         await service.__aexit__(None, None, None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import Any
 
 import click
@@ -12,6 +13,7 @@ from busmaster.cli.arguments import json_option
 from busmaster.cli.ending import until_ended
 from busmaster.cli.output import columns, emit, emit_all, json_line, note
 from busmaster.errors import BusError
+from busmaster.outputs.values import utc
 from busmaster.service.folder import Owner, owners
 from busmaster.service.remote import connect
 
@@ -47,6 +49,7 @@ async def ask(owner: Owner) -> dict[str, Any]:
     line: dict[str, Any] = {"name": owner.name, "port": owner.port, "address": owner.address, "process": owner.pid}
     line |= {"tcp": None, "programs": None, "utilisation": None, "state": None}
     line |= {"up": None, "nodes": None, "error": None}
+    line["time"] = utc(time.time())
     try:
         async with asyncio.timeout(ANSWER_WITHIN), connect(owner.address) as remote:
             nodes, line["tcp"] = remote.about["nodes"], remote.about["tcp"]

@@ -125,7 +125,7 @@ class Watch:
     def tell(self, text: str) -> None:
         """Add to what the screen shows of the last events."""
         if self.service is not None:
-            self.service.journal.note(text)
+            self.service.line.journal.note(text)
 
     def announce(self, text: str, level: Level = Level.NOTICE) -> None:
         """Add to the last events; print a line on standard error, unless the screen that shows them is there."""
@@ -150,10 +150,10 @@ class Watch:
             note(f"{text}, line {counts.utilisation:.1%} busy")
         for node in self.bus.nodes:
             of_node = node.statistics()
-            note(
-                f"{node.label}: {of_node.attempts} requests, {of_node.fruitless} failed, "
-                f"p50 {of_node.latency.p50 * 1000:.2f} ms, p99 {of_node.latency.p99 * 1000:.2f} ms"
-            )
+            text = f"{node.label}: {of_node.attempts} requests, {of_node.fruitless} failed"
+            if of_node.ok:
+                text += f", p50 {of_node.latency.p50 * 1000:.2f} ms, p99 {of_node.latency.p99 * 1000:.2f} ms"
+            note(text)
         for bus_node in self.bus.nodes:
             if text := learned_text(bus_node.statistics().learned):
                 note(f"{bus_node.label}: {text}")

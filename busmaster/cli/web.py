@@ -1,4 +1,4 @@
-"""`busmaster web`: a page for the operator and a REST API over a line that another process owns."""
+"""`busmaster web`: a page for the operator and a REST API over a line that another program owns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BIND = "127.0.0.1:8420"
 NEEDED = ("starlette", "uvicorn", "websockets")
 
 
-@click.command(short_help="Serve a page and a REST API over a line that another process owns.")
+@click.command(short_help="Serve a page and a REST API over a line that another program owns.")
 @door_options(BIND)
 @click.option("--token-file", metavar="FILE", help="A name and a token a line: who writes shows one.")
 def command(line: str | None, bind: str, read_only: bool, token_file: str | None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -23,6 +24,7 @@ from busmaster.config import ConfiguredLine
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Wish
 from busmaster.gate.record import WriteRecord
+from busmaster.outputs.values import utc
 from busmaster.registry import find
 from busmaster.service.remote import connect
 
@@ -39,7 +41,7 @@ Pairs = Sequence[tuple[str, tuple[float, ...]]]
     "--decimals",
     type=Whole(min=0),
     metavar="N",
-    help="How many of the last digits on the line are behind the point, where it carries none: 1 for 1.17=-47.6.",
+    help="How many of the last digits on the line are decimals, where it carries no decimal point: 1 for 1.17=-47.6.",
 )
 @json_option
 def command(
@@ -62,7 +64,7 @@ def command(
     pairs = [parsed(parse_assignment, text) for text in assignments]
     if not is_line_file(connection.port):
         if decimals is not None and not find(connection.protocol).takes_decimals:
-            raise click.UsageError(f"{connection.protocol} carries the point of a number itself: leave --decimals out")
+            raise click.UsageError(f"{connection.protocol} carries the decimal point itself: leave --decimals out")
         until_ended(write, connection, connection.one_address(node), pairs, verify, as_json, decimals)
         return
     file = load(connection.port)
@@ -91,7 +93,7 @@ async def write(
         for item, sends in prepared:
             for send in sends:
                 await send()
-            emit(json_line(node=connection.node_number(address), item=item, ok=True) if as_json else f"{item} ok")
+            tell(item, as_json, node=connection.node_number(address), item=item)
 
 
 async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json: bool) -> None:
@@ -104,7 +106,7 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
         async with line.bus:
             for wish, send in prepared:
                 await pass_on(line, wish, send)
-                emit(json_line(point=wish.name, ok=True) if as_json else f"{wish.name} ok")
+                tell(wish.name, as_json, point=wish.name)
     finally:
         await keep(audit, records)
 
@@ -116,7 +118,12 @@ async def write_points_through(line: ConfiguredLine, address: str, pairs: Pairs,
     async with remote:
         for name, send in prepared:
             await send()
-            emit(json_line(point=name, ok=True) if as_json else f"{name} ok")
+            tell(name, as_json, point=name)
+
+
+def tell(name: str, as_json: bool, **fields: Any) -> None:
+    """Print that what is called so has been written, as a line or as JSON with these fields."""
+    emit(json_line(**fields, ok=True, time=utc(time.time())) if as_json else f"{name} ok")
 
 
 async def pass_on(line: ConfiguredLine, wish: Wish, send: Send) -> None:

@@ -28,14 +28,19 @@ class Between(NamedTuple):
 
 def whole_number(value: SupportsIndex, lowest: int, highest: int, what: str) -> int:
     """Return `value` as an int. Raises InvalidCommand, naming it `what`, unless it is a whole number in that range."""
+    number = value if type(value) is int else _index(value, what)  # an int, as nearly all are, is not asked what it is
+    if not lowest <= number <= highest:
+        raise InvalidCommand(f"{what} must be {lowest} to {highest}, not {number}")
+    return number
+
+
+def _index(value: SupportsIndex, what: str) -> int:
     try:
         number = operator.index(value)
     except TypeError:
         number = None
     if number is None or isinstance(value, bool):
         raise InvalidCommand(f"{what} must be a whole number, not {value!r}")
-    if not lowest <= number <= highest:
-        raise InvalidCommand(f"{what} must be {lowest} to {highest}, not {number}")
     return number
 
 

@@ -81,15 +81,19 @@ class FrameError(Exception):
     `whole` is True only for a whole frame with the right echo and a bad checksum: its reply has begun, so the line
     need not wait for stragglers, only for silence (R3). `send` is a closing ACK owed to the device all the same
     (MSC), else it retransmits into other exchanges. `heard` is all that came in place of the reply, where it may be
-    another request's: it pays what is owed (R15).
+    another request's: it pays what is owed (R15). `hint` is what to try, where that is not what helps against most
+    garbled replies.
     """
 
-    def __init__(self, what: str, *, whole: bool = False, send: bytes = b"", heard: bytes = b"") -> None:
+    def __init__(
+        self, what: str, *, whole: bool = False, send: bytes = b"", heard: bytes = b"", hint: str | None = None
+    ) -> None:
         super().__init__(what)
         self.what = what
         self.whole = whole
         self.send = send
         self.heard = heard
+        self.hint = hint
 
 
 class Exchange(Protocol[T_co]):
@@ -205,9 +209,22 @@ def no_reply() -> FrameError:
     return FrameError(NO_REPLY)
 
 
+OTHER_FORMAT = "this is not the wiring: check the protocol, its options and the command against the node's manual"
+
+
+def other_format(size: int, what: str, *, send: bytes = b"", heard: bytes = b"") -> FrameError:
+    """Return the failure of a reply of `size` bytes whose check is right and whose form is not the protocol's.
+
+    `what` says what differs. No noise makes such a reply, so its hint says that wiring is not what is wrong.
+    """
+    what = f"{size} bytes came, right in their check but of another format: {what}"
+    return FrameError(what, send=send, heard=heard, hint=OTHER_FORMAT)
+
+
 __all__ = [
     "MORE",
     "NO_REPLY",
+    "OTHER_FORMAT",
     "Abandonable",
     "Command",
     "Done",
@@ -221,4 +238,5 @@ __all__ = [
     "Sizes",
     "Step",
     "no_reply",
+    "other_format",
 ]

@@ -103,7 +103,7 @@ class Profile:
         """Return what is wrong with a baud rate, in words; nothing unless its devices cannot have it."""
         if not self.fixed_rate or baudrate == self.line.baudrate:
             return ""
-        return f"{self.title} devices speak at {self.line.baudrate} baud alone, not at {baudrate}"
+        return f"{self.title} nodes speak at {self.line.baudrate} baud alone, not at {baudrate}"
 
     def check_address(self, address: int) -> None:
         """Raise InvalidCommand unless `address` is a node's, or the broadcast, address."""

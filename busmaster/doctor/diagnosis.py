@@ -173,7 +173,9 @@ def node(record: Record, others_are_clean: bool) -> Finding:
     if garbled:
         probe = next(probe for probe in record.probes if probe.outcome is Outcome.GARBLED)
         what = f"{garbled} of {asked} replies garbled ({probe.text}): {garbage(probe.raw)}"
-        if others_are_clean:
+        if probe.hint is not None:
+            advice = probe.hint
+        elif others_are_clean:
             advice = f"look for {who}: does this one still answer when you switch it off? Else check its wiring"
         else:
             advice = "check baud rate, termination, biasing and the common ground; then, whether two share an address"

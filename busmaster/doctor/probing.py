@@ -88,7 +88,7 @@ class Wire(asyncio.Protocol):
 
     @property
     def tunable(self) -> bool:
-        """Whether the port can be set to other rates: a device server's cannot, from here."""
+        """Whether the port can be set to other rates: a serial server's cannot, from here."""
         return hasattr(self.transport, "tune")
 
     async def tune(self, settings: LineSettings) -> None:
@@ -159,7 +159,7 @@ class Probe:
 
     `start`: seconds from the request's end on the wire to the first byte, None if there was none. `text` is the command
     and its value or refusal, or what was wrong. `raw` is all that came, and `again` what of it came after the reply, to
-    which nobody was entitled.
+    which nobody was entitled. `hint` is what to try, where the reader knows that.
     """
 
     outcome: Outcome
@@ -168,6 +168,7 @@ class Probe:
     raw: bytes = b""
     again: bytes = b""
     refused: bool = False
+    hint: str | None = None
 
 
 class Prober:
@@ -270,7 +271,9 @@ class _Hearing:
         if self.start is None:
             return Probe(Outcome.SILENT)
         if verdict not in (Verdict.OK, Verdict.REFUSED):
-            return Probe(Outcome.GARBLED, self.start, result, self._raw + rest)
+            error = None if self.driver.ending is None else self.driver.ending.error
+            hint = error.hint if isinstance(error, FrameError) else None
+            return Probe(Outcome.GARBLED, self.start, result, self._raw + rest, hint=hint)
         text = value_text(result) if verdict is Verdict.OK else result
         left_over = b"" if self.driver.ending is None else self.driver.ending.rest
         told = f"{self._command}: {text}"

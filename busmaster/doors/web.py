@@ -172,6 +172,10 @@ class Api:
 
     def _row(self, request: Request) -> Row:
         group, key = request.path_params["group"], request.path_params["key"]
+        if self._line.picture.frame is None:  # who asks as the door opens is not to think that there is no such point
+            state = self._line.state
+            why = state.why if isinstance(state, Lost) else "its program was found only now"
+            raise LineDown(f"the points of the line are not known yet: {why}", hint="ask again in a moment")
         for row in self._line.picture.rows:
             if (row.group, row.key) == (group, key):
                 return row

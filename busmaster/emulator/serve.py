@@ -198,7 +198,7 @@ class PtyServer(LineServer):
 
 
 class TcpServer(LineServer):
-    """A line on a TCP port, as a serial device server has it. Clients share it: each hears all that comes back.
+    """A line on a TCP port, as a serial server has it. Clients share it: each hears all that comes back.
 
     `path` is "socket://HOST:PORT"; port 0 picks a free one. Raises OSError if the port cannot be bound.
     """

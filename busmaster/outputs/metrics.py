@@ -39,12 +39,12 @@ COUNTS = {
     "late": "Replies after the nominal time, accepted all the same",
     "retries": "Reads that were tried again",
     "unheard": "Replies to callers that had gone",
-    "failed": "Transactions that ended with an error, retries and all",
+    "failed": "Requests that ended with an error, retries and all",
     "probes": "Probes of the node while it was down",
 }
 LINE_COUNTS = {
     "exchanges": "Exchanges on the line",
-    "cancelled": "Transactions whose callers had gone",
+    "cancelled": "Requests whose callers had gone",
     "unasked_bytes": "Bytes that nobody had asked for",
     "tainted": "Replies that came sooner than the baud rate allows",
     "collisions": "Echoes that differ from what was sent",
@@ -142,11 +142,11 @@ class MetricsOutput(Output):
 
         line = self._ask(self._bus.statistics)
         yield GaugeMetricFamily(
-            "busmaster_line_utilisation_ratio", "Share of the time in which the line was in use", value=line.utilisation
+            "busmaster_line_utilisation_ratio", "Share of the time in which the line was busy", value=line.utilisation
         )
         yield CounterMetricFamily("busmaster_line_busy_seconds", "Time in exchanges", value=line.busy)
         yield CounterMetricFamily("busmaster_line_settling_seconds", "Time spent settling", value=line.settling)
-        yield GaugeMetricFamily("busmaster_line_backlog", "Transactions that wait", value=line.backlog)
+        yield GaugeMetricFamily("busmaster_line_backlog", "Requests that wait", value=line.backlog)
         for name, text in LINE_COUNTS.items():
             yield CounterMetricFamily(f"busmaster_line_{name}", text, value=getattr(line, name))
         for name, text in DRIVER_COUNTS.items() if line.driver is not None else ():

@@ -35,7 +35,7 @@ def number_text(value: float) -> str:
 
 
 def rounded_text(value: float, precision: int) -> str:
-    """Return the number as people are shown it, with so many digits behind the point; zero without a sign."""
+    """Return the number as people are shown it, with so many decimals; zero without a sign."""
     text = f"{value:.{precision}f}"
     return text.removeprefix("-") if text.startswith("-") and not text.strip("-0.") else text
 
@@ -56,7 +56,7 @@ def set_bits(word: enum.Flag) -> list[str]:
 
 
 def value_text(value: Any, precision: int | None = None) -> str:
-    """Return one value on one line, a number with so many digits behind the point, all if `precision` is None.
+    """Return one value on one line, a number with so many decimals, all if `precision` is None.
 
     A set of numbers (flags that are on) becomes `0,5,31`, or `none`; what has names is followed by them.
     """
@@ -112,9 +112,9 @@ def micros(moment: float) -> float:
     return round(moment, 6)
 
 
-def utc(moment: float) -> str:
-    """Return a time in seconds since 1970 as UTC text, to the millisecond."""
-    return datetime.fromtimestamp(moment, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+def utc(moment: float, digits: str = "milliseconds") -> str:
+    """Return a time in seconds since 1970 as UTC text, to the millisecond or to the `digits` that `isoformat` knows."""
+    return datetime.fromtimestamp(moment, UTC).isoformat(timespec=digits).replace("+00:00", "Z")
 
 
 def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[str, Any]:

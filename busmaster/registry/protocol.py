@@ -40,8 +40,9 @@ class Option:
     """Describe one thing that can be said of nodes of one kind alone: an argument of that name.
 
     It is an argument of their handle, of reading an item, or of making their emulated device. `help` is what the
-    command line says of it; without one it can be said in LINE.toml alone. `common`: it may also be said once for all
-    nodes of the kind, in [protocols.NAME].
+    command line says of it; without one it can be said in LINE.toml alone. `about` is what the reference of LINE.toml
+    says of it, a whole sentence with its unit and default, where `help` is not all. `common`: it may also be said once
+    for all nodes of the kind, in [protocols.NAME].
     """
 
     name: str
@@ -52,6 +53,7 @@ class Option:
     """All texts that it can be; () if it can be any."""
     fields: tuple[Option, ...] = ()
     """What each of its tables may say."""
+    about: str = ""
     reader: Callable[[str], Mapping[str, int]] | None = None
     """Of "addresses": reads them from the text of a file, which LINE.toml may name in place of the table. Raises
     InvalidCommand, naming the lines that it cannot read: none is guessed."""
@@ -185,12 +187,11 @@ class Protocol:
         if kind is None:
             raise InvalidCommand(f"{self.name} has no command {name!r}: use {', '.join(self.commands)}")
         arguments = {key: _frozen(value) for key, value in written.items() if key != "command"}
-        parts = dict(_parts_of(kind))
-        needed = {part for part, default in parts.items() if default is dataclasses.MISSING}
-        if not needed <= arguments.keys() <= parts.keys():
-            wrong = ", ".join(sorted(needed - arguments.keys() | arguments.keys() - parts.keys()))
-            raise InvalidCommand(f"{self.name}: {name} has the arguments {', '.join(parts)}: look at {wrong}")
-        for part in _options_of(kind):
+        form = _form_of(kind)
+        if not form.needed <= arguments.keys() <= form.defaults.keys():
+            wrong = ", ".join(sorted(form.needed - arguments.keys() | arguments.keys() - form.defaults.keys()))
+            raise InvalidCommand(f"{self.name}: {name} has the arguments {', '.join(form.defaults)}: look at {wrong}")
+        for part in form.options:
             # An option has one form: neither a number nor a text stands for true.
             if not isinstance(arguments.get(part, False), bool):
                 raise InvalidCommand(f"{self.name}: {name}: {part} is true or false, not {arguments[part]!r}")
@@ -203,22 +204,26 @@ class Protocol:
 
 
 def _arguments_of(command: Command[Any]) -> dict[str, Any]:
-    return {name: value for name, default in _parts_of(type(command)) if (value := getattr(command, name)) != default}
+    defaults = _form_of(type(command)).defaults
+    return {name: value for name, default in defaults.items() if (value := getattr(command, name)) != default}
+
+
+class _Form(typing.NamedTuple):
+    """What a command is made of: names and defaults, those that have none, and those that are true or false."""
+
+    defaults: Mapping[str, Any]
+    needed: frozenset[str]
+    options: tuple[str, ...]
 
 
 @cache  # each remote request asks at either end
-def _parts_of(kind: type[Command[Any]]) -> tuple[tuple[str, Any], ...]:
-    """Return the names and defaults of what a command is made of."""
+def _form_of(kind: type[Command[Any]]) -> _Form:
     fields = dataclasses.fields(kind)  # type: ignore[arg-type]  # every command is a dataclass
-    return tuple((part.name, part.default) for part in fields if part.init)
-
-
-@cache
-def _options_of(kind: type[Command[Any]]) -> tuple[str, ...]:
-    """Return which of them are true or false."""
-    return tuple(name for name, default in _parts_of(kind) if isinstance(default, bool))
+    defaults = {part.name: part.default for part in fields if part.init}
+    needed = frozenset(name for name, default in defaults.items() if default is dataclasses.MISSING)
+    return _Form(defaults, needed, tuple(name for name, default in defaults.items() if isinstance(default, bool)))
 
 
 def _frozen(value: Any) -> Any:
     """Return a list, which is what JSON makes of a tuple, as a tuple again."""
-    return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value
+    return tuple(map(_frozen, value)) if isinstance(value, (list, tuple)) else value

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-import logging
 from collections.abc import Hashable, Mapping
-from functools import partial
 from typing import Any
 
 from busmaster.arbiter.clients import Hold, LineClient
@@ -16,19 +13,18 @@ from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import Requester, checked_priority
 from busmaster.contract.arguments import seconds, whole_number
-from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
+from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Permission
-from busmaster.service.errands import Errand, Line
-from busmaster.service.failures import misfit, said_error
+from busmaster.service.errands import Errand
+from busmaster.service.failures import REFUSED, refusal_of, said_error
+from busmaster.service.line import ServedLine
 from busmaster.service.messages import (
     MOST_CHECKED,
     MOST_HOLDS,
     MOST_NODES,
     MOST_POINTS,
     MOST_POLLED,
-    MOST_REQUESTS,
     MOST_STREAMS,
-    MOST_URGENT,
     NO_METHOD,
     Malformed,
     timings_of,
@@ -37,6 +33,7 @@ from busmaster.service.messages import (
 from busmaster.service.outbox import Outbox
 from busmaster.service.overview import said_details
 from busmaster.service.peers import Peer
+from busmaster.service.requests import Requests
 from busmaster.service.streams import Broadcast, GroupBroadcast
 from busmaster.service.telling import point_of, protocol_of, said_statistics
 
@@ -46,7 +43,7 @@ NodeKey = tuple[str, int]
 class Client:
     """One program with a connection. `take` takes its messages, in their order; `leave` ends all that it asked for."""
 
-    def __init__(self, line: Line, peer: Peer, number: int, outbox: Outbox) -> None:
+    def __init__(self, line: ServedLine, peer: Peer, number: int, outbox: Outbox) -> None:
         self.peer = peer
         self.dropped: dict[Hashable, int] = {}
         """Of each stream, how many messages the client was too slow for."""
@@ -56,9 +53,12 @@ class Client:
         self._nodes: dict[NodeKey, Node] = {}
         self._stops: dict[NodeKey, int] = {}
         """How often each had been told to stop when this client named it: the client counts from there."""
+        self._stopping: set[Node] = set()
+        """Nodes that it tells to stop, of which it may not write all: it counts with the write that follows, if that is
+        let through."""
         self._refused: dict[NodeKey, str] = {}
         """Why a node that it named may not be asked as it said; its requests are refused until it names it rightly."""
-        self._errands: dict[int, Errand] = {}
+        self._requests = Requests(self, line, self._tell_result, self._refuse)
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
         self._turn = line.bus.shared.add_client(line.share)
@@ -67,7 +67,6 @@ class Client:
         """Its sequences that nobody comes between, by the number that it gave them; or why one could not be begun."""
         self._gathered: dict[int, list[Point[Any]]] = {}
         """Points for poll groups that it will make, by the streams of those."""
-        self._log = logging.getLogger("busmaster.service")
 
     @property
     def permission(self) -> Permission:
@@ -77,7 +76,7 @@ class Client:
     @property
     def errands(self) -> tuple[Errand, ...]:
         """Return what it asked for that is not done yet."""
-        return tuple(self._errands.values())
+        return self._requests.errands
 
     # what is said to it
 
@@ -123,29 +122,25 @@ class Client:
             return
         if isinstance(number, bool) or not isinstance(number, int):
             raise Malformed("the id of a request is a whole number")
-        if number in self._errands:
+        if number in self._requests:
             raise Malformed(f"request {number} is under way already")
         if method in ("request", "write"):
-            self._begin(number, params)
+            self._requests.begin(number, params)
             return
         if method == "safe":
-            self._begin_safe(number, params)
+            self._requests.begin_safe(number, params)
             return
         try:
             answer = self._answer(method, params)
-        except (BusError, InvalidCommand, Malformed) as error:
-            self._refuse(number, error)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            self._refuse(number, misfit(method, error))
+        except REFUSED as error:
+            self._refuse(number, refusal_of(method, error))
         else:
-            self._say({"id": number, "result": answer})
+            self._tell_result(number, answer)
 
     def _notified(self, method: str, params: Mapping[str, Any]) -> None:
         match method:
             case "cancel":
-                errand = self._errands.get(params.get("id", -1))
-                if errand is not None:
-                    errand.cancel()
+                self._requests.cancel(params.get("id"))
             case "end":
                 self._end_stream(params.get("stream", -1))
             case "hold":
@@ -154,8 +149,10 @@ class Client:
                 self._release(params.get("sequence", -1))
             case "stop":
                 node = self._nodes.get((str(params.get("protocol")), params.get("address", -1)))
-                if node is not None and self.permission.reaches(node):
+                if node is not None and self.permission.covers(node):
                     node.note_stop()
+                elif node is not None:
+                    self._stopping.add(node)
 
     def _answer(self, method: str, params: Mapping[str, Any]) -> Any:
         """Return what a request is answered at once. Raises InvalidCommand, BusError, or Malformed."""
@@ -253,62 +250,19 @@ class Client:
         """Return how often a node had been told to stop when this client named it."""
         return self._stops[node.profile.name, node.address]
 
-    # requests
+    def takes_stop(self, node: Node) -> bool:
+        """Return whether the write to a node that is begun now is the stop that this client has announced: once."""
+        announced = node in self._stopping
+        self._stopping.discard(node)
+        return announced
 
-    def _begin(self, number: int, params: Mapping[str, Any]) -> None:
-        try:
-            if len(self._errands) >= MOST_REQUESTS + (MOST_URGENT if _is_urgent(params) else 0):
-                raise BacklogFull(f"{len(self._errands)} requests of this program are not answered yet")
-            errand = Errand.of(params, self, self._line)
-            errand.begin(partial(self._ended, number, errand))
-        except (BusError, InvalidCommand) as error:
-            self._refuse(number, error)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            self._refuse(number, misfit("request", error))
-        else:
-            self._errands[number] = errand
+    # answers
 
-    def _ended(self, number: int, errand: Errand, future: asyncio.Future[Any]) -> None:
-        del self._errands[number]
-        errand.give_up()  # a task that is cancelled before its first step runs nothing of it
-        if future.cancelled():
-            return
-        error = future.exception()
-        try:
-            if error is not None:
-                raise error
-            self._say({"id": number, "result": future.result()})
-        except (BusError, InvalidCommand) as refusal:
-            self._refuse(number, refusal)
-        except Exception as bug:  # of a protocol: the client is told, and the line goes on
-            self._log.exception("a request of %s failed", self.peer)
-            self._refuse(number, errand.unforeseen(bug))
-
-    def _begin_safe(self, number: int, params: Mapping[str, Any]) -> None:
-        try:
-            sending = self._line.safe_wishes.begin(params["writes"], self.peer)
-        except InvalidCommand as error:
-            self._refuse(number, error)
-        except (KeyError, TypeError, ValueError) as error:
-            self._refuse(number, misfit("safe", error))
-        else:
-            sending.add_done_callback(partial(self._safe_sent, number))
-
-    def _safe_sent(self, number: int, sending: asyncio.Task[dict[str, Any]]) -> None:
-        error = WriteUnconfirmed("the program that owns the line ends") if sending.cancelled() else sending.exception()
-        if error is None:
-            self._say({"id": number, "result": sending.result()})
-        else:
-            self._refuse(number, error if isinstance(error, Exception) else BusError(str(error)))
-
-    def _say(self, message: Mapping[str, Any]) -> None:
-        self.outbox.put(written(message))
+    def _tell_result(self, number: int, result: Any) -> None:
+        self.outbox.put(written({"id": number, "result": result}))
 
     def _refuse(self, number: int, error: Exception) -> None:
-        if isinstance(error, Malformed):
-            self._say({"id": number, "error": {"code": error.code, "message": str(error)}})
-        else:
-            self._say({"id": number, "error": said_error(error)})
+        self.outbox.put(written({"id": number, "error": said_error(error)}))
 
     # sequences
 
@@ -406,27 +360,16 @@ class Client:
 
     def release(self) -> None:
         """Tell it truthfully what becomes of all that it asked for: the service ends, and the bus perhaps with it."""
-        for number, errand in list(self._errands.items()):
-            errand.cancel()
-            unsure = errand.command.writes and errand.journey.sent
-            kind: type[BusError] = WriteUnconfirmed if unsure else BusClosed
-            self._refuse(number, kind("the program that owns the line ends", node=errand.node, command=errand.text))
+        self._requests.end()
 
     async def leave(self) -> None:
         """End all that it asked for, and give back its nodes."""
         for stream in list(self._streams):
             self._end_stream(stream)
-        for errand in self.errands:
-            errand.cancel()
-        while self._errands:
-            await asyncio.wait([errand.future for errand in self.errands])
+        await self._requests.give_up()
         for sequence in list(self._holds):
             self._release(sequence)
         self._line.bus.shared.remove_client(self._turn)
         for node in self._nodes.values():
             self._line.bus.give_back(node)
         self._nodes.clear()
-
-
-def _is_urgent(params: Mapping[str, Any]) -> bool:
-    return bool(params.get("options", {}).get("priority") == Priority.URGENT)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from busmaster.errors import InvalidCommand
-from busmaster.service.frames import frame_size, is_whole_text, payload, text_frame
+from busmaster.service.frames import look_at, text_frame
 
 if TYPE_CHECKING:
     from websockets.client import ClientProtocol
@@ -102,8 +102,9 @@ class Connection(asyncio.BufferedProtocol):
 
     def say(self, text: str) -> None:
         """Say a message: nothing where the connection ends already."""
-        if self._talks and not self.transport.is_closing():
-            self.transport.write(text_frame(text.encode(), masked=not self._serves))
+        transport = self._transport
+        if self._talks and transport is not None and not transport.is_closing():
+            transport.write(text_frame(text.encode(), not self._serves))
 
     def close(self, code: int = NORMAL, reason: str = "") -> None:
         """Say that this is the end, behind all that was said; the other end has CLOSE_WITHIN to agree."""
@@ -154,14 +155,17 @@ class Connection(asyncio.BufferedProtocol):
                 if size <= 0:
                     return
                 self._feed(self._cut(size))
-            elif not self._talks or (size := frame_size(self._rest)) > self._longest:
+                continue
+            size, text = look_at(self._rest, self._serves)
+            if not self._talks or size > self._longest:
                 self._feed(self._cut(len(self._rest)))
             elif len(self._rest) < size:
                 return
-            elif self._part is None and is_whole_text(self._rest, masked=self._serves):
-                self._tell(payload(self._cut(size)), is_text=True)
-            else:
+            elif text is None or self._part is not None:
                 self._feed(self._cut(size))
+            else:
+                del self._rest[:size]
+                self._tell(text, True)
 
     def eof_received(self) -> None:
         if self._rest:

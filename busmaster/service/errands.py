@@ -3,85 +3,30 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection, Hashable, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 from busmaster.arbiter.clients import LineClient
-from busmaster.bus.bus import Bus
+from busmaster.arbiter.health import NodeRecord
 from busmaster.bus.node import Journey, Node
 from busmaster.bus.points import Point
-from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import CommandOptions, RequestOptions
 from busmaster.contract.arguments import seconds
 from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
-from busmaster.gate.gate import FRESH, NEVER_SENT, Gate, Wish, outcome_of
+from busmaster.gate.gate import FRESH, NEVER_SENT, Wish, outcome_of
 from busmaster.gate.permission import Permission
+from busmaster.service.line import ServedLine
 from busmaster.service.messages import value_of
-from busmaster.service.overview import Journal
 from busmaster.service.peers import Peer
-from busmaster.service.safe import SafeWishes
-from busmaster.service.streams import Broadcast
 from busmaster.service.telling import protocol_of
 
 OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
 """Of a request, those that a client may say."""
 DOOR = "service"
-
-
-class Line(Protocol):
-    """What clients share."""
-
-    @property
-    def bus(self) -> Bus: ...
-
-    @property
-    def gate(self) -> Gate: ...
-
-    @property
-    def share(self) -> float:
-        """What weighs the line time of each program: the owner's own share is 1."""
-        ...
-
-    @property
-    def safe_wishes(self) -> SafeWishes: ...
-
-    def broadcast_of(self, group: PollGroup, /) -> Broadcast:
-        """Return what tells the cycles of a poll group."""
-        ...
-
-    def events(self) -> Broadcast:
-        """Return what tells of line and nodes."""
-        ...
-
-    def overview(self) -> Broadcast:
-        """Return what tells what a person sees of it."""
-        ...
-
-    def exchanges(self) -> Broadcast:
-        """Return what tells what passes on it."""
-        ...
-
-    @property
-    def journal(self) -> Journal: ...
-
-    def group(self, name: str, /) -> PollGroup:
-        """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
-        ...
-
-    def point(self, group: str, key: str, /) -> tuple[PollGroup, Point[Any]]:
-        """Return a point of a poll group, and the group. Raises InvalidCommand if there is none."""
-        ...
-
-    def node(self, protocol: str, address: int, /) -> Node:
-        """Return a node that is on the line. Raises InvalidCommand if there is none."""
-        ...
-
-    def named(self, node: Node, places: Collection[Hashable], /) -> Point[Any] | None:
-        """Return the point of a poll group that reads these places of a node."""
-        ...
+RAW_COMMAND = "raw command"
+"""What the record of a write names in place of a point, where no poll group has one: its value says the rest."""
 
 
 class Asker(Protocol):
@@ -105,9 +50,16 @@ class Asker(Protocol):
         """Return the stops of a node from which this client counts."""
         ...
 
+    def takes_stop(self, node: Node, /) -> bool:
+        """Return whether the write that is begun now is a stop of its node, as the client has announced."""
+        ...
 
-@dataclass(frozen=True, slots=True)
-class Task:
+    def tell_stops(self, node: NodeRecord, /) -> None:
+        """Say how often a node was told to stop."""
+        ...
+
+
+class Task(NamedTuple):
     """What is asked for: a command for a node, and what reads what it writes (`touches`); perhaps its point."""
 
     node: Node
@@ -122,10 +74,11 @@ class Task:
         """Return a command that a client names. Raises InvalidCommand for what the protocol does not have."""
         node, protocol = asker.node(params["protocol"], params["address"]), protocol_of(params["protocol"])
         command, touches = protocol.read_back(params["command"]), params.get("touches")
-        return cls(node, command, None if touches is None else protocol.read_back(touches), str(command))
+        value = str(command) if command.writes else None
+        return cls(node, command, None if touches is None else protocol.read_back(touches), value)
 
     @classmethod
-    def of_point(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Task:
+    def of_point(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Task:
         """Return the write of a value to a point of a poll group.
 
         Raises InvalidCommand, and keeps a record of it, for what cannot be written.
@@ -145,15 +98,21 @@ class Task:
             raise InvalidCommand(refusal) from None
 
 
+Told: TypeAlias = Callable[["Errand", Any, BaseException | None], object]
+"""Hears the end of an errand: its value, or its error; neither of one that was given up, see there."""
+
+
 class Errand:
-    """One command with its options, for one client."""
+    """One command with its options, for one client. Of a read it is told itself what became of that: at once, for the
+    turn of the loop that a future takes is a part of what a program waits beyond what the line takes.
+    """
 
     def __init__(
         self,
         task: Task,
         options: CommandOptions,
         *,
-        line: Line,
+        line: ServedLine,
         asker: Asker,
         client: LineClient,
         stops_seen: int | None,
@@ -172,14 +131,18 @@ class Errand:
         self._stop = stop
         self._asked = asked
         self._begun = False
-        self.future: asyncio.Future[Any]
+        self._told: Told
+        self._over = False
+        self.given_up = False
+        self.writing: asyncio.Task[Any] | None = None
+        """What is done for a write, once it is begun."""
 
     @classmethod
-    def of(cls, params: Mapping[str, Any], asker: Asker, line: Line) -> Errand:
+    def of(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
         task = Task.of_point(params, asker, line) if "key" in params else Task.of_node(params, asker)
         node, command = task.node, task.command
-        given = cast("CommandOptions", dict(params.get("options", {})))
+        given: CommandOptions = params.get("options", {})
         if given:
             if not set(given) <= OPTIONS:
                 raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
@@ -211,25 +174,62 @@ class Errand:
             self._line.gate.refuse(wish, str(error))
             raise
 
-    def begin(self, done: Callable[[asyncio.Future[Any]], object]) -> None:
-        """Have it done, and then call `done` with the future that has its value, BusError or InvalidCommand.
+    def begin(self, told: Told) -> None:
+        """Have it done; `told` hears its end once, perhaps before this returns. Every write passes the gate.
 
-        Raises them too, where nothing could be begun. Every write passes the gate.
+        Raises BusError or InvalidCommand where nothing could be begun.
         """
+        self._told = told
         if self.command.writes:
-            self.future = asyncio.ensure_future(self._write())
+            if self._asker.takes_stop(self.node):
+                self._stop_node()
+            self.writing = asyncio.ensure_future(self._write())
+            self.writing.add_done_callback(self._written)
         else:
-            self.future = self.node.begin_reading(
-                self.command, self.journey, stops_seen=self._stops_seen, client=self._client, **self._left()
+            self.node.begin_reading(
+                self.command, self.journey, self, stops_seen=self._stops_seen, client=self._client, **self._left()
             )
-        self.future.add_done_callback(done)
 
     def cancel(self) -> None:
         """Give it up: what is on the wire runs out unheard."""
-        if not self.future.done():
-            self.future.cancel()
-            if not self.command.writes:
-                self.node.give_up(self.journey)
+        if self.writing is not None:
+            self.writing.cancel()
+        elif not self._over:
+            self.node.give_up(self.journey)
+            self._over = self.given_up = True
+            self._told(self, None, None)
+
+    # what the line tells of a read
+
+    def done(self) -> bool:
+        """Return whether nobody waits for it any more."""
+        return self._over
+
+    def set_result(self, value: Any, /) -> None:
+        """Hear what was read."""
+        self._over = True
+        self._told(self, value, None)
+
+    def set_exception(self, error: BaseException, /) -> None:
+        """Hear why nothing was."""
+        self._over = True
+        self._told(self, None, error)
+
+    # inside
+
+    def _stop_node(self) -> None:
+        """Count the stop that this write is, if it may be written; else its program is told how many count."""
+        if self._line.gate.refusal(self._wish()):
+            self._asker.tell_stops(self.node.record)
+        else:
+            self.node.note_stop()
+
+    def _written(self, writing: asyncio.Task[Any]) -> None:
+        if not self._begun:  # a task that is cancelled before its first step runs nothing of it
+            self._line.gate.begin(self._wish()).end(self._truth(asyncio.CancelledError()))
+        self.given_up = writing.cancelled()
+        error = None if self.given_up else writing.exception()
+        self._told(self, None if self.given_up or error is not None else writing.result(), error)
 
     async def _write(self) -> Any:
         self._begun = True
@@ -260,11 +260,6 @@ class Errand:
         passage.end(None)
         return value
 
-    def give_up(self) -> None:
-        """Keep the record of a write that was given up before it was run."""
-        if self.command.writes and not self._begun:
-            self._line.gate.begin(self._wish()).end(self._truth(asyncio.CancelledError()))
-
     def unforeseen(self, bug: Exception) -> BusError:
         """Return the error for a request that failed by a mistake in the program."""
         what = f"the program that owns the line failed: {type(bug).__name__}: {bug}"
@@ -281,9 +276,9 @@ class Errand:
 
     def _left(self) -> CommandOptions:
         """Return the options, less the time that the request took to come here."""
-        options: dict[str, Any] = dict(self._options)
-        if not options:
+        if not self._options:
             return {}
+        options: dict[str, Any] = dict(self._options)
         age = self._line.bus.now() - self._asked
         for name in ("start_within", "finish_within"):
             limit = options.get(name)
@@ -299,7 +294,7 @@ class Errand:
             point = self._line.named(self.node, changes.keys())
             if point is not None:
                 value = _value(point, changes, value)
-        point = point or Point(self.node, self.text, command)
+        point = point or Point(self.node, RAW_COMMAND, command)
         return Wish(
             door=DOOR,
             by=str(self._asker.peer),

@@ -6,11 +6,13 @@ from typing import Any
 
 from busmaster import errors
 from busmaster.errors import BusError, InvalidCommand, Refused
-from busmaster.service.messages import BUS_ERROR, INTERNAL, INVALID_PARAMS
+from busmaster.service.messages import BUS_ERROR, INTERNAL, INVALID_PARAMS, Malformed
 
 FIELDS = ("what", "line", "label", "address", "command", "attempts", "hint")
 DEEPEST = 5
 """Causes behind causes that are told."""
+REFUSED = (BusError, Malformed, KeyError, TypeError, ValueError, AttributeError)
+"""What may be raised of a request: by the line, and by parameters that are not what they should be."""
 KNOWN: dict[str, type[BusError]] = {
     name: thing
     for name in errors.__all__
@@ -20,6 +22,8 @@ KNOWN: dict[str, type[BusError]] = {
 
 def said_error(error: Exception) -> dict[str, Any]:
     """Return an error as JSON-RPC has it; what it was is in its `data`."""
+    if isinstance(error, Malformed):
+        return {"code": error.code, "message": str(error)}
     if isinstance(error, BusError):
         return {"code": BUS_ERROR, "message": str(error), "data": error_data(error)}
     if isinstance(error, InvalidCommand):
@@ -27,8 +31,12 @@ def said_error(error: Exception) -> dict[str, Any]:
     return {"code": INTERNAL, "message": f"{type(error).__name__}: {error}"}
 
 
-def misfit(method: str, error: Exception) -> InvalidCommand:
-    """Return the error for a request whose parameters are none of its method's."""
+def refusal_of(method: str, error: Exception) -> Exception:
+    """Return why a request is refused, in words for its program: of REFUSED, what is raised of parameters that are
+    none of its method's says too little.
+    """
+    if isinstance(error, BusError | InvalidCommand | Malformed):
+        return error
     what = f"{error} is missing" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
     return InvalidCommand(f"{method}: {what}; service.schema.json has its parameters")
 

@@ -12,28 +12,27 @@ MASKED = 0x80
 SHORT, LONG = 126, 127
 
 
-def frame_size(data: bytearray) -> int:
-    """Return how many bytes the frame that begins so has, or how many it takes to tell."""
-    if len(data) < 2:
-        return 2
-    length = data[1] & ~MASKED
-    head = 6 if data[1] & MASKED else 2
-    if length < SHORT:
-        return head + length
-    wide = 4 if length == SHORT else 10
-    return head + wide - 2 + int.from_bytes(data[2:wide], "big") if len(data) >= wide else wide
-
-
-def is_whole_text(frame: bytes | bytearray, masked: bool) -> bool:
-    """Return whether a frame is a whole text, masked or not as its sender is to do."""
-    return frame[0] == TEXT and (frame[1] >= MASKED) is masked
-
-
-def payload(frame: bytes) -> bytes:
-    """Return what is in a frame."""
-    length = frame[1] & ~MASKED
-    begin = 2 if length < SHORT else 4 if length == SHORT else 10
-    return frame[begin:] if frame[1] < MASKED else mask(frame[begin + 4 :], frame[begin : begin + 4])
+def look_at(data: bytearray, masked: bool) -> tuple[int, bytes | None]:
+    """Return how many bytes the frame that begins so has, or how many it takes to tell, and the text in it: None unless
+    it has come, is a whole text, and is masked or not as its sender is to do.
+    """
+    come = len(data)
+    if come < 2:
+        return 2, None
+    length, begin = data[1], 2
+    if is_masked := length >= MASKED:
+        length -= MASKED
+    if length >= SHORT:
+        begin = 4 if length == SHORT else 10
+        if come < begin:
+            return begin, None
+        length = int.from_bytes(data[2:begin], "big")
+    text = begin + 4 if is_masked else begin
+    size = text + length
+    if come < size or data[0] != TEXT or is_masked is not masked:
+        return size, None
+    said = bytes(data[text:size])
+    return size, mask(said, data[begin:text]) if masked else said
 
 
 def text_frame(data: bytes, masked: bool) -> bytes:
@@ -51,7 +50,7 @@ def text_frame(data: bytes, masked: bool) -> bytes:
     return head + key + mask(data, key)
 
 
-def mask(data: bytes, key: bytes) -> bytes:
+def mask(data: bytes, key: bytes | bytearray) -> bytes:
     """Return data with a mask put on, or taken off."""
     length = len(data)
     keys = (key * (length // 4 + 1))[:length]

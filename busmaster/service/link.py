@@ -47,13 +47,14 @@ class Asked:
         writes: bool,
         node: Addressed | None,
         command: Command[Any] | None,
+        handed: bool = False,
     ) -> None:
         self.number = number
         self.future = future
         self.writes = writes
         self.node = node
         self.command = command
-        self.handed = False
+        self.handed = handed
         """Whether it was handed to the connection: what was not has certainly not been sent."""
 
     def fail(self, kind: type[BusError], what: str, hint: str | None = None) -> None:
@@ -130,7 +131,9 @@ class Link:
     def tell(self, method: str, params: Mapping[str, Any]) -> None:
         """Say something that is not answered; nothing once the connection is lost."""
         if self._over is None:
-            self._put(written({"method": method, "params": params}), None)
+            text = written({"method": method, "params": params})
+            if not self._passes(text):
+                self._waiting.append((text, None))
 
     def ask(
         self,
@@ -142,11 +145,15 @@ class Link:
         command: Command[Any] | None = None,
     ) -> Asked:
         """Ask something, after all that was said before; its future has the answer. Raises LineDown or BusClosed."""
-        self.check(node, command)
-        self._count += 1
-        asked = Asked(self._count, asyncio.get_running_loop().create_future(), writes, node, command)
-        self._asked[asked.number] = asked
-        self._put(written({"id": asked.number, "method": method, "params": params}), asked)
+        if self._over is not None:
+            self.check(node, command)
+        self._count = number = self._count + 1
+        text = written({"id": number, "method": method, "params": params})
+        handed = self._passes(text)  # what is kept of it is made while the other end is at it already
+        asked = Asked(number, asyncio.get_running_loop().create_future(), writes, node, command, handed)
+        self._asked[number] = asked
+        if not handed:
+            self._waiting.append((text, asked))
         return asked
 
     def check(self, node: Addressed | None = None, command: Command[Any] | None = None) -> None:
@@ -193,9 +200,15 @@ class Link:
 
     def writable(self) -> None:
         """Say what waits, as far as the connection takes it."""
-        while self._waiting and self._takes_more():
+        connection = self._connection
+        assert connection is not None
+        while self._waiting and self._is_open and not connection.full:
             text, asked = self._waiting.popleft()
-            self._say(text, asked)
+            if asked is not None:
+                if asked.future.done():
+                    continue  # nobody waits for it any more: it is not even said
+                asked.handed = True
+            connection.say(text)
 
     def lost(self) -> None:
         """Tell whoever waits that the connection is over."""
@@ -227,22 +240,13 @@ class Link:
             return None
         return LineDown(f"no program serves {where}: {complaint}", hint="start busmaster run, or see busmaster status")
 
-    def _takes_more(self) -> bool:
-        return self._is_open and self._connection is not None and not self._connection.full
-
-    def _put(self, text: str, asked: Asked | None) -> None:
-        if self._waiting or not self._takes_more():
-            self._waiting.append((text, asked))
-        else:
-            self._say(text, asked)
-
-    def _say(self, text: str, asked: Asked | None) -> None:
-        if asked is not None:
-            if asked.future.done():
-                return  # nobody waits for it any more: it is not even said
-            asked.handed = True
-        assert self._connection is not None
-        self._connection.say(text)
+    def _passes(self, text: str) -> bool:
+        """Say it at once where nothing waits before it; return whether that was so."""
+        connection = self._connection
+        if self._waiting or not self._is_open or connection is None or connection.full:
+            return False
+        connection.say(text)
+        return True
 
     def _drop(self, asked: Asked) -> None:
         """Wait for it no longer, and have it cancelled there."""

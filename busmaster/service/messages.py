@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Set as AbstractSet
+from functools import partial
 from math import inf, isnan
 from typing import Any
 
@@ -16,6 +17,8 @@ VERSIONS = (1,)
 """Of what is said. The first message of a client says which ones it knows, and the highest that both know holds."""
 LONGEST_REQUEST = 1 << 16
 """Bytes of one message of a client: what it takes to understand one holds up the line."""
+MOST_PARTS = 1 << 13
+"""Values in one message of a client: of as many bytes, those of many small ones take longest to understand."""
 LONGEST_ANSWER = 1 << 20
 """Bytes of one message to a client."""
 MOST_CLIENTS = 64
@@ -74,9 +77,9 @@ def written(message: Mapping[str, Any]) -> str:
 def encoded(value: Any) -> str:
     """Return a value as JSON. Raises TypeError for what it cannot say."""
     try:
-        return _encode(value)
+        return "".join(_encode(value))
     except ValueError:  # a number that JSON does not have
-        return _encode(_finite(value))
+        return "".join(_encode(_finite(value)))
 
 
 def read(text: str | bytes) -> dict[str, Any]:
@@ -93,6 +96,13 @@ def read(text: str | bytes) -> dict[str, Any]:
     if not isinstance(said, dict) or said.get("jsonrpc") != "2.0":
         raise Malformed("this is no message of JSON-RPC 2.0")
     return said
+
+
+def read_request(text: str | bytes) -> dict[str, Any]:
+    """Return a message of a client. Raises Malformed for what is none, or has too many parts."""
+    if isinstance(text, str) and len(text) > MOST_PARTS and sum(map(text.count, ",[{")) > MOST_PARTS:
+        raise Malformed(f"a message has {MOST_PARTS} values at most")
+    return read(text)
 
 
 def value_of(said: Any) -> Any:
@@ -158,16 +168,18 @@ def _said_set(value: Any) -> dict[str, list[Any]]:
     raise TypeError(f"a {type(value).__name__} cannot be said")
 
 
-def _encoder() -> Callable[[Any], str]:
-    """Return what encodes a value: what Python makes anew for each, which takes longer than to use it, made once."""
+def _encoder() -> Callable[[Any], Iterable[str]]:
+    """Return what makes the parts of a value's text. It is made once: Python does so anew for each value, which takes
+    longer than to use it.
+    """
     usual = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_said_set)
     text = json.encoder.encode_basestring_ascii
     try:
         make = json.encoder.c_make_encoder  # type: ignore[attr-defined]  # undocumented
         encode = make(None, usual.default, text, None, ":", ",", False, False, False)
     except (AttributeError, TypeError):  # another Python
-        return usual.encode
-    return lambda value: "".join(encode(value, 0))
+        return usual.iterencode
+    return partial(encode, _current_indent_level=0)
 
 
 _decode = json.JSONDecoder().raw_decode  # half of what `loads` takes, which looks for other encodings and blanks

@@ -7,7 +7,7 @@ from typing import Any
 
 from busmaster.bus.points import Point
 from busmaster.bus.snapshots import Cycles
-from busmaster.service.telling import FindNode, point_of, snapshot_of
+from busmaster.service.telling import FindNode, owners_point_of, snapshot_of
 
 
 class RemoteGroup(Cycles):
@@ -48,7 +48,7 @@ class RemoteGroup(Cycles):
             self._set = body["set"]
             # By its own points, a program gets the values that they decode.
             if not self._own:
-                self._points = tuple(point_of(said, self._find) for said in body["points"])
+                self._points = tuple(owners_point_of(said, self._find) for said in body["points"])
         elif method == "snapshot" and body["set"] == self._set:
             self._tell(snapshot_of(body, self.name, self._points))
         elif method == "ended":

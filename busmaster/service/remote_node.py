@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Coroutine, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
 from typing import Any, Protocol, TypeVar, Unpack
@@ -108,7 +108,7 @@ class RemoteNode:
         """
         self._bus.prepare(self, commands, stop is True)
 
-    async def request(
+    def request(
         self,
         command: Command[T],
         /,
@@ -117,13 +117,13 @@ class RemoteNode:
         stops_seen: int | None = None,
         stop: bool = False,
         **options: Unpack[CommandOptions],
-    ) -> T:
+    ) -> Coroutine[Any, Any, T]:
         """Run one command on the line and return its value: as `Requester.request`, with the same errors.
 
         If the connection is lost meanwhile, a write raises WriteUnconfirmed, or NotStarted where it was not handed over
         yet, and a read LineDown. Cancelling it cancels it there.
         """
-        return await self.ask(command, None, touches=touches, stops_seen=stops_seen, stop=stop, **options)
+        return self.ask(command, None, touches=touches, stops_seen=stops_seen, stop=stop, **options)
 
     async def ask(
         self,
@@ -145,7 +145,7 @@ class RemoteNode:
         link, room = self._bus.opened(self, command), self._bus.room
         # What is of a sequence waits for nothing else of this program, which waits for the sequence.
         waits = sequence is None and chosen.priority is not Priority.URGENT
-        waited = await room.take(chosen, self, command) if waits else 0.0
+        waited = await room.wait(chosen, self, command) if waits and not room.take() else 0.0
         try:
             left: Mapping[str, Any] = {**options, **shortened(chosen, waited)} if waited else options
             params = self._said(command, left, touches, stops_seen, stop)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, Protocol, TypeVar, Unpack
@@ -21,30 +22,50 @@ class Room:
     """Lets so many requests of a program be under way; the others wait here, in their order, as long as they may."""
 
     def __init__(self, now: Callable[[], float]) -> None:
-        self._free = asyncio.Semaphore(MOST_UNDER_WAY)
+        self._free = MOST_UNDER_WAY
+        self._waiting: deque[asyncio.Future[None]] = deque()
         self._now = now
 
-    async def take(self, options: RequestOptions, node: Requester, command: Command[Any]) -> float:
+    def take(self) -> bool:
+        """Take room, which is to be given back, if there is some; return whether there was."""
+        if not self._free:
+            return False
+        self._free -= 1
+        return True
+
+    async def wait(self, options: RequestOptions, node: Requester, command: Command[Any]) -> float:
         """Wait for room, which is to be given back, and return how many seconds that took.
 
         Raises NotStarted if the time of the request is over before.
         """
-        if not self._free.locked():
-            await self._free.acquire()
-            return 0.0
         began = self._now()
         limits = [limit for limit in (options.start_within, options.finish_within) if limit is not None]
         try:
             async with asyncio.timeout(min(limits, default=None)):
-                await self._free.acquire()
+                await self._given()
         except TimeoutError:
             what = f"{MOST_UNDER_WAY} requests of this program are not answered yet, and its time was over"
             raise NotStarted(what, node=node, command=str(command)) from None
         return self._now() - began
 
     def give_back(self) -> None:
-        """Make room for another."""
-        self._free.release()
+        """Make room for another: for whoever waits longest."""
+        while self._waiting:
+            given = self._waiting.popleft()
+            if not given.done():
+                given.set_result(None)
+                return
+        self._free += 1
+
+    async def _given(self) -> None:
+        given = asyncio.get_running_loop().create_future()
+        self._waiting.append(given)
+        try:
+            await given
+        except asyncio.CancelledError:
+            if given.done() and not given.cancelled():  # it was given in the turn in which nobody wanted it any more
+                self.give_back()
+            raise
 
 
 def shortened(options: RequestOptions, by: float) -> dict[str, float]:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import os
 import socket
-from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
@@ -17,17 +15,13 @@ from typing import TYPE_CHECKING, Any
 from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE
 from busmaster.arbiter.health import NodeRecord
 from busmaster.bus.bus import Bus
-from busmaster.bus.node import Node
-from busmaster.bus.points import Point
-from busmaster.bus.polling import PollGroup
-from busmaster.contract.places import Placed
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
 from busmaster.registry import protocols
 from busmaster.service.client import Client
 from busmaster.service.connection import CLOSE_WITHIN, check_installed
-from busmaster.service.exchanges import ExchangesBroadcast
-from busmaster.service.folder import Owner, ServedSocket, line_name, runtime_folder
+from busmaster.service.folder import Owner, ServedSocket, checked_name, line_name, runtime_folder
+from busmaster.service.line import ServedLine
 from busmaster.service.messages import (
     INVALID_PARAMS,
     MOST_CLIENTS,
@@ -37,10 +31,8 @@ from busmaster.service.messages import (
     written,
 )
 from busmaster.service.outbox import Outbox
-from busmaster.service.overview import Journal, Overview, state_text
+from busmaster.service.overview import state_text
 from busmaster.service.peers import Peer, find_name, process_of
-from busmaster.service.safe import SafeWishes
-from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
 from busmaster.service.tcp import HostPort, check_listening, holder, is_our_name, listening
 from busmaster.service.visit import Reception, Visit
 
@@ -60,13 +52,13 @@ class Service:
     """Serve a bus that is open, on a Unix socket, in `async with`. It ends before the bus is closed.
 
     `path` is the socket's; without it, it is NAME.sock in this user's runtime folder, where `name` is that of the
-    line, by default its port's. Every write passes `gate`, which says who may do what: without one, its own, which
-    keeps a record in the log "busmaster.audit", and lets this user write and others read. `mode` and `group`, a number,
-    are the socket's. `listen` is a host and a port where programs may come by TCP too: off this machine only where the
-    gate knows tokens. Each program takes turns with the others and with this one; `share`, 0.1 to 10, weighs its line
-    time: with 0.5, half as much as this one has, as long as both wait. `title` is written over what a person sees of
-    the line. Entering raises InvalidCommand where the socket is served by another process, which it names, or cannot be
-    made.
+    line, by default its port's: letters, digits, and _.- between them. Every write passes `gate`, which says who may do
+    what: without one, its own, which keeps a record in the log "busmaster.audit", and lets this user write and others
+    read. `mode` and `group`, a number, are the socket's. `listen` is a host and a port where programs may come by TCP
+    too: off this machine only where the gate knows tokens. Each program takes turns with the others and with this one;
+    `share`, 0.1 to 10, weighs its line time: with 0.5, half as much as this one has, as long as both wait. `title` is
+    written over what a person sees of the line. Raises InvalidCommand for what cannot be; so does entering where the
+    socket is served by another process, which it names, or cannot be made.
     """
 
     def __init__(
@@ -85,16 +77,11 @@ class Service:
         if isinstance(share, bool) or not LEAST_SHARE <= share <= MOST_SHARE:
             raise InvalidCommand(f"a program's share is a number from {LEAST_SHARE:g} to {MOST_SHARE:g}, not {share!r}")
         self.bus = bus
-        self.share = share
         self.gate = gate or Gate(bus)
         if listen is not None:
             check_listening(listen, tokens=bool(self.gate.access.secrets))
-        self.safe_wishes = SafeWishes(self.gate)
-        self.name = name or line_name(bus.endpoint.name)
-        self.title = title or self.name
-        """What is written over what a person sees of the line."""
-        self.journal = Journal(bus)
-        """What happens from now on, also before it is entered."""
+        self.name = line_name(bus.endpoint.name) if name is None else checked_name(name)
+        self.line = ServedLine(bus, self.gate, share, title or self.name)
         self.refused = 0
         """Connections that were one too many, or that began with what no client says."""
         self._path = None if path is None else Path(path).absolute()
@@ -109,13 +96,6 @@ class Service:
         self._leaving: set[asyncio.Task[None]] = set()
         self._count = 0
         self.reception = Reception()
-        self._groups: dict[PollGroup, GroupBroadcast] = {}
-        self._events: EventBroadcast | None = None
-        self._overview: Overview | None = None
-        self._exchanges: ExchangesBroadcast | None = None
-        self._points: dict[object, Point[Any]] = {}
-        self._points_of: list[tuple[str, tuple[Point[Any], ...]]] = []
-        self._log = logging.getLogger("busmaster.service")
 
     @property
     def address(self) -> str:
@@ -171,7 +151,7 @@ class Service:
             served.__exit__(None, None, None)
             raise
         self.bus.on_stop.append(self._tell_stop)
-        self.journal.begin()
+        self.line.journal.begin()
         self.bus.on_touched.append(self._tell_touched)
         self.gate.on_access.append(self._let_go)
         return self
@@ -183,7 +163,7 @@ class Service:
         self.bus.on_stop.remove(self._tell_stop)
         self.bus.on_touched.remove(self._tell_touched)
         self.gate.on_access.remove(self._let_go)
-        await self.safe_wishes.close()
+        await self.line.safe_wishes.close()
         for server in self._servers:
             server.close()
         visits = [*self._clients.values(), *self._strangers]
@@ -202,81 +182,7 @@ class Service:
                     await asyncio.wait(self._leaving)
             finally:
                 self._served.__exit__(None, None, None)
-                await self.journal.close()
-
-    # what clients share
-
-    def broadcast_of(self, group: PollGroup) -> Broadcast:
-        """Return what tells the cycles of a poll group."""
-        if group not in self._groups:
-            self._groups[group] = GroupBroadcast(group, partial(self._forget_group, group))
-        return self._groups[group]
-
-    def events(self) -> Broadcast:
-        """Return what tells of line and nodes."""
-        if self._events is None:
-            self._events = EventBroadcast(self.bus, self._end_events)
-        return self._events
-
-    def overview(self) -> Broadcast:
-        """Return what tells what a person sees of the line."""
-        if self._overview is None:
-            self._overview = Overview(self.bus, self.gate, self.journal, lambda: self.title, self._end_overview)
-        return self._overview
-
-    def exchanges(self) -> Broadcast:
-        """Return what tells what passes on the line."""
-        if self._exchanges is None:
-            self._exchanges = ExchangesBroadcast(self.bus, self._end_exchanges)
-        return self._exchanges
-
-    def group(self, name: str) -> PollGroup:
-        """Return a poll group. Raises InvalidCommand, with those that there are, for a name that is none."""
-        found = next((group for group in self.bus.groups if group.name == name), None)
-        if found is None:
-            names = ", ".join(group.name for group in self.bus.groups) or "none"
-            raise InvalidCommand(f"no poll group {name!r}; there are: {names}")
-        return found
-
-    def point(self, group: str, key: str) -> tuple[PollGroup, Point[Any]]:
-        """Return a point of a poll group, and the group. Raises InvalidCommand if there is none."""
-        found = self.group(group)
-        for point in found.points:
-            if point.key == key:
-                return found, point
-        raise InvalidCommand(f"poll group {group!r} has no point {key!r}")
-
-    def node(self, protocol: str, address: int) -> Node:
-        """Return a node that is on the line. Raises InvalidCommand if there is none."""
-        for node in self.bus.nodes:
-            if (node.profile.name, node.address) == (protocol, address):
-                return node
-        raise InvalidCommand(f"there is no node {address} of {protocol} on this line")
-
-    def named(self, node: Node, places: Collection[Hashable]) -> Point[Any] | None:
-        """Return the point of a poll group that reads these places of a node."""
-        groups = [(group.name, group.points) for group in self.bus.groups]
-        if groups != self._points_of:
-            self._points_of = groups
-            self._points = {
-                (point.node, frozenset(point.command.places)): point
-                for _, points in groups
-                for point in points
-                if isinstance(point.command, Placed)
-            }
-        return self._points.get((node, frozenset(places)))
-
-    def _forget_group(self, group: PollGroup) -> None:
-        self._groups.pop(group, None)
-
-    def _end_events(self) -> None:
-        self._events = None
-
-    def _end_overview(self) -> None:
-        self._overview = None
-
-    def _end_exchanges(self) -> None:
-        self._exchanges = None
+                await self.line.journal.close()
 
     def _tell_stop(self, record: NodeRecord) -> None:
         for client in self._clients:
@@ -360,7 +266,7 @@ class Service:
             client.dropped[stream] = client.dropped.get(stream, 0) + 1
 
         self._count += 1
-        client = Client(self, visit.peer, self._count, Outbox(visit.connection, drop))
+        client = Client(self.line, visit.peer, self._count, Outbox(visit.connection, drop))
         del self._strangers[visit]
         self._clients[client] = visit
         client.outbox.put(written({"id": said.get("id"), "result": self._about(client, max(common))}))

@@ -63,12 +63,37 @@ def said_points(points: Iterable[Point[Any]]) -> list[dict[str, Any]]:
     ]
 
 
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class OwnersPoint(Point[Any]):
+    """A point under the name that the line's owner has for it: "winder/position". It equals one that reads the same."""
+
+    owners_key: str = ""
+
+    @property
+    def key(self) -> str:
+        """Return node and item as the owner's file has them."""
+        return self.owners_key
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Point):
+            return NotImplemented
+        return (self.node, self.item, self.command) == (other.node, other.item, other.command)
+
+    __hash__ = Point.__hash__
+
+
 def point_of(said: Mapping[str, Any], find: FindNode) -> Point[Any]:
     """Return a point that was said. It takes values as they come: they were decoded where they were read."""
     protocol = protocol_of(said.get("protocol"))
     node = find(protocol.name, said["address"])
     command = protocol.read_back(said["command"])
     return Point(node, str(said.get("item", "")), command, str(said.get("unit", "")))
+
+
+def owners_point_of(said: Mapping[str, Any], find: FindNode) -> Point[Any]:
+    """Return a point of the owner's that was said, with the owner's name for it."""
+    point = point_of(said, find)
+    return OwnersPoint(point.node, point.item, point.command, point.unit, owners_key=str(said["key"]))
 
 
 def said_snapshot(snapshot: Snapshot) -> dict[str, Any]:
@@ -139,7 +164,7 @@ def event_of(said: Mapping[str, Any], find: FindNode) -> BusEvent | None:
     if name == "PortFailed":
         return PortFailed(said["cause"], said["hint"], None if said["bug"] is None else Exception(said["bug"]))
     if name == "AlarmChanged":
-        point = point_of(said["point"], find)
+        point = owners_point_of(said["point"], find)
         return AlarmChanged(point, said["limit"], said["bound"], said["value"], said["active"])
     if name not in ("NodeChanged", "LatenessRaised", "LatenessLowered"):
         return None

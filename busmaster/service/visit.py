@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from busmaster.service.client import Client
 from busmaster.service.connection import GOING_AWAY, POLICY, ServedConnection
-from busmaster.service.messages import HELLO_WITHIN, INVALID_PARAMS, LONGEST_REQUEST, Malformed, read, written
+from busmaster.service.messages import HELLO_WITHIN, INVALID_PARAMS, LONGEST_REQUEST, Malformed, read_request, written
 from busmaster.service.peers import Peer
 
 if TYPE_CHECKING:
@@ -34,18 +34,17 @@ class Reception:
         """Have a message of this program taken: at once, or when it is its turn."""
         if self._taken:
             self._waiting.append(visit)
-        else:
-            self._take(visit)
-
-    def _take(self, visit: Visit) -> None:
+            return
         self._taken = True
-        asyncio.get_running_loop().call_soon(self._next)
-        visit.take()
+        try:
+            visit.take()
+        finally:  # and not before: what is asked for is not to wait for this
+            asyncio.get_running_loop().call_soon(self._next)
 
     def _next(self) -> None:
         self._taken = False
         if self._waiting:
-            self._take(self._waiting.popleft())
+            self.ask(self._waiting.popleft())
 
 
 class Host(Protocol):
@@ -122,7 +121,7 @@ class Visit:
         if self._ended:
             return
         try:
-            said = read(self._messages.popleft())
+            said = read_request(self._messages.popleft())
             if self.client is None:
                 self.client = self._host.welcome(self, said)
                 self._stranger.cancel()

@@ -84,7 +84,7 @@ def endpoint(url: str, *, defaults: LineSettings | None = None) -> SerialPort | 
     if is_served(url):
         raise InvalidCommand(
             f"{url} is a line that a busmaster serves, which read, write, poll and scan take: here a port is needed, "
-            "and a serial device server is written socket://HOST:PORT"
+            "and a serial server is written socket://HOST:PORT"
         )
     if "://" not in url:
         path, _, query = url.partition("?")

@@ -1,7 +1,7 @@
 """asyncio meets the arbiter: bytes and time in, bytes and events out.
 
 The hot path: a reply arrives, the arbiter completes it and encodes the next request, and that request is written
-in the same callback. Only then are futures resolved. No task runs between a reply and the next request, and no
+in the same callback. Only then are those told who wait. No task runs between a reply and the next request, and no
 user code runs in here.
 """
 
@@ -11,7 +11,7 @@ import asyncio
 import time
 from collections.abc import Callable
 from math import inf
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import anyio
 
@@ -22,7 +22,7 @@ from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Attempt, Tap
 from busmaster.arbiter.transaction import Poll, Transaction
-from busmaster.errors import cause_text
+from busmaster.errors import BusError, cause_text
 from busmaster.transport.alarm import Alarm
 from busmaster.transport.clock import clock_of
 from busmaster.transport.kernel import OpenPort, open_port
@@ -31,6 +31,20 @@ STUCK_AFTER = 5.0
 """Seconds after which output that has not left is discarded with its connection. Flow control, a busy adapter and a
 network that lost a segment let go within one or two; whatever holds it longer does not mend by itself, and a request
 that old may move a machine when nobody expects it any more."""
+
+
+class Waiter(Protocol):
+    """Who waits for what becomes of a transaction: a future, or what has more haste, is told at once, and is the
+    library's own. Nothing of it may raise, or ask anything of the line.
+    """
+
+    def done(self) -> bool:
+        """Return whether it was told already, or waits no longer."""
+        ...
+
+    def set_result(self, value: Any, /) -> None: ...
+
+    def set_exception(self, error: BusError, /) -> None: ...
 
 
 class Pump(asyncio.Protocol):
@@ -87,11 +101,15 @@ class Pump(asyncio.Protocol):
         """Submit a transaction; the future gets its value or its error."""
         assert self._loop is not None
         future: asyncio.Future[Any] = self._loop.create_future()
-        transaction.tag = future
+        self.begin(transaction, future)
+        return future
+
+    def begin(self, transaction: Transaction, waiter: Waiter) -> None:
+        """Submit a transaction; `waiter` is told its value or its error, perhaps before this returns."""
+        transaction.tag = waiter
         # A request that only waits changes nothing that is to be sent, told or timed.
         if self.arbiter.submit(transaction, self.clock()):
             self.turn()
-        return future
 
     def cancel(self, transaction: Transaction) -> None:
         """Cancel a transaction, at the time it is now."""
@@ -115,13 +133,13 @@ class Pump(asyncio.Protocol):
             if type(event) is Transaction:
                 if event.writes and event.attempts:
                     self._on_written(event, event.ended_at)  # before its caller wakes: no snapshot slips in between
-                future = event.tag
-                if future is None or future.done():
+                waiter = event.tag
+                if waiter is None or waiter.done():
                     pass  # nobody waits for it any more
                 elif event.error is None:
-                    future.set_result(event.value)
+                    waiter.set_result(event.value)
                 else:
-                    future.set_exception(event.error)
+                    waiter.set_exception(event.error)
             elif type(event) is Sampled:
                 self._on_sample(event.poll, event.transaction)
             elif type(event) is Polled:
@@ -223,9 +241,9 @@ class Pump(asyncio.Protocol):
         transaction = late.transaction
         if transaction.writes:
             self._on_written(transaction, self.clock())
-        future = transaction.tag
-        if future is not None and not future.done():
-            future.set_exception(late.error)
+        waiter = transaction.tag
+        if waiter is not None and not waiter.done():
+            waiter.set_exception(late.error)
 
     def _arm(self, due: float) -> None:
         if self._alarm is not None:

@@ -59,7 +59,9 @@ OPEN_DEADLINE = 10.0
 """Seconds after which an opening that does not come back is given up."""
 CLOSE_DEADLINE = 0.5
 """Seconds for which `close` waits for the driver before it reports the port closed all the same."""
-READ_SIZE = 4096
+READ_SIZE = 448
+"""Bytes of one read, more than any frame has. Python serves up to 512, its own header included, from a pool of its own;
+what is larger costs a call of malloc, and another to cut it to what came."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""A serial device server in raw TCP mode."""
+"""A serial server in raw TCP mode."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KEEP_ALIVE = {"TCP_KEEPIDLE": 4, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3, "TCP_USER
 
 @dataclass(frozen=True, slots=True)
 class TcpPort:
-    """A serial line behind a device server that passes raw bytes (ser2net, Moxa and the like).
+    """A serial line behind a serial server that passes raw bytes (ser2net, Moxa and the like).
 
     `baudrate` is the server's, so that reply windows run from the end of the request on the wire; without it they
     run from the write. `receive_latency` in seconds is how long the server may hold bytes back (ser2net: 0.0033

@@ -8,10 +8,9 @@ byte. The first byte tells the two apart, and every request has one legal set of
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
 from typing import ClassVar, Generic, NoReturn, TypeVar
 
-from busmaster.contract.exchange import MORE, Done, Expect, FrameError, LaterLeg, Need, Sizes, no_reply
+from busmaster.contract.exchange import MORE, Done, Expect, FrameError, LaterLeg, Need, Sizes, no_reply, other_format
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import Refused
 from busmaster.wire.characters import made_of
@@ -30,6 +29,8 @@ NAK = b"\x15"
 _STX = STX[0]
 _PRINTABLE = made_of(bytes(range(0x20, 0x7F)))
 _ENVELOPE = len(STX + ETX) + 1
+_LONGER = 60
+"""Characters by which data may be too long and their end still be awaited."""
 _REFUSALS: Mapping[int, type[Refused]] = {NAK[0]: Refused}
 
 
@@ -37,7 +38,8 @@ def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes]
     """Return where the ETX of a whole and valid telegram is; 0 if more bytes are needed.
 
     `header` is STX and the echo, without an ETX; `longest` the most data characters. Raises FrameError as soon as the
-    bytes cannot become such a telegram; `whole` only if nothing but the checksum is wrong, and nothing follows.
+    bytes cannot become such a telegram; `whole` only if nothing but the checksum is wrong, and nothing follows. Of
+    data that are too long the end is awaited, for its check tells another format from a damaged ETX.
     """
     start = len(header)
     if buffer[:start] != header:
@@ -49,13 +51,24 @@ def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes]
     if field.translate(_PRINTABLE) != field:
         raise FrameError("a control character within the data")
     if len(field) > longest:
-        raise FrameError(f"more than {longest} characters of data")
+        return _await_end(head, tail, start, longest, check)
     if not tail:
         return 0
     etx = len(head)
     if tail[0] != check(buffer[1 : etx + 1]):
         raise FrameError("bad checksum", whole=len(tail) == 1)
     return etx
+
+
+def _await_end(head: bytes, tail: bytes, start: int, longest: int, check: Callable[[bytes], int]) -> int:
+    """Return 0 while the end of data that are too long may still come; else raise what became of them."""
+    field = head[start:]
+    printable = field.translate(_PRINTABLE) == field
+    if printable and not tail and len(field) <= longest + _LONGER:
+        return 0
+    if printable and tail and tail[0] == check(head[1:] + ETX):
+        raise other_format(len(head) + 2, f"{len(field)} characters of data where {longest} are the most")
+    raise FrameError(f"more than {longest} characters of data")
 
 
 def telegram_sizes(echo: int, typical: int, longest: int) -> Sizes:
@@ -85,14 +98,8 @@ class SingleLeg:
         raise FrameError(f"a reply cannot begin with {heard[0]:02x}", heard=heard)
 
 
-@lru_cache(maxsize=4096)
-def answers_to(echo: bytes) -> tuple[bytes, ...]:
-    """Return what a telegram with this echo begins with, as the `answers` of an exchange."""
-    return (STX + echo,)
-
-
 class TelegramReader(SingleLeg, Generic[T]):
-    """One read: a telegram, or a refusal.
+    """One read: a telegram, or a refusal. `header` is what the telegram begins with: STX and the echo.
 
     A protocol sets the class attributes. `parse` makes the value of the data field, or raises FrameError.
     """
@@ -104,10 +111,10 @@ class TelegramReader(SingleLeg, Generic[T]):
     sizes: ClassVar[Sizes]
     starts: ClassVar[bytes] = STX + NAK
 
-    def __init__(self, request: bytes, echo: bytes, timing: ReplyTiming) -> None:
+    def __init__(self, request: bytes, header: bytes, timing: ReplyTiming) -> None:
         self.request = request
         self.timing = timing
-        self.answers = answers_to(echo)
+        self.answers: tuple[bytes, ...] = (header,)
         self._buffer = b""
 
     @property
@@ -128,7 +135,11 @@ class TelegramReader(SingleLeg, Generic[T]):
         etx = find_etx(buffer, header, self.longest, self.check)
         if not etx:
             return MORE
-        value, end = self.parse(buffer[len(header) : etx]), etx + 2
+        end = etx + 2
+        try:
+            value = self.parse(buffer[len(header) : etx])
+        except FrameError as error:
+            raise other_format(end, error.what, send=error.send, heard=error.heard) from None
         return Done(value) if len(buffer) == end else Done(value, buffer[end:])
 
     def expired(self, started: bool) -> NoReturn:

@@ -13,6 +13,7 @@ from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.contract.exchange import no_reply
 from busmaster.errors import BacklogFull, BusError, Superseded, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 
@@ -58,7 +59,7 @@ class Desk:
             if ok:
                 self.dispatcher.succeeded(transaction, 5.0, self.now)
             else:
-                self.dispatcher.attempt_failed(transaction, True, "no reply", self.now)
+                self.dispatcher.attempt_failed(transaction, True, no_reply(), self.now)
                 transaction.node.health = Health.UP
                 transaction.node.failures = 0
         self.start()

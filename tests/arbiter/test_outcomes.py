@@ -9,11 +9,13 @@ import pytest
 from busmaster.arbiter.events import LatenessLowered, LatenessRaised
 from busmaster.arbiter.health import CALM_LATENESS, Health, NodeRecord
 from busmaster.arbiter.transaction import Priority
+from busmaster.contract.exchange import OTHER_FORMAT
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, GarbledReply, NoReply, Refused, Superseded, WriteUnconfirmed
 from busmaster.protocols._comms.codec import Reading, Writing
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.modbus import codec as modbus
 from tests.arbiter.bench import ACK, FIVE, LATENESS, NAK, QUIET, READ_1_OF_NODE_1, TAU, WRITE_5, Bench, request_of, up
 
 REQUEST = 8 * TAU
@@ -66,6 +68,26 @@ def test_r7_a_write_whose_ack_may_have_lost_a_bit_is_unconfirmed_and_sent_once()
     assert isinstance(asked.error, WriteUnconfirmed)
     bench.until_ready()
     assert bench.sent() == ""
+
+
+def test_r7_a_write_answered_in_another_format_is_to_be_read_back_first() -> None:
+    bench = Bench()
+    asked = bench.ask(bench.node(1, modbus.PROFILE), modbus.WriteRegisters(100, (5,)))
+    bench.sent()
+    bench.hear(modbus.with_crc(bytes.fromhex("01 06 00 65 00 05")).hex(), after=0.030)
+    assert isinstance(asked.error, WriteUnconfirmed)
+    assert "of another format" in asked.error.what
+    assert asked.error.hint == WriteUnconfirmed.hint
+
+
+def test_a_read_answered_in_another_format_has_the_hint_of_its_reader() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node(1, mentor.PROFILE), mentor.Read(1, 17), retries=0)
+    bench.sent()
+    bench.hear("02 30 31 31 37 2b 34 37 2e 36 03 34", after=0.030)
+    assert isinstance(read.error, GarbledReply)
+    assert read.error.what.startswith("12 bytes came, right in their check but of another format: b'+47.6'")
+    assert read.error.hint == OTHER_FORMAT
 
 
 def test_r7_a_write_that_was_never_sent_is_superseded() -> None:

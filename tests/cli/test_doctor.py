@@ -7,7 +7,6 @@ number, and is deaf while it is another than its own.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import random
 import socket
@@ -36,7 +35,7 @@ from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import find, kinds, make_device
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport import identity
-from tests.cli.conftest import Command
+from tests.cli.conftest import Command, without_time
 from tests.cli.conftest import Outcome as Ended
 from tests.transport.fakes import plugged
 from tests.transport.usb import UsbTree
@@ -135,7 +134,7 @@ def test_a_rate_that_no_device_of_the_protocol_has_is_a_note_and_nothing_to_mend
     line = Line(LineSettings(19200), [EmulatedMsc(3)], chance=random.Random(1))
     findings = examined(line, (3,), "msc")
     assert findings.wrong == set()
-    assert findings.on("open").advice == "MSC devices speak at 9600 baud alone, not at 19200"
+    assert findings.on("open").advice == "MSC nodes speak at 9600 baud alone, not at 19200"
 
 
 def test_a_node_is_left_with_nothing_unacknowledged() -> None:
@@ -262,7 +261,7 @@ def test_where_nobody_answers_that_is_one_finding() -> None:
 
 def test_what_learned_windows_would_come_to_is_said() -> None:
     findings = examined(line_of("hcp2", [hcp2(5, Delay(0.020))]), (5,))
-    assert findings.on("learning").what.startswith("learned windows would be 42 ms at most: a lost reply would hold up")
+    assert findings.on("learning").what.startswith("learned windows would be 32 ms at most: a lost reply would hold up")
     assert "in place of 150 ms" in findings.on("learning").what
     findings = examined(line_of("hcp2", [hcp2(5, Delay(0.080))]), (5,))
     assert "no shorter than the one that is set" in findings.on("learning").what
@@ -321,7 +320,7 @@ def test_a_pty_is_examined_and_the_status_is_0_if_all_is_well(busmaster: Command
 def test_json_has_an_object_for_each_finding(busmaster: Command) -> None:
     with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
         done = busmaster("doctor", server.path, *HCP2, "--nodes", "1", "--timeout", "1000", "--json")
-    findings = [json.loads(line) for line in done.lines]
+    findings = list(map(without_time, done.lines))
     assert {tuple(finding) for finding in findings} == {("topic", "ok", "what", "advice")}
     assert findings[0] == {"topic": "port", "ok": True, "what": f"{server.path} exists", "advice": ""}
 

@@ -16,6 +16,8 @@ from termios import tcgetattr
 import pytest
 
 from busmaster.bus.requester import Priority
+from busmaster.capture.frames import Direction
+from busmaster.capture.pcapng import read_packets
 from busmaster.config import open_line
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_pty
@@ -131,6 +133,20 @@ def test_a_safe_write_that_is_not_confirmed_is_named_and_the_status_is_1(
 def test_safe_sends_the_safe_state_alone(busmaster: Command, path: Path, winder: TcpServer) -> None:
     outcome = busmaster("safe", str(path))
     assert (outcome.status, outcome.out, outcome.err) == (0, "winder/force ok\n", "")
+    assert force(winder) == 15
+
+
+def test_safe_is_recorded_and_what_cannot_be_recorded_is_sent_all_the_same(
+    busmaster: Command, path: Path, winder: TcpServer, tmp_path: Path
+) -> None:
+    capture = tmp_path / "safe.pcapng"
+    assert busmaster("safe", str(path), "--capture", str(capture)).err == ""
+    with capture.open("rb") as file:
+        assert {packet.direction for packet in read_packets(file)} == {Direction.HOST, Direction.NODE}
+    assert busmaster("write", str(path), "winder/force=3").status == 0
+    outcome = busmaster("safe", str(path), "--capture", str(tmp_path / "no" / "such"))
+    assert (outcome.status, outcome.out) == (0, "winder/force ok\n")
+    assert "No such file or directory" in outcome.err
     assert force(winder) == 15
 
 

@@ -50,7 +50,7 @@ REPLY = bytes.fromhex("02 30 31 35 03 37")
 
 
 class Tapped:
-    """A serial device server on somebody else's line."""
+    """A serial server on somebody else's line."""
 
     def __init__(self) -> None:
         self.heard = b""

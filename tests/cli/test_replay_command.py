@@ -43,7 +43,7 @@ def test_json_has_every_exchange_with_its_time_and_the_counts(
 ) -> None:
     assert main(["replay", capture(tmp_path, Outcome.OK, Outcome.REFUSED), "--json"]) == 1
     same, changed, counts = map(json.loads, capsys.readouterr().out.splitlines())
-    assert same["time"] == "1970-01-01T00:00:00.000Z"
+    assert same["time"] == "1970-01-01T00:00:00.000000Z"
     assert (same["packet"], same["node"], same["command"]) == (1, 255, "read element 105")
     assert (same["judged"], same["changed"]) == (True, False)
     assert (changed["recorded"], changed["now"], changed["changed"]) == ("refused", "ok: 4096.0", True)

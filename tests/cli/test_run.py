@@ -157,7 +157,7 @@ def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     assert outcome.lines[4].startswith("it fits: the schedule asks for ")
     assert outcome.lines[-2].startswith("reply times are assumed, half of the nominal one, for ")
     assert outcome.lines[-1].startswith("with 1% of all frames lost it asks for ")
-    assert 'with timing = "learned" (a window of 52 ms) for ' in outcome.lines[-1]
+    assert 'with timing = "learned" (a window of 39.5 ms) for ' in outcome.lines[-1]
 
 
 def test_plan_says_what_would_fit_where_it_does_not_and_ends_with_1(busmaster: Command, line: Path) -> None:

@@ -130,4 +130,4 @@ async def test_what_was_learned_of_reply_times_is_in_the_summary_once_it_is_trus
         for _ in range(2):
             await controller.read(1)
         watch.summarise()
-        assert "busmaster: node 1: learned windows: Read 6.35 ms" in capfd.readouterr().err.splitlines()
+        assert "busmaster: node 1: learned windows: Read 5.26 ms" in capfd.readouterr().err.splitlines()

@@ -7,12 +7,14 @@ import contextlib
 import http.server
 import threading
 from collections.abc import AsyncIterator, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, Service
 from busmaster.bus.limits import Limit
+from busmaster.bus.meaning import Meaning
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.line import Line
 from busmaster.gate.permission import digest_of
@@ -118,6 +120,23 @@ async def test_on_hovering_an_exchange_says_what_was_said_and_the_arrow_keys_go_
             """,
         )
         assert "→ +0.0 ms" in found
+
+
+@pytest.mark.asyncio
+async def test_a_good_value_that_is_a_text_is_not_drawn_as_one_that_is_missing(
+    browser: Browser, tmp_path: Path
+) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line, replace(Hcp2Controller(line.bus, 5).point("20"), meaning=Meaning(labels={0: "off"})))
+        await shows(of.line)
+        await asyncio.to_thread(browser.open, of.url)
+        blank = """
+            [...document.querySelectorAll('#point-rows canvas')].map((canvas) => {
+              const drawn = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+              return parseInt(canvas.ariaLabel.split(' ')[2]) > 5 && drawn.every((part) => part === 0);
+            })
+        """
+        await asyncio.to_thread(browser.until, f"`${{{blank}}}` === 'false,false,true'")
 
 
 def exchanges_are_drawn(browser: Browser) -> None:

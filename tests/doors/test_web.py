@@ -71,6 +71,14 @@ async def test_all_that_it_answers_is_as_its_schema_says(tmp_path: Path) -> None
 
 
 @pytest.mark.asyncio
+async def test_a_point_that_is_not_known_yet_is_not_told_to_be_none(tmp_path: Path) -> None:
+    async with page(tmp_path) as of:  # and nobody serves a line
+        answer = await of.client.get(ONE)
+        assert (answer.status_code, answer.json()["error"]) == (503, "LineDown")
+        check("/api/points/{group}/{key}", "get", 503, answer.json())
+
+
+@pytest.mark.asyncio
 async def test_its_schema_has_every_path_and_is_served(tmp_path: Path) -> None:
     async with page(tmp_path) as of:
         assert (await of.client.get("/openapi.json")).json() == SCHEMA

@@ -264,7 +264,7 @@ def test_what_lost_frames_cost_and_learning_would_spare_is_reckoned() -> None:
     assert full.utilisation == pytest.approx(1.0)
     assert 1 / full.losses.documented == pytest.approx(0.58, abs=0.1)
     assert 1 / full.losses.learned == pytest.approx(0.95, abs=0.015)
-    assert full.losses.windows == pytest.approx((0.006, 0.006))
+    assert full.losses.windows == pytest.approx((0.005, 0.005))
 
 
 def test_learning_spares_nothing_where_replies_take_as_long_as_the_window() -> None:

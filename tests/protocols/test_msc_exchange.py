@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from typing import Any
 
 import pytest
 
-from busmaster.contract.exchange import MORE, Done, Expect, FrameError, Refused
+from busmaster.contract.exchange import MORE, OTHER_FORMAT, Done, Expect, FrameError, Refused
 from busmaster.protocols.msc.codec import PROFILE, BlockRead, DataRead, DataWrite, ReadFlag, ReadStatus
 from busmaster.protocols.msc.exchange import PacketExchange, StalePacketListener, packet, packet_size
 
@@ -31,7 +32,7 @@ def writing() -> PacketExchange[None]:
     return DataWrite(2008, 1234).open(1, TIMINGS)
 
 
-def feed_in_chunks(exchange: PacketExchange[None], data: bytes, chunk: int) -> None:
+def feed_in_chunks(exchange: PacketExchange[Any], data: bytes, chunk: int) -> None:
     for start in range(0, len(data), chunk):
         exchange.feed(data[start : start + chunk])
 
@@ -149,6 +150,40 @@ def test_a_babbling_line_is_not_listened_to_without_end() -> None:
     assert all(exchange.feed(b"\xaa") is MORE for _ in range(248))
     with pytest.raises(FrameError, match="without a pause"):
         exchange.feed(b"\xaa")
+
+
+def test_a_packet_that_is_longer_than_any_may_be_is_another_format_if_its_check_is_right() -> None:
+    what = "249 bytes came, right in their check but of another format: 241 bytes of data where 240 are the most"
+    for chunk in (1, 99, 999):
+        exchange = acked()
+        with pytest.raises(FrameError) as error:
+            feed_in_chunks(exchange, packet(1, b"DREAD," + bytes(235)), chunk)
+        assert error.value.what == what
+        assert (error.value.hint, error.value.send, error.value.whole) == (OTHER_FORMAT, ACK, False)
+
+
+@pytest.mark.parametrize(
+    ("heard", "after"),
+    [
+        pytest.param(packet(1, b"DREAD," + bytes(235))[:-1] + b"x", 249, id="wrong in its check"),
+        pytest.param(packet(1, b"DREAD," + bytes(235)) + b"x", 250, id="with a byte behind it"),
+        pytest.param(b"\x02\x01\x02" + bytes(600), 249, id="longer than is listened to"),
+    ],
+)
+def test_another_packet_that_is_too_long_is_not_answered(heard: bytes, after: int) -> None:
+    exchange = acked()
+    with pytest.raises(FrameError, match="without a pause") as error:
+        exchange.feed(heard[:after])
+    assert (error.value.hint, error.value.send) == (None, b"")
+
+
+def test_a_packet_of_another_length_than_asked_for_is_another_format_if_none_follows() -> None:
+    exchange = acked()
+    assert says(exchange.feed(packet(1, b"DREAD," + bytes(6)))) == ACK
+    with pytest.raises(FrameError) as error:
+        exchange.expired(False)
+    assert error.value.what == "20 bytes came, right in their check but of another format: the packet asked for has 18"
+    assert (error.value.hint, error.value.send) == (OTHER_FORMAT, ACK)
 
 
 def test_no_packet_after_the_ack_fails_with_an_ack_for_one_that_was_lost() -> None:

@@ -17,6 +17,7 @@ from busmaster.arbiter.turns import PASSED_BY_EACH
 from busmaster.errors import BusError, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.service.messages import MOST_HOLDS, MOST_REQUESTS, MOST_UNDER_WAY
+from busmaster.transport.pump import Waiter
 from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until
 
 MANY = MOST_REQUESTS + MOST_REQUESTS // 2
@@ -25,13 +26,13 @@ MANY = MOST_REQUESTS + MOST_REQUESTS // 2
 def watched(line: Served) -> list[Transaction]:
     """What is asked on the line from now on, in its order."""
     asked: list[Transaction] = []
-    transact = line.bus.pump.transact
+    begin = line.bus.pump.begin
 
-    def watch(transaction: Transaction) -> asyncio.Future[Any]:
+    def watch(transaction: Transaction, waiter: Waiter) -> None:
         asked.append(transaction)
-        return transact(transaction)
+        begin(transaction, waiter)
 
-    line.bus.pump.transact = watch  # type: ignore[method-assign]  # what goes out is seen here
+    line.bus.pump.begin = watch  # type: ignore[method-assign]  # what goes out is seen here
     return asked
 
 
@@ -111,6 +112,7 @@ def test_r9_an_urgent_request_waits_for_nothing_else_of_its_program(tmp_path: Pa
     on_a_served_line(tmp_path, story)
 
 
+@pytest.mark.usefixtures("_unhurried")
 def test_r9_a_program_with_thousands_of_requests_delays_anothers_by_two_exchanges_at_most(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         asked = watched(line)

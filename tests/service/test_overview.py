@@ -225,7 +225,7 @@ def test_details_have_limits_alarms_and_the_last_exchange(tmp_path: Path) -> Non
 
 def test_what_happened_before_somebody_looks_is_told(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
-        line.service.journal.note("the winder was threaded")
+        line.service.line.journal.note("the winder was threaded")
         controller = Hcp2Controller(line.bus, 8, timings=PATIENT)
         while Node.of(controller).health is not Health.DOWN:
             with pytest.raises(BusError):
@@ -322,8 +322,8 @@ def test_nothing_is_worked_out_while_nobody_looks(tmp_path: Path) -> None:
         polled(line.bus)
         async with connect(line.address) as second:
             await second.overview(lambda method, body: None)
-            assert line.service._overview is not None
-        await until(lambda: line.service._overview is None)
+            assert line.service.line._overview is not None
+        await until(lambda: line.service.line._overview is None)
         picture = Picture()
         await remote.overview(picture.hear)
         await until(lambda: picture.rows and picture.rows[0].value == 0)

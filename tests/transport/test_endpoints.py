@@ -82,7 +82,7 @@ def test_the_protocol_fills_in_what_the_url_leaves_open() -> None:
         ("socket://server:4001/dev/ttyS0", "is not of the form"),
         ("socket://[::1:4001", "is not of the form"),
         ("127.0.0.1:4001", "'127.0.0.1:4001' is no device path; a TCP port is written socket://127.0.0.1:4001"),
-        ("tcp://server:4001", "a line that a busmaster serves, .* a serial device server is written socket://"),
+        ("tcp://server:4001", "a line that a busmaster serves, .* a serial server is written socket://"),
         ("unix:/run/line.sock", "unix:/run/line.sock is a line that a busmaster serves, .* here a port is needed"),
         ("udp://server:4001", "no such kind of port: udp://; use a device path, usb:SERIAL or socket://HOST:PORT"),
         ("rfc2217://server:4001", "does not work with any asyncio serial library: .* use socket://server:4001"),

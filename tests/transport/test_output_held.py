@@ -389,7 +389,7 @@ async def test_a_tty_stopped_for_good_takes_the_line_down_in_words(
 
 
 class Server:
-    """A serial device server and the node behind it: each request of the same length is answered by a count."""
+    """A serial server and the node behind it: each request of the same length is answered by a count."""
 
     def __init__(self) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))

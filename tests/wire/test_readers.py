@@ -6,10 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from busmaster.contract.exchange import MORE, Done, FrameError
+from busmaster.contract.exchange import MORE, OTHER_FORMAT, Done, FrameError
 from busmaster.contract.timing import ReplyTiming
 from busmaster.errors import Refused
 from busmaster.wire.checks import xor
+from busmaster.wire.numbers import parse_number
 from busmaster.wire.readers import AcknowledgeReader, TelegramReader, find_etx, telegram_sizes
 
 TIMING = ReplyTiming(0.05, 0.1, 0.15, 0.02)
@@ -27,7 +28,7 @@ class Text(TelegramReader[bytes]):
 
 
 def reader() -> Text:
-    return Text(b"request", b"01", TIMING)
+    return Text(b"request", HEADER, TIMING)
 
 
 def test_the_data_lies_between_the_echo_and_etx() -> None:
@@ -83,7 +84,6 @@ def test_a_bad_checksum_is_a_whole_frame_unless_something_follows() -> None:
         (b"\x0201\0", "control character"),
         (b"\x02011\x02", "control character"),
         (b"\x0201\xb1", "control character"),
-        (b"\x0201" + b"1" * 21, "more than 20"),
         (b"\x06", "cannot begin with 06"),
         (b"x", "cannot begin with 78"),
     ],
@@ -102,6 +102,53 @@ def test_a_frame_that_cannot_be_right_fails_at_its_first_wrong_byte(reply: bytes
 def test_20_characters_of_data_are_read() -> None:
     body = b"01" + b"1" * 20 + b"\x03"
     assert reader().feed(b"\x02" + body + bytes([xor(body)])) == Done(b"1" * 20)
+
+
+def too_long(check: int = 0) -> bytes:
+    body = b"01" + b"1" * 24 + b"\x03"
+    return b"\x02" + body + bytes([xor(body) ^ check])
+
+
+def test_data_that_are_too_long_are_another_format_if_their_check_is_right() -> None:
+    exchange = reader()
+    for byte in too_long()[:-1]:
+        assert exchange.feed(bytes([byte])) is MORE
+    with pytest.raises(FrameError) as failure:
+        exchange.feed(too_long()[-1:])
+    what = "29 bytes came, right in their check but of another format: 24 characters of data where 20 are the most"
+    assert failure.value.what == what
+    assert (failure.value.hint, failure.value.whole, failure.value.heard) == (OTHER_FORMAT, False, b"")
+
+
+@pytest.mark.parametrize(
+    "heard",
+    [
+        pytest.param(too_long(check=1), id="wrong in their check"),
+        pytest.param(HEADER + b"1" * 24 + b"\x04", id="with a control character in them"),
+        pytest.param(HEADER + b"1" * 81, id="without an end"),
+    ],
+)
+def test_data_that_are_too_long_otherwise_are_damaged(heard: bytes) -> None:
+    exchange = reader()
+    for byte in heard[:-1]:
+        assert exchange.feed(bytes([byte])) is MORE
+    for reading, rest in ((exchange, heard[-1:]), (reader(), heard)):
+        with pytest.raises(FrameError, match="more than 20 characters") as failure:
+            reading.feed(rest)
+        assert (failure.value.hint, failure.value.whole) == (None, False)
+
+
+class Number(Text):
+    __slots__ = ()
+    parse = staticmethod(parse_number)  # type: ignore[assignment]  # its value is a number
+
+
+def test_data_that_mean_nothing_are_another_format() -> None:
+    body = b"01+1.5V\x03"
+    with pytest.raises(FrameError) as failure:
+        Number(b"request", b"01", TIMING).feed(b"\x02" + body + bytes([xor(body)]))
+    assert failure.value.what == "10 bytes came, right in their check but of another format: b'+1.5V' is not a number"
+    assert failure.value.hint == OTHER_FORMAT
 
 
 @pytest.mark.parametrize("character", [0x20, 0x7E])

@@ -61,7 +61,7 @@ export class PointDialog {
     if (!row || !box.open && line) return;
     this.row = row;
     by("point-value").textContent = shown(row.value, row.precision);
-    draw_trend(by("point-trend"), row.past, { ...this.colours(), bounds: true, precision: row.precision });
+    draw_trend(by("point-trend"), row, { ...this.colours(), bounds: true, precision: row.precision });
     const facts = [["group", row.group], ["protocol", `${row.protocol}, address ${row.address}`]];
     if (this.details) facts.push(["asked as", this.details.command]);
     if (this.details && (this.details.low !== null || this.details.high !== null)) facts.push(["alarms", `below ${bound(this.details.low)}, above ${bound(this.details.high)}`]);

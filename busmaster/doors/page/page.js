@@ -183,7 +183,7 @@ function fill_row(cells, row, ink, periods) {
   if (cells.drawn !== last || cells.ink !== ink.ink) {
     cells.drawn = last;
     cells.ink = ink.ink;
-    draw_trend(cells.trend, row.past, ink);
+    draw_trend(cells.trend, row, ink);
     cells.trend.setAttribute("aria-label", `trend of ${row.past.length} values`);
   }
 }

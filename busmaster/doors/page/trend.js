@@ -1,4 +1,4 @@
-// A trend on a small canvas: a line through the numbers, with a gap where there was no value.
+// A trend on a small canvas: a line through the numbers, with a mark where there was no value. Texts have none.
 
 export function fit(canvas) {
   const scale = devicePixelRatio || 1;
@@ -13,10 +13,10 @@ export function fit(canvas) {
   return { pen, width, height };
 }
 
-export function draw_trend(canvas, past, { ink, dim, bad, bounds = false, precision = null }) {
+export function draw_trend(canvas, { past, value: last }, { ink, dim, bad, bounds = false, precision = null }) {
   const { pen, width, height } = fit(canvas);
   const numbers = past.map(([, value]) => value).filter((value) => value !== null);
-  if (!past.length || !width) return;
+  if (!past.length || !width || (!numbers.length && typeof last === "string")) return;
   let low = Math.min(...numbers), high = Math.max(...numbers);
   const begin = past[0][0], span = past.at(-1)[0] - begin || 1;
   const flat = high === low, edge = bounds ? 14 : 3;

@@ -55,12 +55,12 @@ class ReadElement:
 
     @staticmethod
     def encode(address: int, element: int) -> tuple[bytes, bytes]:
-        """Return the request, and the element as its reply echoes it."""
+        """Return the request, and what its reply begins with: STX, and the element as it is echoed."""
         raise NotImplementedError
 
     def open(self, address: int, timings: Timings) -> Reading:
-        request, echo = self.encode(address, self.element)
-        return Reading(request, echo, timings.read)
+        request, header = self.encode(address, self.element)
+        return Reading(request, header, timings.read)
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,8 +58,8 @@ class Read(mentor.Read):
 
     def open(self, address: int, timings: Timings) -> Reading:  # type: ignore[override]  # its value may be a float
         """Begin the read. Raises InvalidCommand for the broadcast address: every drive would answer at once."""
-        request, echo = read_request(address, self.menu, self.number)
-        return Reading(request, echo, timings.read)
+        request, header = read_request(address, self.menu, self.number)
+        return Reading(request, header, timings.read)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from busmaster.contract.arguments import whole_number
-from busmaster.contract.exchange import MORE, Done, FrameError, Need, Sizes, no_reply
+from busmaster.contract.exchange import MORE, Done, FrameError, Need, Sizes, no_reply, other_format
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.wire.checks import sum8
@@ -63,6 +63,8 @@ class Reading(SingleLeg):
         if parameter != self._parameter:
             raise FrameError(f"wrong echo: parameter {parameter} in place of {self._parameter}", heard=buffer)
         if check != sum8(bytes((parameter, high, low))):
+            if rest and buffer[-1] == sum8(buffer[1:-1]):
+                raise other_format(len(buffer), f"a reply has {self.length}")
             raise FrameError("bad checksum", whole=not rest)  # only a whole frame is spared the lateness (R3)
         return Done(high << 8 | low, rest=rest)
 

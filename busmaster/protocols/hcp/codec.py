@@ -29,8 +29,8 @@ class Read(ReadElement):
     @staticmethod
     @lru_cache(maxsize=4096)
     def encode(address: int, element: int) -> tuple[bytes, bytes]:
-        echo = b"%02d" % element
-        return _reset(address) + STX + echo + ENQ, echo
+        header = STX + b"%02d" % element
+        return _reset(address) + header + ENQ, header
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from typing import ClassVar
 from busmaster.contract.profile import Profile
 from busmaster.protocols._comms.codec import CHECKED, LINE, OTHER_LINES, TIMINGS, ReadElement, WriteElements
 from busmaster.wire.checks import xor
-from busmaster.wire.readers import BEL, ENQ, ETX
+from busmaster.wire.readers import BEL, ENQ, ETX, STX
 
 LAST_ELEMENT = 255
 
@@ -29,10 +29,10 @@ class Read(ReadElement):
     @staticmethod
     @lru_cache(maxsize=4096)
     def encode(address: int, element: int) -> tuple[bytes, bytes]:
-        echo = b"%02X" % element
+        header = STX + b"%02X" % element
         # begun after STX, the check would be right for node 2, the note's example: there node and STX cancel out
-        body = b"%02X\x02%b" % (address, echo) + ENQ
-        return BEL + body + bytes((xor(body),)), echo
+        body = b"%02X%b" % (address, header) + ENQ
+        return BEL + body + bytes((xor(body),)), header
 
 
 @dataclass(frozen=True, slots=True)

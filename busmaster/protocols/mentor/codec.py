@@ -101,8 +101,8 @@ class Read:
 
     def open(self, address: int, timings: Timings) -> Reading:
         """Begin the read. Raises InvalidCommand for the broadcast address: every drive would answer at once."""
-        request, echo = read_request(address, self.menu, self.number)
-        return Reading(request, echo, timings.read)
+        request, header = read_request(address, self.menu, self.number)
+        return Reading(request, header, timings.read)
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,14 +229,14 @@ class RunReading:
     answered: ClassVar[bool] = True
 
     def __init__(self, run: ReadRun, address: int, timing: ReplyTiming) -> None:
-        numbers = [run.number + run.step * i for i in range(run.count)]
-        self.request, echo = read_request(address, run.menu, run.number)
+        headers = tuple(header_of(run.menu, run.number + run.step * i) for i in range(run.count))
+        self.request, _ = read_request(address, run.menu, run.number)
         self.timing = timing
         self.later: Sequence[LaterLeg] = (LaterLeg(timing, self.sizes, sent=1),) * (run.count - 1)
         self._short = _SHORT_COMMANDS[run.step]
-        self._next = [b"%02d%02d" % (run.menu, number) for number in reversed(numbers[1:])]
-        self._leg = self.reading(self.request, echo, timing)
-        self.answers = tuple(STX + b"%02d%02d" % (run.menu, number) for number in numbers)
+        self._next = list(reversed(headers[1:]))
+        self._leg = self.reading(self.request, headers[0], timing)
+        self.answers = headers
         self._values: list[Any] = []
 
     @property
@@ -319,11 +319,15 @@ def merge_runs(commands: Sequence[Command[Any]]) -> list[Batch]:
 
 @lru_cache(maxsize=4096)
 def read_request(address: int, menu: int, number: int) -> tuple[bytes, bytes]:
-    """Return the read request, and the parameter as its reply echoes it. Raises InvalidCommand for address 0."""
+    """Return the read request, and what its reply begins with. Raises InvalidCommand for address 0."""
     if not address:
         raise InvalidCommand("a read cannot go to all drives: they would answer at once")
-    echo = b"%02d%02d" % (menu, number)
-    return reset(address) + echo + ENQ, echo
+    return reset(address) + b"%02d%02d" % (menu, number) + ENQ, header_of(menu, number)
+
+
+def header_of(menu: int, number: int) -> bytes:
+    """Return what the reply to a read begins with: STX, and the parameter as it is echoed."""
+    return STX + b"%02d%02d" % (menu, number)
 
 
 def reset(address: int) -> bytes:

@@ -21,7 +21,7 @@ from busmaster.protocols.modbus.codec import (
     ReadRegisters,
     WriteCoils,
     WriteRegisters,
-    with_crc,
+    is_sound,
 )
 
 TABLES = {function: table for table, function in READS.items()}
@@ -129,11 +129,6 @@ class ModbusDialect:
                 return WriteCoils(int(first), tuple(value == 1 for value in values))
             case _:
                 return WriteRegisters(int(first), tuple(values))
-
-
-def is_sound(raw: bytes) -> bool:
-    """Return whether the CRC of a whole frame is right."""
-    return with_crc(raw[:-2]) == raw
 
 
 def request_length(data: bytes) -> int:

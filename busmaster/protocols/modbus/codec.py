@@ -19,7 +19,7 @@ from functools import lru_cache
 from typing import Any, ClassVar, Generic, TypeVar
 
 from busmaster.contract.arguments import whole_number
-from busmaster.contract.exchange import MORE, Done, FrameError, LaterLeg, Sizes, Step, no_reply
+from busmaster.contract.exchange import MORE, Done, FrameError, LaterLeg, Sizes, Step, no_reply, other_format
 from busmaster.contract.profile import LineSettings, Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand, Refused
@@ -76,6 +76,11 @@ def with_crc(body: bytes) -> bytes:
     return body + crc.to_bytes(2, "little")
 
 
+def is_sound(frame: bytes) -> bool:
+    """Return whether the CRC of a whole frame is right."""
+    return with_crc(frame[:-2]) == frame
+
+
 class Frames:
     """What is said in a conversation, and what its reply looks like: `header`, then `payload` bytes and the CRC.
 
@@ -127,19 +132,22 @@ class Conversation(Generic[T]):
         if buffer.startswith(self._frames.refusal):
             return self._refused(buffer)
         if not buffer.startswith(header) and not header.startswith(buffer):
-            raise FrameError(
-                f"wrong echo: {buffer[: len(header)].hex(' ')} in place of {header.hex(' ')}", heard=buffer
-            )
+            what = f"{buffer[: len(header)].hex(' ')} in place of {header.hex(' ')}"
+            if buffer.startswith(header[:2]) and is_sound(buffer):
+                raise other_format(len(buffer), f"they begin with {what}", heard=buffer)
+            raise FrameError(f"wrong echo: {what}", heard=buffer)
         if len(buffer) < size:
             return MORE
-        if with_crc(buffer[: size - 2]) != buffer[:size]:
+        if not is_sound(buffer[:size]):
+            if is_sound(buffer):
+                raise other_format(len(buffer), f"the reply to this has {size}")
             raise FrameError("bad CRC", whole=len(buffer) == size)  # only a whole frame is spared the lateness (R3)
         return Done(self._decode(buffer[len(header) : size - 2]), rest=buffer[size:])
 
     def _refused(self, buffer: bytes) -> Step[T]:
         if len(buffer) < 5:
             return MORE
-        if with_crc(buffer[:3]) != buffer:
+        if with_crc(buffer[:3]) != buffer:  # to the byte: a sound frame and the byte 00 have a right CRC, too
             raise FrameError("bad CRC")  # or a damaged function code before a longer reply: not whole
         code = buffer[2]
         name = EXCEPTIONS.get(code, f"exception {code}")

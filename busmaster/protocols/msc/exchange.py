@@ -27,7 +27,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from busmaster.contract.exchange import MORE, Done, Expect, FrameError, LaterLeg, Need, Refused, Sizes, Step, no_reply
+from busmaster.contract.exchange import (
+    MORE,
+    Done,
+    Expect,
+    FrameError,
+    LaterLeg,
+    Need,
+    Refused,
+    Sizes,
+    Step,
+    no_reply,
+    other_format,
+)
 from busmaster.contract.timing import Timings
 from busmaster.wire.checks import sum16
 from busmaster.wire.readers import ACK, NAK, STX
@@ -38,6 +50,8 @@ HEADER = 6
 FRAMING = 8
 LONGEST_BODY = 240
 LONGEST_PACKET = LONGEST_BODY + FRAMING
+LONGEST_HEARD = 2 * LONGEST_PACKET
+"""Bytes of a packet that no controller may say, and whose end is awaited all the same: it is told from noise then."""
 UNITS = range(1, 16)
 
 RESENDS = 3  # the manual leaves the number to the host
@@ -60,8 +74,13 @@ def packet_size(data: bytes | bytearray) -> int | None:
         return None
     if len(data) < 4:
         return 0
-    length = int.from_bytes(data[2:4], "big")
-    return length + FRAMING if data[1] in UNITS and length <= LONGEST_BODY else None
+    size = claimed_size(data)
+    return size if 0 < size <= LONGEST_PACKET else None
+
+
+def claimed_size(data: bytes | bytearray) -> int:
+    """Return the bytes of a packet whose header `data` begins with, be it longer than any may be; 0 if none does."""
+    return int.from_bytes(data[2:4], "big") + FRAMING if data[0] == STX[0] and data[1] in UNITS else 0
 
 
 def is_sound(whole: bytes) -> bool:
@@ -90,7 +109,11 @@ class Reply:
         """Return whether this packet has the length, the unit and the command name of the reply."""
         payload = len(whole) - FRAMING - len(self.name)
         right_length = payload == self.payload if self.shortest is None else payload >= self.shortest
-        return right_length and whole[1] == self.unit and whole.startswith(self.name, HEADER)
+        return right_length and self.named_by(whole)
+
+    def named_by(self, whole: bytes) -> bool:
+        """Return whether this packet has the unit and the command name of the reply, of whatever length it is."""
+        return whole[1] == self.unit and whole.startswith(self.name, HEADER)
 
     @property
     def header(self) -> bytes:
@@ -116,6 +139,7 @@ class PacketExchange(Generic[T]):
         "_failure",
         "_lost",
         "_naks",
+        "_other",
         "_packet_timing",
         "_reply",
         "_resends",
@@ -145,6 +169,7 @@ class PacketExchange(Generic[T]):
         self._acked = self._lost = False
         self._resends = self._naks = self._stale = 0
         self._failure: FrameError | Refused = no_reply()
+        self._other: FrameError | None = None
 
     @property
     def owed(self) -> tuple[bytes, ...]:
@@ -186,7 +211,7 @@ class PacketExchange(Generic[T]):
         if not self._acked or (self._lost and self._stale):
             raise FrameError(what, send=ACK)
         if not arrived:
-            raise FrameError("no packet followed the ACK", send=ACK)
+            raise self._other or FrameError("no packet followed the ACK", send=ACK)
         # Fewer bytes than any packet has are none: noise, another unit's NAK, the end of one that was asked for again
         # already. A NAK would have the packet that is still to come said twice, into the next exchange.
         passed_over = self._lost and arrived < FRAMING
@@ -218,8 +243,13 @@ class PacketExchange(Generic[T]):
 
     def _swallow(self) -> Need:
         self._lost = True
-        if len(self._buffer) > LONGEST_PACKET:
-            raise FrameError("more bytes without a pause than any packet has")
+        heard = len(self._buffer)
+        if heard > LONGEST_PACKET:
+            size = claimed_size(self._buffer)
+            if heard == size and is_sound(bytes(self._buffer)):
+                raise other_format(size, f"{size - FRAMING} bytes of data where {LONGEST_BODY} are the most", send=ACK)
+            if not heard < size <= LONGEST_HEARD:
+                raise FrameError("more bytes without a pause than any packet has")
         return MORE
 
     def _take(self, whole: bytes) -> Step[T]:
@@ -236,6 +266,8 @@ class PacketExchange(Generic[T]):
             return Done(self._decode(reply.payload_of(whole)), send=ACK, rest=bytes(self._buffer))
         if whole == self.request:
             raise FrameError("the request came back: if this line echoes, declare echo=True", send=ACK)
+        if reply is not None and reply.named_by(whole):  # it may be an earlier one's: then the right one follows
+            self._other = other_format(len(whole), f"the packet asked for has {reply.size}", send=ACK)
         return self._drop()
 
     def _ask_again(self, failure: FrameError, send: bytes = NAK) -> Expect:

@@ -1,14 +1,11 @@
-"""The pages of docs/ say what is so: telegrams are the codecs', programs run, links lead somewhere."""
+"""The telegrams on the pages of docs/ are the codecs': each side says the very bytes that are shown."""
 
 from __future__ import annotations
 
 import ast
 import json
 import re
-import sys
 from collections.abc import Iterator
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -17,23 +14,11 @@ from busmaster.contract.driver import Driver, Ending
 from busmaster.errors import NoSuchParameter, Refused
 from busmaster.registry import NodeKind, find, kinds, make_device, protocols
 from busmaster.testing import Case, answers_of, check_dialect
+from tests.docs.pages import PAGES, ROOT, blocks
 
-ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-LINKED = [*PAGES, ROOT / "README.md", ROOT / "benchmarks" / "README.md"]
 VECTORS = json.loads((ROOT / "tests" / "vectors" / "frames.json").read_text())
-BLOCK = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
-LINK = re.compile(r"(?<!!)\[[^\]]*\]\(([^)\s]+)\)")
 DONE = "done"
 REFUSALS = {kind.__name__: kind for kind in (Refused, NoSuchParameter)}
-
-
-def name_of(page: Path) -> str:
-    return page.relative_to(ROOT).as_posix()
-
-
-def blocks(page: Path, language: str) -> list[str]:
-    return [text for _, said, text in BLOCK.findall(page.read_text()) if said == language]
 
 
 def value_of(node: ast.expr) -> Any:
@@ -103,8 +88,8 @@ class Telegrams:
 
 def examples() -> Iterator[tuple[str, Telegrams]]:
     for page in PAGES:
-        for text in blocks(page, "telegrams"):
-            for part in re.split(r"\n{2,}", text.strip()):
+        for block in blocks(page, "telegrams"):
+            for part in re.split(r"\n{2,}", block.text.strip()):
                 yield page.stem, Telegrams(part)
 
 
@@ -158,88 +143,3 @@ def test_every_item_that_has_a_name_is_on_its_page_with_its_unit_and_access(kind
         rows = [line for line in page.splitlines() if line.startswith(f"| {item.number} | `{item.item}` |")]
         suits = [row for row in rows if ("| R/W |" in row) is (item.access == "read/write") and item.unit in row]
         assert suits or not rows, f"{item.item} is {item.access} in {item.unit or 'no unit'}, not {rows}"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_the_programs_on_a_page_run_in_their_order_as_one(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run as a module, so that what stands under `if __name__ == "__main__"` (a real port) does not."""
-    module = ModuleType("page")
-    monkeypatch.setitem(sys.modules, "page", module)  # dataclasses look there
-    exec(compile("\n".join(blocks(page, "python")), name_of(page), "exec"), vars(module))
-
-
-def anchors(page: Path) -> set[str]:
-    """What the headings of a page can be linked to by, as most renderers make it."""
-    headings = re.findall(r"^#+ (.*)$", re.sub(BLOCK, "", page.read_text()), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
-
-
-@pytest.mark.parametrize("page", LINKED, ids=name_of)
-def test_links_within_the_repository_lead_somewhere(page: Path) -> None:
-    for link in LINK.findall(re.sub(BLOCK, "", page.read_text())):
-        path, _, anchor = link.partition("#")
-        if "://" in path:
-            continue
-        target = (page.parent / path).resolve() if path else page
-        assert target.exists(), f"{name_of(page)}: {link} leads nowhere"
-        assert not anchor or anchor in anchors(target), f"{name_of(page)}: {link} names no heading"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_files_that_a_page_names_are_there(page: Path) -> None:
-    """In `backquotes`, perhaps with others."""
-    for words in re.findall(r"`([^`\n]+)`", re.sub(BLOCK, "", page.read_text())):
-        for name in re.findall(r"\b(?:busmaster|tests|benchmarks|examples|docs)/[\w./-]*", words):
-            assert (ROOT / name).exists(), f"{name_of(page)}: there is no {name}"
-
-
-@pytest.mark.parametrize("page", [page for page in PAGES if page.name != "README.md"], ids=name_of)
-def test_every_page_can_be_found_from_the_index(page: Path) -> None:
-    index = ROOT / "docs" / "README.md"
-    linked = {(index.parent / link.partition("#")[0]).resolve() for link in LINK.findall(index.read_text())}
-    assert page.resolve() in linked
-
-
-def test_the_picture_and_the_table_of_rooms_have_every_room() -> None:
-    page = (ROOT / "docs" / "architecture.md").read_text()
-    [picture] = [text for _, said, text in BLOCK.findall(page) if said == "text"]
-    rooms = {path.stem for path in (ROOT / "busmaster").iterdir() if path.suffix in ("", ".py") and path.name[0] != "_"}
-    rooms -= {"py"}  # py.typed
-    assert {Path(name).stem for name in re.findall(r"^\| `busmaster/(\w+)(?:/|\.py)`", page, re.MULTILINE)} == rooms
-    assert rooms - {"dissectors", "templates"} <= set(re.findall(r"\w+", picture))
-
-
-def test_pre_commit_runs_what_the_extras_install_and_fetches_nothing() -> None:
-    text = (ROOT / ".pre-commit-config.yaml").read_text()
-    hooks = re.findall(r"entry: \.venv/bin/(.*?)(?: --force-exclude)?$", text, re.MULTILINE)
-    assert set(hooks) == {"ruff check", "ruff format --check", "mypy"}
-    assert re.findall(r"repo: (.*)", text) == ["local"]
-
-
-# what is cited
-
-READ_BY_USERS = ("busmaster", "tests", "benchmarks", "examples", "docs")
-CITED_NOWHERE = re.compile(
-    r"\bDESIGN(\.md)?\b|\bPROTOCOLS(\.md)?\b|\bCLI\.md\b|\b[Ii]ssue #?\d|\((H|G|M|S|D)\d{1,2}\)"
-    r"|\b(PUBLISHED in|data from|example from) seeds?\b|\bthe card('s)?\b"
-)
-"""Papers that are not here. The promises, R1 to R15, are in docs/promises.md."""
-
-
-def prose() -> Iterator[tuple[str, int, str]]:
-    paths = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", ROOT / "pyproject.toml"]
-    for room in READ_BY_USERS:
-        paths += [path for path in (ROOT / room).rglob("*") if path.suffix in (".py", ".md", ".toml", ".lua", ".json")]
-    for path in paths:
-        for number, line in enumerate(path.read_text().splitlines(), 1):
-            yield name_of(path), number, line
-
-
-def test_nothing_cites_what_is_not_in_the_repository() -> None:
-    """A protocol's own manual may be cited, by its title."""
-    found = [
-        f"{name}:{number}: {line.strip()}"
-        for name, number, line in prose()
-        if CITED_NOWHERE.search(line) and name != name_of(Path(__file__))
-    ]
-    assert found == []
