@@ -172,6 +172,7 @@ def test_a_drive_without_an_address_is_called_the_drive() -> None:
         (mentor.Read(1, 17), 1, b"\x02\x15\x04\x82\x95\x84", (12, 12)),
         (mentor.Write(1, 17, 1), 1, b"\x06\x15\x04\x86\x95\x84", (1, 1)),
         (mentor.Write(1, 17, 1), 0, b"", (0, 0)),
+        (ct_ansi.Read(1, 17), 11, b"\x02\x15\x04\x82\x95\x84", (13, 19)),
         (ct_ansi.Write(1, 17, 1), 0, b"", (0, 0)),
         (modbus.ReadRegisters(0, 2), 17, b"\x11", (9, 9)),
         (modbus.ReadBits(0, 8), 17, b"\x11", (6, 6)),
