@@ -51,7 +51,7 @@ class Bus:
 
     `capacity` bounds the requests that may wait in each priority class (R12). `seed` makes the jitter of probes and
     reconnects repeatable. `tap` sees every byte (see busmaster.capture). `strict`: an answer that could be another
-    request's is held until that one would have come (R15), at the line time that the README gives. Entering raises
+    request's is held until that one would have come (R15), at about a third of the line's rate. Entering raises
     LineDown if the port cannot be opened, or, with `wait_for_port`, goes on as after a loss; once open, a lost port
     fails its callers at once and is opened again by itself, as soon as the same device is back (R13); `events` tells
     of attempts that fail.

@@ -222,7 +222,7 @@ def viewed(command: F) -> F:
     def gathered(seconds: float | None, as_json: bool, plain: bool, read_only: bool, **options: Any) -> Any:
         return command(view=View(seconds, as_json, plain, read_only), **options)
 
-    read_only = click.option("--read-only", is_flag=True, help="No key, no MQTT command and no program writes to a node.")
+    read_only = click.option("--read-only", is_flag=True, help="No key, MQTT command or program writes to a node.")
     for option in (read_only, plain_option, json_option, seconds_option):
         gathered = option(gathered)
     return gathered  # type: ignore[return-value]  # likewise

@@ -131,11 +131,11 @@ def left(text: str, width: int, style: str = "") -> Text:
 # the head
 
 
-def title_line(frame: Frame, width: int, silent: float = 0.0) -> Text:
-    """Draw the first line: the title, the port, and the time since the start; or for how long there was no news."""
+def title_line(frame: Frame, width: int, trouble: str = "") -> Text:
+    """Draw the first line: the title, the port, and the time since the start; or why there is no news."""
     where = f"{frame.line}  {frame.settings}".rstrip()
     line = Text.assemble((f" {frame.title}", "bold"), f"  {where}")
-    clock = Text(f"no news for {silent:.0f} s", "bold reverse") if silent else Text(clock_text(frame.elapsed))
+    clock = Text(trouble, "bold reverse") if trouble else Text(clock_text(frame.elapsed))
     line.truncate(max(1, width - len(clock) - 2), overflow="ellipsis", pad=True)
     return Text.assemble(line, " ", clock, " ")
 

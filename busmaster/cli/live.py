@@ -108,6 +108,8 @@ class Screen(App[int]):
         self.order = ORDERS[0]
         self.said: tuple[float, str] | None = None
         """What became of the last wish, and when."""
+        self.away = ""
+        """Why the line's owner is not there, "" while it is."""
         self.heard = time.monotonic()
         self.head = Static(id="head")
         self.columns = Static(id="columns")
@@ -184,8 +186,7 @@ class Screen(App[int]):
 
     def _head(self, frame: Frame, groups: list[Group]) -> Text:
         width, room = self.size.width, max(1, self.size.height // 8)
-        silent = time.monotonic() - self.heard
-        lines = [title_line(frame, width, silent if silent > SILENT_AFTER else 0.0), gauge_line(frame, width)]
+        lines = [title_line(frame, width, self._trouble()), gauge_line(frame, width)]
         shown = groups
         if len(groups) > room:  # the selected row's is among those that are shown
             row = self.table.selected
@@ -198,9 +199,18 @@ class Screen(App[int]):
             lines.append(Text(fit(f" {frame.left_out} points more than are shown", width), "bold"))
         return Text("\n").join(lines)
 
+    def _trouble(self) -> str:
+        """Return why what is shown may be old, "" while there is news."""
+        silent = time.monotonic() - self.heard
+        if self.away:
+            return "its owner is away"
+        return f"no news for {silent:.0f} s" if silent > SILENT_AFTER else ""
+
     def _foot(self, frame: Frame) -> Text:
         width, row = self.size.width, self.table.selected
         lines: list[Text] = []
+        if self.away:
+            lines.append(Text(fit(f" {self.away}", width), "bold"))
         if row is not None and row.error:
             lines.append(Text(fit(f" {row.name}: {row.error}", width), "bold"))
         happened = [*frame.events, *([self.said] if self.said else [])]

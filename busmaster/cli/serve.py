@@ -16,7 +16,7 @@ from busmaster.cli.run import run
 @port_option
 @capture_option
 @seconds_option
-@click.option("--read-only", is_flag=True, help="No MQTT command and no program writes to a node.")
+@click.option("--read-only", is_flag=True, help="No MQTT command or program writes to a node.")
 def command(path: str, port: str | None, capture: str | None, seconds: float | None, read_only: bool) -> int:
     """Do what `busmaster run` does with LINE.toml, and print nothing but what happens, on standard error.
 

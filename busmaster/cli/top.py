@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
-from collections.abc import Mapping
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -17,10 +16,9 @@ from busmaster.cli.lines import is_line_file, load
 from busmaster.cli.reaching import owner_of, token_for
 from busmaster.cli.terminal import made_printable
 from busmaster.contract.profile import LineSettings
+from busmaster.doors.following import Following, Lost
 from busmaster.errors import LineDown
 from busmaster.service.folder import find_owner, line_name, owners
-from busmaster.service.picture import Picture
-from busmaster.service.remote import connect
 from busmaster.transport.endpoints import endpoint, is_served
 
 if TYPE_CHECKING:
@@ -78,31 +76,45 @@ def address_of(line: str | None) -> str:
 
 
 async def top(address: str, read_only: bool = False, of_owner: bool = False) -> int:
-    """Show a line until the person leaves, and return the exit status. Raises LineDown when its owner is gone."""
+    """Show a line until the person leaves, and return the exit status. While its owner is away that is shown.
+
+    Raises LineDown where its owner is not there at first, or, of the owner's own view, when it is gone.
+    """
     from busmaster.cli.live import Screen
 
-    picture = Picture(made_printable)
-    screen: Screen | None = None
+    token = token_for(address)
+    following = Following(lambda: address, token=token, read_only=read_only, clean=made_printable)
+    connected = asyncio.Event()
+    unwatch = following.on_state(connected.set)
+    tasks = [asyncio.ensure_future(following.follow(patient=False)), asyncio.ensure_future(connected.wait())]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        unwatch()
+        if tasks[0].done():
+            await tasks[0]
+        screen = Screen(following.picture, following, leave="end the run" if of_owner else "leave")
 
-    def hear(method: str, body: Mapping[str, Any]) -> None:
-        picture.hear(method, body)
-        if method == "frame" and screen is not None:
+        def show_state() -> None:
+            screen.away = following.state.why if isinstance(following.state, Lost) else ""
+            screen.picture, screen.read_only = following.picture, following.read_only
             screen.take_picture()
+            if of_owner and screen.away:
+                screen.exit(FAILED)  # the terminal is given back, then it is said why
 
-    async with connect(address, token=token_for(address)) as remote:
-        overview = await remote.overview(hear)
-        leave = "end the run" if of_owner else "leave"
-        screen = Screen(picture, overview, read_only=read_only or remote.about["read_only"], leave=leave)
-        ended = asyncio.ensure_future(overview.over())
-        looking = asyncio.ensure_future(hang_up(screen))
-        ended.add_done_callback(lambda _: screen.exit(FAILED))  # the terminal is given back, then it is said why
-        try:
-            status = await screen.run_async()
-            if ended.done():
-                await ended
-        finally:
-            ended.cancel()
-            looking.cancel()
+        following.on_state(show_state)
+        following.on_picture(lambda method, _: screen.take_picture() if method == "frame" else None)
+        show_state()
+        tasks.append(asyncio.ensure_future(hang_up(screen)))
+        tasks[0].add_done_callback(lambda _: screen.exit(FAILED))
+        status = None if of_owner and screen.away else await screen.run_async()
+        if tasks[0].done():
+            await tasks[0]
+        if of_owner and screen.away:
+            raise LineDown(screen.away, hint="")
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
     return FAILED if status is None else status
 
 

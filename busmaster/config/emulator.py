@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from busmaster.config.keys import Key, names_of
 from busmaster.config.names import expanded
 from busmaster.config.options import check_keys, read_delay, read_options
 from busmaster.config.table import Table
@@ -14,7 +15,28 @@ from busmaster.emulator.device import Delay
 from busmaster.emulator.faults import NAMES, Faults
 from busmaster.registry import NodeKind
 
-OWN_KEYS = ("reply_delay", "faults", "lively", "values")
+SHARED = (
+    Key("lively", "flag", "Whether things move by themselves, but for what `values` give.", "true"),
+    Key(
+        "reply_delay",
+        "delay",
+        "From the end of a request to the reply: one time, or the bounds of one, `[0.001, 0.004]`.",
+        f"{Delay().low:g}",
+        "s",
+    ),
+    Key("faults", "table", "What goes wrong, and how often: `faults = { lost = 0.01 }`."),
+)
+KEYS = (
+    Key("paced", "flag", "Whether bytes take their time on the wire.", "true"),
+    Key("seed", "whole", "The seed of all that is random.", "1"),
+    *SHARED,
+    Key("nodes", "table", "A table for each node, or range of nodes, that differs: `[emulator.nodes.NAME]`."),
+)
+"""Of `[emulator]`."""
+NODE_KEYS = (
+    *SHARED,
+    Key("values", "table", "What it holds from the start, by point, item or symbol: one value or several."),
+)
 """What can be said of every emulated device; its kind's options come to it."""
 
 
@@ -48,7 +70,7 @@ def read_emulator(table: Table, nodes: Mapping[str, NodeKind]) -> EmulatorSectio
 
     Raises FileError, naming line and key.
     """
-    table.only("paced", "seed", "lively", "reply_delay", "faults", "nodes")
+    table.only(*names_of(KEYS))
     shared = table.table("faults")
     every = EmulatedSection(_delay(table, Delay()), _faults(shared, {}), table.flag("lively", True))
     # of its own each: faults are set anew while a line is emulated
@@ -65,7 +87,7 @@ def read_emulator(table: Table, nodes: Mapping[str, NodeKind]) -> EmulatorSectio
 
 def _changed(section: EmulatedSection, table: Table, kind: NodeKind, shared: Table) -> EmulatedSection:
     """Return the section with what a node's table says."""
-    check_keys(table, kind, OWN_KEYS, lambda other: other.emulated)
+    check_keys(table, kind, names_of(NODE_KEYS), lambda other: other.emulated)
     values = table.table("values")
     return EmulatedSection(
         delay=_delay(table, section.delay),

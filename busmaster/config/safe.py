@@ -20,6 +20,7 @@ from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle, Send
 from busmaster.bus.node import Node
 from busmaster.bus.requester import Priority
+from busmaster.config.keys import Key, names_of
 from busmaster.config.points import NamedPoint
 from busmaster.config.table import Table
 from busmaster.contract.exchange import Command
@@ -32,6 +33,30 @@ WITHIN = 2.0
 LONGEST = 60.0
 LOOK_AGAIN = 0.05
 """Seconds from a failure to the next try at the same node."""
+KEYS = (
+    Key(
+        "writes",
+        "table",
+        'The value that each point is left at, in its unit: `writes = { "winder/setpoint" = 0 }`, in this order. '
+        "One that may not be repeated, or cannot be read back, is refused when the file is read.",
+    ),
+    Key(
+        "within",
+        "number",
+        "The time for all of it. What is not confirmed by then is named, and the exit status is 1.",
+        f"{WITHIN:g}",
+        "s",
+        least=0,
+        most=LONGEST,
+    ),
+    Key(
+        "repeatable",
+        "texts",
+        "Points whose write the protocol does not know to be repeatable, and of which only you know that writing them "
+        "twice harms nobody.",
+    ),
+)
+"""Of `[safe]`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +71,7 @@ class SafeSection:
 
 def read_safe(table: Table) -> SafeSection:
     """Read `[safe]`. Raises FileError, naming line and key, for what is wrong in it."""
-    table.only("within", "repeatable", "writes")
+    table.only(*names_of(KEYS))
     within = table.number("within", WITHIN)
     if not 0 < within <= LONGEST:
         raise table.error(f"must be more than 0 and at most {LONGEST:g} seconds, not {within}", "within")

@@ -10,6 +10,7 @@ from typing import Any
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.suitability import check_company
 from busmaster.config.emulator import EmulatorSection, read_emulator
+from busmaster.config.keys import REQUIRED, Key, names_of
 from busmaster.config.names import NODE_NAME, expanded
 from busmaster.config.options import check_keys, read_options
 from busmaster.config.point_section import PointSection
@@ -31,10 +32,62 @@ from busmaster.registry import NodeKind, find, kinds
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
-NODE_KEYS = ("protocol", "address", "timing", "retries", "reply_time", "template", "points")
-"""What every node's table may say; its kind's options come to it."""
-TABLES = ("protocols", "nodes", "groups", "outputs", "safe", "service", "emulator")
 PRIORITIES = {"poll": Priority.POLL, "background": Priority.BACKGROUND}
+MOST_RETRIES = 100
+KEYS = (
+    Key("title", "text", "What the line is called: in lists, views and pages. The file's name by default."),
+    Key(
+        "port",
+        "port",
+        "The PORT, as on the command line: a device path, `usb:SERIAL`, or `socket://HOST:PORT`; or a table: `[port]`.",
+        REQUIRED,
+    ),
+    Key(
+        "strict",
+        "flag",
+        "Whether an answer that could be another request's is held until it is certain (R15).",
+        "false",
+    ),
+    Key("timing", "timing", 'Only `timing = "learned"`: the windows of all nodes are learned from their replies.'),
+    Key("learned", "text", "The file in which learned windows are kept from one run to the next."),
+    Key("protocols", "table", "A table for each protocol, of what holds for its nodes: `[protocols.NAME]`."),
+    Key("nodes", "table", "A table for each node: `[nodes.NAME]`.", REQUIRED),
+    Key("groups", "table", "A table for each poll group: `[groups.NAME]`."),
+    Key("outputs", "table", "A table for each output: `[outputs.csv]` and others."),
+    Key("safe", "table", "What the line is left at: `[safe]`."),
+    Key("service", "table", "Who may use the line beside its owner: `[service]`."),
+    Key("emulator", "table", "What `busmaster emulate` makes of the nodes: `[emulator]`."),
+)
+"""Of the top of a file."""
+SHARED_KEYS = (
+    Key("timing", "timing", 'Its reply times: a table, or `"learned"`. The protocol\'s by default.'),
+    Key(
+        "retries", "whole", "How often a read that failed is tried again. The protocol's by default.", most=MOST_RETRIES
+    ),
+    Key("reply_time", "seconds", "From a request to its reply, where it is known, for `plan`.", unit="s", least=0),
+)
+"""Of nodes, and of all nodes of one protocol."""
+NODE_KEYS = (
+    Key("protocol", "text", "What it speaks.", REQUIRED),
+    Key("address", "address", 'Its address; `"4-7"` where NAME is a range too. Left out where the protocol has none.'),
+    *SHARED_KEYS,
+    Key("template", "text", "The template of its points: one that is shipped, or a file, from the folder of this one."),
+    Key("points", "table", "A table for each point that has a name, a unit, or limits: `[nodes.NAME.points]`."),
+)
+"""What every node's table may say; its kind's options come to it."""
+GROUP_KEYS = (
+    Key("period", "seconds", "From one cycle to the next.", REQUIRED, "s", least=0),
+    Key("points", "texts", 'What is read: `"drive4-7/speed_measured,current"` is eight points.', REQUIRED),
+    Key(
+        "phase",
+        "seconds",
+        "When in its period it begins. By itself it keeps out of the others' way.",
+        unit="s",
+        least=0,
+    ),
+    Key("priority", "text", "`background`: only in what time the others leave.", '"poll"', choices=tuple(PRIORITIES)),
+)
+"""Of each poll group."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +155,7 @@ def load(path: str | os.PathLike[str]) -> LineFile:
 def read(source: Source) -> LineFile:
     """Read what a source says of a line. Raises FileError, naming line and key, for what is wrong in it."""
     top = Table(source)
-    top.only("title", "port", "strict", "timing", "learned", *TABLES)
+    top.only(*names_of(KEYS))
     nodes = {node.name: node for node in _nodes(top, _defaults(top))}
     groups = {table.name: _group(table) for table in top.tables("groups")}
     file = LineFile(
@@ -144,7 +197,7 @@ def _defaults(top: Table) -> dict[str, Table]:
     top.table("protocols").only(*kinds())
     for protocol, table in tables.items():
         common = (option.name for option in find(protocol).options if option.common)
-        table.only("timing", "retries", "reply_time", *common)
+        table.only(*names_of(SHARED_KEYS), *common)
     return tables
 
 
@@ -174,7 +227,7 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
     """
     protocol = table.choice("protocol", kinds())
     own = find(protocol).options
-    check_keys(table, find(protocol), NODE_KEYS, lambda kind: kind.options)
+    check_keys(table, find(protocol), names_of(NODE_KEYS), lambda kind: kind.options)
     with table.at():
         names = list(expanded(table.name))
     profile = find(protocol).profile
@@ -186,7 +239,7 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
     document = read_timings(table, base)
     is_learned = reads_learned(table, reads_learned(default, learned))
     timings = Learned(document) if is_learned else None if document == profile.timings else document
-    retries = table.whole("retries", default.whole("retries", None, most=100), most=100)
+    retries = table.whole("retries", default.whole("retries", None, most=MOST_RETRIES), most=MOST_RETRIES)
     reply_time = table.seconds("reply_time", default.seconds("reply_time", None))
     options = {**read_options(default, own), **read_options(table, own)}
     points = read_points(table, find(protocol))
@@ -234,7 +287,7 @@ def _no_address(text: str) -> int:
 
 
 def _group(table: Table) -> GroupSection:
-    table.only("period", "phase", "points", "priority")
+    table.only(*names_of(GROUP_KEYS))
     group = GroupSection(
         name=table.name,
         period=table.seconds("period"),

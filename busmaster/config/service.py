@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE
+from busmaster.config.keys import REQUIRED, Key, names_of
 from busmaster.config.names import NODE_NAME
 from busmaster.config.recording import read_mode
 from busmaster.config.table import Table
@@ -22,6 +23,44 @@ MODE = 0o600
 SHORTEST = 16
 """Characters of a token: what is shorter may be guessed."""
 ROLES = ("read", "write")
+KEYS = (
+    Key("enabled", "flag", "Whether other programs may come at all.", "true"),
+    Key("group", "text", "The group of this machine whose members may come to the socket, beside this user."),
+    Key(
+        "mode",
+        "mode",
+        "The mode of the socket: 0660 where there is a `group`.",
+        f'"{MODE:04o}"',
+    ),
+    Key(
+        "share",
+        "number",
+        "The share of line time of each program, where the owner's is 1, as long as both wait.",
+        "1",
+        least=LEAST_SHARE,
+        most=MOST_SHARE,
+    ),
+    Key(
+        "listen",
+        "text",
+        "Where programs may come by TCP too, as HOST:PORT; beyond this machine only with `token_file`.",
+    ),
+    Key("token_file", "text", "The file of the tokens that who comes by TCP shows: a name and its token a line."),
+    Key("users", "table", "A table for each user of this machine that has a role: `[service.users.NAME]`."),
+    Key("groups", "table", "A table for each group of this machine that has a role: `[service.groups.NAME]`."),
+    Key("tokens", "table", "A table for each token that has a role: `[service.tokens.NAME]`."),
+)
+"""Of `[service]`."""
+ROLE_KEYS = (
+    Key("role", "text", "What who has it may do. Whoever writes may read.", REQUIRED, choices=ROLES),
+    Key(
+        "allow_writes",
+        "texts",
+        "The points that a writer may write, as groups name points; `*` is any part of a node's name, and behind the "
+        "slash all of the node. Left out: all of the line.",
+    ),
+)
+"""Of each of its users, groups and tokens."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +113,7 @@ class ServiceSection:
 
 def read_service(table: Table) -> ServiceSection:
     """Read `[service]`. Raises FileError, naming line and key, for what is wrong in it."""
-    table.only("enabled", "mode", "group", "listen", "token_file", "users", "groups", "tokens", "share")
+    table.only(*names_of(KEYS))
     group = table.text("group", None)
     mode = read_mode(table, "mode") if "mode" in table else MODE if group is None else 0o660
     token_file = table.text("token_file", None)
@@ -103,7 +142,7 @@ def read_service(table: Table) -> ServiceSection:
 
 
 def _role(table: Table, kind: str) -> RoleSection:
-    table.only("role", "allow_writes")
+    table.only(*names_of(ROLE_KEYS))
     writes = table.choice("role", ROLES) == "write"
     only = table.texts("allow_writes", None)
     if only is not None and not (writes and only):

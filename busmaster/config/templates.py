@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from busmaster.config.keys import REQUIRED, Key, names_of
 from busmaster.config.point_section import PointSection, read_point
 from busmaster.config.source import FileError, Source
 from busmaster.config.table import Table
@@ -26,6 +27,12 @@ from busmaster.registry import NodeKind, kinds
 
 FOLDER = Path(__file__).parent.parent / "templates"
 SUFFIX = ".toml"
+KEYS = (
+    Key("title", "text", "What it is a template of, for people."),
+    Key("protocol", "texts", "The protocol of the nodes that it is for, or several.", REQUIRED),
+    Key("points", "table", "A table for each point, as `[nodes.NAME.points]` has them."),
+)
+"""Of a template's file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +58,7 @@ def read_template(node: Table, kind: NodeKind) -> Template:
         return Template("", {})
     name = node.text("template")
     top = Table(_source(node, name))
-    top.only("title", "protocol", "points")
+    top.only(*names_of(KEYS))
     protocols = top.texts("protocol")
     for protocol in protocols:
         if protocol not in kinds():

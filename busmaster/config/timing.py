@@ -9,13 +9,41 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from busmaster.config.keys import Key, names_of
 from busmaster.config.table import Table
 from busmaster.contract.timing import ReplyTiming, Timings
 
 LONGEST = 10.0
 """Seconds: whoever writes more means milliseconds."""
-TIMES = ("nominal", "window", "lateness", "byte_gap", "turnaround")
 LEARNED_WORD = "learned"
+
+
+def _time(name: str, about: str) -> Key:
+    return Key(name, "seconds", f"{about} The protocol's by default.", unit="s", least=0, most=LONGEST)
+
+
+TIME_KEYS = (
+    _time("nominal", "A reply that begins by then is on time; a later one is counted late."),
+    _time("window", "A reply that begins by then is awaited: how long one attempt waits."),
+    _time("lateness", "What has not begun by then never comes: on this it rests that no value is another's (R3)."),
+    _time("byte_gap", "The longest pause between two bytes of one reply."),
+    _time("turnaround", "How long the node's driver holds the line after its reply."),
+)
+KEYS = (
+    *TIME_KEYS,
+    Key("read", "table", "The same times, of reads alone."),
+    Key("write", "table", "The same times, of writes alone."),
+    Key("packet", "table", "The same times, of the packet that follows an ACK; MSC alone has one."),
+    Key(
+        LEARNED_WORD,
+        "flag",
+        'Whether windows are learned from the replies; `timing = "learned"` is short for it. The others are then those '
+        "to begin with.",
+        "false",
+    ),
+)
+"""Of `timing`."""
+TIMES = names_of(TIME_KEYS)
 
 
 def read_timings(table: Table, base: Timings) -> Timings:
@@ -27,7 +55,7 @@ def read_timings(table: Table, base: Timings) -> Timings:
         table.choice("timing", (LEARNED_WORD,))
         return base
     timing = table.table("timing")
-    timing.only(*TIMES, "read", "write", "packet", LEARNED_WORD)
+    timing.only(*names_of(KEYS))
     read, write = _changed(timing, base.read), _changed(timing, base.write)
     return Timings(
         read=_changed(timing.table("read"), read, leg=True),

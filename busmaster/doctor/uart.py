@@ -9,7 +9,7 @@ from busmaster.doctor.adapters import Finding
 
 UART_ERRORS = {
     "framing": ("framing error", "wrong baud rate, or no termination; then missing biasing, swapped wires A and B"),
-    "parity": ("parity error", "wrong parity or number of data bits; then noise: termination, the cable's screen, common ground"),
+    "parity": ("parity error", "wrong parity or number of data bits; then noise: termination, shield, common ground"),
     "damaged": ("parity or framing error", "wrong baud rate or parity, or no termination"),
     "breaks": (
         "break",

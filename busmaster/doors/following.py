@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from busmaster.errors import BusError, InvalidCommand, LineDown, NotStarted
+from busmaster.service.messages import value_of
 from busmaster.service.picture import Picture
 from busmaster.service.remote import RemoteBus, connect
 from busmaster.service.remote_overview import RemoteOverview
@@ -44,12 +45,21 @@ class Following:
     `address` is asked anew each time: the owner may come back at another. It returns what `connect` takes, and raises
     BusError or InvalidCommand where no line is to be found. `read_only`: nothing is written, whatever the owner allows.
     `picture` is what is known of the line; while the owner is away it is what was known last, and `state` a `Lost`.
+    `clean` makes of what is said what the picture takes, as `Picture` has it.
 
     All is of one event loop. Times are of the line's clock, in seconds; `wall_time` makes them times of day.
     """
 
-    def __init__(self, address: Callable[[], str], *, token: str | None = None, read_only: bool = False) -> None:
-        self.picture = Picture()
+    def __init__(
+        self,
+        address: Callable[[], str],
+        *,
+        token: str | None = None,
+        read_only: bool = False,
+        clean: Callable[[Any], Any] = value_of,
+    ) -> None:
+        self._clean = clean
+        self.picture = Picture(clean)
         self.state: Connected | Lost = Lost("it was not connected yet")
         self._address = address
         self._token = token
@@ -103,14 +113,31 @@ class Following:
             raise self._away(LineDown)
         return self._remote
 
+    @property
+    def overview(self) -> RemoteOverview:
+        """Return what is seen of the line, and may be done there. Raises LineDown while the owner is away."""
+        if self._overview is None:
+            raise self._away(LineDown)
+        return self._overview
+
     async def details(self, group: str, key: str) -> Mapping[str, Any]:
         """Return what there is to know of a point: limits, last exchange (`details` in docs/service.md).
 
         Raises LineDown while the owner is away, and InvalidCommand for a point that is gone.
         """
-        if self._overview is None:
-            raise self._away(LineDown)
-        return await self._overview.details(group, key)
+        return await self.overview.details(group, key)
+
+    async def pause(self, group: str, paused: bool) -> None:
+        """Have a poll group rest, or go on, for all who use the line. Raises as `details`."""
+        await self.overview.pause(group, paused)
+
+    async def demand(self, group: str) -> None:
+        """Have a poll group read now. Raises as `details`."""
+        await self.overview.demand(group)
+
+    async def suspend(self, protocol: str, address: int, for_: float) -> None:
+        """Let a node rest for so many seconds, 0 for no longer, for all who use the line. Raises as `details`."""
+        await self.overview.suspend(protocol, address, for_)
 
     async def write(self, group: str, key: str, value: Any) -> None:
         """Write a point of a poll group, through the owner's gate: its roles, limits and record hold.
@@ -126,24 +153,28 @@ class Following:
 
     # following
 
-    async def follow(self) -> None:
-        """Follow the line until cancelled. Raises nothing of the line: what ends a connection is in `state`."""
+    async def follow(self, *, patient: bool = True) -> None:
+        """Follow the line until cancelled. Raises nothing of the line: what ends a connection is in `state`. If it is
+        not `patient`, what keeps the first connection from being made is raised all the same.
+        """
         pause = FIRST_PAUSE
         while True:
             try:
                 # a thread, since it looks into folders and may ask for a host's address
                 address = await asyncio.to_thread(self._address)
                 async with connect(address, token=self._token) as remote:
-                    pause = FIRST_PAUSE
+                    pause, patient = FIRST_PAUSE, True
                     await self._stay(remote)
             except (BusError, InvalidCommand) as error:
+                if not patient:
+                    raise
                 self._change(Lost(str(error)))
             await asyncio.sleep(pause)
             pause = min(2 * pause, LONGEST_PAUSE)
 
     async def _stay(self, remote: RemoteBus) -> None:
         """Take in what is said until the connection ends."""
-        self.picture = Picture()
+        self.picture = Picture(self._clean)
         try:
             self._remote = remote
             self._change(Connected(remote.about))

@@ -1,1 +1,1 @@
-"""A line with physics and the slaves on it, told the time: what cannot be tried on real drives is tried here."""
+"""A line with physics and the devices on it, told the time: what cannot be tried on real drives is tried here."""

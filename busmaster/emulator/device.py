@@ -1,4 +1,4 @@
-"""What an emulated slave is: it hears bytes, says bytes, and is told the time.
+"""What an emulated device is: it hears bytes, says bytes, and is told the time.
 
 A device is written apart from the master's readers: it shares checksums with them (`busmaster.wire`) and nothing else,
 so that a misreading of a document on one side is not hidden by the same misreading on the other.
@@ -81,7 +81,7 @@ def held(value: float, low: int, high: int, what: str) -> int:
 
 
 class Device(ABC):
-    """One slave on the line. A kind of device writes `hear_byte`, its `routes`, and `take` for speed.
+    """One device on the line. A kind of device writes `hear_byte`, its `routes`, and `take` for speed.
 
     `delay` may be changed at any time. `tau` (seconds per byte) and `chance` are set when the device joins a line.
     """

@@ -84,7 +84,9 @@ class Faults:
     drop: float = 0.0
     """What comes while it still has something to say is lost on it. At 0 a UART's queue holds it."""
     late_by: float = 0.1
+    """The most seconds by which `late` delays a reply."""
     away_for: float = 5.0
+    """The most seconds for which `flapping` and `restart` keep it away."""
     hearing: tuple[tuple[str, float], ...] = field(default=(), init=False, repr=False)
     """The faults in use that concern what a device hears. Kept up to date by itself; so is `speaking`."""
     speaking: tuple[tuple[str, float], ...] = field(default=(), init=False, repr=False)

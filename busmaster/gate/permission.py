@@ -32,6 +32,10 @@ class Permission:
         """Return whether anything of a node may be written."""
         return self.writes and (self.only is None or _key(node) in self.only)
 
+    def covers(self, node: Requester) -> bool:
+        """Return whether all of a node may be written."""
+        return self.writes and (self.only is None or self.only.get(_key(node), frozenset()) is None)
+
     def refusal(self, node: Requester, command: Command[Any]) -> str:
         """Return why a write is not let through, "" if it is."""
         if not self.writes:

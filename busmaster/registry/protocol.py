@@ -40,8 +40,9 @@ class Option:
     """Describe one thing that can be said of nodes of one kind alone: an argument of that name.
 
     It is an argument of their handle, of reading an item, or of making their emulated device. `help` is what the
-    command line says of it; without one it can be said in LINE.toml alone. `common`: it may also be said once for all
-    nodes of the kind, in [protocols.NAME].
+    command line says of it; without one it can be said in LINE.toml alone. `about` is what the reference of LINE.toml
+    says of it, a whole sentence with its unit and default, where `help` is not all. `common`: it may also be said once
+    for all nodes of the kind, in [protocols.NAME].
     """
 
     name: str
@@ -52,6 +53,7 @@ class Option:
     """All texts that it can be; () if it can be any."""
     fields: tuple[Option, ...] = ()
     """What each of its tables may say."""
+    about: str = ""
     reader: Callable[[str], Mapping[str, int]] | None = None
     """Of "addresses": reads them from the text of a file, which LINE.toml may name in place of the table. Raises
     InvalidCommand, naming the lines that it cannot read: none is guessed."""

@@ -53,6 +53,9 @@ class Client:
         self._nodes: dict[NodeKey, Node] = {}
         self._stops: dict[NodeKey, int] = {}
         """How often each had been told to stop when this client named it: the client counts from there."""
+        self._stopping: set[Node] = set()
+        """Nodes that it tells to stop, of which it may not write all: it counts with the write that follows, if that is
+        let through."""
         self._refused: dict[NodeKey, str] = {}
         """Why a node that it named may not be asked as it said; its requests are refused until it names it rightly."""
         self._requests = Requests(self, line, self._tell_result, self._refuse)
@@ -146,8 +149,10 @@ class Client:
                 self._release(params.get("sequence", -1))
             case "stop":
                 node = self._nodes.get((str(params.get("protocol")), params.get("address", -1)))
-                if node is not None and self.permission.reaches(node):
+                if node is not None and self.permission.covers(node):
                     node.note_stop()
+                elif node is not None:
+                    self._stopping.add(node)
 
     def _answer(self, method: str, params: Mapping[str, Any]) -> Any:
         """Return what a request is answered at once. Raises InvalidCommand, BusError, or Malformed."""
@@ -244,6 +249,12 @@ class Client:
     def stops_before(self, node: Node) -> int:
         """Return how often a node had been told to stop when this client named it."""
         return self._stops[node.profile.name, node.address]
+
+    def takes_stop(self, node: Node) -> bool:
+        """Return whether the write to a node that is begun now is the stop that this client has announced: once."""
+        announced = node in self._stopping
+        self._stopping.discard(node)
+        return announced
 
     # answers
 

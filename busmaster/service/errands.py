@@ -7,6 +7,7 @@ from collections.abc import Callable, Hashable, Mapping
 from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 from busmaster.arbiter.clients import LineClient
+from busmaster.arbiter.health import NodeRecord
 from busmaster.bus.node import Journey, Node
 from busmaster.bus.points import Point
 from busmaster.bus.requester import CommandOptions, RequestOptions
@@ -24,6 +25,8 @@ from busmaster.service.telling import protocol_of
 OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
 """Of a request, those that a client may say."""
 DOOR = "service"
+RAW_COMMAND = "raw command"
+"""What the record of a write names in place of a point, where no poll group has one: its value says the rest."""
 
 
 class Asker(Protocol):
@@ -45,6 +48,14 @@ class Asker(Protocol):
 
     def stops_before(self, node: Node, /) -> int:
         """Return the stops of a node from which this client counts."""
+        ...
+
+    def takes_stop(self, node: Node, /) -> bool:
+        """Return whether the write that is begun now is a stop of its node, as the client has announced."""
+        ...
+
+    def tell_stops(self, node: NodeRecord, /) -> None:
+        """Say how often a node was told to stop."""
         ...
 
 
@@ -170,6 +181,8 @@ class Errand:
         """
         self._told = told
         if self.command.writes:
+            if self._asker.takes_stop(self.node):
+                self._stop_node()
             self.writing = asyncio.ensure_future(self._write())
             self.writing.add_done_callback(self._written)
         else:
@@ -203,6 +216,13 @@ class Errand:
         self._told(self, None, error)
 
     # inside
+
+    def _stop_node(self) -> None:
+        """Count the stop that this write is, if it may be written; else its program is told how many count."""
+        if self._line.gate.refusal(self._wish()):
+            self._asker.tell_stops(self.node.record)
+        else:
+            self.node.note_stop()
 
     def _written(self, writing: asyncio.Task[Any]) -> None:
         if not self._begun:  # a task that is cancelled before its first step runs nothing of it
@@ -274,7 +294,7 @@ class Errand:
             point = self._line.named(self.node, changes.keys())
             if point is not None:
                 value = _value(point, changes, value)
-        point = point or Point(self.node, self.text, command)
+        point = point or Point(self.node, RAW_COMMAND, command)
         return Wish(
             door=DOOR,
             by=str(self._asker.peer),

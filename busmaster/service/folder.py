@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 
-from busmaster.errors import InvalidCommand
+from busmaster.errors import InvalidCommand, LineDown
 
 SYSTEM = Path("/run/busmaster")
 """Where the lines are that systemd runs."""
@@ -49,6 +49,13 @@ def line_name(text: str) -> str:
     """Return what a line is called after its file or its port: /dev/ttyUSB0 is "ttyUSB0"."""
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", os.path.basename(text.rstrip("/")) or text).strip(".-")[:LONGEST_NAME]
     return name or "line"
+
+
+def checked_name(name: str) -> str:
+    """Return a line's name. Raises InvalidCommand for what can be none: a socket is called so."""
+    if name != line_name(name):
+        raise InvalidCommand(f"{name!r} is no name of a line: like {line_name(name)!r}, it has letters, digits and _.-")
+    return name
 
 
 def runtime_folder() -> Path:
@@ -107,13 +114,18 @@ def _device(port: str) -> str:
 
 
 def socket_path(address: str) -> str:
-    """Return the socket that `unix:PATH`, or a line's or a port's name, stands for. Raises InvalidCommand."""
+    """Return the socket that `unix:PATH`, or a line's or a port's name, stands for.
+
+    Raises LineDown where nobody serves a line of that name: an owner that has ended leaves nothing that could tell its
+    name from one that never was, and whoever waits for the owner to come back waits for the name.
+    """
     if address.startswith("unix:"):
         return address.removeprefix("unix:").removeprefix("//")
     owner = find_owner(address)
     if owner is None:
         names = ", ".join(owner.name for owner in owners()) or "none"
-        raise InvalidCommand(f"no program of this user serves {address!r}; use unix:PATH, or the name of: {names}")
+        what = f"no program of this user serves {address!r}, and there are the lines: {names}"
+        raise LineDown(what, hint="start busmaster run, or name one of those, or unix:PATH")
     return owner.socket
 
 

@@ -17,6 +17,8 @@ VERSIONS = (1,)
 """Of what is said. The first message of a client says which ones it knows, and the highest that both know holds."""
 LONGEST_REQUEST = 1 << 16
 """Bytes of one message of a client: what it takes to understand one holds up the line."""
+MOST_PARTS = 1 << 13
+"""Values in one message of a client: of as many bytes, those of many small ones take longest to understand."""
 LONGEST_ANSWER = 1 << 20
 """Bytes of one message to a client."""
 MOST_CLIENTS = 64
@@ -94,6 +96,13 @@ def read(text: str | bytes) -> dict[str, Any]:
     if not isinstance(said, dict) or said.get("jsonrpc") != "2.0":
         raise Malformed("this is no message of JSON-RPC 2.0")
     return said
+
+
+def read_request(text: str | bytes) -> dict[str, Any]:
+    """Return a message of a client. Raises Malformed for what is none, or has too many parts."""
+    if isinstance(text, str) and len(text) > MOST_PARTS and sum(map(text.count, ",[{")) > MOST_PARTS:
+        raise Malformed(f"a message has {MOST_PARTS} values at most")
+    return read(text)
 
 
 def value_of(said: Any) -> Any:

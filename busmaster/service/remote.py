@@ -59,9 +59,9 @@ class RemoteBus:
 
     Handles take it as they take a Bus: `MicroFlexDrive(remote, 7)`. What is safe lives with the line: a stop of any
     program counts for all, limits and the record of writes are the owner's. A node that the owner does not have is
-    asked as this program says, and leaves the line with it. Entering raises LineDown if nobody serves the line, and
-    InvalidCommand for a name that nobody's line has, and for a write that was prepared before and that the line would
-    not take. A lost connection is not made again: enter a new RemoteBus.
+    asked as this program says, and leaves the line with it. Entering raises LineDown if nobody serves the line, or none
+    of that name: it may be served later; and InvalidCommand for a write that was prepared before and that the line
+    would not take. A lost connection is not made again: enter a new RemoteBus.
     """
 
     def __init__(self, address: str, *, token: str | None = None) -> None:

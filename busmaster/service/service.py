@@ -20,7 +20,7 @@ from busmaster.gate.gate import Gate
 from busmaster.registry import protocols
 from busmaster.service.client import Client
 from busmaster.service.connection import CLOSE_WITHIN, check_installed
-from busmaster.service.folder import Owner, ServedSocket, line_name, runtime_folder
+from busmaster.service.folder import Owner, ServedSocket, checked_name, line_name, runtime_folder
 from busmaster.service.line import ServedLine
 from busmaster.service.messages import (
     INVALID_PARAMS,
@@ -52,13 +52,13 @@ class Service:
     """Serve a bus that is open, on a Unix socket, in `async with`. It ends before the bus is closed.
 
     `path` is the socket's; without it, it is NAME.sock in this user's runtime folder, where `name` is that of the
-    line, by default its port's. Every write passes `gate`, which says who may do what: without one, its own, which
-    keeps a record in the log "busmaster.audit", and lets this user write and others read. `mode` and `group`, a number,
-    are the socket's. `listen` is a host and a port where programs may come by TCP too: off this machine only where the
-    gate knows tokens. Each program takes turns with the others and with this one; `share`, 0.1 to 10, weighs its line
-    time: with 0.5, half as much as this one has, as long as both wait. `title` is written over what a person sees of
-    the line. Entering raises InvalidCommand where the socket is served by another process, which it names, or cannot be
-    made.
+    line, by default its port's: letters, digits, and _.- between them. Every write passes `gate`, which says who may do
+    what: without one, its own, which keeps a record in the log "busmaster.audit", and lets this user write and others
+    read. `mode` and `group`, a number, are the socket's. `listen` is a host and a port where programs may come by TCP
+    too: off this machine only where the gate knows tokens. Each program takes turns with the others and with this one;
+    `share`, 0.1 to 10, weighs its line time: with 0.5, half as much as this one has, as long as both wait. `title` is
+    written over what a person sees of the line. Raises InvalidCommand for what cannot be; so does entering where the
+    socket is served by another process, which it names, or cannot be made.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Service:
         self.gate = gate or Gate(bus)
         if listen is not None:
             check_listening(listen, tokens=bool(self.gate.access.secrets))
-        self.name = name or line_name(bus.endpoint.name)
+        self.name = line_name(bus.endpoint.name) if name is None else checked_name(name)
         self.line = ServedLine(bus, self.gate, share, title or self.name)
         self.refused = 0
         """Connections that were one too many, or that began with what no client says."""

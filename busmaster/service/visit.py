@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from busmaster.service.client import Client
 from busmaster.service.connection import GOING_AWAY, POLICY, ServedConnection
-from busmaster.service.messages import HELLO_WITHIN, INVALID_PARAMS, LONGEST_REQUEST, Malformed, read, written
+from busmaster.service.messages import HELLO_WITHIN, INVALID_PARAMS, LONGEST_REQUEST, Malformed, read_request, written
 from busmaster.service.peers import Peer
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ class Visit:
         if self._ended:
             return
         try:
-            said = read(self._messages.popleft())
+            said = read_request(self._messages.popleft())
             if self.client is None:
                 self.client = self._host.welcome(self, said)
                 self._stranger.cancel()

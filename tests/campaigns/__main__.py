@@ -116,8 +116,9 @@ def _sum(many: Iterable[Totals]) -> Totals:
 
 
 def _report_beyond(found: Found) -> None:
-    """Wrong values and acknowledgements per million transactions, and what was noticed, as the README has it; then
-    writes that a drive heard twice, per million, right outcomes per thousand, and milliseconds of line time each."""
+    """Wrong values and acknowledgements per million transactions, and what was noticed, as the documentation has it;
+    then writes that a drive heard twice, per million, right outcomes per thousand, and milliseconds of line time
+    each."""
     protocols = sorted({protocol for protocol, _ in found})
     _say(f"\n| what happens | {' | '.join(protocols)} | noticed | heard twice | good | ms each |")
     _say(f"| --- |{' ---: |' * (len(protocols) + 4)}")

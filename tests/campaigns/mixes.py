@@ -179,6 +179,13 @@ WITHIN = (
     ),
     Mix("edges", "replies at the last moment", edges=Edges(), latency=0.0, writes=0.4, runs=True),
     Mix("edges, held back", "likewise, behind an adapter of 16 ms", edges=Edges(), latency=0.016, writes=0.4),
+    Mix(
+        "edges, equal",
+        "likewise, equal reads, behind an adapter of 16 ms",
+        edges=Edges(0.4),
+        latency=0.016,
+        equal=True,
+    ),
     Mix("edges, echo", "likewise, the adapter echoes", edges=Edges(), echo=Echo(0.001), writes=0.4, runs=True),
     Mix("edges, pauses", "replies pause as long as they may", edges=Edges(0.05, 0.1, sums=True), writes=0.4),
     Mix(

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.turns import Turns
@@ -97,6 +98,17 @@ def test_an_echo_that_is_not_looked_at_is_caught(protocol: str, monkeypatch: pyt
     monkeypatch.setattr(dc104.Reading, "feed", feed)
     monkeypatch.setattr(msc_exchange.Reply, "echoed_by", lambda reply, whole: len(whole) == reply.size)
     assert "WRONG" in caught(protocol, "wrong").problems[0]
+
+
+@EVERY_PROTOCOL
+def test_a_byte_time_left_out_of_the_lateness_brings_a_wrong_value(
+    protocol: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neighbours are asked the same, or what comes too late would look like nothing that was asked. A straggler that is
+    seen raises its node's lateness, which would heal the bug."""
+    without_the_byte_time(monkeypatch)
+    monkeypatch.setattr(NodeRecord, "raise_lateness", lambda node, lateness, until: None)
+    assert "WRONG" in caught(protocol, "edges, equal").problems[0]
 
 
 @pytest.mark.parametrize("protocol", ["hcp", "hcp2", "mentor", "dc104"])

@@ -6,11 +6,13 @@ import json
 import logging
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,6 +24,7 @@ from busmaster.cli import main
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import TcpServer, serve_tcp
 from busmaster.registry import find, make_device
+from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parent.parent.parent
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "error", "PYTHONUNBUFFERED": ""}
@@ -101,3 +104,51 @@ def started(*arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:
         text=True,
         start_new_session=True,
     )
+
+
+# a line that one process owns and others use
+
+SLITTER = """
+title = "Slitter"
+port = "PORT?baudrate=57600"
+[nodes.winder]
+protocol = "hcp2"
+address = 1
+points.force = { item = "10", unit = "N", factor = 0.1, maximum = 50 }
+[groups.fast]
+period = 0.02
+points = ["winder/force"]
+[outputs.sqlite]
+path = "FOLDER/line.sqlite"
+"""
+
+
+@pytest.fixture
+def three_controllers() -> Iterator[TcpServer]:
+    """Mint controllers 1 to 3, for one test alone: its process is the only one that is to connect."""
+    with serve("hcp2", 1, 2, 3) as server:
+        yield server
+
+
+@pytest.fixture
+def file(tmp_path: Path, three_controllers: TcpServer) -> Path:
+    """The file of their line, SLITTER."""
+    path = tmp_path / "slitter.toml"
+    path.write_text(SLITTER.replace("PORT", three_controllers.path).replace("FOLDER", str(tmp_path)))
+    return path
+
+
+@contextmanager
+def owner(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A process that serves a line, and its address; ended as a service is."""
+    with started(*arguments) as process:
+        assert process.stderr is not None
+        try:
+            said = ""
+            while not (found := re.search(r"is served at (unix:\S+)", said)):
+                said = process.stderr.readline()
+                assert said, "it ended"
+            yield process, found[1]
+        finally:
+            process.terminate()
+            process.communicate(timeout=PATIENCE)

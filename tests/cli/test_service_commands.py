@@ -11,8 +11,8 @@ import socket
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -21,53 +21,10 @@ import pytest
 from busmaster import Hcp2Controller, connect
 from busmaster.emulator.serve import TcpServer
 from busmaster.service.folder import find_owner
-from tests.cli.conftest import ENVIRONMENT, ROOT, Command, ended_once, serve, started
+from tests.cli.conftest import ENVIRONMENT, ROOT, Command, ended_once, owner, serve, started
 from tests.patience import PATIENCE
 
-TEXT = """
-title = "Slitter"
-port = "PORT?baudrate=57600"
-[nodes.winder]
-protocol = "hcp2"
-address = 1
-points.force = { item = "10", unit = "N", factor = 0.1, maximum = 50 }
-[groups.fast]
-period = 0.02
-points = ["winder/force"]
-[outputs.sqlite]
-path = "FOLDER/line.sqlite"
-"""
 HCP2 = ("--protocol", "hcp2")
-
-
-@pytest.fixture
-def controllers() -> Iterator[TcpServer]:
-    """Mint controllers 1 to 3, for one test alone: its process is the only one that is to connect."""
-    with serve("hcp2", 1, 2, 3) as server:
-        yield server
-
-
-@pytest.fixture
-def file(tmp_path: Path, controllers: TcpServer) -> Path:
-    path = tmp_path / "slitter.toml"
-    path.write_text(TEXT.replace("PORT", controllers.path).replace("FOLDER", str(tmp_path)))
-    return path
-
-
-@contextmanager
-def owner(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A process that serves a line, and its address; ended as a service is."""
-    with started(*arguments) as process:
-        assert process.stderr is not None
-        try:
-            said = ""
-            while not (found := re.search(r"is served at (unix:\S+)", said)):
-                said = process.stderr.readline()
-                assert said, "it ended"
-            yield process, found[1]
-        finally:
-            process.terminate()
-            process.communicate(timeout=PATIENCE)
 
 
 def audit(folder: Path) -> list[tuple[Any, ...]]:
@@ -76,15 +33,15 @@ def audit(folder: Path) -> list[tuple[Any, ...]]:
         return database.execute("select door, point, value, outcome from audit order by time").fetchall()
 
 
-def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, controllers: TcpServer) -> None:
+def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, three_controllers: TcpServer) -> None:
     with owner("serve", str(file)) as (process, address):
-        ran = busmaster("write", controllers.path, *HCP2, "--node", "2", "1=123.456", "--verify")
+        ran = busmaster("write", three_controllers.path, *HCP2, "--node", "2", "1=123.456", "--verify")
         assert (ran.status, ran.out) == (0, "1 ok\n")
-        port = controllers.path.removeprefix("socket://")
+        port = three_controllers.path.removeprefix("socket://")
         assert ran.err == (f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n")
         ran = busmaster("read", address, *HCP2, "--node", "2", "1")
         assert (ran.status, ran.out, ran.err) == (0, "1 123.456\n", "")
-        ran = busmaster("read", controllers.path.replace("127.0.0.1", "localhost"), *HCP2, "--node", "2", "1")
+        ran = busmaster("read", three_controllers.path.replace("127.0.0.1", "localhost"), *HCP2, "--node", "2", "1")
         assert (ran.status, ran.out) == (0, "1 123.456\n")
         assert "is owned by process" in ran.err
 
@@ -99,20 +56,20 @@ def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, con
                         break
 
         asyncio.run(asyncio.wait_for(program(), PATIENCE))
-        ran = busmaster("write", controllers.path, *HCP2, "--node", "1", "10=501")
+        ran = busmaster("write", three_controllers.path, *HCP2, "--node", "1", "10=501")
         assert ran.status == 2
         assert "50" in ran.err
         process.terminate()
         assert process.wait(PATIENCE) == 0
     assert audit(file.parent) == [
-        ("service", "2/write element 1 = 123.456", "'write element 1 = 123.456'", "written"),
+        ("service", "2/raw command", "'write element 1 = 123.456'", "written"),
         ("service", "winder/force", 3.0, "written"),
         ("service", "winder/force", 50.1, "refused"),
     ]
 
 
 def test_options_that_differ_from_the_owners_are_wrong_usage(
-    busmaster: Command, file: Path, controllers: TcpServer
+    busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
     with owner("serve", str(file)):
         for options, complaint in (
@@ -120,17 +77,17 @@ def test_options_that_differ_from_the_owners_are_wrong_usage(
             (("--echo",), "not with an echo"),
             (("--capture", "x.pcapng"), "not by --capture"),
         ):
-            ran = busmaster("read", controllers.path, *HCP2, *options, "--node", "2", "1")
+            ran = busmaster("read", three_controllers.path, *HCP2, *options, "--node", "2", "1")
             assert (ran.status, ran.out) == (2, "")
             assert complaint in ran.err
-        ran = busmaster("read", f"{controllers.path}?baudrate=9600", *HCP2, "--node", "2", "1")
+        ran = busmaster("read", f"{three_controllers.path}?baudrate=9600", *HCP2, "--node", "2", "1")
         assert ran.status == 2
-        ran = busmaster("read", controllers.path, *HCP2, "--baud", "57600", "--node", "2", "1")
+        ran = busmaster("read", three_controllers.path, *HCP2, "--baud", "57600", "--node", "2", "1")
         assert ran.status == 0
 
 
-def test_run_serves_its_line_and_status_lists_it(busmaster: Command, file: Path, controllers: TcpServer) -> None:
-    port = controllers.path.removeprefix("socket://")
+def test_run_serves_its_line_and_status_lists_it(busmaster: Command, file: Path, three_controllers: TcpServer) -> None:
+    port = three_controllers.path.removeprefix("socket://")
     assert busmaster("status").err == "busmaster: no line of this user is served: start busmaster run LINE.toml\n"
     with started("run", "--plain", str(file)) as process:
         assert process.stdout is not None
@@ -140,7 +97,7 @@ def test_run_serves_its_line_and_status_lists_it(busmaster: Command, file: Path,
         assert (said["name"], said["port"], said["process"]) == ("slitter", port, process.pid)
         assert (said["programs"], said["up"], said["nodes"], said["error"]) == (0, 1, 1, None)
         assert busmaster("status").lines[1].split()[:4] == ["slitter", port, str(process.pid), "0"]
-        controllers.close()
+        three_controllers.close()
         while (said := json.loads(busmaster("status", "--json").out))["state"] != "offline":
             pass
         assert (said["up"], said["nodes"]) == (0, 1)
@@ -208,12 +165,12 @@ def test_where_the_extra_is_not_installed_a_line_runs_and_says_what_it_takes_to_
     assert "pip install 'busmaster[service]'" in ran.stderr
 
 
-def test_an_owner_that_was_killed_leaves_nothing_in_the_way(file: Path, controllers: TcpServer) -> None:
+def test_an_owner_that_was_killed_leaves_nothing_in_the_way(file: Path, three_controllers: TcpServer) -> None:
     with owner("serve", str(file)) as (process, first):
         process.send_signal(signal.SIGKILL)
         process.wait(PATIENCE)
         assert os.path.exists(first.removeprefix("unix:"))
-        assert find_owner(controllers.path) is None
+        assert find_owner(three_controllers.path) is None
     with owner("serve", str(file)) as (_, again):
         assert again == first
 
@@ -234,7 +191,7 @@ asyncio.run(main())
 
 
 def test_the_audit_is_true_of_a_program_that_was_killed_as_it_wrote(
-    busmaster: Command, file: Path, controllers: TcpServer
+    busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
     with owner("serve", str(file)) as (process, address):
         code = PROGRAM.replace("ADDRESS", address)
@@ -274,15 +231,15 @@ def test_the_section_of_the_service_is_checked_with_its_line(busmaster: Command,
 # every command with a PORT
 
 
-def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, controllers: TcpServer) -> None:
+def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, three_controllers: TcpServer) -> None:
     with owner("serve", str(file)) as (process, address):
-        port = controllers.path.removeprefix("socket://")
+        port = three_controllers.path.removeprefix("socket://")
         said = f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n"
-        ran = busmaster("scan", controllers.path, *HCP2, "--nodes", "2-4", "--timeout", "20")
+        ran = busmaster("scan", three_controllers.path, *HCP2, "--nodes", "2-4", "--timeout", "20")
         assert (ran.status, [line.split()[0] for line in ran.lines]) == (0, ["2", "3"])
         assert ran.err.startswith(said)
         options = ("--nodes", "2,3", "--items", "1", "--period", "0.02")
-        ran = ended_once(lambda lines: len(lines) >= 5, "poll", controllers.path, *HCP2, *options)
+        ran = ended_once(lambda lines: len(lines) >= 5, "poll", three_controllers.path, *HCP2, *options)
         assert ran.status == 130
         assert {line.split()[1] for line in ran.lines} == {"2/1", "3/1"}
         assert ran.err.startswith(said)
@@ -293,7 +250,7 @@ def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, cont
         assert busmaster("poll", address, *HCP2, *options, "--seconds", "0.05").status == 0
 
 
-def test_a_poll_whose_owner_ends_says_so(file: Path, controllers: TcpServer) -> None:
+def test_a_poll_whose_owner_ends_says_so(file: Path, three_controllers: TcpServer) -> None:
     with (
         owner("serve", str(file)) as (process, address),
         started("poll", address, *HCP2, "--nodes", "2", "--items", "1", "--period", "0.02") as polling,
@@ -307,7 +264,7 @@ def test_a_poll_whose_owner_ends_says_so(file: Path, controllers: TcpServer) -> 
 
 
 def test_nothing_is_written_through_an_owner_unless_all_may_be(
-    busmaster: Command, file: Path, controllers: TcpServer
+    busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
     with owner("serve", str(file)) as (process, address):
         for refused in ("10=501", "300=1", "1=nothing"):
@@ -318,11 +275,11 @@ def test_nothing_is_written_through_an_owner_unless_all_may_be(
         assert ran.lines == ["1 ok", "10 ok", "2 ok"]
         process.terminate()
         process.wait(PATIENCE)
-    assert [(row[1], row[3]) for row in audit(file.parent)] == [
-        ("winder/force", "refused"),
-        ("1/write element 1 = 5", "written"),
-        ("winder/force", "written"),
-        ("1/write element 2 = 6", "written"),
+    assert [row[1:] for row in audit(file.parent)] == [
+        ("winder/force", 50.1, "refused"),
+        ("1/raw command", "'write element 1 = 5'", "written"),
+        ("winder/force", 50.0, "written"),
+        ("1/raw command", "'write element 2 = 6'", "written"),
     ]
 
 
@@ -397,14 +354,14 @@ SAFE = '[safe]\nwithin = 2.0\nrepeatable = ["winder/force"]\nwrites = { "winder/
 
 
 def test_safe_has_the_owner_send_the_safe_state_and_the_line_goes_on(
-    busmaster: Command, file: Path, controllers: TcpServer
+    busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
     file.write_text(file.read_text() + SAFE)
     with owner("serve", str(file)) as (process, address):
         assert busmaster("write", address, *HCP2, "--node", "1", "10=300").status == 0
         ran = busmaster("safe", str(file))
         assert (ran.status, ran.out) == (0, "winder/force ok\n")
-        port = controllers.path.removeprefix("socket://")
+        port = three_controllers.path.removeprefix("socket://")
         assert ran.err == f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n"
         assert busmaster("read", address, *HCP2, "--node", "1", "10").out == "10 15\n"
         assert busmaster("write", address, *HCP2, "--node", "1", "10=30").status == 0
@@ -420,7 +377,7 @@ def test_safe_has_the_owner_send_the_safe_state_and_the_line_goes_on(
 
 
 def test_options_of_a_node_that_differ_from_the_owners_are_named_with_its_own(
-    busmaster: Command, file: Path, controllers: TcpServer
+    busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
     with owner("serve", str(file)) as (_, address):
         for options, complaint in (
@@ -436,7 +393,7 @@ def test_options_of_a_node_that_differ_from_the_owners_are_named_with_its_own(
 
 
 def test_status_lists_the_lines_of_the_system_too_and_which_of_them_are_not_for_this_user(
-    busmaster: Command, file: Path, tmp_path: Path, controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
+    busmaster: Command, file: Path, tmp_path: Path, three_controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     system = tmp_path / "run" / "busmaster"
     folder = system / "slitter"
@@ -448,12 +405,13 @@ def test_status_lists_the_lines_of_the_system_too_and_which_of_them_are_not_for_
         ran = busmaster("status", "--json")
         said = json.loads(ran.out)
         assert (said["address"], said["process"], said["error"]) == (address, process.pid, None)
-        assert busmaster("read", controllers.path, *HCP2, "--node", "2", "1").out == "1 0\n"
+        assert busmaster("read", three_controllers.path, *HCP2, "--node", "2", "1").out == "1 0\n"
         # Root may connect whatever the mode, so that the socket itself cannot show this.
         monkeypatch.setattr(socket.socket, "connect", refuse(socket.socket.connect))
         ran = busmaster("status")
         assert ran.status == 0
-        assert ran.lines[1].split()[:3] == ["slitter", controllers.path.removeprefix("socket://"), str(process.pid)]
+        port = three_controllers.path.removeprefix("socket://")
+        assert ran.lines[1].split()[:3] == ["slitter", port, str(process.pid)]
         assert ran.lines[1].endswith("not for this user")
 
 
@@ -469,7 +427,7 @@ def refuse(connect: Callable[[socket.socket, Any], None]) -> Callable[[socket.so
 
 
 def test_points_of_a_file_are_written_through_its_lines_owner(
-    busmaster: Command, file: Path, controllers: TcpServer
+    busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
     with owner("serve", str(file)) as (process, address):
         ran = busmaster("write", str(file), "winder/force=30", "winder/2=7", "--verify")

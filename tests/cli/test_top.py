@@ -14,25 +14,11 @@ import pytest
 from busmaster.cli import top
 from busmaster.emulator.serve import TcpServer
 from busmaster.errors import LineDown
-from tests.cli.conftest import Command, serve, started
+from tests.cli.conftest import SLITTER, Command, owner, serve, started
 from tests.cli.test_processes import Terminal
-from tests.cli.test_service_commands import TEXT, owner
 from tests.patience import PATIENCE
 
 ON_SCREEN = b"\x1b[?1049h"
-
-
-@pytest.fixture
-def controllers() -> Iterator[TcpServer]:
-    with serve("hcp2", 1, 2, 3) as server:
-        yield server
-
-
-@pytest.fixture
-def file(tmp_path: Path, controllers: TcpServer) -> Path:
-    path = tmp_path / "slitter.toml"
-    path.write_text(TEXT.replace("PORT", controllers.path).replace("FOLDER", str(tmp_path)))
-    return path
 
 
 @contextmanager
@@ -75,10 +61,34 @@ def draws_on(shown: Terminal) -> None:
     shown.until(lambda drawn: len(drawn) > 1000)
 
 
+ends = pytest.mark.parametrize(("end", "said"), [(signal.SIGTERM, b"has ended"), (signal.SIGKILL, b"was lost")])
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("end", "said"), [(signal.SIGTERM, b"has ended"), (signal.SIGKILL, b"was lost")])
-def test_the_end_of_the_owner_ends_it_with_a_sentence(file: Path, end: signal.Signals, said: bytes) -> None:
+@ends
+def test_while_its_owner_is_away_it_says_so_and_goes_on_when_that_is_back(
+    file: Path, end: signal.Signals, said: bytes
+) -> None:
     with owner("serve", str(file)) as (process, _), terminal("top", str(file)) as shown:
+        draws(shown)
+        process.send_signal(end)
+        shown.until(lambda drawn: b"its owner is away" in drawn)
+        shown.until(lambda drawn: said in drawn or b"no program serves" in drawn)
+        shown.drawn = ON_SCREEN
+        with owner("serve", str(file)):
+            draws(shown, b"missed")  # of a group: it is drawn anew, as it is of another owner
+            os.write(shown.master, b"q")
+            assert shown.status() == 0
+            assert b"Traceback" not in shown.drawn
+            assert gave_back(shown)
+
+
+@pytest.mark.slow
+@ends
+def test_the_end_of_the_owner_ends_the_owners_own_view_with_a_sentence(
+    file: Path, end: signal.Signals, said: bytes
+) -> None:
+    with owner("serve", str(file)) as (process, _), terminal("top", str(file), "--of-owner") as shown:
         draws(shown)
         process.send_signal(end)
         assert shown.status() == 1
@@ -88,10 +98,10 @@ def test_the_end_of_the_owner_ends_it_with_a_sentence(file: Path, end: signal.Si
 
 
 @pytest.mark.slow
-def test_a_line_that_is_lost_is_offline_until_it_is_back(file: Path, controllers: TcpServer) -> None:
+def test_a_line_that_is_lost_is_offline_until_it_is_back(file: Path, three_controllers: TcpServer) -> None:
     with owner("serve", str(file)), terminal("top") as shown:
         draws(shown, b"up")
-        controllers.close()
+        three_controllers.close()
         shown.drawn = ON_SCREEN
         draws(shown, b"offline")
 
@@ -189,15 +199,15 @@ def test_top_without_a_terminal_is_wrong_usage(file: Path) -> None:
 
 
 def test_a_line_is_meant_by_its_name_its_file_its_port_or_its_address(
-    file: Path, tmp_path: Path, controllers: TcpServer
+    file: Path, tmp_path: Path, three_controllers: TcpServer
 ) -> None:
     with pytest.raises(LineDown, match="start busmaster run"):
         top.address_of(str(file))
     with owner("serve", str(file)) as (_, address):
         other_name = tmp_path / "other.toml"
         other_name.write_text(file.read_text())
-        port = controllers.path.removeprefix("socket://")
-        for meant in ("slitter", str(file), str(other_name), controllers.path, port, address, None):
+        port = three_controllers.path.removeprefix("socket://")
+        for meant in ("slitter", str(file), str(other_name), three_controllers.path, port, address, None):
             assert top.address_of(meant) == address
     assert top.address_of("unix:/x") == "unix:/x"
     assert top.address_of("nobody") == "nobody"
@@ -209,7 +219,7 @@ def test_top_names_the_lines_where_several_run_and_says_where_none_does(file: Pa
         assert b"no line of this user is served; start busmaster run LINE.toml" in shown.drawn
     with serve("hcp2", 1, 2, 3) as second:
         other = tmp_path / "winder.toml"
-        other.write_text(TEXT.replace("PORT", second.path).replace("FOLDER", str(tmp_path)))
+        other.write_text(SLITTER.replace("PORT", second.path).replace("FOLDER", str(tmp_path)))
         with owner("serve", str(file)), owner("serve", str(other)), terminal("top") as shown:
             assert shown.status() == 2
             assert b"several lines run: say which, one of slitter, winder" in shown.drawn

@@ -13,25 +13,10 @@ from typing import Any
 import httpx2 as httpx
 import pytest
 
-from busmaster.emulator.serve import TcpServer
-from tests.cli.conftest import Command, serve, started
-from tests.cli.test_service_commands import TEXT, owner
+from tests.cli.conftest import Command, owner, started
 from tests.patience import PATIENCE
 
 HERE = ("--bind", "127.0.0.1:0")
-
-
-@pytest.fixture
-def controllers() -> Iterator[TcpServer]:
-    with serve("hcp2", 1) as server:
-        yield server
-
-
-@pytest.fixture
-def file(tmp_path: Path, controllers: TcpServer) -> Path:
-    path = tmp_path / "slitter.toml"
-    path.write_text(TEXT.replace("PORT", controllers.path).replace("FOLDER", str(tmp_path)))
-    return path
 
 
 def until_said(process: subprocess.Popen[str], text: str) -> str:

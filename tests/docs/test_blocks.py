@@ -85,7 +85,7 @@ class Page:
                 source.data = {"port": "/dev/ttyUSB0", "nodes": {"node": node}}
                 ConfiguredLine(read(source))
             return
-        if "port" in data:
+        if "port" in data and "nodes" in data:
             self._whole = data
         source.data = merged(self._whole, data)
         ConfiguredLine(read(source), outputs=False)

@@ -19,8 +19,7 @@ from cryptography.x509.oid import NameOID
 from opcua import ua
 
 from busmaster.emulator.serve import TcpServer
-from tests.cli.conftest import Command, busmaster, serve, started
-from tests.cli.test_service_commands import owner
+from tests.cli.conftest import Command, busmaster, owner, serve, started
 from tests.doors.opcua_client import other_client
 from tests.patience import PATIENCE
 

@@ -50,8 +50,11 @@ class Served:
         await until(lambda: not self.service.clients)
 
     def audit(self) -> list[tuple[str, str]]:
-        """What was written, and what became of it."""
-        return [(record.point, record.outcome.value) for record in self.records]
+        """What was written, and what became of it: of a raw command, itself."""
+        return [
+            (record.point.replace("raw command", str(record.value).strip("'")), record.outcome.value)
+            for record in self.records
+        ]
 
 
 class SlowWay:

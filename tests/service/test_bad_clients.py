@@ -122,14 +122,16 @@ def test_the_audit_is_true_of_a_program_that_is_killed_mid_write(tmp_path: Path)
     ("said", "complaint"),
     [
         ("{", "this is no JSON"),
-        ("[" * 60_000, "this is no JSON"),
+        ("[" * 8_000, "this is no JSON"),
+        ("[" * 60_000, "a message has 8192 values at most"),
+        ("[" + "[]," * 20_000 + "0]", "a message has 8192 values at most"),
         ("[]", "this is no message of JSON-RPC 2.0"),
         ('{"jsonrpc": "2.0", "id": 2, "method": 3}', "a message has a method"),
         ('{"jsonrpc": "2.0", "method": "cancel", "params": {"id": [1]}}', "cancel: "),
         ('{"jsonrpc": "2.0", "id": true, "method": "groups"}', "the id of a request is a whole number"),
         (b"\x00\xff", "a message is text"),
     ],
-    ids=range(7),
+    ids=range(9),
 )
 def test_garbage_ends_the_conversation_with_its_reason(said: str | bytes, complaint: str, tmp_path: Path) -> None:
     async def story(line: Served) -> None:

@@ -84,6 +84,25 @@ def test_a_program_with_a_token_that_reads_writes_nothing_and_stops_nothing(tmp_
     on_a_port(tmp_path, story)
 
 
+def test_who_may_write_a_part_of_a_node_stops_it_with_a_write_that_is_let_through(tmp_path: Path) -> None:
+    async def story(line: Served, address: str) -> None:
+        async with connect(address, token=SECRETS["hmi"]) as remote:
+            controller, own = Hcp2Controller(remote, 5), Hcp2Controller(line.bus, 5).node
+            await controller.read(1)
+            controller.node.note_stop()
+            with pytest.raises(InvalidCommand, match="may not write this"):
+                await controller.write(2, 0)
+            assert own.stops == controller.node.stops == 0
+            controller.node.note_stop()
+            await remote.groups()
+            assert own.stops == 0, "it is not known yet what it writes"
+            await controller.write(1, 0)
+            await controller.write(1, 1)
+            assert own.stops == controller.node.stops == 1
+
+    on_a_port(tmp_path, story)
+
+
 def test_nobody_comes_by_tcp_without_a_token_that_is_known(tmp_path: Path) -> None:
     async def story(line: Served, address: str) -> None:
         for token in ("a-token-of-nobody-at-all", SECRETS["hmi"][:-1]):

@@ -361,7 +361,7 @@ def test_nobody_there_is_said_with_what_to_do(tmp_path: Path) -> None:
         with pytest.raises(LineDown, match=r"no program serves .*line.sock: .*; start busmaster run"):
             async with connect(f"unix:{tmp_path}/line.sock"):
                 pass
-        with pytest.raises(InvalidCommand, match="no program of this user serves 'slitter'"):
+        with pytest.raises(LineDown, match="no program of this user serves 'slitter', and there are the lines: "):
             async with connect("slitter"):
                 pass
         with socket.create_server(("127.0.0.1", 0)) as left:

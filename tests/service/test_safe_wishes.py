@@ -6,6 +6,7 @@ import asyncio
 import os
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,10 +15,12 @@ from busmaster.config import ConfiguredLine
 from busmaster.config.sections import read
 from busmaster.config.source import Source
 from busmaster.emulator.line import Line
-from busmaster.errors import BusError, InvalidCommand, NoReply, Superseded, WriteUnconfirmed
+from busmaster.errors import BacklogFull, BusError, InvalidCommand, NoReply, Superseded, WriteUnconfirmed
+from busmaster.gate.gate import SafeWrites
 from busmaster.gate.permission import Access, Permission
 from busmaster.gate.record import WriteRecord
 from busmaster.registry import make_device
+from busmaster.service.safe import SafeWishes
 from tests.patience import PATIENCE
 from tests.service.lines import PATIENT, until
 
@@ -113,6 +116,31 @@ def test_it_is_sent_to_the_end_when_whoever_asked_for_it_has_gone(tmp_path: Path
         assert service.clients[0].permission.writes  # the other program is where it was
 
     on_a_line(tmp_path, TEXT + BOTH, story)
+
+
+def test_who_waits_for_it_has_one_request_more_that_is_not_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("busmaster.service.requests.MOST_REQUESTS", 1)
+    send = SafeWishes._send
+
+    async def story(line: ConfiguredLine, service: Service, remote: RemoteBus, records: list[WriteRecord]) -> None:
+        meant = asyncio.Event()
+
+        async def hold(wishes: SafeWishes, state: SafeWrites, by: str) -> dict[str, Any]:
+            await meant.wait()
+            return await send(wishes, state, by)
+
+        monkeypatch.setattr(SafeWishes, "_send", hold)
+        asking = asyncio.ensure_future(remote.enter_safe_state({"winder/speed": 0}))
+        await until(lambda: service.line.safe_wishes.under_way)
+        with pytest.raises(BacklogFull, match="1 requests of this program are not answered yet"):
+            await Hcp2Controller(remote, 5).read(10)
+        meant.set()
+        assert await asking == {"winder/speed": None}
+        assert await Hcp2Controller(remote, 5).read(10) == 0
+
+    on_a_line(tmp_path, TEXT + SAFE, story)
 
 
 def test_it_is_for_those_who_may_write_all_of_it_and_expect_it(tmp_path: Path) -> None:

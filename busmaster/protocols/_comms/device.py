@@ -1,4 +1,4 @@
-"""The slave's side of Host Comms Protocol (AN00110) and Host Comms Protocol 2 (AN00129): frames, numbers, ACK and NAK.
+"""The node's side of Host Comms Protocol (AN00110) and Host Comms Protocol 2 (AN00129): frames, numbers, ACK and NAK.
 
 What the elements mean is the business of the kinds of device: a Mint controller, a MicroFlex drive.
 """
@@ -71,7 +71,7 @@ def sendable(value: float, element: int) -> float:
 
 
 class HostCommsDevice(Device):
-    """A slave of either protocol. A kind of device says what its elements hold: `read_element`, `write_element`.
+    """A node of either protocol. A kind of device says what its elements hold: `read_element`, `write_element`.
 
     `fixed_decimals` sends "12.5000" instead of "12.5". `all_or_nothing` refuses a multi-value write before it stores
     any of it. With a `traceable` every element is the traceable's.

@@ -23,7 +23,11 @@ PROTOCOL = Protocol(
             read_options=(CHAIN,),
             width=lambda item: 0 if is_decimal(item.partition(":")[2]) else 32,
             takes_decimals=True,
-            emulated=(*EMULATED, Option("plus", "flag"), Option("width", "whole")),
+            emulated=(
+                *EMULATED,
+                Option("plus", "flag", about="A value that is not negative is sent with its sign."),
+                Option("width", "whole", about="Zeros fill a value up to so many characters; none do by default."),
+            ),
             capture_id=8,
         ),
     ),

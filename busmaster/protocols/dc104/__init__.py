@@ -8,8 +8,8 @@ from busmaster.protocols.dc104.codec import PROFILE, Read, Write
 from busmaster.protocols.dc104.handle import Dc104Drive
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
-MAXIMUM = Option("maximum", "whole")
-ALLOW_ZERO = Option("allow_zero", "flag")
+MAXIMUM = Option("maximum", "whole", about="The number of its last parameter, 1 to 255; 255 by default.")
+ALLOW_ZERO = Option("allow_zero", "flag", about="It has a parameter 0 too.")
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -25,9 +25,9 @@ PROTOCOL = Protocol(
             emulated=(
                 MAXIMUM,
                 ALLOW_ZERO,
-                Option("read_only", "numbers"),
-                Option("eeprom", "delay"),
-                Option("silent", "flag"),
+                Option("read_only", "numbers", about="The parameters that refuse writes."),
+                Option("eeprom", "delay", about="How long storing a value takes; 0.01 by default."),
+                Option("silent", "flag", about="A read of what is not there gets no answer, in place of NAK."),
             ),
             whole_numbers=everywhere,
             width=lambda item: 16,

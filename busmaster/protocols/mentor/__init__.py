@@ -12,19 +12,34 @@ from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 CHAIN = Option("chain", "flag", "read a run in one exchange, where no other drive can mistake it")
 
 EMULATED = (
-    Option("acceleration", "positive"),
-    Option("ripple", "share"),
-    Option("short_after_write", "flag"),
-    Option("refuse_malformed", "flag"),
+    Option(
+        "acceleration", "positive", about="How fast its speed follows the reference, in 0.1 % a second; 500 by default."
+    ),
+    Option(
+        "ripple",
+        "share",
+        about="By how much of itself, 0 to 1, the measured speed swings with the shaft; 0.01 by "
+        "default, 0 where it is not lively.",
+    ),
+    Option("short_after_write", "flag", about="Short commands work after a write too."),
+    Option("refuse_malformed", "flag", about="A read request that is none is answered by NAK, not by silence."),
     Option(
         "parameters",
         "tables",
         fields=(
-            Option("low", "number"),
-            Option("high", "number"),
-            Option("read_only", "flag"),
-            Option("wide", "flag"),
-            Option("fine", "flag"),
+            Option(
+                "low",
+                "number",
+                about="The least that it takes, without its decimals; what its form can carry by default.",
+            ),
+            Option(
+                "high",
+                "number",
+                about="The most that it takes, without its decimals; what its form can carry by default.",
+            ),
+            Option("read_only", "flag", about="Writes to it are refused."),
+            Option("wide", "flag", about="It has five digits and no sign, as `:wide` reads it."),
+            Option("fine", "flag", about="It has one digit more, as `:hires` reads it."),
         ),
     ),
 )
@@ -41,7 +56,13 @@ PROTOCOL = Protocol(
             f"name: {' '.join(NAMED)}",
             probe_item="1.17",
             documented=ITEMS,
-            options=(Option("chained", "flag"),),
+            options=(
+                Option(
+                    "chained",
+                    "flag",
+                    about="A run is read in one exchange, where no other drive on the line can mistake it.",
+                ),
+            ),
             read_options=(CHAIN,),
             whole_numbers=everywhere,
             width=lambda item: 0 if is_decimal(item.partition(":")[2]) else 16,

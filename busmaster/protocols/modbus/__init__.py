@@ -32,7 +32,16 @@ PROTOCOL = Protocol(
             ),
             whole_numbers=is_whole,
             width=width_of,
-            emulated=(Option("size", "whole"), Option("functions", "numbers"), Option("read_only", "numbers")),
+            emulated=(
+                Option("size", "whole", about="How many addresses each of its four tables has; 1000 by default."),
+                Option(
+                    "functions",
+                    "numbers",
+                    about="The function codes that it knows; all that busmaster sends by default. Others are "
+                    "answered by exception 1.",
+                ),
+                Option("read_only", "numbers", about="The holding registers that refuse writes, with exception 3."),
+            ),
             capture_id=7,
         ),
     ),

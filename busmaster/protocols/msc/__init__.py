@@ -10,8 +10,18 @@ from busmaster.protocols.msc.items import ITEMS, width_of
 from busmaster.protocols.msc.listing import read_listing
 from busmaster.registry import NodeKind, Option, Protocol, device_of, everywhere
 
-ADDRESS_STEP = Option("address_step", "whole", "addresses from one value to the next")
-MODEL = Option("model", "text", choices=("MSC-250", "MSC-850", "MSC-850/32"))
+ADDRESS_STEP = Option(
+    "address_step",
+    "whole",
+    "addresses from one value to the next",
+    about="By how much data addresses grow from one value to the next: 1, 2 or 4. Its emulated unit has 4 by default.",
+)
+MODEL = Option(
+    "model",
+    "text",
+    choices=("MSC-250", "MSC-850", "MSC-850/32"),
+    about="Which model it is, and so which commands it knows. For its emulated unit MSC-250 by default.",
+)
 
 PROTOCOL = Protocol(
     profile=PROFILE,
@@ -24,18 +34,35 @@ PROTOCOL = Protocol(
             probe_item="status",
             documented=ITEMS,
             options=(
-                Option("symbols", "addresses", common=False, reader=read_listing),
+                Option(
+                    "symbols",
+                    "addresses",
+                    common=False,
+                    reader=read_listing,
+                    about="Names of data addresses, `{ count = 2008 }`; or the path of the program's listing, from "
+                    "the folder of LINE.toml.",
+                ),
                 ADDRESS_STEP,
                 MODEL,
             ),
             emulated=(
                 ADDRESS_STEP,
                 MODEL,
-                Option("addresses", "whole"),
-                Option("read_only_flags", "numbers"),
-                Option("battery", "flag"),
-                Option("period", "positive"),
-                Option("packet_delay", "delay"),
+                Option("addresses", "whole", about="How many data addresses it has; 32768 by default."),
+                Option(
+                    "read_only_flags", "numbers", about="The flags that cannot be set or cleared, as inputs and timers."
+                ),
+                Option("battery", "flag", about="Data outlives a power failure, and the program starts again."),
+                Option(
+                    "period",
+                    "positive",
+                    about="Every how many seconds its program adds 1 to the value at 2000; 0.1 by default.",
+                ),
+                Option(
+                    "packet_delay",
+                    "delay",
+                    about="From the end of an ACK to the packet that follows it; 0.002 by default.",
+                ),
             ),
             whole_numbers=everywhere,
             width=width_of,
