@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from busmaster.arbiter.clients import LineClient
+from busmaster.arbiter.health import NodeRecord
 from busmaster.bus.node import Node
 from busmaster.bus.requester import Priority
 from busmaster.cli.write import pass_on, prepare
@@ -32,8 +33,8 @@ from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
 from busmaster.service.errands import Errand
+from busmaster.service.line import ServedLine
 from busmaster.service.peers import Process
-from busmaster.service.service import Service
 from busmaster.testing.virtual_time import run_in_virtual_time
 
 FILE = """
@@ -187,13 +188,21 @@ class Person:
     def stops_before(self, node: Node, /) -> int:
         return 0
 
+    def takes_stop(self, node: Node, /) -> bool:
+        return False
+
+    def tell_stops(self, node: NodeRecord, /) -> None:
+        pass
+
 
 def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
         params = {"group": "all", "key": f"drive/{name}", "value": value}
-        errand = Errand.of(params, Person(), Service(plant.line.bus, gate=plant.line.gate))
-        errand.begin(lambda _: None)
-        await errand.future
+        errand = Errand.of(params, Person(), ServedLine(plant.line.bus, plant.line.gate, 1.0, ""))
+        ended: asyncio.Future[BaseException | None] = asyncio.get_running_loop().create_future()
+        errand.begin(lambda _, __, error: ended.set_result(error))
+        if (error := await ended) is not None:
+            raise error
 
     return write
 
