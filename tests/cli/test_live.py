@@ -329,6 +329,21 @@ async def test_silence_of_the_owner_is_told(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.asyncio
+async def test_while_the_owner_is_away_what_was_known_last_is_shown_with_why() -> None:
+    async with drawn(tell(Picture(), row())) as (screen, _, pilot):
+        screen.away = "no program serves /run/line.sock"
+        screen.take_picture()
+        await pilot.pause()
+        assert "its owner is away" in lines(screen)[0]
+        assert any("no program serves /run/line.sock" in line for line in lines(screen))
+        assert len(table(screen)) == 1
+        screen.away = ""
+        screen.take_picture()
+        await pilot.pause()
+        assert not any("away" in line or "no program" in line for line in lines(screen))
+
+
+@pytest.mark.asyncio
 async def test_keys_do_nothing_before_there_is_a_picture() -> None:
     async with drawn(Picture()) as (screen, line, pilot):
         assert "waiting for the program that owns the line" in lines(screen)[0]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 
 import pytest
 
 from busmaster.doors import following
-from busmaster.doors.following import Connected, Lost
+from busmaster.doors.following import Connected, Following, Lost
 from busmaster.errors import InvalidCommand, LineDown, NotStarted
 from tests.doors.lines import assert_goes_on_alone, followed, poll, shows
 from tests.patience import PATIENCE
@@ -55,6 +56,46 @@ async def test_a_write_passes_the_owners_gate(tmp_path: Path) -> None:
         await door.write("axes", "5/10", 7)
         assert line.audit() == [("5/10", "written")]
         await until(lambda: door.picture.rows[0].value == 7)
+
+
+@pytest.mark.asyncio
+async def test_groups_and_nodes_rest_as_a_door_wishes_while_the_owner_is_there(tmp_path: Path) -> None:
+    async with followed(tmp_path) as door:
+        async with served(tmp_path) as line:
+            poll(line)
+            [group] = line.bus.groups
+            await shows(door)
+            await door.pause("axes", True)
+            assert group.paused
+            await door.pause("axes", False)
+            await door.demand("axes")
+            await door.suspend("hcp2", 5, 60.0)
+            assert [node.label for node in line.bus.nodes if node.suspended] == ["node 5"]
+        await until(lambda: isinstance(door.state, Lost))
+        for wish in (door.pause("axes", True), door.demand("axes"), door.suspend("hcp2", 5, 0.0)):
+            with pytest.raises(LineDown, match="is not there"):
+                await wish
+
+
+@pytest.mark.asyncio
+async def test_who_has_no_patience_is_told_why_there_is_no_first_connection_and_follows_for_good_after_it(
+    tmp_path: Path,
+) -> None:
+    door = Following(lambda: f"unix:{tmp_path}/line.sock")
+    with pytest.raises(LineDown, match="no program serves"):
+        await door.follow(patient=False)
+    async with asyncio.timeout(PATIENCE):
+        async with served(tmp_path) as line:
+            poll(line)
+            task = asyncio.ensure_future(door.follow(patient=False))
+            await shows(door)
+        await until(lambda: isinstance(door.state, Lost))
+        async with served(tmp_path) as line:
+            poll(line)
+            await shows(door)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+    assert task.cancelled()
 
 
 @pytest.mark.asyncio
