@@ -18,7 +18,6 @@ from busmaster.errors import BusError, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.service.messages import MOST_HOLDS, MOST_REQUESTS, MOST_UNDER_WAY
 from busmaster.transport.pump import Waiter
-from tests.patience import PATIENCE
 from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until
 
 MANY = MOST_REQUESTS + MOST_REQUESTS // 2
