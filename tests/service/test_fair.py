@@ -23,12 +23,6 @@ from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, 
 MANY = MOST_REQUESTS + MOST_REQUESTS // 2
 
 
-@pytest.fixture(autouse=True)
-def _unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A busy machine may take longer over so many requests than a write is fresh: that is not what is asked here."""
-    monkeypatch.setattr("busmaster.service.errands.FRESH", PATIENCE)
-
-
 def watched(line: Served) -> list[Transaction]:
     """What is asked on the line from now on, in its order."""
     asked: list[Transaction] = []
