@@ -62,7 +62,11 @@ KEYS = (
 SHARED_KEYS = (
     Key("timing", "timing", 'Its reply times: a table, or `"learned"`. The protocol\'s by default.'),
     Key(
-        "retries", "whole", "How often a read that failed is tried again. The protocol's by default.", least=0, most=MOST_RETRIES
+        "retries",
+        "whole",
+        "How often a read that failed is tried again.",
+        least=0,
+        most=MOST_RETRIES,
     ),
     Key("reply_time", "seconds", "From a request to its reply, where it is known, for `plan`.", unit="s", least=0),
 )

@@ -92,6 +92,18 @@ def test_r9_who_comes_has_saved_nothing_up() -> None:
     assert abs(Counter(desk.serve(100))[second] - 50) <= 1
 
 
+def test_r9_who_comes_and_asks_for_one_thing_after_the_other_has_saved_nothing_up_either() -> None:
+    desk = Desk()
+    first, second = desk.client(), desk.client()
+    desk.ask(first, FLOOD)
+    desk.serve(1000)
+    for _ in range(100):
+        if not desk.backlog.waiting_of(COMMAND, second):
+            desk.ask(second)
+        desk.serve(1)
+    assert abs(Counter(desk.served[-100:])[second] - 50) <= 1
+
+
 def test_r9_what_a_program_had_while_nobody_waited_is_not_held_against_it() -> None:
     desk = Desk()
     first, second = desk.client(takes=1.0), desk.client()

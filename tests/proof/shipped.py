@@ -61,6 +61,8 @@ class _Uncounted:
 class _NoCounters:
     """Stands for the counters of a line or a node."""
 
+    entered = 0.0
+
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
@@ -68,9 +70,6 @@ class _NoCounters:
 
     def __setattr__(self, name: str, value: Any) -> None:
         pass
-
-    def spend(self, *arguments: Any) -> float:
-        return 0.0
 
     def mark(self, *arguments: Any) -> None:
         pass

@@ -115,9 +115,10 @@ def test_a_nak_to_a_read_or_a_single_value_is_worth_asking_again() -> None:
         assert refusal.value.confirm
 
 
-def test_a_nak_to_several_values_is_final_and_says_that_some_may_be_stored() -> None:
+@pytest.mark.parametrize("behind", [b"", b"\x06"])
+def test_a_nak_to_several_values_is_final_and_says_that_some_may_be_stored(behind: bytes) -> None:
     with pytest.raises(Refused, match="may be stored") as refusal:
-        Write(99, (7, 8)).open(1, TIMINGS).feed(b"\x15")
+        Write(99, (7, 8)).open(1, TIMINGS).feed(b"\x15" + behind)
     assert not refusal.value.confirm
 
 

@@ -51,6 +51,16 @@ def test_the_line_is_the_documents(profile: Profile, title: str, line: LineSetti
     assert profile.wrong_rate(line.baudrate) == ""
 
 
+RATES = {1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200}
+
+
+@pytest.mark.parametrize("kind", kinds().values(), ids=kinds())
+def test_other_settings_that_are_tried_have_usual_rates_and_are_tried_once(kind: NodeKind) -> None:
+    tried = [kind.profile.line, *kind.profile.other_lines]
+    assert {line.baudrate for line in tried} <= RATES
+    assert len(set(tried)) == len(tried)
+
+
 @pytest.mark.parametrize(
     ("profile", "addresses", "broadcast"),
     [
@@ -162,6 +172,7 @@ def test_a_drive_without_an_address_is_called_the_drive() -> None:
         (mentor.Read(1, 17), 1, b"\x02\x15\x04\x82\x95\x84", (12, 12)),
         (mentor.Write(1, 17, 1), 1, b"\x06\x15\x04\x86\x95\x84", (1, 1)),
         (mentor.Write(1, 17, 1), 0, b"", (0, 0)),
+        (ct_ansi.Read(1, 17), 11, b"\x02\x15\x04\x82\x95\x84", (13, 19)),
         (ct_ansi.Write(1, 17, 1), 0, b"", (0, 0)),
         (modbus.ReadRegisters(0, 2), 17, b"\x11", (9, 9)),
         (modbus.ReadBits(0, 8), 17, b"\x11", (6, 6)),
