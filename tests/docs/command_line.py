@@ -131,6 +131,12 @@ def _page() -> Iterator[str]:
     yield "\n## ITEM\n\nWhat ITEM is, by protocol; `busmaster items PROTOCOL` says what each means.\n"
     yield "| protocol | ITEM |\n|---|---|"
     yield from (f"| {kind.name} | {kind.items} |" for kind in kinds().values())
+    yield """
+## Manual page and completion
+
+The package brings busmaster(1), and completion of commands and options by Tab for bash, zsh and fish, to where the system
+looks for them. In a virtual environment the manual page is found while that is active, and bash completes after
+`source .venv/share/bash-completion/completions/busmaster`."""
     yield f"\n<!-- line {LINE}: --protocol hcp2 --nodes 1-8 -->\n<!-- file: line.toml from examples/line.toml -->"
     yield f"<!-- line {TCP}: line.toml -->\n"
     for command in commands():
