@@ -134,8 +134,8 @@ def _page() -> Iterator[str]:
     yield """
 ## Manual page and completion
 
-The package brings busmaster(1), and completion of commands and options by Tab for bash, zsh and fish, to where the system
-looks for them. In a virtual environment the manual page is found while that is active, and bash completes after
+The package brings busmaster(1), and completion of commands and options by Tab for bash, zsh and fish, to where the
+system looks for them. In a virtual environment the manual page is found while that is active, and bash completes after
 `source .venv/share/bash-completion/completions/busmaster`."""
     yield f"\n<!-- line {LINE}: --protocol hcp2 --nodes 1-8 -->\n<!-- file: line.toml from examples/line.toml -->"
     yield f"<!-- line {TCP}: line.toml -->\n"

@@ -64,7 +64,7 @@ def _titled(header: str) -> str:
 
 
 def _type(key: Key) -> str:
-    text = " or ".join(f"`{choice}`" for choice in key.choices) or KINDS[key.kind]
+    text = " or ".join(f'`"{choice}"`' for choice in key.choices) or KINDS[key.kind]
     if key.unit:
         text += f", {key.unit}"
     if key.least > -math.inf and key.most < math.inf:
