@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import asyncio
 import os
 import re
 import shlex
@@ -10,10 +11,15 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import busmaster
+from busmaster import Hcp2Controller, MemoryPort
+from busmaster.emulator.line import Line
+from busmaster.registry import make_device
+from busmaster.testing import answers_of, run_in_virtual_time
 from tests.docs.pages import ROOT, Block, blocks
 from tests.patience import PATIENCE
 
@@ -52,6 +58,20 @@ def test_a_program_in_the_readme_imports_public_names_alone(block: Block) -> Non
     for node in ast.walk(ast.parse(block.text)):
         if isinstance(node, ast.ImportFrom) and node.module == "busmaster":
             assert {alias.name for alias in node.names} <= set(busmaster.__all__)
+
+
+def test_the_program_in_the_readme_writes_and_polls(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = Line(Hcp2Controller.profile.line, [make_device("hcp2", 5)])
+    monkeypatch.setattr(busmaster, "SerialPort", lambda path, *, baudrate: MemoryPort(line))
+    [block] = blocks(README, "python")
+    program: dict[str, Any] = {"__name__": "readme"}
+    exec(block.text, program)
+    with pytest.raises(TimeoutError):
+        run_in_virtual_time(asyncio.wait_for(program["main"](), timeout=1.0))
+    assert answers_of(line.device(5))(bytes.fromhex("07 30 35 02 30 31 05 03"))[3:10] == b"123.456"
+    assert len(capsys.readouterr().out.splitlines()) >= 5
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: str(path.name))

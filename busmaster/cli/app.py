@@ -21,6 +21,16 @@ from busmaster.contract.arguments import meant
 from busmaster.errors import BusError, InvalidCommand, NoReply
 
 OK, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+STATUSES = {
+    str(OK): "All is good.",
+    str(
+        FAILED
+    ): "An error came from the line, a port or a file; one line on standard error says what, and what to try.",
+    str(WRONG_USAGE): "The usage or a value is wrong, and nothing was sent.",
+    str(INTERRUPTED): "Ctrl-C ended it.",
+    "128 + N": "Signal N ended it; of `run` and `serve` SIGTERM is no error, and ends with 0.",
+}
+"""With what a command ends; where one means more by it, its help says so."""
 COMMANDS = (
     "demo",
     "read",
@@ -95,9 +105,9 @@ def cli() -> None:
     """One master for many drives on one serial line.
 
     PORT is a device path, with options as in a URL (/dev/ttyUSB0?baudrate=9600&parity=E); usb:SERIAL for the USB
-    adapter with that serial number, whatever its path; or socket://HOST:PORT for a serial server that passes
-    raw TCP. A PORT that another busmaster owns is used through that, as `busmaster status` lists it; `read`, `write`,
-    `poll` and `scan` take its address too: unix:PATH, or tcp://HOST:PORT with a token in BUSMASTER_TOKEN.
+    adapter with that serial number, whatever its path; or socket://HOST:PORT for a serial server that passes raw TCP.
+    A PORT that another busmaster owns is used through its owner; `busmaster status` lists those. `read`, `write`,
+    `poll` and `scan` take the address of an owner too: unix:PATH, or tcp://HOST:PORT with a token in BUSMASTER_TOKEN.
     """
 
 

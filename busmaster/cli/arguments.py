@@ -194,7 +194,7 @@ def connected(command: F, *, or_file: bool = False) -> F:
             "--timeout",
             type=option_type(parse_window),
             metavar="MS",
-            help="The reply window, in milliseconds; or the word learned: from the replies.",
+            help="The reply window, in milliseconds; or `learned`, from the replies.",
         ),
         click.option("--retries", type=Whole(min=0), metavar="N", help="How often a read is tried again."),
         capture_option,

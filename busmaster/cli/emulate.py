@@ -55,7 +55,7 @@ LOOK_FOR_SIGNALS = 0.2
     metavar="NAME=VALUE",
     help=f"What goes wrong with every drive, like lost=0.1. Again for more. One of {' '.join(NAMES)}.",
 )
-@click.option("--seed", type=int, metavar="N", help="Of all that is random; the file's or 1 by default.")
+@click.option("--seed", type=int, metavar="N", help="Makes what is random repeatable; the file's, or 1, by default.")
 @seconds_option
 def command(
     path: str | None,

@@ -47,8 +47,8 @@ def command(port: str, protocol: str | None, baud: int | None, as_json: bool, ca
     An arrow tells who spoke, the host (->) or a node (<-); the time behind a reply is its delay. Frames are told
     apart by what they say: a silence only ends one that was cut short.
 
-    With a LINE.toml, its points and outputs are fed from what its line's own master asks: a line a value that passed,
-    or, with --json, a line a group and period.
+    With a LINE.toml, its points and outputs are fed from what its line's own master asks: a line for each value that
+    passed, or, with --json, for each group and period.
     """
     if is_line_file(port):
         if protocol is not None or baud is not None:
@@ -99,7 +99,7 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
 
 
 def plain_values(snapshot: Snapshot) -> list[str]:
-    """Return a line a value, as `2026-11-22T14:02:11.485Z winder/position 12.5`."""
+    """Return a line for each value, as `2026-11-22T14:02:11.485Z winder/position 12.5`."""
     return [
         f"{utc(sample.wall)} {point.key} {value_text(sample.value, point.meaning.precision)}"
         for point, sample in snapshot.samples.items()

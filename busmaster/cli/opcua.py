@@ -20,11 +20,16 @@ FOLDER = click.Path(exists=True, file_okay=False)
 
 @click.command(short_help="Serve a line that another program owns by OPC UA.")
 @door_options(BIND)
-@click.option("--allow", multiple=True, metavar="POINT", help="May be written, as winder/force or 'drive*/speed'.")
-@click.option("--token-file", metavar="FILE", help="Who writes is a user of this file: a name and its token a line.")
-@click.option("--certificate", type=FILE, metavar="FILE", help="Of the server: what is said is signed or encrypted.")
+@click.option(
+    "--allow",
+    multiple=True,
+    metavar="POINT",
+    help="Clients may write it, like winder/force or 'drive*/speed'. Again for more.",
+)
+@click.option("--token-file", metavar="FILE", help="Who may write: a name and its token on each line.")
+@click.option("--certificate", type=FILE, metavar="FILE", help="The server's: what is said is signed or encrypted.")
 @click.option("--key", type=FILE, metavar="FILE", help="The private key of the certificate.")
-@click.option("--trusted", type=FOLDER, metavar="FOLDER", help="Certificates of clients: no others may come.")
+@click.option("--trusted", type=FOLDER, metavar="FOLDER", help="Certificates of clients; no others may come.")
 def command(
     line: str | None,
     bind: str,

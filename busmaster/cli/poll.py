@@ -42,8 +42,8 @@ def command(
 ) -> int:
     """Read the items of every node on PORT once a period, until Ctrl-C.
 
-    On a terminal a live table; else, or with --plain, a line a value: the time in UTC, NODE/ITEM and the value, or `-`
-    and what went wrong. A summary on standard error ends it.
+    On a terminal a live table; else, or with --plain, a line for each value: the time in UTC, NODE/ITEM and the value,
+    or `-` and what went wrong. A summary on standard error ends it.
     """
     return until_ended(poll, connection, connection.addresses(nodes), items, period, view)
 

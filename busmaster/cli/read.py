@@ -32,7 +32,7 @@ class ItemsReadCommand(ItemCommand):
 @click.argument("items", nargs=-1, required=True, metavar="ITEM...")
 @json_option
 def command(connection: Connection, node: int | None, items: tuple[str, ...], as_json: bool, **options: Any) -> None:
-    """Read each ITEM of one node on PORT and print `ITEM VALUE`, a line each; for a run a line a value."""
+    """Read each ITEM of one node on PORT and print `ITEM VALUE` on a line; of a run of values each on its own."""
     how = take_options(read_options(), connection.protocol, options)
     until_ended(read, connection, connection.one_address(node), items, how, as_json)
 
@@ -59,7 +59,7 @@ async def read(
 
 
 def plain_lines(handle: Handle, item: str, value: Any, precision: int | None) -> Iterator[str]:
-    """Yield a line, or for a run a line a value."""
+    """Yield a line, or a line for each value of a run."""
     if not isinstance(value, tuple):
         yield f"{item} {value_text(value, precision)}"
         return

@@ -39,10 +39,10 @@ FAREWELL = 2.0
 def command(path: str, port: str | None, capture: str | None, view: View) -> int:
     """Poll the groups of LINE.toml until a signal ends it, and feed the outputs that it enables.
 
-    On a terminal a live table; else, or with --plain, a line a value; with --json a line a cycle. A summary on
-    standard error ends it: of groups, of nodes, and of what each output has written and dropped. There each write from
-    outside is told too, with what became of it. An output that is slow or down never holds up the line. A port that is
-    missing is waited for. SIGHUP has the file read again.
+    On a terminal a live table; else, or with --plain, a line for each value; with --json one for each cycle. A summary
+    on standard error ends it: of groups, of nodes, and of what each output has written and dropped. There each write
+    from outside is told too, with what became of it. An output that is slow or down never holds up the line. A port
+    that is missing is waited for. SIGHUP has the file read again.
 
     When it ends, however it ends, the writes of the file's [safe] are sent first. The exit status is 1 if one was not
     confirmed; else 0 after SIGTERM, 130 after Ctrl-C, and 128 and its number after another signal.

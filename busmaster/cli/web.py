@@ -18,7 +18,7 @@ NEEDED = ("starlette", "uvicorn", "websockets")
 
 @click.command(short_help="Serve a page and a REST API over a line that another program owns.")
 @door_options(BIND)
-@click.option("--token-file", metavar="FILE", help="A name and a token a line: who writes shows one.")
+@click.option("--token-file", metavar="FILE", help="Who may write: a name and its token on each line.")
 def command(line: str | None, bind: str, read_only: bool, token_file: str | None) -> int:
     """Show a line in browsers: values with trends, health, every exchange on the wire, events; and write its points.
 

@@ -28,7 +28,7 @@ SHARED = (
 )
 KEYS = (
     Key("paced", "flag", "Whether bytes take their time on the wire.", "true"),
-    Key("seed", "whole", "The seed of all that is random.", "1"),
+    Key("seed", "whole", "The seed of all that is random.", "1", least=0),
     *SHARED,
     Key("nodes", "table", "A table for each node, or range of nodes, that differs: `[emulator.nodes.NAME]`."),
 )

@@ -30,6 +30,7 @@ Kind: TypeAlias = Literal[
 """What a key takes. "texts" are one or a list; a "delay" is seconds or two bounds, an "address" a number or a range;
 "port" and "timing" are a text or a table."""
 
+MILLION = 1_000_000
 REQUIRED: Final = "required"
 
 
@@ -89,7 +90,11 @@ def _key_of(part: dataclasses.Field[Any], hint: Any, about: str) -> Key:
         hint = str
     kinds = get_args(hint) or (hint,)
     known: tuple[tuple[type, Kind], ...] = ((bool, "flag"), (int, "whole"), (float, "number"))
-    found = next((name for kind, name in known if kind in kinds), "texts" if get_origin(hint) is tuple else "text")
+    found: Kind = next(
+        (name for kind, name in known if kind in kinds), "texts" if get_origin(hint) is tuple else "text"
+    )
+    if found == "whole":
+        least = max(least, 0)
     return Key(part.name, found, about, _shown(part), "", least, most, choices)
 
 
@@ -102,5 +107,5 @@ def _shown(part: dataclasses.Field[Any]) -> str:
         case bool():
             return str(part.default).lower()
         case float() | int():
-            return f"{part.default:_}" if isinstance(part.default, int) else f"{part.default:g}"
+            return f"{part.default:_}" if part.default >= MILLION else f"{part.default:g}"
     return f'"{part.default}"'

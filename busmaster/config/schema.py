@@ -23,7 +23,7 @@ ECHO = "Whether what is sent is heard too, as on some two-wire adapters. It is c
 SERIAL = {
     "path": "The device, a link to it, or `usb:SERIAL`.",
     "baudrate": "The protocol's by default, where all nodes are meant for one.",
-    "bytesize": "Bits of a byte, 5 to 8. The protocol's by default.",
+    "bytesize": "Bits of a byte. The protocol's by default.",
     "parity": "N, E, O, M or S. The protocol's by default.",
     "stopbits": "1, 1.5 or 2. The protocol's by default.",
     "rtscts": "Whether RTS and CTS hold up what is sent.",
@@ -56,7 +56,7 @@ POINT = {
     "bits": "Names of the word's bits, 0 the lowest, each a point of its own: `bits = { READY = 0, FAULT = 3 }`.",
     "labels": 'Names of whole numbers: `labels = { 0 = "off", 1 = "run" }`.',
     "deadband": "Outputs are told a value only where it is further than this from what they were told; 0: each change.",
-    "heartbeat": "Outputs are told a value at the latest after so long.",
+    "heartbeat": "Outputs are told a value at the latest after so long, which is more than 0.",
     "low": "A value below it begins an alarm.",
     "high": "A value above it begins an alarm.",
     "hysteresis": "How far a value must be back for its alarm to end. By default a hundredth of what is between `low` "
@@ -100,11 +100,13 @@ OUTPUT_ABOUT = {
 
 def tables() -> Iterator[TableKeys]:
     """Yield every table of a file, in the order of the reference."""
-    yield TableKeys("", "What stands at the top of the file, before the first table.", sections.KEYS)
+    yield TableKeys("The top", "What stands at the top of the file, before the first table.", sections.KEYS)
     bounds = {"receive_latency": {"kind": "seconds", "unit": "s", "least": 0}}
-    serial = keys_of(SerialPort, SERIAL, baudrate={"default": ""}, rs485={"kind": "flag"}, **bounds)
+    framing: dict[str, dict[str, object]] = {name: {"default": ""} for name in ("parity", "stopbits")}
+    framing |= {"baudrate": {"default": "", "least": 1}, "bytesize": {"default": "", "least": 5, "most": 8}}
+    serial = keys_of(SerialPort, SERIAL, rs485={"kind": "flag"}, **framing, **bounds)
     yield TableKeys("[port]", "A serial port as a table.", serial)
-    tcp = keys_of(TcpPort, TCP, port={"least": 1, "most": 65535}, **bounds)
+    tcp = keys_of(TcpPort, TCP, port={"least": 1, "most": 65535}, baudrate={"least": 1}, **bounds)
     yield TableKeys("[port] with host", "A serial device server as a table.", tcp)
     common = "What holds for all nodes of one protocol that do not say otherwise. Its options may stand here too."
     yield TableKeys("[protocols.NAME]", common, sections.SHARED_KEYS)

@@ -48,7 +48,7 @@ KEYS = (
         "Whether an answer that could be another request's is held until it is certain (R15).",
         "false",
     ),
-    Key("timing", "timing", 'Only `timing = "learned"`: the windows of all nodes are learned from their replies.'),
+    Key("timing", "text", "The windows of all nodes are learned from their replies.", choices=(LEARNED_WORD,)),
     Key("learned", "text", "The file in which learned windows are kept from one run to the next."),
     Key("protocols", "table", "A table for each protocol, of what holds for its nodes: `[protocols.NAME]`."),
     Key("nodes", "table", "A table for each node: `[nodes.NAME]`.", REQUIRED),
@@ -62,7 +62,11 @@ KEYS = (
 SHARED_KEYS = (
     Key("timing", "timing", 'Its reply times: a table, or `"learned"`. The protocol\'s by default.'),
     Key(
-        "retries", "whole", "How often a read that failed is tried again. The protocol's by default.", most=MOST_RETRIES
+        "retries",
+        "whole",
+        "How often a read that failed is tried again.",
+        least=0,
+        most=MOST_RETRIES,
     ),
     Key("reply_time", "seconds", "From a request to its reply, where it is known, for `plan`.", unit="s", least=0),
 )

@@ -172,6 +172,8 @@ class Table:
     def _typed(self, key: str, hint: Any) -> Any:
         if get_origin(hint) is Annotated:
             bare, bounds = get_args(hint)
+            if bare is int:
+                return self.whole(key, least=int(bounds.least), most=bounds.most)
             value = self._typed(key, bare)
             if not bounds.least <= value <= bounds.most:
                 most = " or more" if bounds.most == math.inf else f" to {bounds.most}"

@@ -33,7 +33,7 @@ KEYS = (
     *TIME_KEYS,
     Key("read", "table", "The same times, of reads alone."),
     Key("write", "table", "The same times, of writes alone."),
-    Key("packet", "table", "The same times, of the packet that follows an ACK; MSC alone has one."),
+    Key("packet", "table", "The same times, of a packet that follows an acknowledgement, where there are such."),
     Key(
         LEARNED_WORD,
         "flag",

@@ -165,7 +165,7 @@ class Buggy(Reading):
 class BuggyRead(hcp2.Read):
     def open(self, address: int, timings: Timings) -> Reading:
         sound = super().open(address, timings)
-        return Buggy(sound.request, b"%02X" % self.element, timings.read)
+        return Buggy(sound.request, sound.answers[0], timings.read)
 
 
 class BuggyWriting(Writing):

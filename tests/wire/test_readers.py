@@ -146,7 +146,7 @@ class Number(Text):
 def test_data_that_mean_nothing_are_another_format() -> None:
     body = b"01+1.5V\x03"
     with pytest.raises(FrameError) as failure:
-        Number(b"request", b"01", TIMING).feed(b"\x02" + body + bytes([xor(body)]))
+        Number(b"request", HEADER, TIMING).feed(b"\x02" + body + bytes([xor(body)]))
     assert failure.value.what == "10 bytes came, right in their check but of another format: b'+1.5V' is not a number"
     assert failure.value.hint == OTHER_FORMAT
 

@@ -26,6 +26,7 @@ EMULATED = (
     Option(
         "parameters",
         "tables",
+        about='Further parameters, or other limits, by number: `parameters = { "7.05" = { low = 0, high = 999 } }`.',
         fields=(
             Option(
                 "low",
