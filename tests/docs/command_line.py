@@ -80,7 +80,8 @@ def described(command: click.Command, name: str = "") -> Described:
     context = click.Context(command, top, info_name=name) if name else top
     usage = " ".join(command.collect_usage_pieces(context))
     text = inspect.cleandoc(command.help or "")
-    options = [one for one in command.get_params(context) if isinstance(one, click.Option) and "--help" not in one.opts]
+    parameters = [one for one in command.get_params(context) if isinstance(one, click.Option) and not one.hidden]
+    options = [option for option in parameters if "--help" not in option.opts]
     return Described(
         name,
         f"busmaster {name} {usage}".replace("  ", " "),
