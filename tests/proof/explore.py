@@ -99,10 +99,14 @@ class Explorer:
         begin_run(sample(zone))
         world = restore(key)
         possible = [(action, *window(world, action)) for action in actions(world)]
+        goes_on = False
         for action, *bounds in possible:
             begun = constrained(zone, *bounds)
             if begun is not None:
+                goes_on = True
                 self._happen(place, key, begun, action)
+        if not goes_on:
+            self.found.violations.setdefault("progress: nothing can happen any more", self.path(place))
 
     def _happen(self, place: int, key: bytes, zone: Zone, action: Action) -> None:
         """Let one event happen in all its zone: piece by piece, each as one run decides."""

@@ -21,7 +21,7 @@ from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo, Queue
 from busmaster.arbiter.schedule import Schedule
 from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.state import EXCHANGE, SETTLING, LineState
-from busmaster.arbiter.transaction import BACKGROUND, COMMAND, Phase, Priority, Transaction
+from busmaster.arbiter.transaction import BACKGROUND, COMMAND, ENDED, Phase, Priority, Transaction
 from busmaster.arbiter.turns import Turns
 from busmaster.arbiter.unasked import QUIET, STRAGGLER_MEMORY
 from busmaster.contract.profile import Profile
@@ -162,16 +162,20 @@ def past_requests(view: View) -> None:
     ranks = _ranks_of_queued(view) if world.setup.longest_hold else {}
     for transaction in transactions(world):
         transaction.queued = ranks.get(transaction, 0.0)
-        transaction.first_byte = transaction.last_byte = transaction.ended_at = transaction.refused_until = -inf
-        transaction.exchanges_ahead = 0
-        transaction.settling_ahead = 0.0
-        transaction.refused_cycles = 0
-        transaction.late = False
-        transaction.attempts = min(transaction.attempts, 1)
-        if transaction.priority <= COMMAND:
-            transaction.deadline = inf
+        _past_request(transaction)
         if not (limited and transaction is world.arbiter._wire.transaction) and not world.frozen:
             transaction.started = -inf
+
+
+def _past_request(transaction: Transaction) -> None:
+    transaction.first_byte = transaction.last_byte = transaction.ended_at = transaction.refused_until = -inf
+    transaction.exchanges_ahead = 0
+    transaction.settling_ahead = 0.0
+    transaction.refused_cycles = 0
+    transaction.late = False
+    transaction.attempts = min(transaction.attempts, 1)
+    if transaction.priority <= COMMAND:
+        transaction.deadline = inf
 
 
 def _ranks_of_queued(view: View) -> dict[Transaction, Time]:
@@ -247,7 +251,7 @@ def past_waiting(view: View) -> None:
         backlog._streak = 0
     backlog._streak_before, backlog._rotated_before = 0, BACKGROUND
     if isinstance(backlog, SharedBacklog) and isinstance(world, SharingWorld):
-        _past_turns(backlog, world.ranks)
+        _past_turns(view, backlog, world.ranks)
 
 
 def _past_queue(queue: Queue) -> None:
@@ -261,14 +265,23 @@ def _past_queue(queue: Queue) -> None:
         queue._order = count()
 
 
-def _past_turns(backlog: SharedBacklog, ranks: dict[LineClient, int]) -> None:
+def _past_turns(view: View, backlog: SharedBacklog, ranks: dict[LineClient, int]) -> None:
     """What turns cost is counted by nobody, in what order they were had neither. Of what was taken out last it is asked
-    whether a sequence begins with it, and since when."""
+    whether a sequence begins with it, in which class, and since when, unless that is longer ago than it may last: then
+    it is over as it begins. How it ended is not."""
     backlog._payer = None
     last = backlog._last
     hold = None if last is None else last.client
-    if not isinstance(hold, Hold) or hold.holds or hold.over:
+    if last is None or not isinstance(hold, Hold) or hold.holds or hold.over:
         backlog._last, backlog._attempts, backlog._since = None, 0, -inf
+    else:
+        if view.past(backlog._since, hold.longest):
+            backlog._since = -inf
+        if last.phase is ENDED:
+            _past_request(last)
+            last.queued, last.started, last.tag, last.value, last.error = 0.0, -inf, None, None, None
+            last.retried = last.refusals = 0
+            last.wanted, last.unsure = True, False
     for turns in backlog._turns:
         kept = [turn for turn in turns._turns.values() if turn.queue.live or turn is turns._next or turn.client is OWN]
         turns._turns = OrderedDict((turn.client, turn) for turn in sorted(kept, key=lambda turn: ranks[turn.client]))

@@ -59,6 +59,9 @@ class SharingWorld(World):
 
     def pump(self) -> None:
         super().pump()
+        deadlines = self.arbiter._deadlines
+        if deadlines.hold < self.now:  # it began long ago: what is overdue is due now, before any time passes
+            deadlines.hold = self.now
         sequence = self.sequence
         if sequence is not None and sequence.over and all(ticket.client is not sequence for ticket in self.live):
             on_wire = self.arbiter._wire.transaction

@@ -128,6 +128,12 @@ def without_what_began(view: View) -> None:
         backlog._last = None
 
 
+def without_when_it_began(view: View) -> None:
+    backlog = view.world.arbiter.dispatcher.backlog
+    if isinstance(backlog, SharedBacklog):
+        backlog._since = -inf
+
+
 @pytest.mark.parametrize(
     ("forget", "setup"),
     [
@@ -148,6 +154,7 @@ def without_what_began(view: View) -> None:
         (without_what_is_held, HOLDS),
         (without_what_is_being_said, MSC),
         (without_what_began, SEQUENCES),
+        (without_when_it_began, SEQUENCES),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )

@@ -208,6 +208,17 @@ def with_no_deadline_behind_a_first_byte(patch: Any) -> None:
     patch.setattr(Leg, "gap_over", lambda leg, now: inf)
 
 
+def with_a_deadline_that_is_past(patch: Any) -> None:
+    """What is due before now leaves no time in which anything could happen."""
+    right, short = LineMachine._settle, tick()
+
+    def settle(line: LineMachine, now: float, begun: bool = False) -> None:
+        right(line, now, begun)
+        line._deadlines.line = now - short
+
+    patch.setattr(LineMachine, "_settle", settle)
+
+
 def with_damage_that_completes(patch: Any) -> None:
     """A checksum that is not looked at."""
     right = readers.find_etx
@@ -289,6 +300,7 @@ def with_what_a_sequence_leaves_behind(patch: Any) -> None:
         (without_unconfirmed_writes, replace(LINE, adversary=(LOSS,)), "R7"),
         (with_a_request_that_is_forgotten, replace(LINE, adversary=(NAKS,)), "R8"),
         (with_no_deadline_behind_a_first_byte, LINE, "progress"),
+        (with_a_deadline_that_is_past, LINE, "progress"),
         (with_damage_that_completes, replace(LINE, adversary=(FLIPS,)), "R5"),
         (with_two_said_at_once, replace(LINE, adversary=(HELD,)), "R1"),
         (without_sequences, SEQUENCES, "R9"),
