@@ -15,13 +15,19 @@ class Addressed(Protocol):
     """What an error is told of the node that it is about."""
 
     @property
-    def line(self) -> str: ...
+    def line(self) -> str:
+        """The line on which it happened, "" where that is not known."""
+        ...
 
     @property
-    def label(self) -> str: ...
+    def label(self) -> str:
+        """What messages call the node, "" where it is about none."""
+        ...
 
     @property
-    def address(self) -> int: ...
+    def address(self) -> int:
+        """The node's address, None where it is about none."""
+        ...
 
 
 class InvalidCommand(ValueError):

@@ -129,10 +129,14 @@ class Requester(Protocol):
         ...
 
     @property
-    def address(self) -> int: ...
+    def address(self) -> int:
+        """The node's address in its protocol."""
+        ...
 
     @property
-    def profile(self) -> Profile: ...
+    def profile(self) -> Profile:
+        """The profile of the node's protocol."""
+        ...
 
     @property
     def stops(self) -> int:

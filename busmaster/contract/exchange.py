@@ -100,7 +100,9 @@ class Exchange(Protocol[T_co]):
     """One attempt at one command: the bytes to send and a reader for what comes back. Fresh per attempt."""
 
     @property
-    def request(self) -> bytes: ...
+    def request(self) -> bytes:
+        """The bytes with which it begins."""
+        ...
 
     @property
     def timing(self) -> ReplyTiming:

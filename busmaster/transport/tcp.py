@@ -54,6 +54,7 @@ class TcpPort:
 
     @property
     def name(self) -> str:
+        """What messages call the port: HOST:PORT."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{host}:{self.port}"
 

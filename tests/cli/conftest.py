@@ -114,6 +114,7 @@ port = "PORT?baudrate=57600"
 [nodes.winder]
 protocol = "hcp2"
 address = 1
+timing = { window = 0.3 }
 points.force = { item = "10", unit = "N", factor = 0.1, maximum = 50 }
 [groups.fast]
 period = 0.02
@@ -121,6 +122,7 @@ points = ["winder/force"]
 [outputs.sqlite]
 path = "FOLDER/line.sqlite"
 """
+"""The window is for a busy machine: the emulated controllers answer from a thread of the test's own process."""
 
 
 @pytest.fixture

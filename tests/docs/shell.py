@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import mkdtemp
 
 from tests.docs.pages import ROOT, Block
 from tests.patience import PATIENCE
@@ -191,13 +194,14 @@ class Shell:
         self.folder = folder / "page"
         self.replace = Replacing()
         self._programs = folder / "bin"
-        self._run_time = folder / "run"
-        for path in (self.folder, self._programs, self._run_time):
-            path.mkdir(mode=0o700)
+        self._run_time = Path(mkdtemp(prefix="busmaster-"))  # short: the path of a socket has 107 characters at most
+        for path in (self.folder, self._programs):
+            path.mkdir()
         self._program("busmaster", f'exec {shlex.quote(sys.executable)} -m busmaster "$@"')
         for name in ("python", "python3"):
             self._program(name, f'exec {shlex.quote(sys.executable)} "$@"')
-        self._going: list[Running] = []
+        self._leaving = ExitStack()
+        self._leaving.callback(shutil.rmtree, self._run_time)
         self._status = 0
 
     def _program(self, name: str, text: str) -> None:
@@ -209,8 +213,7 @@ class Shell:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for going in reversed(self._going):
-            going.interrupt()
+        self._leaving.close()
 
     @property
     def environment(self) -> dict[str, str]:
@@ -238,7 +241,7 @@ class Shell:
         if port.startswith("socket://"):
             self._start(f"busmaster emulate {drives} --tcp {port.removeprefix('socket://')}", place)
             return
-        link = self._run_time / f"line-{len(self._going)}"
+        link = self._run_time / port.replace("/", "-")
         self._start(f"busmaster emulate {drives} --pty {link}", place)
         self.replace.device(port, link)
 
@@ -267,7 +270,7 @@ class Shell:
     def _start(self, text: str, place: str, command: Command | None = None) -> None:
         """Start what goes on, and wait until it has said what is shown of it; end it where that is shown."""
         going = Running(self._bash(text), self.folder, self.environment)
-        self._going.append(going)
+        self._leaving.callback(going.interrupt)
         shown, ends, after = (command.shown if command else "").partition(f"{CTRL_C}\n")
         vary = command is not None and command.vary
         found = going.await_lines(shown, vary, self.replace)

@@ -17,7 +17,6 @@ from busmaster.arbiter.turns import PASSED_BY_EACH
 from busmaster.errors import BusError, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.service.messages import MOST_HOLDS, MOST_REQUESTS, MOST_UNDER_WAY
-from busmaster.transport.pump import Waiter
 from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until
 
 MANY = MOST_REQUESTS + MOST_REQUESTS // 2
@@ -26,13 +25,14 @@ MANY = MOST_REQUESTS + MOST_REQUESTS // 2
 def watched(line: Served) -> list[Transaction]:
     """What is asked on the line from now on, in its order."""
     asked: list[Transaction] = []
-    begin = line.bus.pump.begin
+    arbiter = line.bus.shared.arbiter
+    submit = arbiter.submit
 
-    def watch(transaction: Transaction, waiter: Waiter) -> None:
+    def watch(transaction: Transaction, now: float) -> bool:
         asked.append(transaction)
-        begin(transaction, waiter)
+        return submit(transaction, now)
 
-    line.bus.pump.begin = watch  # type: ignore[method-assign]  # what goes out is seen here
+    arbiter.submit = watch  # type: ignore[method-assign]  # what goes out is seen here
     return asked
 
 

@@ -1,0 +1,135 @@
+"""What is made of the program itself: the reference of LINE.toml, of the command line and of the API, the manual page.
+
+`python -m tests.docs.reference` writes the files; a test holds that they are today's.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Iterator
+from importlib import import_module
+
+import busmaster
+from busmaster.config.keys import REQUIRED, Key
+from busmaster.config.schema import tables
+from tests.docs.command_line import manual, page
+from tests.docs.pages import ROOT
+
+KINDS = {
+    "text": "text",
+    "flag": "true or false",
+    "whole": "whole number",
+    "number": "number",
+    "seconds": "number",
+    "texts": "text, or list of texts",
+    "wholes": "list of whole numbers",
+    "table": "table",
+    "mode": "text, octal",
+    "delay": "number, or list of two",
+    "address": "whole number, or range as text",
+    "timing": "table or text",
+    "port": "text or table",
+}
+
+
+def line_toml() -> str:
+    """The reference of LINE.toml, in Markdown."""
+    return "\n".join(_line_toml())
+
+
+def _line_toml() -> Iterator[str]:
+    yield """# LINE.toml
+
+One file describes a line: its port, its nodes, what is polled and where the values go. This page is made of the
+declarations by which the program reads the file: each key with its type, unit, range, default and meaning. A key that
+is not here is an error, with its line in the file and the nearest key that there is.
+[examples/line.toml](../../examples/line.toml) is a whole file with remarks.
+
+All times are in seconds. A key without a default may be left out; its meaning says what holds then.
+"""
+    for table in tables():
+        yield f"## {_titled(table.header)}\n\n{table.about}\n"
+        yield "| key | type | default | meaning |\n|---|---|---|---|"
+        for key in table.keys:
+            yield f"| `{key.name}` | {_type(key)} | {_default(key)} | {key.about} |"
+        yield ""
+
+
+def _titled(header: str) -> str:
+    """A header as a title, with what is code in backquotes."""
+    code, closing, rest = header.partition("]")
+    return f"`{code}]`{rest}" if closing else f"`{header}`" if "=" in header else header
+
+
+def _type(key: Key) -> str:
+    text = " or ".join(f'`"{choice}"`' for choice in key.choices) or KINDS[key.kind]
+    if key.unit:
+        text += f", {key.unit}"
+    if key.least > -math.inf and key.most < math.inf:
+        most = f"{key.most:g}" if key.most < 1e6 else f"{int(key.most):_d}"
+        text += f", {key.least:g} to {most}"
+    elif key.least > -math.inf:
+        text += f", {key.least:g} or more"
+    elif key.most < math.inf:
+        text += f", at most {key.most:g}"
+    return text
+
+
+def _default(key: Key) -> str:
+    if key.default == REQUIRED:
+        return "must be there"
+    return f"`{key.default}`" if key.default else ""
+
+
+def api() -> str:
+    """The reference of the API, in Markdown: the site puts in what the docstrings say."""
+    return "\n".join(_api())
+
+
+def _api() -> Iterator[str]:
+    yield """# The API
+
+Every public name, from the docstrings of this very version; [what is public](../public-api.md) says how names change.
+Times are in seconds and baud rates in bits a second, unless a name or a docstring says otherwise. A wrong argument
+raises `InvalidCommand` before anything is sent. On a code host this page is a list of modules: the site has the texts,
+and so has `help(busmaster.Bus)`. What a module shares with `busmaster` itself is shown there.
+"""
+    table = (ROOT / "docs" / "public-api.md").read_text()
+    yield _module("busmaster", "applications", [])
+    for name, who in re.findall(r"^\| `(busmaster\.[\w.]+)` \| (.*) \|$", table, re.MULTILINE):
+        module = import_module(name)
+        shared = [each for each in module.__all__ if each in busmaster.__all__ and callable(getattr(module, each))]
+        yield _module(name, who, shared)
+
+
+def _module(name: str, who: str, without: list[str]) -> str:
+    options = "".join(f"   :exclude-members: {', '.join(without)}\n" for _ in without[:1])
+    if not without:
+        options = "   :inherited-members: BaseException, Enum, int, object, tuple\n"
+    directive = f".. automodule:: {name}\n   :members:\n   :undoc-members:\n{options}"
+    return f"## {name}\n\nFor {who}.\n\n```{{eval-rst}}\n{directive}```\n"
+
+
+def files() -> dict[str, str]:
+    """Every file that is made, by its path, with its text."""
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    return {
+        "docs/reference/line-toml.md": line_toml(),
+        "docs/reference/command-line.md": page(),
+        "docs/reference/api.md": api(),
+        "share/man/man1/busmaster.1": manual(version),
+    }
+
+
+def main() -> None:
+    """Write them."""
+    for name, text in files().items():
+        path = ROOT / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+
+if __name__ == "__main__":
+    main()
