@@ -254,6 +254,16 @@ def test_a_sequence_that_never_sent_anything_held_nothing() -> None:
     assert table.bench.served(table.bench.ask(table.node)).error is None
 
 
+def test_sequences_that_come_and_go_leave_nothing() -> None:
+    table = Table()
+    for _ in range(50):
+        hold = table.hold()
+        table.bench.served(table.bench.ask(table.node, WRITE, client=hold))
+        table.bench.served(table.bench.ask(table.node, hcp2.Read(1), client=hold))
+        table.release(hold)
+    assert all(len(turns._turns) == 1 for turns in table.arbiter.dispatcher.share()._turns)
+
+
 def test_r8_a_lost_line_ends_what_waits_of_a_sequence_and_what_waits_for_it() -> None:
     table = Table()
     bench, hold = table.bench, table.hold()

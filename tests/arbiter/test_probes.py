@@ -284,6 +284,16 @@ def test_r11_a_request_to_a_dead_node_may_spend_what_the_line_has_earned_until_n
     assert probes.spare(0.1, 5.1)
 
 
+def test_r11_a_node_whose_probe_is_overdue_is_not_kept_waiting_by_one_that_is_not_due() -> None:
+    overdue, later = node(), node()
+    overdue.health = later.health = DOWN
+    overdue.probe_at, overdue.probed_at = 6.0, 5.0
+    later.probe_at, later.probed_at = 30.0, 1.0
+    probe = Probes(Deadlines(), [later, overdue], 0.0).next(7.0, usable=True, idle=False)
+    assert probe is not None
+    assert probe.node is overdue
+
+
 def test_r11_an_owner_may_probe_at_any_time() -> None:
     bench = Bench()
     record = dead(bench)

@@ -59,15 +59,18 @@ class SharingWorld(World):
 
     def pump(self) -> None:
         super().pump()
-        deadlines = self.arbiter._deadlines
-        if deadlines.hold < self.now:  # it began long ago: what is overdue is due now, before any time passes
-            deadlines.hold = self.now
         sequence = self.sequence
         if sequence is not None and sequence.over and all(ticket.client is not sequence for ticket in self.live):
             on_wire = self.arbiter._wire.transaction
             if on_wire is None or on_wire.client is not sequence:
                 self.sequence = None
                 self.held_until = -inf
+
+    def _check_rest(self) -> None:
+        deadlines = self.arbiter._deadlines
+        if deadlines.hold < self.now:  # it began long ago: what is overdue is due now, before any time passes
+            deadlines.hold = self.now
+        super()._check_rest()
 
     def is_held(self) -> bool:
         due: Time = self.arbiter._deadlines.hold
