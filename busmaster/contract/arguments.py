@@ -49,10 +49,17 @@ def seconds(value: object, what: str) -> float:
     if type(value) is float:  # as nearly all are: to ask what else is a number takes longer than all the rest
         number = value
     else:
-        number = nan if isinstance(value, bool) or not isinstance(value, Real) else float(value)
+        number = nan if isinstance(value, bool) or not isinstance(value, Real) else _float(value)
     if not 0 <= number < inf:
         raise InvalidCommand(f"{what} is a time of 0 s or more, not {value!r}")
     return number
+
+
+def _float(value: Real) -> float:
+    try:
+        return float(value)
+    except OverflowError:  # a whole number of some hundred digits
+        return inf
 
 
 def is_decimal(text: str) -> bool:

@@ -11,7 +11,16 @@ from busmaster.service.messages import BUS_ERROR, INTERNAL, INVALID_PARAMS, Malf
 FIELDS = ("what", "line", "label", "address", "command", "attempts", "hint")
 DEEPEST = 5
 """Causes behind causes that are told."""
-REFUSED = (BusError, Malformed, KeyError, TypeError, ValueError, AttributeError)
+REFUSED = (
+    BusError,
+    Malformed,
+    KeyError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    OverflowError,  # a number of some hundred digits
+    RecursionError,  # a list in a list in a list
+)
 """What may be raised of a request: by the line, and by parameters that are not what they should be."""
 KNOWN: dict[str, type[BusError]] = {
     name: thing

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections import deque
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 from busmaster.service.client import Client
 from busmaster.service.connection import GOING_AWAY, POLICY, ServedConnection
-from busmaster.service.messages import HELLO_WITHIN, INVALID_PARAMS, LONGEST_REQUEST, Malformed, read_request, written
+from busmaster.service.messages import (
+    HELLO_WITHIN,
+    INTERNAL,
+    INVALID_PARAMS,
+    LONGEST_REQUEST,
+    Malformed,
+    read_request,
+    written,
+)
 from busmaster.service.peers import Peer
 
 if TYPE_CHECKING:
@@ -82,6 +91,7 @@ class Visit:
         self._messages: deque[str | bytes] = deque()
         self._queued = False
         self._ended = False
+        self._log = logging.getLogger("busmaster.service")
         self._stranger = asyncio.get_running_loop().call_later(HELLO_WITHIN, self._wait_no_longer)
 
     # what the connection tells
@@ -129,6 +139,9 @@ class Visit:
                 self.client.take(said)
         except Malformed as error:
             self._send_away(error)
+        except Exception as bug:  # unheard, it would wait for ever to be read on, and keep its place
+            self._log.exception("a message of %s could not be taken", self.peer)
+            self._send_away(Malformed(f"the program that owns the line failed: {type(bug).__name__}: {bug}", INTERNAL))
         else:
             self._go_on()
 

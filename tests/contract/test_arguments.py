@@ -44,7 +44,7 @@ def test_a_time_is_0_s_or_more(value: Any) -> None:
     assert type(seconds(value, "a pause")) is float
 
 
-@pytest.mark.parametrize("value", [-0.001, -1, inf, -inf, nan, True, "1", None])
+@pytest.mark.parametrize("value", [-0.001, -1, inf, -inf, nan, 10**310, -(10**310), True, "1", None])
 def test_anything_else_is_no_time(value: Any) -> None:
     with pytest.raises(InvalidCommand, match="a pause is a time of 0 s or more, not"):
         seconds(value, "a pause")

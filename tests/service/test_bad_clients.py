@@ -9,11 +9,13 @@ import random
 import re
 import socket
 import stat
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import Frame, Opcode
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, Service, connect
 from busmaster.emulator.line import Line
@@ -23,11 +25,14 @@ from busmaster.gate.record import WriteRecord
 from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.registry import make_device
 from busmaster.service import messages
+from busmaster.service.client import Client
 from busmaster.service.folder import Owner, ServedSocket, find_owner, line_name, owners, runtime_folder, socket_path
 from busmaster.service.outbox import Outbox
 from tests.patience import PATIENCE
 from tests.service.lines import ABSENT, PATIENT, Served, SlowWay, on_a_line, on_a_served_line, raw, until
 
+ENORMOUS = 10**310
+"""JSON has it, and no float is as large."""
 READ = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
 
 UPGRADE = (
@@ -41,7 +46,7 @@ UPGRADE = (
 
 def test_a_write_is_on_record_with_who_wrote_what_and_what_it_was_before(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
-        point = Hcp2Controller(line.bus, 5).point("1")
+        point = Hcp2Controller(line.bus, 5, timings=PATIENT).point("1")
         group = line.bus.poll_group("axes", period=0.02, points=[point])
         async for snapshot in group:
             if snapshot[point].value == 0.0:
@@ -164,6 +169,9 @@ def test_garbage_ends_the_conversation_with_its_reason(said: str | bytes, compla
         ("subscribe", {"group": "axes", "stream": 1}, "no poll group 'axes'"),
         ("poll", {"name": "x", "stream": 1, "period": 0, "points": []}, "period"),
         ("poll", {"name": "x", "stream": 1, "period": 1, "points": [{**READ, "command": {}}]}, "has no command"),
+        ("poll", {"name": "x", "stream": 1, "period": ENORMOUS, "points": []}, "a period is a time"),
+        ("request", {**READ, "asked": ENORMOUS}, "asked is a time"),
+        ("request", {**READ, "options": {"finish_within": ENORMOUS}}, "finish_within is a time"),
         ("events", {"stream": -1}, "a stream"),
         ("erase", {}, "no method 'erase'"),
     ],
@@ -180,6 +188,43 @@ def test_what_cannot_be_asked_is_refused_in_words_and_the_conversation_goes_on(
             assert (await client.ask("request", **READ))["result"] == 0
         await line.alone()
         assert (line.bus.nodes, line.bus.groups) == ((), ())
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_value_that_is_too_large_for_a_number_is_refused_in_words(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        line.bus.poll_group("axes", period=0.02, points=[Hcp2Controller(line.bus, 5).point("1")])
+        async with raw(line) as client:
+            said = await client.ask("write", group="axes", key="5/1", value={"float": ENORMOUS})
+            assert "request: OverflowError" in said["error"]["message"]
+            assert len((await client.ask("groups"))["result"]) == 1
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_message_that_the_owner_fails_at_ends_its_program_and_keeps_no_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    usual = Client.take
+
+    def take(client: Client, said: Mapping[str, Any]) -> None:
+        if said["method"] == "groups":
+            raise ZeroDivisionError("a bug")
+        usual(client, said)
+
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            monkeypatch.setattr(Client, "take", take)
+            both = (messages.written({"id": 1, "method": method}).encode() for method in ("now", "groups"))
+            frames = [Frame(Opcode.TEXT, said).serialize(mask=True) for said in both]
+            client.connection.transport.write(b"".join(frames))  # the second waits for its turn
+            assert "result" in await client.hear()
+            assert "failed: ZeroDivisionError: a bug" in (await client.hear())["error"]["message"]
+            with pytest.raises(ConnectionClosed):
+                await client.hear()
+        await line.alone()
+        assert "a message of" in caplog.text
 
     on_a_line(tmp_path, story)
 
