@@ -25,7 +25,8 @@ FILES = {
     "/run/busmaster": "Those of lines that are services of the system.",
 }
 LINE, TCP = "/dev/ttyUSB0", "socket://127.0.0.1:5020"
-RUN, CTRL_C, LONG, BROWSER = "", "Ctrl-C", "not run: takes long", "not run: needs a browser"
+RUN, CTRL_C = "", "Ctrl-C"
+LONG, TERMINAL, DRIVES = "not run: takes long", "not run: needs a terminal", "not run: needs hardware"
 EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "demo": (("demo --plain", CTRL_C),),
     "read": ((f"read {LINE} --protocol hcp2 --node 5 1 axis0.position", RUN),),
@@ -38,18 +39,18 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "discover": ((f"discover {LINE} --yes -o found.toml", LONG),),
     "emulate": (
         ("emulate --protocol hcp2 --nodes 1-8 --pty line", CTRL_C),
-        ("emulate line.toml", LONG),
+        ("emulate line.toml --tcp 127.0.0.1:0", CTRL_C),
     ),
     "run": (("run line.toml", CTRL_C),),
     "serve": (("serve line.toml", CTRL_C),),
     "status": (("status", RUN),),
-    "top": (("top", LONG),),
-    "web": (("web --bind 127.0.0.1:8420", BROWSER),),
-    "opcua": (("opcua --allow 'drive*/speed_reference'", LONG),),
-    "safe": (("safe line.toml", LONG),),
+    "top": (("top", TERMINAL),),
+    "web": (("web --bind 127.0.0.1:8420", CTRL_C),),
+    "opcua": (("opcua --allow 'drive*/speed_reference'", CTRL_C),),
+    "safe": (("safe line.toml", DRIVES),),
     "plan": (("plan line.toml", RUN),),
     "points": (("points line.toml --csv >points.csv", RUN), ("points line.toml --from points.csv", RUN)),
-    "monitor": ((f"monitor {LINE} --protocol hcp2", LONG),),
+    "monitor": ((f"monitor {LINE} --protocol hcp2", DRIVES),),
     "doctor": ((f"doctor {LINE} --protocol hcp2 --nodes 1-8", LONG),),
     "replay": (
         (f"read {LINE} --protocol hcp2 --node 5 1 --capture line.pcapng", RUN),
@@ -80,7 +81,8 @@ def described(command: click.Command, name: str = "") -> Described:
     context = click.Context(command, top, info_name=name) if name else top
     usage = " ".join(command.collect_usage_pieces(context))
     text = inspect.cleandoc(command.help or "")
-    options = [one for one in command.get_params(context) if isinstance(one, click.Option) and "--help" not in one.opts]
+    parameters = [one for one in command.get_params(context) if isinstance(one, click.Option) and not one.hidden]
+    options = [option for option in parameters if "--help" not in option.opts]
     return Described(
         name,
         f"busmaster {name} {usage}".replace("  ", " "),

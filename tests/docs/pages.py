@@ -23,6 +23,7 @@ REASONS = (
     "needs the network",
     "needs another machine",
     "needs a browser",
+    "needs a terminal",
     "takes long",
 )
 """Why a block of commands is not run."""
