@@ -206,6 +206,19 @@ def test_r9_sequences_of_one_program_in_a_row_alternate_with_the_requests_of_all
         assert any(bench.ended(transaction) for transaction in queue)
 
 
+def test_r9_behind_a_sequence_goes_what_waits_in_a_lower_class() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold()
+    write = bench.ask(table.node, WRITE, client=hold)
+    command = bench.ask(table.there, hcp2.Read(20))
+    lower = bench.ask(table.there, hcp2.Read(21), priority=BACKGROUND)
+    bench.served(write)
+    table.release(hold)
+    bench.served(lower)
+    bench.served(command)
+    assert lower.started < command.started
+
+
 def test_r10_polls_that_were_due_meanwhile_are_counted_as_missed() -> None:
     table = Table()
     bench = table.bench
