@@ -29,7 +29,7 @@ class AlarmChanged:
 
     @property
     def text(self) -> str:
-        """It in a sentence."""
+        """Say in a sentence what began or ended, with the value and its unit."""
         crossed = f"{'above' if self.limit == 'high' else 'below'} its {self.limit} of {self._text(self.bound)}"
         if self.active:
             return f"{self.point.key} = {self._text(self.value)} is {crossed}"

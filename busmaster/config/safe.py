@@ -43,7 +43,7 @@ KEYS = (
     Key(
         "within",
         "number",
-        "The time for all of it. What is not confirmed by then is named, and the exit status is 1.",
+        "The time for all of it, more than 0. What is not confirmed by then is named, and the exit status is 1.",
         f"{WITHIN:g}",
         "s",
         least=0,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import math
 import textwrap
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
@@ -18,7 +19,7 @@ from busmaster.registry import Option, kinds
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
-LATENCY = "How long the adapter or the device server may hold bytes back: FTDI's latency timer, say."
+LATENCY = "How long the adapter or the serial server may hold bytes back: FTDI's latency timer, say."
 ECHO = "Whether what is sent is heard too, as on some two-wire adapters. It is compared byte for byte."
 SERIAL = {
     "path": "The device, a link to it, or `usb:SERIAL`.",
@@ -35,7 +36,7 @@ SERIAL = {
     "paced": "Whether bytes leave at the baud rate. By default so for a serial device, and not for a pseudo-terminal.",
 }
 TCP = {
-    "host": "The name or address of the device server.",
+    "host": "The name or address of the serial server.",
     "port": "Its TCP port, on which it passes raw bytes.",
     "baudrate": "The baud rate behind it: reply windows run from the end of the request there.",
     "receive_latency": LATENCY,
@@ -50,7 +51,7 @@ POINT = {
     "decimals": "How many of the number's last digits are decimals, where the line carries no point.",
     "minimum": "The least that may be written, in its unit, by whatever name and whoever writes.",
     "maximum": "The most that may be written, likewise.",
-    "max_step": "How far a write may be from the last value that was confirmed.",
+    "max_step": "How far a write may be from the last value that was confirmed; more than 0.",
     "writable": "Whether it may be written at all.",
     "precision": "Digits behind the point that people are shown. Nothing else is rounded.",
     "bits": "Names of the word's bits, 0 the lowest, each a point of its own: `bits = { READY = 0, FAULT = 3 }`.",
@@ -70,8 +71,8 @@ OUTPUTS = {
     "spill": "The file for what waits while the output is down, and over a restart. Best on another disk.",
     "spill_values": "The most values that wait in that file.",
     "sync_every": "After so long at most what was written survives a loss of power, too; 0: after each batch.",
-    "keep_days": "What is older is deleted.",
-    "keep_mb": "The oldest is deleted where the database is larger.",
+    "keep_days": "What is older is deleted. More than 0; all is kept by default.",
+    "keep_mb": "The oldest is deleted where the database is larger. More than 0; all is kept by default.",
     "host": "The broker; of metrics, where they are served.",
     "port": "The TCP port there.",
     "prefix": "What all topics begin with.",
@@ -107,7 +108,7 @@ def tables() -> Iterator[TableKeys]:
     serial = keys_of(SerialPort, SERIAL, rs485={"kind": "flag"}, **framing, **bounds)
     yield TableKeys("[port]", "A serial port as a table.", serial)
     tcp = keys_of(TcpPort, TCP, port={"least": 1, "most": 65535}, baudrate={"least": 1}, **bounds)
-    yield TableKeys("[port] with host", "A serial device server as a table.", tcp)
+    yield TableKeys("[port] with host", "A serial server as a table.", tcp)
     common = "What holds for all nodes of one protocol that do not say otherwise. Its options may stand here too."
     yield TableKeys("[protocols.NAME]", common, sections.SHARED_KEYS)
     yield TableKeys("[nodes.NAME]", "A node; several where NAME is a range, as drive4-7.", sections.NODE_KEYS)
@@ -132,7 +133,7 @@ def tables() -> Iterator[TableKeys]:
 def point_keys() -> tuple[Key, ...]:
     """Return what may be said of a point."""
     digits = {"kind": "whole", "least": 0, "most": MOST_DIGITS}
-    named = {"kind": "table"}
+    named = {"kind": "table", "least": -math.inf}
     seconds = {"kind": "seconds", "unit": "s"}
     own = keys_of(PointSection, POINT, without=NOT_SAID, item={"default": ""})
     meaning = keys_of(
@@ -143,7 +144,7 @@ def point_keys() -> tuple[Key, ...]:
 
 def _outputs() -> Iterator[TableKeys]:
     enabled = Key("enabled", "flag", OUTPUTS["enabled"], "true")
-    mode = {"mode": {"kind": "mode", "default": '"0640"'}}
+    mode = {"mode": {"kind": "mode", "default": '"0640"', "least": -math.inf}}
     changes = {"sync_every": {"unit": "s"}, "keep_days": {"unit": "days"}, "keep_mb": {"unit": "MB"}}
     for name, kind in KINDS.items():
         about = OUTPUTS | {"path": PATHS.get(name, "")}

@@ -80,12 +80,12 @@ NODE_KEYS = (
 )
 """What every node's table may say; its kind's options come to it."""
 GROUP_KEYS = (
-    Key("period", "seconds", "From one cycle to the next.", REQUIRED, "s", least=0),
+    Key("period", "seconds", "From one cycle to the next.", REQUIRED, "s", least=0.001),
     Key("points", "texts", 'What is read: `"drive4-7/speed_measured,current"` is eight points.', REQUIRED),
     Key(
         "phase",
         "seconds",
-        "When in its period it begins. By itself it keeps out of the others' way.",
+        "When in its period, and before its end, it begins. By itself it keeps out of the others' way.",
         unit="s",
         least=0,
     ),

@@ -62,9 +62,9 @@ class Faults:
     duplicate: float = 0.0
     """A second device with the same address answers too, after a delay of its own."""
     leading: float = 0.0
-    """A few noise bytes before it (a driver switched on): never one of `NO_NOISE`."""
+    """A few noise bytes before it (a driver switched on): never an ACK, NAK, EOT or BS."""
     trailing: float = 0.0
-    """A few noise bytes glued to its end: never one of `NO_NOISE`."""
+    """A few noise bytes glued to its end: never an ACK, NAK, EOT or BS."""
     forged: float = 0.0
     """An unasked ACK, NAK or EOT in front of it."""
     babble: float = 0.0
@@ -78,7 +78,7 @@ class Faults:
     flapping: float = 0.0
     """It goes away for up to `away_for` seconds when a request comes."""
     restart: float = 0.0
-    """Likewise, and what was in its RAM is lost."""
+    """It goes away as by `flapping`, and what was in its RAM is lost."""
     dead: float = 0.0
     """Above 0: it hears and says nothing."""
     drop: float = 0.0

@@ -80,6 +80,16 @@ def test_r3_bytes_after_a_reply_settle_but_the_value_stands() -> None:
     assert bench.until_sent() == pytest.approx(LATENESS - 0.002)
 
 
+def test_r3_what_comes_behind_a_reply_is_told_as_nobodys() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node())
+    bench.sent()
+    bench.hear(f"{FIVE} 41 42", after=0.004)
+    assert read.value == 5.0
+    assert [event.data for event in bench.events if isinstance(event, CameUnasked)] == [b"AB"]
+    assert bench.arbiter.statistics(bench.now).unasked_bytes == 2
+
+
 def test_r3_unasked_bytes_on_an_idle_line_settle_too() -> None:
     bench = Bench()
     node = bench.node()

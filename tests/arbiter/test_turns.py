@@ -132,6 +132,18 @@ def test_r9_line_time_is_shared_evenly_where_one_takes_half_as_long_again() -> N
     assert served[quick] * 0.010 == pytest.approx(served[slow] * 0.015, rel=0.02)
 
 
+def test_r9_line_time_is_shared_evenly_by_those_who_ask_for_more_when_something_is_done() -> None:
+    desk = Desk()
+    slow, quick = desk.client(takes=0.015), desk.client(takes=0.010)
+    for client in (slow, quick):
+        desk.ask(client, 2)
+    for _ in range(500):
+        [served] = desk.serve()
+        desk.ask(served)
+    counted = Counter(desk.served)
+    assert counted[quick] * 0.010 == pytest.approx(counted[slow] * 0.015, rel=0.02)
+
+
 @pytest.mark.parametrize("share", [0.1, 0.5, 2.0])
 def test_r9_a_share_weighs_the_line_time_of_a_program(share: float) -> None:
     desk = Desk()
