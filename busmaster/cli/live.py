@@ -116,6 +116,8 @@ class Screen(App[int]):
         self.table = Table(self._row_line)
         self.foot = Static(id="foot")
         self._widths = column_widths(80)
+        self._frame: Frame | None = None
+        """Of the rows that are drawn: the picture may be another's by now, who has told nothing yet."""
         self._of_node: Mapping[tuple[str, int], Node] = {}
         self._of_group: Mapping[str, Group] = {}
         self._due = False
@@ -151,6 +153,7 @@ class Screen(App[int]):
             self.head.update(Text(fit(" waiting for the program that owns the line", self.size.width)))
             return
         self._widths = column_widths(self.size.width)
+        self._frame = frame
         self._of_node = self.picture.nodes
         groups = self.picture.groups
         self._of_group = {group.name: group for group in groups}
@@ -180,9 +183,9 @@ class Screen(App[int]):
         return not row.error, up, not row.alarm, row.quality not in ("late", "stale")
 
     def _row_line(self, row: Row, selected: bool) -> Text:
-        assert self.picture.frame is not None
+        assert self._frame is not None
         node, group = self._of_node.get((row.protocol, row.address)), self._of_group.get(row.group)
-        return row_line(row, node, group, self.picture.frame, self._widths, selected)
+        return row_line(row, node, group, self._frame, self._widths, selected)
 
     def _head(self, frame: Frame, groups: list[Group]) -> Text:
         width, room = self.size.width, max(1, self.size.height // 8)

@@ -344,6 +344,21 @@ async def test_while_the_owner_is_away_what_was_known_last_is_shown_with_why() -
 
 
 @pytest.mark.asyncio
+async def test_rows_stay_until_an_owner_that_is_back_has_told_its_own() -> None:
+    async with drawn(tell(Picture(), *three_drives())) as (screen, _, pilot):
+        screen.picture = Picture()
+        screen.take_picture()
+        await pilot.resize_terminal(90, 24)  # all rows are drawn again
+        await pilot.pause()
+        assert "waiting for the program that owns the line" in lines(screen)[0]
+        assert len(table(screen)) == 3
+        tell(screen.picture, *three_drives()[:2])
+        screen.take_picture()
+        await pilot.pause()
+        assert len(table(screen)) == 2
+
+
+@pytest.mark.asyncio
 async def test_keys_do_nothing_before_there_is_a_picture() -> None:
     async with drawn(Picture()) as (screen, line, pilot):
         assert "waiting for the program that owns the line" in lines(screen)[0]
