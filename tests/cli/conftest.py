@@ -150,6 +150,7 @@ def owner(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
             while not (found := re.search(r"is served at (unix:\S+)", said)):
                 said = process.stderr.readline()
                 assert said, "it ended"
+                assert "no other program can use this line" not in said, said
             yield process, found[1]
         finally:
             process.terminate()

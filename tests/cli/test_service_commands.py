@@ -398,10 +398,9 @@ def test_options_of_a_node_that_differ_from_the_owners_are_named_with_its_own(
 def test_status_lists_the_lines_of_the_system_too_and_which_of_them_are_not_for_this_user(
     busmaster: Command, file: Path, tmp_path: Path, three_controllers: TcpServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    system = tmp_path / "run" / "busmaster"
-    folder = system / "slitter"
-    folder.mkdir(parents=True)
-    monkeypatch.setattr("busmaster.service.folder.SYSTEM", system)
+    folder = tmp_path / "slitter"  # no deeper: a socket's path is short
+    folder.mkdir()
+    monkeypatch.setattr("busmaster.service.folder.SYSTEM", tmp_path)
     monkeypatch.setitem(ENVIRONMENT, "RUNTIME_DIRECTORY", str(folder))  # as systemd says it
     with owner("serve", str(file)) as (process, address):
         assert address == f"unix:{folder}/slitter.sock"
