@@ -250,7 +250,8 @@ def test_scan_and_poll_go_through_the_owner(busmaster: Command, file: Path, thre
         cycle = json.loads(ran.lines[0])
         assert (cycle["group"], cycle["samples"]["2/1"]["value"]) == ("poll", 0)
         ran = busmaster("poll", address, *HCP2, *options, "--seconds", "0.05", "--json")
-        assert ran.status == (0 if '"value": 0' in ran.out else 1)  # a busy machine may bring none in that time
+        # A busy machine may bring no value in that time, or one so late that it is counted and no longer told.
+        assert ran.status == 0 or (ran.status == 1 and '"value": 0' not in ran.out)
 
 
 def test_a_poll_whose_owner_ends_says_so(file: Path, three_controllers: TcpServer) -> None:
