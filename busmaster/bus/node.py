@@ -97,12 +97,12 @@ class Node:
 
     @property
     def profile(self) -> Profile:
-        """The profile of the node's protocol."""
+        """Return the profile of the node's protocol."""
         return self.record.profile
 
     @property
     def address(self) -> int:
-        """The node's address in its protocol."""
+        """Return the node's address in its protocol."""
         return self.record.address
 
     @property
@@ -151,7 +151,7 @@ class Node:
 
     @property
     def health(self) -> Health:
-        """What is known of the node: up, suspect, down or unknown."""
+        """Return what is known of the node: up, suspect, down or unknown."""
         return self.record.health
 
     def __repr__(self) -> str:
@@ -429,7 +429,7 @@ class Node:
 
     @property
     def suspended(self) -> bool:
-        """Whether it rests: its polls are not sent."""
+        """Return whether it rests: its polls are not sent."""
         return self.shared.now() < self.record.suspended_until
 
     def times_to_keep(self) -> tuple[LearnedTimes, ...]:

@@ -62,7 +62,7 @@ class Point(Generic[T]):
 
     @property
     def writable(self) -> bool:
-        """Whether the protocol has a write for it."""
+        """Return whether the protocol has a write for it."""
         return self.encode is not None
 
     @property

@@ -90,12 +90,12 @@ class PollGroup(Cycles):
 
     @property
     def points(self) -> tuple[Point[Any], ...]:
-        """The points that a cycle reads, in their order."""
+        """Return the points that a cycle reads, in their order."""
         return tuple(self._points)
 
     @property
     def period(self) -> float:
-        """The seconds from one cycle to the next."""
+        """Return the seconds from one cycle to the next."""
         return self._poll.period
 
     @property
@@ -105,7 +105,7 @@ class PollGroup(Cycles):
 
     @property
     def paused(self) -> bool:
-        """Whether its cycles rest."""
+        """Return whether its cycles rest."""
         return self._poll.paused
 
     def add(self, *points: Point[Any]) -> None:

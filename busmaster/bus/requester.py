@@ -130,12 +130,12 @@ class Requester(Protocol):
 
     @property
     def address(self) -> int:
-        """The node's address in its protocol."""
+        """Return the node's address in its protocol."""
         ...
 
     @property
     def profile(self) -> Profile:
-        """The profile of the node's protocol."""
+        """Return the profile of the node's protocol."""
         ...
 
     @property

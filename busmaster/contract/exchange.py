@@ -101,7 +101,7 @@ class Exchange(Protocol[T_co]):
 
     @property
     def request(self) -> bytes:
-        """The bytes with which it begins."""
+        """Return the bytes with which it begins."""
         ...
 
     @property

@@ -39,7 +39,7 @@ class LineSettings:
 
     @property
     def framing(self) -> str:
-        """Bits, parity and stop bits as people write them: 8N1, 7E1."""
+        """Return bits, parity and stop bits as people write them: 8N1, 7E1."""
         return f"{self.bytesize}{self.parity}{self.stopbits:g}"
 
     def at(self, *baudrates: int) -> tuple[LineSettings, ...]:

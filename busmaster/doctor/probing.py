@@ -88,7 +88,7 @@ class Wire(asyncio.Protocol):
 
     @property
     def tunable(self) -> bool:
-        """Whether the port can be set to other rates: a serial server's cannot, from here."""
+        """Return whether the port can be set to other rates: a serial server's cannot, from here."""
         return hasattr(self.transport, "tune")
 
     async def tune(self, settings: LineSettings) -> None:
