@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import FrozenInstanceError, astuple, fields, replace
 from typing import Any
 
 import pytest
 
 from busmaster.arbiter.counters import DriverErrors
+from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.protocols.hcp2 import codec as hcp2
-from tests.arbiter.bench import FIVE, Bench
+from tests.arbiter.bench import BAD_CHECKSUM, FIVE, NAK, SEVEN, TAU, Bench
 
+REQUEST = 8 * TAU
+Story = Callable[[Bench, NodeRecord], None]
 LINE = Bench().arbiter.statistics(1.0)
 NODE = Bench().node().counters.snapshot(0.150)
 
@@ -19,6 +23,95 @@ def test_nothing_is_counted_before_anything_has_happened() -> None:
     counts = ("exchanges", "tainted", "collisions", "noisy", "losses", "checks", "doubted", "breaks")
     assert [getattr(LINE, name) for name in counts] == [0] * len(counts)
     assert (NODE.attempts, NODE.failed, NODE.latency.count) == (0, 0, 0)
+
+
+def is_late(bench: Bench, node: NodeRecord) -> None:
+    bench.ask(node)
+    bench.sent()
+    bench.hear(FIVE, after=REQUEST + 0.060)
+
+
+def is_refused_twice(bench: Bench, node: NodeRecord) -> None:
+    bench.ask(node)
+    for _ in range(2):
+        bench.until_sent()
+        bench.sent()
+        bench.hear(NAK, after=0.004)
+
+
+def is_silent(bench: Bench, node: NodeRecord) -> None:
+    node.health = Health.UP
+    bench.ask(node, retries=1)
+    bench.sent()
+    bench.wait(0.120)
+
+
+def answers_something_else(heard: str, after: float) -> Story:
+    def story(bench: Bench, node: NodeRecord) -> None:
+        bench.ask(node, retries=0)
+        bench.sent()
+        bench.hear(heard, after)
+
+    return story
+
+
+def is_asked_and_not_waited_for(bench: Bench, node: NodeRecord) -> None:
+    on_the_wire, waiting = bench.ask(node), bench.ask(node)
+    bench.sent()
+    for asked in (on_the_wire, waiting):
+        bench.arbiter.cancel(asked, bench.now)
+    bench.answer()
+
+
+def speaks_unasked(count: int) -> Story:
+    def story(bench: Bench, node: NodeRecord) -> None:
+        for _ in range(count):
+            bench.hear("FF", after=0.010)
+
+    return story
+
+
+def vanishes_with_the_port(bench: Bench, node: NodeRecord) -> None:
+    bench.ask(node)
+    bench.sent()
+    bench.arbiter.line_down("unplugged", bench.now)
+    bench.listen()
+
+
+ONE = {"attempts": 1, "exchanges": 1, "completed": 1}
+FAILED = ONE | {"failed": 1}
+
+
+@pytest.mark.parametrize(
+    ("story", "line", "counts"),
+    [
+        (is_late, {}, ONE | {"ok": 1, "late": 1}),
+        (is_refused_twice, {}, FAILED | {"attempts": 2, "exchanges": 2, "refused": 2, "settles": 2}),
+        (is_silent, {}, {"attempts": 1, "exchanges": 1, "no_reply": 1, "retries": 1, "settles": 1}),
+        (answers_something_else(BAD_CHECKSUM, 0.004), {}, FAILED | {"garbled": 1, "settles": 1}),
+        (answers_something_else(FIVE, 0.0001), {"paced": True}, FAILED | {"garbled": 1, "tainted": 1, "settles": 1}),
+        (answers_something_else(SEVEN, 0.001), {"echo": True}, FAILED | {"garbled": 1, "collisions": 1, "settles": 1}),
+        (
+            is_asked_and_not_waited_for,
+            {},
+            {"attempts": 1, "exchanges": 1, "ok": 1, "unheard": 1, "cancelled": 2},
+        ),
+        (speaks_unasked(2), {}, {"unasked_bytes": 2, "settles": 1}),
+        (speaks_unasked(120), {}, {"unasked_bytes": 120, "settles": 1, "noisy": 1}),
+        (vanishes_with_the_port, {}, FAILED | {"losses": 1}),
+    ],
+)
+def test_what_happens_is_counted_once_and_nothing_else_is(
+    story: Story, line: dict[str, Any], counts: dict[str, int]
+) -> None:
+    bench = Bench(**line)
+    node = bench.node()
+    bench.arbiter.reset_statistics(bench.now)
+    story(bench, node)
+    records = (bench.arbiter.statistics(bench.now), node.counters.snapshot(0.150))
+    known = {each.name: getattr(record, each.name) for record in records for each in fields(record)}
+    known.pop("backlog")
+    assert {name: count for name, count in known.items() if type(count) is int and count} == counts
 
 
 def test_the_utilisation_of_a_line_is_the_share_of_the_time_in_which_it_was_in_use() -> None:
