@@ -16,13 +16,12 @@ import busmaster.arbiter.phases as phases_module
 import busmaster.arbiter.schedule as schedule_module
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.phases import KINKS, STRIDE, common_divisor, quietest_offset
-from busmaster.arbiter.schedule import AT_ONCE, SLICE, Schedule, begin_cycle, line_time, set_members
+from busmaster.arbiter.schedule import AT_ONCE, SLICE, Schedule, begin_cycle, set_members
 from busmaster.arbiter.transaction import LONGEST_PATIENCE, Poll, Priority, Transaction
 from busmaster.contract.profile import LineSettings
 from busmaster.errors import InvalidCommand
 from busmaster.planning.merging import at_once
 from busmaster.protocols.hcp2 import codec as hcp2
-from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import Bench, request_of, up
 
 TAU = LineSettings(57600).byte_time
@@ -52,6 +51,18 @@ def members(*addresses: int) -> list[Transaction]:
 def test_r10_a_poll_is_due_on_a_fixed_grid_from_its_phase_on() -> None:
     schedule = running(Poll("a", 0.25, phase=0.1), now=10.0)
     assert [due for due, _ in released(schedule, 10.9)] == pytest.approx([10.1, 10.35, 10.6, 10.85])
+
+
+def test_polls_that_were_removed_do_not_pile_up_and_those_that_are_left_stay_due() -> None:
+    kept = [Poll(str(number), 1.0 if number < 2 else 9.0, phase=0.5) for number in range(150)]
+    schedule = running(*kept)
+    for number in range(10 * AT_ONCE):
+        poll = Poll(str(number), 5.0, phase=0.01 * (number % 100))
+        schedule.add(poll, 0.0)
+        schedule.remove(poll)
+        assert len(schedule._heap) <= 2 * len(kept) + AT_ONCE + 1
+    assert len(released(schedule, 0.5)) == len(kept)
+    assert [name for _, name in released(schedule, 2.0)] == ["0", "1"]
 
 
 def test_r10_a_poll_added_later_joins_the_grid_of_the_first() -> None:
@@ -282,21 +293,7 @@ def test_the_common_divisor_of_two_periods() -> None:
     assert common_divisor(0.5, 0.5) == 0.5
 
 
-# line time
-
-
-def test_line_time_of_a_read_counts_bytes_both_ways_and_one_wait() -> None:
-    """HCP2 read: 8 bytes there; STX, 2, 7 typical, ETX and a checksum back."""
-    read = hcp2.Read(1).open(1, hcp2.PROFILE.timings)
-    assert line_time(read, TAU, 0.002) == pytest.approx((8 + 12) * TAU + 0.002)
-    assert line_time(read, TAU) == pytest.approx((8 + 12) * TAU + 0.025)
-
-
-def test_line_time_of_a_conversation_counts_each_leg_and_the_closing_ack() -> None:
-    """MSC DREAD: a packet of 16 bytes, ACK, a packet of 18 bytes, ACK."""
-    tau = msc.PROFILE.line.byte_time
-    read = msc.DataRead(2008).open(1, msc.PROFILE.timings)
-    assert line_time(read, tau, 0.01) == pytest.approx((16 + 1 + 18 + 1) * tau + 2 * 0.01)
+# the clock
 
 
 @given(st.floats(0.001, 10.0), st.floats(0.0, 100.0), st.integers(2, 1000))
@@ -470,6 +467,9 @@ def test_a_demand_waits_until_the_poll_is_prepared() -> None:
     assert schedule.begin(0.0) == [member]
     assert poll.due == 0.0
     assert schedule.next_due() == pytest.approx(5.0)
+    poll.remaining, poll.preparation = 0, work()
+    schedule.prepare(poll, 1.0)
+    assert schedule.begin(1.0) == [], "it was demanded once"
 
 
 def test_a_demand_runs_one_cycle_at_once_and_leaves_the_grid_alone() -> None:

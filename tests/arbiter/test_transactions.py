@@ -198,6 +198,17 @@ def test_r12_start_within_fails_a_request_without_touching_the_wire() -> None:
     assert bench.sent() == ""
 
 
+def test_r12_a_request_whose_time_to_start_is_over_is_not_sent_before_its_timer_is_looked_at_either() -> None:
+    bench = Bench()
+    node = bench.node()
+    bench.ask(node)
+    bench.sent()
+    waiting = bench.ask(node, start_by=bench.now + 0.030)
+    bench.arbiter.data_received(bytes.fromhex(FIVE), bench.now + 0.031)
+    assert bench.sent() == ""
+    assert isinstance(waiting.error, NotStarted)
+
+
 def test_r12_start_within_does_not_end_a_request_that_has_started() -> None:
     bench = Bench()
     read = bench.ask(bench.node(), start_by=bench.now + 0.010)

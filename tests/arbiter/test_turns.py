@@ -189,6 +189,17 @@ def test_r9_a_program_cannot_starve_the_others_by_urgent_requests() -> None:
     assert served.index(other) == URGENT_RUN
 
 
+def test_r9_urgent_requests_that_come_one_by_one_yield_as_well() -> None:
+    desk = Desk()
+    one, other = desk.client(), desk.client()
+    desk.ask(other, 10)
+    served = []
+    for _ in range(2 * (URGENT_RUN + 1)):
+        desk.ask(one, 1 - desk.backlog.waiting(URGENT), URGENT)
+        served += desk.serve(1)
+    assert served == [*[one] * URGENT_RUN, other] * 2
+
+
 def test_r9_the_owners_urgent_requests_yield_to_nobody() -> None:
     desk = Desk()
     flood, other = desk.client(), desk.client()
