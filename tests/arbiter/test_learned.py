@@ -21,6 +21,7 @@ from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.learning import LEARNED, Learned
 from busmaster.errors import NoReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import ACK, FIVE, LATENESS, TAU, Bench, reply_of, request_of, up
 
 REQUEST = 8 * TAU
@@ -150,8 +151,10 @@ def test_another_node_that_answers_with_another_echo_is_asked_at_once() -> None:
     assert unlike.value == 9.0
 
 
-@pytest.mark.parametrize("retries", [0, 1, 2])
-def test_a_second_attempt_is_awaited_twice_as_long_and_the_last_as_long_as_the_document_says(retries: int) -> None:
+@pytest.mark.parametrize("retries", [0, 1, 2, 4])
+def test_a_second_attempt_is_awaited_twice_as_long_and_those_behind_and_the_last_as_long_as_the_document_says(
+    retries: int,
+) -> None:
     bench = Bench()
     node = trained(bench)
     asked = bench.ask(node, retries=retries)
@@ -166,7 +169,8 @@ def test_a_second_attempt_is_awaited_twice_as_long_and_the_last_as_long_as_the_d
         bench.to(bench.arbiter.poll_timeout())
         sent_at.append(bench.now)
     waited = [end - begin for begin, end in zip(sent_at[::2], sent_at[1::2], strict=True)]
-    windows = [*[WINDOW, 2 * WINDOW][:retries], TIMINGS.read.window]
+    windows = [WINDOW, 2 * WINDOW][:retries]
+    windows += [TIMINGS.read.window] * (retries + 1 - len(windows))
     assert waited == pytest.approx([REQUEST + window for window in windows])
     assert isinstance(asked.error, NoReply)
 
@@ -230,6 +234,24 @@ def test_r15_where_checks_are_in_vain_a_write_waits_for_the_documents_lateness()
     checks = [request_of(element) for element in (10, 11, 2, 3)]
     assert [request for request, _ in asked[:5]] == [request_of(1), *checks], "then it is taken to be silent"
     assert asked[5][1] - (asked[4][1] + REQUEST) >= LATENESS - 1e-9
+
+
+def test_r15_a_write_waits_for_the_packet_too_that_may_come_behind_a_late_ack() -> None:
+    bench = Bench()
+    node = bench.arbiter.add_node(msc.PROFILE, 1, bench.now, LEARNED)
+    read = msc.DataRead(2008)
+    for _ in range(TRUSTED_AFTER + 1):
+        answered = bench.ask(node, read)
+        bench.until_sent()
+        bench.sent()
+        bench.hear("06 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D", after=0.030)
+        assert (bench.ended(answered), bench.sent()) == (1, ACK)
+        bench.until_ready()
+    bench.ask(node, read, retries=1)
+    node.unheard = MOST_UNHEARD  # it is taken to be silent, and not asked for a check
+    [lost, after, *_] = requests_before(bench, bench.ask(bench.node(2, msc.PROFILE), msc.DataWrite(2024, 5)))
+    times = msc.PROFILE.timings
+    assert after[1] - lost[1] >= times.read.lateness + times.packet.lateness
 
 
 def test_r15_all_that_owe_are_asked_before_a_write_waits_for_a_lateness() -> None:

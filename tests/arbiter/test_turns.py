@@ -221,6 +221,19 @@ def test_r9_urgent_requests_of_another_go_before_those_of_a_flood() -> None:
     assert other in desk.serve(1)
 
 
+def test_what_suits_is_picked_from_whom_had_the_least_and_else_from_another() -> None:
+    desk = Desk()
+    first, second = desk.client(), desk.client()
+    desk.ask(first, 3)
+    desk.ask(second, 3)
+    assert desk.serve(1) == [first]
+    picked = [
+        desk.backlog.pick(COMMAND, suits) for suits in (lambda _: True, lambda t: t.client is first, lambda _: False)
+    ]
+    assert [None if one is None else one.client for one in picked] == [second, first, None]
+    assert desk.backlog.waiting(COMMAND) == 3
+
+
 def test_what_is_given_back_is_the_next_to_go_whoever_waits() -> None:
     desk = Desk()
     first, second = desk.client(), desk.client()

@@ -47,6 +47,8 @@ PATIENCE = 5.0
 """Times its usual seconds, after which a test is over: that a mutant makes it hang is noticed."""
 SHORTEST, SHORTEST_COMPUTED = 10.0, 2.0
 """Seconds that every test may take, because others compute too; and that it may compute itself."""
+COLLECTING = 60.0
+"""Seconds that all tests may take to be imported and collected."""
 UNLIKE = 99
 """How a child ends that could not replace the code of the functions."""
 NAME = 1000
@@ -71,6 +73,7 @@ def main() -> None:
 
 def judged_anew(request: Any, begun: mmap.mmap) -> int:
     """Import and collect what the request names, and return how its tests end."""
+    signal.setitimer(signal.ITIMER_VIRTUAL, COLLECTING)
     return status_of(request["paths"], Once(request["tests"], begun))
 
 
@@ -170,7 +173,7 @@ def answer(request: Any, answers: Any, judged: Callable[[Any, mmap.mmap], int]) 
                 os._exit(judged(request, begun))
             finally:
                 os._exit(1)  # no child goes on as its parent, whatever it raises
-        status = end_of(child, sum(SHORTEST + PATIENCE * seconds for seconds in request["tests"].values()))
+        status = end_of(child, 2 * COLLECTING + PATIENCE * sum(request["tests"].values()))
     last = begun[:].rstrip(b"\0").decode()
     answers.write(json.dumps({"status": status, "test": last}) + "\n")
     answers.flush()
