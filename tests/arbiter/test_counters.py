@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics
+from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
 from busmaster.arbiter.health import Health, NodeRecord
+from busmaster.arbiter.histogram import Histogram
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import BAD_CHECKSUM, FIVE, NAK, SEVEN, TAU, Bench
 
@@ -119,6 +120,15 @@ def test_what_happens_is_counted_once_and_nothing_else_is(
     known = {each.name: getattr(record, each.name) for record in records for each in fields(record)}
     known.pop("backlog")
     assert {name: count for name, count in known.items() if type(count) is int and count} == counts
+
+
+def test_quantiles_are_of_what_the_histogram_holds() -> None:
+    histogram = Histogram()
+    for number in range(1, 101):
+        histogram.record(number / 1000)
+    quantiles = Quantiles.of(histogram)
+    assert (quantiles.count, quantiles.mean, quantiles.highest) == (100, pytest.approx(0.0505), pytest.approx(0.1))
+    assert (quantiles.p50, quantiles.p99) == (pytest.approx(0.050, rel=0.1), pytest.approx(0.099, rel=0.1))
 
 
 def test_the_utilisation_of_a_line_is_the_share_of_the_time_in_which_it_was_in_use() -> None:

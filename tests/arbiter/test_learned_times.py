@@ -48,6 +48,18 @@ def test_what_an_adapter_hands_over_late_or_in_pieces_is_waited_for() -> None:
     assert learned.byte_gap == pytest.approx(0.008)
 
 
+def test_a_reply_that_was_slower_than_any_is_forgotten_after_two_epochs() -> None:
+    node, read = Learning(), hcp2.Read(1)
+    node.timings(read, TIMINGS, AT_FIRST)
+    for _ in range(TRUSTED_AFTER):
+        node.note(read, False, 0.010, 0.010, 0.0, TAU)
+    assert node.timings(read, TIMINGS, AT_FIRST).read.window == pytest.approx(0.017)
+    for _ in range(2 * EPOCH):
+        node.note(read, False, 0.001, 0.001, 0.0, TAU)
+        window = node.timings(read, TIMINGS, AT_FIRST).read.window
+    assert window == LEAST
+
+
 def test_no_learned_time_exceeds_the_documents() -> None:
     times = LegTimes()
     for _ in range(TRUSTED_AFTER):

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from busmaster.arbiter.events import LatenessLowered, LatenessRaised
+from busmaster.arbiter.events import LatenessLowered, LatenessRaised, Sampled
 from busmaster.arbiter.health import CALM_LATENESS, Health, NodeRecord
 from busmaster.arbiter.transaction import Priority
 from busmaster.contract.exchange import OTHER_FORMAT, Command
@@ -322,3 +322,17 @@ def test_r15_what_may_be_repeated_is_asked_once_more_after_a_nak_that_may_be_ano
     bench.hear(NAK, after=0.002)
     bench.served(asked)
     assert (asked.error, asked.attempts) == (None, 2)
+
+
+def test_what_a_removed_poll_has_queued_is_never_sent_and_what_it_has_on_the_wire_reaches_nobody() -> None:
+    bench = Bench()
+    node = up(bench)
+    poll = bench.poll(node, 10.0, 3, 4)
+    bench.until_sent()
+    assert bench.sent() == request_of(3)
+    bench.arbiter.remove_poll(poll, bench.now)
+    bench.events.clear()
+    bench.answer()
+    bench.wait(20.0)
+    assert (bench.sent(), bench.cycles) == ("", [])
+    assert not any(isinstance(event, Sampled) for event in bench.events)

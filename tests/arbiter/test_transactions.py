@@ -273,9 +273,11 @@ def test_r8_close_ends_whatever_waits_and_lets_the_exchange_on_the_wire_finish()
     bench = Bench()
     node = bench.node()
     on_wire, waiting = bench.ask(node), bench.ask(node)
+    poll = bench.poll(node, 0.1, 7)
     bench.arbiter.close(bench.now)
     bench.listen()
     assert isinstance(waiting.error, BusClosed)
+    assert not poll.active
     bench.hear(FIVE, after=0.004)
     assert on_wire.value == 5.0
     assert bench.arbiter.state is LineState.OFFLINE
