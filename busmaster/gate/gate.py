@@ -129,19 +129,17 @@ class Gate:
 
     `record` is told of every one.
 
-    `access` says what other programs may do.
-
     `write` never raises but when it is cancelled: whatever somebody sends, it ends as a record.
     """
 
     def __init__(self, bus: Bus, *, read_only: bool = False, access: Access | None = None) -> None:
         self.read_only = read_only
         self.leaving = False
-        self.access = access or Access()
+        self._access = access or Access()
         self.safe_state: SafeWrites | None = None
         """What the line's file calls safe; None of a line without a file."""
         self.on_access: list[Callable[[], None]] = []
-        """Called when other tokens hold."""
+        """Called when other roles or tokens hold."""
         self.record: Callable[[WriteRecord], None] = lambda _: None
         self.bus = bus
         self._log = logging.getLogger("busmaster.audit")
@@ -149,11 +147,20 @@ class Gate:
         self._user = this_user()
         self._running: dict[str, int] = {}
 
+    @property
+    def access(self) -> Access:
+        """Return what other programs may do. Those of `on_access` are told when it is set."""
+        return self._access
+
+    @access.setter
+    def access(self, access: Access) -> None:
+        self._access = access
+        for tell in self.on_access:
+            tell()
+
     def take_secrets(self, secrets: Mapping[str, bytes]) -> None:
         """Have these tokens hold from now on, and no other: their digests by their names."""
         self.access = replace(self.access, secrets=secrets)
-        for tell in self.on_access:
-            tell()
 
     def refusal(self, wish: Wish) -> str:
         """Return why it is not let through, "" if it is."""
