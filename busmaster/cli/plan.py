@@ -13,7 +13,7 @@ from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import json_option
 from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import columns, emit, emit_all, json_line
-from busmaster.config import ConfiguredLine
+from busmaster.config import ConfiguredLine, emulated_line
 from busmaster.contract.profile import LineSettings
 from busmaster.planning import GroupPlan, Losses, Plan
 from busmaster.transport.endpoints import Endpoint
@@ -29,12 +29,15 @@ HEAD = ("GROUP", "PERIOD", "VALUES", "EXCHANGES", "LINE", "CYCLE", "LONGEST", "M
 @file_argument()
 @json_option
 def command(path: str, as_json: bool) -> int:
-    """Reckon how busy LINE.toml's poll groups will keep its line, and what would fit. Nothing is opened.
+    """Reckon how busy LINE.toml's poll groups will keep its line, and what would fit. Nothing is opened; what the file
+    says of emulated nodes is checked too.
 
     Reply times are the file's `reply_time`, else half of the nominal one. The exit status is 1 if cycles will be
     missed.
     """
-    line = ConfiguredLine(load(path), outputs=False)
+    file = load(path)
+    line = ConfiguredLine(file, outputs=False)
+    emulated_line(file)  # made for its complaints alone, as `emulate` says them
     plan = line.plan()
     assumed = [name for name, node in line.file.nodes.items() if node.reply_time is None]
     if as_json:

@@ -143,6 +143,32 @@ def test_a_file_that_is_wrong_is_one_line_that_names_line_and_key_and_status_2(
     assert "does not exist" in missing.err
 
 
+@pytest.mark.parametrize("command", ["plan", "emulate"])
+@pytest.mark.parametrize(
+    ("before", "after", "complaint"),
+    [
+        (
+            "period = 0.02",
+            "period = 0",
+            "12: groups.fast.period: poll group 'fast': a period is at least 0.001 s, not 0",
+        ),
+        (
+            "[groups.slow]",
+            "[emulator.nodes.winder]\naxes = 9\n[groups.slow]",
+            "14: emulator.nodes.winder: a controller",
+        ),
+    ],
+)
+def test_plan_finds_wrong_what_emulate_does_at_the_same_place(
+    busmaster: Command, tmp_path: Path, command: str, before: str, after: str, complaint: str
+) -> None:
+    path = tmp_path / "line.toml"
+    path.write_text(TEXT.replace("PORT", "socket://127.0.0.1:1").replace(before, after))
+    outcome = busmaster(command, str(path))
+    assert (outcome.status, outcome.out) == (2, "")
+    assert outcome.err.startswith(f"busmaster: {path}:{complaint}")
+
+
 def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     text = (
         line.read_text()
