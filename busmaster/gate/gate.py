@@ -26,16 +26,16 @@ from busmaster.errors import (
     WriteUnconfirmed,
 )
 from busmaster.gate.permission import EVERYTHING, Access, Permission
-from busmaster.gate.record import Outcome, WriteRecord, this_user
+from busmaster.gate.record import Outcome, WriteRecord, cut, this_user
 
 FRESH = 1.0
 """Seconds for which a command may wait that does not say until when it is meant."""
 MOST_AT_ONCE = 16
 """Commands of one door that may be on their way to their nodes."""
+LARGEST_KEPT = 1e100
+"""Of what is kept as a number; beyond it nobody means one, and its text is kept."""
 NEVER_SENT = (ArithmeticError, TypeError, ValueError, RecursionError)
 """What is raised of values of which no frame can be made, InvalidCommand among them."""
-LONGEST_SHOWN = 200
-"""Characters of a value, or of an error, that are kept of a write."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,14 +221,14 @@ class Gate:
         record = WriteRecord(
             time=self.bus.wall_time(),
             door=wish.door,
-            by=wish.by[:LONGEST_SHOWN],
+            by=cut(wish.by),
             user=self._user,
             process=os.getpid(),
-            point=wish.name[:LONGEST_SHOWN],
+            point=cut(wish.name),
             before=before,
             value=_shown(wish.value),
             outcome=outcome,
-            error=error[:LONGEST_SHOWN],
+            error=cut(error),
             took=took,
             id=wish.id,
         )
@@ -247,5 +247,5 @@ def _before(point: Point[Any] | None) -> Any:
 def _shown(value: Any) -> Any:
     """Return the value as it fits into a record."""
     if isinstance(value, bytes):  # a command that was not read: as it came, but for what could harm a terminal
-        return repr(value.decode(errors="replace"))[1:-1][:LONGEST_SHOWN]
-    return value if isinstance(value, int | float) and abs(value) < 1e300 else repr(value)[:LONGEST_SHOWN]
+        return cut(repr(value.decode(errors="replace"))[1:-1])
+    return value if isinstance(value, int | float) and abs(value) < LARGEST_KEPT else cut(repr(value))

@@ -106,6 +106,18 @@ async def test_a_write_passes_the_owners_gate_and_its_limits_hold(tmp_path: Path
         assert len(of.writes) == 2
 
 
+@pytest.mark.asyncio
+async def test_of_nonsense_only_the_beginning_is_told(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        assert (await put(of, "x" * 4000))[0] == 400
+        [told] = of.writes
+        assert told.startswith("5/10 = 'xxx")
+        assert told.count("... (40") == 2  # the value, and the error that has it
+        assert len(told) < 600
+
+
 @pytest.mark.parametrize(
     ("body", "kind", "status"),
     [
