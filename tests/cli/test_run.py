@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import sqlite3
 import subprocess
@@ -181,6 +182,13 @@ def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     assert outcome.lines[0].startswith("Slitter: 127.0.0.1:")
     assert [row.split()[0] for row in outcome.lines[1:4]] == ["GROUP", "fast", "slow"]
     assert outcome.lines[4].startswith("it fits: the schedule asks for ")
+    waits = re.fullmatch(
+        r"a command waits up to (.*) ms on a healthy line; while a dead node is probed all waits are about (.*) ms longer",
+        outcome.lines[5],
+    )
+    assert waits is not None
+    assert float(waits[1]) < float(waits[2]) < 200  # a lateness of HCP2, not a bound that no line comes near
+    assert outcome.lines[6].startswith("the bounds (R9), if every exchange took the longest that one can: urgent ")
     assert outcome.lines[-2].startswith("reply times are assumed, half of the nominal one, for ")
     assert outcome.lines[-1].startswith("with 1% of all frames lost it asks for ")
     assert 'with timing = "learned" (a window of 39.5 ms) for ' in outcome.lines[-1]
@@ -195,6 +203,7 @@ def test_plan_says_what_would_fit_where_it_does_not_and_ends_with_1(busmaster: C
     assert plan["fits"] is False
     assert [group["group"] for group in plan["groups"]] == ["fast", "slow"]
     assert plan["groups"][0]["values"] == 3
+    assert plan["typical_wait"] < plan["dead_wait"] < plan["worst_waits"]["urgent"]
     assert plan["worst_waits"].keys() == {"urgent", "command", "poll", "background"}
     assert plan["utilisation"] < plan["losses"]["learned_utilisation"] < plan["losses"]["utilisation"]
 
