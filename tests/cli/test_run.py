@@ -182,12 +182,8 @@ def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     assert outcome.lines[0].startswith("Slitter: 127.0.0.1:")
     assert [row.split()[0] for row in outcome.lines[1:4]] == ["GROUP", "fast", "slow"]
     assert outcome.lines[4].startswith("it fits: the schedule asks for ")
-    waits = re.fullmatch(
-        r"a command waits up to (.*) ms on a healthy line; while a dead node is probed all waits are about (.*) ms longer",
-        outcome.lines[5],
-    )
-    assert waits is not None
-    assert float(waits[1]) < float(waits[2]) < 200  # a lateness of HCP2, not a bound that no line comes near
+    healthy, dead = re.findall(r"([\d.]+) ms", outcome.lines[5])
+    assert float(healthy) < float(dead) < 200  # a lateness of HCP2, not a bound that no line comes near
     assert outcome.lines[6].startswith("the bounds (R9), if every exchange took the longest that one can: urgent ")
     assert outcome.lines[-2].startswith("reply times are assumed, half of the nominal one, for ")
     assert outcome.lines[-1].startswith("with 1% of all frames lost it asks for ")
