@@ -8,7 +8,7 @@ from math import nextafter
 import pytest
 
 from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.endings import too_late
+from busmaster.arbiter.endings import TOO_LATE, too_late
 from busmaster.arbiter.events import Overdue
 from busmaster.arbiter.expiries import SLACK, Expiries
 from busmaster.arbiter.health import Health
@@ -63,6 +63,10 @@ def test_r12_whoever_waited_in_vain_is_told_for_how_many_milliseconds() -> None:
     waiting = Transaction(Bench().node(), hcp2.Read(1))
     waiting.queued = 1.0
     assert "it waited 2500 ms" in str(too_late(waiting, 3.5))
+    waiting.attempts = 1
+    error = too_late(waiting, 3.5)
+    assert "sent, but not answered within its time: 2500 ms" in str(error)
+    assert error.hint == TOO_LATE
 
 
 @pytest.mark.parametrize(("command", "kind"), [(hcp2.Read(1), NoReply), (REPEATED, WriteUnconfirmed)])

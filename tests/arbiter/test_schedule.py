@@ -53,18 +53,6 @@ def test_r10_a_poll_is_due_on_a_fixed_grid_from_its_phase_on() -> None:
     assert [due for due, _ in released(schedule, 10.9)] == pytest.approx([10.1, 10.35, 10.6, 10.85])
 
 
-def test_polls_that_were_removed_do_not_pile_up_and_those_that_are_left_stay_due() -> None:
-    kept = [Poll(str(number), 1.0 if number < 2 else 9.0, phase=0.5) for number in range(150)]
-    schedule = running(*kept)
-    for number in range(10 * AT_ONCE):
-        poll = Poll(str(number), 5.0, phase=0.01 * (number % 100))
-        schedule.add(poll, 0.0)
-        schedule.remove(poll)
-        assert len(schedule._heap) <= 2 * len(kept) + AT_ONCE + 1
-    assert len(released(schedule, 0.5)) == len(kept)
-    assert [name for _, name in released(schedule, 2.0)] == ["0", "1"]
-
-
 def test_r10_a_poll_added_later_joins_the_grid_of_the_first() -> None:
     schedule = running(Poll("a", 0.25, phase=0.0), now=10.0)
     late = Poll("b", 0.25, phase=0.1)
