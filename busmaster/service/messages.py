@@ -74,6 +74,16 @@ def written(message: Mapping[str, Any]) -> str:
     return encoded({"jsonrpc": "2.0", **message})
 
 
+def words(method: str, params: Mapping[str, Any]) -> str:
+    """Return a question as text, up to its number. Raises TypeError for what cannot be said in it."""
+    return written({"method": method, "params": params})[:-1]
+
+
+def numbered(words: str, number: int) -> str:
+    """Return a question as text, with its number: behind the words, which may be the same as before."""
+    return f'{words},"id":{number}}}'
+
+
 def encoded(value: Any) -> str:
     """Return a value as JSON. Raises TypeError for what it cannot say."""
     try:
