@@ -123,7 +123,7 @@ class Client:
             return
         if isinstance(number, bool) or not isinstance(number, int):
             raise Malformed("the id of a request is a whole number")
-        self._check_number(number)
+        self._requests.check_number(number)
         if method in ("request", "write"):
             self._requests.begin(number, params)
             return
@@ -139,12 +139,8 @@ class Client:
 
     def take_read(self, number: int, read: PlainRead) -> None:
         """Do what a message asks that is a plain read. Raises Malformed where one of its number is under way."""
-        self._check_number(number)
+        self._requests.check_number(number)
         self._requests.begin(number, read)
-
-    def _check_number(self, number: int) -> None:
-        if number in self._requests:
-            raise Malformed(f"request {number} is under way already")
 
     def _notified(self, method: str, params: Mapping[str, Any]) -> None:
         match method:

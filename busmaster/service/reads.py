@@ -4,21 +4,18 @@ worked out once at either end.
 
 from __future__ import annotations
 
-import re
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 from busmaster.contract.exchange import Command
 from busmaster.service.failures import REFUSED
-from busmaster.service.messages import read, words
+from busmaster.service.messages import BEFORE_NUMBER, numbered, read, words
 from busmaster.service.telling import protocol_of
 
 KEPT = 1024
 """Reads whose words are kept, the last that were asked, whoever asked."""
 SHORT = 256
-"""Characters of words that are kept: no read takes more."""
-_PLAIN = re.compile(rf'(.{{,{SHORT}}}\}}\}}),"id":(0|[1-9][0-9]{{,15}})\}}')
-"""A message that ends with its command, or its options, and its number."""
+"""Characters of a message whose words are kept: no read takes more."""
 
 
 class PlainRead(NamedTuple):
@@ -30,25 +27,32 @@ class PlainRead(NamedTuple):
 
 
 @lru_cache(KEPT)
-def words_of(asked: PlainRead) -> str:
-    """Return how it is said, up to its number. Raises InvalidCommand for a command that its protocol does not have."""
-    command = protocol_of(asked.protocol).write_down(asked.command)
-    return words("request", {"protocol": asked.protocol, "address": asked.address, "command": command})
+def words_of(protocol: str, address: int, command: Command[Any]) -> str:
+    """Return how a plain read is said, up to its number.
+
+    Raises InvalidCommand for a command that the protocol does not have.
+    """
+    said = protocol_of(protocol).write_down(command)
+    return words("request", {"protocol": protocol, "address": address, "command": said})
 
 
 def plain_read_of(message: str | bytes) -> tuple[int, PlainRead] | None:
     """Return the number of a message that is a plain read, and that; None for any other, and for a bad one."""
-    if not isinstance(message, str) or (found := _PLAIN.fullmatch(message)) is None:
+    if not isinstance(message, str) or len(message) > SHORT:
         return None
-    said, number = found.groups()
-    asked = _said_so(said)
-    return None if asked is None else (int(number), asked)
+    said, _, rest = message.rpartition(BEFORE_NUMBER)
+    if not said.endswith("}}") or not (digits := rest[:-1]).isdecimal():  # no command, which is the last of a plain one
+        return None
+    number = int(digits)
+    asked = _asked_in(said) if message == numbered(said, number) else None
+    return None if asked is None else (number, asked)
 
 
 @lru_cache(KEPT)
-def _said_so(said: str) -> PlainRead | None:
+def _asked_in(said: str) -> PlainRead | None:
+    """Return the plain read that is asked in these words, whatever their number; None if none is."""
     try:
-        message = read(f"{said}}}")  # the number behind the words changes nothing of them
+        message = read(f"{said}}}")
         params = message["params"]
         if message.keys() != {"jsonrpc", "method", "params"} or message["method"] != "request":
             return None

@@ -18,7 +18,7 @@ from busmaster.errors import InvalidCommand
 from busmaster.planning.merging import Merge
 from busmaster.service.link import Link
 from busmaster.service.messages import value_of, words
-from busmaster.service.reads import PlainRead, words_of
+from busmaster.service.reads import words_of
 from busmaster.service.sequences import HoldsLine, Room, held_remotely, shortened
 from busmaster.service.telling import protocol_of
 
@@ -175,7 +175,7 @@ class RemoteNode:
     ) -> str:
         more = options or stop or touches is not None or stops_seen is not None or sequence is not None
         if not more and not getattr(command, "writes", True):
-            return words_of(PlainRead(self._profile.name, self._address, command))
+            return words_of(self._profile.name, self._address, command)
         params: dict[str, Any] = {
             "protocol": self._profile.name,
             "address": self._address,

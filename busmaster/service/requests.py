@@ -13,7 +13,7 @@ from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, W
 from busmaster.service.errands import Asker, Errand
 from busmaster.service.failures import REFUSED, refusal_of
 from busmaster.service.line import ServedLine
-from busmaster.service.messages import MOST_REQUESTS, MOST_URGENT
+from busmaster.service.messages import MOST_REQUESTS, MOST_URGENT, Malformed
 from busmaster.service.reads import PlainRead
 
 
@@ -36,9 +36,10 @@ class Requests:
         """Those that wait for the safe state to be sent."""
         self._log = logging.getLogger("busmaster.service")
 
-    def __contains__(self, number: int) -> bool:
-        """Return whether something of this number is not answered yet."""
-        return number in self._errands or number in self._safe
+    def check_number(self, number: int) -> None:
+        """Raise Malformed for the number of something that is not answered yet."""
+        if number in self._errands or number in self._safe:
+            raise Malformed(f"request {number} is under way already")
 
     @property
     def errands(self) -> tuple[Errand, ...]:
