@@ -230,7 +230,7 @@ class Connection(asyncio.BufferedProtocol):
             data, self._part = bytes(self._part), None
             self._tell(data, self._is_text)
 
-    def _tell(self, data: bytes | bytearray, is_text: bool) -> None:
+    def _tell(self, data: bytes, is_text: bool) -> None:
         try:
             message = data.decode() if is_text else data
         except UnicodeDecodeError:

@@ -141,13 +141,11 @@ class Errand:
     @classmethod
     def of(cls, said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLine) -> Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
-        return cls._reading(said, asker, line) if isinstance(said, PlainRead) else cls._of_params(said, asker, line)
-
-    @classmethod
-    def _reading(cls, read: PlainRead, asker: Asker, line: ServedLine) -> Errand:
-        node = asker.node(read.protocol, read.address)
+        if not isinstance(said, PlainRead):
+            return cls._of_params(said, asker, line)
+        node = asker.node(said.protocol, said.address)
         client = asker.client_of(None, node)
-        return cls(Task(node, read.command), {}, line=line, asker=asker, client=client, asked=line.bus.now())
+        return cls(Task(node, said.command), {}, line=line, asker=asker, client=client, asked=line.bus.now())
 
     @classmethod
     def _of_params(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Errand:

@@ -5,8 +5,6 @@ long for this one, at either end of each request.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from functools import cache
 
 TEXT = 0x81
 """The first byte of a message of text in one piece."""
@@ -14,7 +12,7 @@ MASKED = 0x80
 SHORT, LONG = 126, 127
 
 
-def look_at(data: bytearray, masked: bool) -> tuple[int, bytes | bytearray | None]:
+def look_at(data: bytearray, masked: bool) -> tuple[int, bytes | None]:
     """Return how many bytes the frame that begins so has, or how many it takes to tell, and the text in it: None unless
     it has come, is a whole text, and is masked or not as its sender is to do.
     """
@@ -34,7 +32,7 @@ def look_at(data: bytearray, masked: bool) -> tuple[int, bytes | bytearray | Non
     if come < size or data[0] != TEXT or is_masked is not masked:
         return size, None
     said = data[text:size]
-    return size, _mask()(said, data[begin:text]) if masked else said
+    return size, mask(said, data[begin:text]) if masked else bytes(said)
 
 
 def text_frame(data: bytes, key: bytes) -> bytes:
@@ -46,7 +44,7 @@ def text_frame(data: bytes, key: bytes) -> bytes:
         head = bytes((TEXT, flag | SHORT)) + length.to_bytes(2, "big")
     else:
         head = bytes((TEXT, flag | LONG)) + length.to_bytes(8, "big")
-    return head + key + _mask()(data, key) if key else head + data
+    return head + key + mask(data, key) if key else head + data
 
 
 def new_key() -> bytes:
@@ -54,9 +52,8 @@ def new_key() -> bytes:
     return os.urandom(4)
 
 
-@cache  # looked up with each frame, and not before the first: who shares no line does without the library
-def _mask() -> Callable[[bytes | bytearray, bytes | bytearray], bytes]:
-    """Return what puts a mask on data, or takes it off."""
-    from websockets.frames import apply_mask
-
-    return apply_mask
+def mask(data: bytes | bytearray, key: bytes | bytearray) -> bytes:
+    """Return data with a mask put on, or taken off."""
+    length = len(data)
+    keys = (key * (length // 4 + 1))[:length]
+    return (int.from_bytes(data, "little") ^ int.from_bytes(keys, "little")).to_bytes(length, "little")
