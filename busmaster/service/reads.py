@@ -41,7 +41,9 @@ def plain_read_of(message: str | bytes) -> tuple[int, PlainRead] | None:
     if not isinstance(message, str) or len(message) > SHORT:
         return None
     said, _, rest = message.rpartition(BEFORE_NUMBER)
-    if not said.endswith("}}") or not (digits := rest[:-1]).isdecimal():  # the last that a plain one says is its command
+    if (
+        not said.endswith("}}") or not (digits := rest[:-1]).isdecimal()
+    ):  # the last that a plain one says is its command
         return None
     number = int(digits)
     asked = _asked_in(said) if message == numbered(said, number) else None

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Coroutine, Hashable, Iterable, Mapping
+from collections.abc import Coroutine, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
-from typing import Any, Protocol, TypeVar, Unpack, cast
+from typing import Any, Protocol, TypeVar, Unpack
 
 from busmaster.bus.exclusive import checked_hold
 from busmaster.bus.limits import Limit
@@ -176,7 +176,7 @@ class RemoteNode:
         """Return how a request is said. `asked` is left out where nothing is counted from it."""
         more = options or stop or touches is not None or stops_seen is not None or sequence is not None
         if not more and not getattr(command, "writes", True):
-            return words_of(self._profile.name, self._address, cast("Hashable", command))
+            return words_of(self._profile.name, self._address, command)  # type: ignore[arg-type]  # it is hashable
         params: dict[str, Any] = {
             "protocol": self._profile.name,
             "address": self._address,

@@ -8,16 +8,36 @@ from pathlib import Path
 
 import pytest
 
-from busmaster import Hcp2Controller, RemoteBus
-from busmaster.protocols import hcp2
+from busmaster import RemoteBus
+from busmaster.protocols.hcp2 import PROTOCOL
+from busmaster.protocols.hcp2.codec import PROFILE, Read
 from busmaster.service.connection import Connection
 from busmaster.service.messages import MOST_REQUESTS, Malformed, numbered
 from busmaster.service.reads import SHORT, PlainRead, plain_read_of, words_of
 from tests.service.lines import Served, on_a_line, on_a_served_line, raw
 
-READ = hcp2.Read(1)
+READ = Read(1)
 WORDS = words_of("hcp2", 5, READ)
-PARTS = ("", '"', "{", "}", "}}", ",", ',"id":', '"id":7', '"step":0', "0", "1", "12", "-", ".5", " ", "\n", "\u0663", "true")
+PARTS = (
+    "",
+    '"',
+    "{",
+    "}",
+    "}}",
+    ",",
+    ',"id":',
+    '"id":7',
+    '"step":0',
+    "0",
+    "1",
+    "12",
+    "-",
+    ".5",
+    " ",
+    "\n",
+    "\u0663",
+    "true",
+)
 OTHERS = (
     WORDS,
     f"{WORDS}}}",
@@ -72,8 +92,9 @@ def test_what_is_taken_for_a_plain_read_says_that_and_nothing_else() -> None:
             assert (said.pop("jsonrpc"), said.pop("method"), said.pop("id")) == ("2.0", "request", number)
             params = said.pop("params")
             assert (params.pop("protocol"), params.pop("address")) == (read.protocol, read.address)
-            assert hcp2.PROTOCOL.read_back(params.pop("command")) == read.command
-            assert not said and not params
+            assert PROTOCOL.read_back(params.pop("command")) == read.command
+            assert not said
+            assert not params
     assert taken > 100
 
 
@@ -88,7 +109,7 @@ def test_a_program_says_a_plain_read_in_the_same_words_each_time(
         say(self, text)
 
     async def story(line: Served, remote: RemoteBus) -> None:
-        node = remote.node(hcp2.PROFILE, 5)
+        node = remote.node(PROFILE, 5)
         await node.request(READ)
         monkeypatch.setattr(Connection, "say", noted)
         assert [await node.request(READ) for _ in range(2)] == [0, 0]
