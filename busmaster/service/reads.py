@@ -41,9 +41,8 @@ def plain_read_of(message: str | bytes) -> tuple[int, PlainRead] | None:
     if not isinstance(message, str) or len(message) > SHORT:
         return None
     said, _, rest = message.rpartition(BEFORE_NUMBER)
-    if (
-        not said.endswith("}}") or not (digits := rest[:-1]).isdecimal()
-    ):  # the last that a plain one says is its command
+    digits = rest[:-1]
+    if not said.endswith("}}") or not digits.isdecimal():  # a plain one ends with its command and its number
         return None
     number = int(digits)
     asked = _asked_in(said) if message == numbered(said, number) else None
