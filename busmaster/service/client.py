@@ -75,6 +75,11 @@ class Client:
         return self.peer.permission(self._line.gate.access)
 
     @property
+    def read_only(self) -> bool:
+        """Return whether nothing that it writes is let through, as it is now."""
+        return self._line.gate.read_only or not self.permission.writes
+
+    @property
     def errands(self) -> tuple[Errand, ...]:
         """Return what it asked for that is not done yet."""
         return self._requests.errands
@@ -93,6 +98,10 @@ class Client:
         dropped = self.dropped.get(stream, 0)
         head = f'{{"jsonrpc":"2.0","method":"{method}","params":{{"stream":{stream},"dropped":{dropped},"body":'
         return f"{head}{body}}}}}"
+
+    def tell_access(self) -> None:
+        """Say what it may do now."""
+        self.outbox.put_latest("access", written({"method": "access", "params": {"read_only": self.read_only}}))
 
     def tell_stops(self, node: NodeRecord) -> None:
         """Say how often a node was told to stop, if this client knows it."""

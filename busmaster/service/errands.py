@@ -88,9 +88,7 @@ class Task(NamedTuple):
         value = value_of(params["value"])
         assert isinstance(point.node, Node)
         try:
-            if point.encode is None:
-                raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
-            return cls(point.node, point.encode(value), point.command, value, point)
+            return cls(point.node, _encoded(point, value), point.command, value, point)
         except NEVER_SENT as error:
             by, permission = str(asker.peer), asker.permission
             wish = Wish(door=DOOR, by=by, name=point.key, point=point, value=value, permission=permission)
@@ -313,6 +311,22 @@ class Errand:
             command=command,
             permission=self._asker.permission,
         )
+
+
+def _encoded(point: Point[Any], value: Any) -> Command[Any]:
+    """Return the write of a value. Raises InvalidCommand for one that cannot be written.
+
+    True and false are that where the line would carry them as the numbers 1 and 0: who means a number says one.
+    """
+    if point.encode is None:
+        raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
+    command = point.encode(value)
+    if isinstance(value, bool) and isinstance(command, Changing):
+        is_state = any(isinstance(held, bool) for held in command.changes(point.node.profile).values())
+        if not is_state and str(command) == str(point.encode(int(value))):
+            said = str(value).lower()
+            raise InvalidCommand(f"{point.node.label}: {point.item} is a number, not {said}: write {int(value)}")
+    return command
 
 
 def _check_stop(node: Node, command: Command[Any]) -> bool:
