@@ -33,6 +33,7 @@ from busmaster.service.messages import (
 from busmaster.service.outbox import Outbox
 from busmaster.service.overview import said_details
 from busmaster.service.peers import Peer
+from busmaster.service.reads import PlainRead
 from busmaster.service.requests import Requests
 from busmaster.service.streams import Broadcast, GroupBroadcast
 from busmaster.service.telling import point_of, protocol_of, said_statistics
@@ -131,8 +132,7 @@ class Client:
             return
         if isinstance(number, bool) or not isinstance(number, int):
             raise Malformed("the id of a request is a whole number")
-        if number in self._requests:
-            raise Malformed(f"request {number} is under way already")
+        self._requests.check_number(number)
         if method in ("request", "write"):
             self._requests.begin(number, params)
             return
@@ -145,6 +145,11 @@ class Client:
             self._refuse(number, refusal_of(method, error))
         else:
             self._tell_result(number, answer)
+
+    def take_read(self, number: int, read: PlainRead) -> None:
+        """Do what a message asks that is a plain read. Raises Malformed where one of its number is under way."""
+        self._requests.check_number(number)
+        self._requests.begin(number, read)
 
     def _notified(self, method: str, params: Mapping[str, Any]) -> None:
         match method:

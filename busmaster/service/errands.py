@@ -20,6 +20,7 @@ from busmaster.gate.permission import Permission
 from busmaster.service.line import ServedLine
 from busmaster.service.messages import value_of
 from busmaster.service.peers import Peer
+from busmaster.service.reads import PlainRead
 from busmaster.service.telling import protocol_of
 
 OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
@@ -64,8 +65,8 @@ class Task(NamedTuple):
 
     node: Node
     command: Command[Any]
-    touches: Command[Any] | None
-    value: Any
+    touches: Command[Any] | None = None
+    value: Any = None
     """As the record of a write has it."""
     point: Point[Any] | None = None
 
@@ -113,9 +114,9 @@ class Errand:
         line: ServedLine,
         asker: Asker,
         client: LineClient,
-        stops_seen: int | None,
-        stop: bool,
         asked: float,
+        stops_seen: int | None = None,
+        stop: bool = False,
     ) -> None:
         self.node = task.node
         self.command = task.command
@@ -136,8 +137,16 @@ class Errand:
         """What is done for a write, once it is begun."""
 
     @classmethod
-    def of(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Errand:
+    def of(cls, said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLine) -> Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
+        if not isinstance(said, PlainRead):
+            return cls._of_params(said, asker, line)
+        node = asker.node(said.protocol, said.address)
+        client = asker.client_of(None, node)
+        return cls(Task(node, said.command), {}, line=line, asker=asker, client=client, asked=line.bus.now())
+
+    @classmethod
+    def _of_params(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Errand:
         task = Task.of_point(params, asker, line) if "key" in params else Task.of_node(params, asker)
         node, command = task.node, task.command
         given: CommandOptions = params.get("options", {})

@@ -140,13 +140,18 @@ async def test_a_good_value_that_is_a_text_is_not_drawn_as_one_that_is_missing(
 
 
 def exchanges_are_drawn(browser: Browser) -> None:
-    """Wait until the line's lane has the colour of an exchange that was answered, between the rules."""
+    """Wait until the line's lane has the colour of exchanges that were answered in two places, between the rules."""
     browser.until(
         """(() => {
           const canvas = document.getElementById('wire-canvas'), pen = canvas.getContext('2d');
           const row = pen.getImageData(70, 30, canvas.width - 70, 1).data;
-          for (let at = 0; at < row.length; at += 4) if (`${row.slice(at, at + 3)}` === '0,114,178') return true;
-          return false;
+          let places = 0, within = false;
+          for (let at = 0; at < row.length; at += 4) {
+            const answered = `${row.slice(at, at + 3)}` === '0,114,178';
+            places += answered && !within;
+            within = answered;
+          }
+          return places > 1;
         })()"""
     )
 
