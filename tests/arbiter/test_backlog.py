@@ -133,6 +133,15 @@ def test_draining_empties_it_in_order_of_class() -> None:
     assert backlog.pop(0.0) is None
 
 
+def test_draining_keeps_the_order_of_arrival_among_equal_deadlines() -> None:
+    backlog = Backlog()
+    transactions = [waiting(POLL) for _ in range(6)]
+    for transaction in transactions:
+        backlog.push(transaction)
+    assert backlog.pop(0.0) is transactions.pop(0)
+    assert backlog.drain() == transactions
+
+
 def test_cancelled_transactions_do_not_pile_up() -> None:
     for priority in Priority:
         backlog = Backlog()

@@ -428,6 +428,16 @@ def test_r15_three_answers_of_a_node_that_prove_nothing_are_enough_and_it_is_ask
     assert len(asked) == 1 + MOST_BEFORE
 
 
+def test_r15_after_something_was_said_twice_what_is_unlike_keeps_its_order() -> None:
+    bench = Bench()
+    node = up(bench)
+    bench.hear(reply_of(1, 5))
+    bench.until_ready()
+    for element in (3, 4, 5):
+        bench.ask(node, hcp2.Read(element))
+    assert [bench.answer() for _ in range(3)] == [request_of(element) for element in (3, 4, 5)]
+
+
 def test_r15_after_something_was_said_twice_answers_alike_are_not_asked_for_in_a_row_where_there_is_a_choice() -> None:
     bench = Bench()
     node, other = up(bench), up(bench, 2)

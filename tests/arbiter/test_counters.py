@@ -2,38 +2,148 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import FrozenInstanceError, astuple, fields, replace
 from typing import Any
 
 import pytest
 
-from busmaster.arbiter.counters import DriverErrors
+from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
+from busmaster.arbiter.health import Health, NodeRecord
+from busmaster.arbiter.histogram import Histogram
 from busmaster.protocols.hcp2 import codec as hcp2
-from tests.arbiter.bench import FIVE, Bench
+from tests.arbiter.bench import BAD_CHECKSUM, FIVE, NAK, SEVEN, TAU, Bench
 
-LINE = Bench().arbiter.statistics(1.0)
-NODE = Bench().node().counters.snapshot(0.150)
+REQUEST = 8 * TAU
+Story = Callable[[Bench, NodeRecord], None]
+
+
+def line_statistics() -> LineStatistics:
+    return Bench().arbiter.statistics(1.0)
+
+
+def node_statistics() -> NodeStatistics:
+    return Bench().node().counters.snapshot(0.150)
 
 
 def test_nothing_is_counted_before_anything_has_happened() -> None:
     counts = ("exchanges", "tainted", "collisions", "noisy", "losses", "checks", "doubted", "breaks")
-    assert [getattr(LINE, name) for name in counts] == [0] * len(counts)
-    assert (NODE.attempts, NODE.failed, NODE.latency.count) == (0, 0, 0)
+    line, node = line_statistics(), node_statistics()
+    assert [getattr(line, name) for name in counts] == [0] * len(counts)
+    assert (node.attempts, node.failed, node.latency.count) == (0, 0, 0)
+
+
+def is_late(bench: Bench, node: NodeRecord) -> None:
+    bench.ask(node)
+    bench.sent()
+    bench.hear(FIVE, after=REQUEST + 0.060)
+
+
+def is_refused_twice(bench: Bench, node: NodeRecord) -> None:
+    bench.ask(node)
+    for _ in range(2):
+        bench.until_sent()
+        bench.sent()
+        bench.hear(NAK, after=0.004)
+
+
+def is_silent(bench: Bench, node: NodeRecord) -> None:
+    node.health = Health.UP
+    bench.ask(node, retries=1)
+    bench.sent()
+    bench.wait(0.120)
+
+
+def answers_something_else(heard: str, after: float) -> Story:
+    def story(bench: Bench, node: NodeRecord) -> None:
+        bench.ask(node, retries=0)
+        bench.sent()
+        bench.hear(heard, after)
+
+    return story
+
+
+def is_asked_and_not_waited_for(bench: Bench, node: NodeRecord) -> None:
+    on_the_wire, waiting = bench.ask(node), bench.ask(node)
+    bench.sent()
+    for asked in (on_the_wire, waiting):
+        bench.arbiter.cancel(asked, bench.now)
+    bench.answer()
+
+
+def speaks_unasked(count: int) -> Story:
+    def story(bench: Bench, node: NodeRecord) -> None:
+        for _ in range(count):
+            bench.hear("FF", after=0.010)
+
+    return story
+
+
+def vanishes_with_the_port(bench: Bench, node: NodeRecord) -> None:
+    bench.ask(node)
+    bench.sent()
+    bench.arbiter.line_down("unplugged", bench.now)
+    bench.listen()
+
+
+ONE = {"attempts": 1, "exchanges": 1, "completed": 1}
+FAILED = ONE | {"failed": 1}
+
+
+@pytest.mark.parametrize(
+    ("story", "line", "counts"),
+    [
+        (is_late, {}, ONE | {"ok": 1, "late": 1}),
+        (is_refused_twice, {}, FAILED | {"attempts": 2, "exchanges": 2, "refused": 2, "settles": 2}),
+        (is_silent, {}, {"attempts": 1, "exchanges": 1, "no_reply": 1, "retries": 1, "settles": 1}),
+        (answers_something_else(BAD_CHECKSUM, 0.004), {}, FAILED | {"garbled": 1, "settles": 1}),
+        (answers_something_else(FIVE, 0.0001), {"paced": True}, FAILED | {"garbled": 1, "tainted": 1, "settles": 1}),
+        (answers_something_else(SEVEN, 0.001), {"echo": True}, FAILED | {"garbled": 1, "collisions": 1, "settles": 1}),
+        (
+            is_asked_and_not_waited_for,
+            {},
+            {"attempts": 1, "exchanges": 1, "ok": 1, "unheard": 1, "cancelled": 2},
+        ),
+        (speaks_unasked(2), {}, {"unasked_bytes": 2, "settles": 1}),
+        (speaks_unasked(120), {}, {"unasked_bytes": 120, "settles": 1, "noisy": 1}),
+        (vanishes_with_the_port, {}, FAILED | {"losses": 1}),
+    ],
+)
+def test_what_happens_is_counted_once_and_nothing_else_is(
+    story: Story, line: dict[str, Any], counts: dict[str, int]
+) -> None:
+    bench = Bench(**line)
+    node = bench.node()
+    bench.arbiter.reset_statistics(bench.now)
+    story(bench, node)
+    records = (bench.arbiter.statistics(bench.now), node.counters.snapshot(0.150))
+    known = {each.name: getattr(record, each.name) for record in records for each in fields(record)}
+    known.pop("backlog")
+    assert {name: count for name, count in known.items() if type(count) is int and count} == counts
+
+
+def test_quantiles_are_of_what_the_histogram_holds() -> None:
+    histogram = Histogram()
+    for number in range(1, 101):
+        histogram.record(number / 1000)
+    quantiles = Quantiles.of(histogram)
+    assert (quantiles.count, quantiles.highest) == (100, 0.1)
+    assert quantiles.mean == pytest.approx(0.0505)
+    assert [quantiles.p50, quantiles.p99] == pytest.approx([0.050, 0.099], rel=0.1)
 
 
 def test_the_utilisation_of_a_line_is_the_share_of_the_time_in_which_it_was_in_use() -> None:
     for busy, settling, elapsed, share in ((0.25, 0.5, 1.5, 0.5), (0.0, 0.0, 0.0, 0.0), (0.6, 0.5, 1.0, 1.0)):
-        assert replace(LINE, busy=busy, settling=settling, elapsed=elapsed).utilisation == share
+        assert replace(line_statistics(), busy=busy, settling=settling, elapsed=elapsed).utilisation == share
 
 
-@pytest.mark.parametrize(
-    "record", [LINE, LINE.waits[0], NODE, DriverErrors(0, 0, 0, 0, 0)], ids=lambda record: type(record).__name__
-)
-def test_statistics_never_change(record: Any) -> None:
-    for each in fields(record):
-        with pytest.raises(FrozenInstanceError):
-            setattr(record, each.name, None)
-    assert astuple(replace(record)) == astuple(record)
+def test_statistics_never_change() -> None:
+    line = line_statistics()
+    for record in (line, line.waits[0], node_statistics(), DriverErrors(0, 0, 0, 0, 0)):
+        for each in fields(record):
+            with pytest.raises(FrozenInstanceError):
+                setattr(record, each.name, None)
+        assert astuple(replace(record)) == astuple(record)
 
 
 def test_a_timeline_says_when_the_first_byte_of_a_reply_came_and_when_the_last() -> None:

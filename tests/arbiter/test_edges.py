@@ -352,6 +352,17 @@ def test_a_broadcast_is_over_when_it_is_out_and_the_turnaround_later() -> None:
     assert bench.until_sent() == pytest.approx(said + turnaround)
 
 
+def test_a_broadcast_that_echoes_is_over_a_turnaround_behind_its_echo() -> None:
+    bench = Bench(echo=True)
+    everybody, drive = bench.node(0, mentor.PROFILE), bench.node(12, mentor.PROFILE)
+    bench.wait(1.0)
+    bench.ask(everybody, mentor.Write(1, 17, 100))
+    bench.ask(drive, mentor.Read(1, 17))
+    bench.hear(bench.sent(), after=0.030)
+    turnaround = mentor.Write(1, 17, 100).open(0, mentor.PROFILE.timings).timing.turnaround
+    assert bench.until_sent() == pytest.approx(turnaround)
+
+
 def test_r1_what_is_said_behind_an_ack_is_reckoned_from_the_end_of_both() -> None:
     bench, node = msc_line()
     bench.ask(node, msc.DataRead(2008))

@@ -7,7 +7,10 @@ from math import nextafter
 
 import pytest
 
+from busmaster.arbiter.deadlines import Deadlines
+from busmaster.arbiter.endings import TOO_LATE, too_late
 from busmaster.arbiter.events import Overdue
+from busmaster.arbiter.expiries import SLACK, Expiries
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.emulator.device import Delay
@@ -42,6 +45,28 @@ def test_r12_what_was_never_sent_is_not_started() -> None:
     assert "not sent within its time: it waited 30 ms for the line" in str(waiting.error)
     bench.answer()
     assert bench.sent() == ""
+
+
+def test_requests_that_end_in_time_do_not_pile_up_and_one_that_waits_is_not_forgotten() -> None:
+    node, expiries = Bench().node(), Expiries(Deadlines())
+    waiting = Transaction(node, hcp2.Read(1), start_by=5.0)
+    expiries.expect(waiting, 1)
+    for number in range(1000):
+        ended = Transaction(node, hcp2.Read(1), start_by=1000.0 - number, finish_by=2000.0)
+        expiries.expect(ended, 1)
+        ended.phase = Phase.ENDED
+        assert len(expiries._heap) <= 2 + SLACK + 2
+    assert list(expiries.due(6.0)) == [waiting]
+
+
+def test_r12_whoever_waited_in_vain_is_told_for_how_many_milliseconds() -> None:
+    waiting = Transaction(Bench().node(), hcp2.Read(1))
+    waiting.queued = 1.0
+    assert "it waited 2500 ms" in str(too_late(waiting, 3.5))
+    waiting.attempts = 1
+    error = too_late(waiting, 3.5)
+    assert "sent, but not answered within its time: 2500 ms" in str(error)
+    assert error.hint == TOO_LATE
 
 
 @pytest.mark.parametrize(("command", "kind"), [(hcp2.Read(1), NoReply), (REPEATED, WriteUnconfirmed)])
@@ -191,6 +216,16 @@ def test_a_retry_whose_time_is_over_does_not_go_before_another_either() -> None:
     asked.node.health = Health.UP
     may_go = bench.arbiter.dispatcher.may_go
     assert (may_go(asked, bench.now), may_go(asked, asked.finish_by)) == (True, False)
+
+
+def test_a_retry_may_go_before_another_though_the_time_to_start_is_over() -> None:
+    bench = Bench()
+    asked = bench.ask(heard(bench), start_by=bench.now + 0.1)
+    bench.sent()
+    bench.wait(0.12)
+    assert (asked.phase, asked.attempts) == (Phase.QUEUED, 1)
+    asked.node.health = Health.UP
+    assert bench.arbiter.dispatcher.may_go(asked, bench.now)
 
 
 def test_an_urgent_write_that_comes_too_late_is_not_sent_and_what_it_overtook_is_not_either() -> None:

@@ -269,6 +269,21 @@ def test_a_suspended_dead_node_is_not_probed_until_the_suspension_ends() -> None
     assert bench.until_sent() == pytest.approx(5.0, abs=0.01)
 
 
+def test_a_suspended_dead_node_is_not_probed_in_the_place_of_another() -> None:
+    bench = Bench()
+    record, other = dead(bench), bench.node(2)
+    bench.ask(other, retries=0)
+    bench.wait(0.2)
+    bench.sent()
+    end = bench.now + 5.0
+    bench.arbiter.dispatcher.suspend(record, end)
+    probed = []
+    while bench.now + bench.until_sent() < end:
+        probed.append(bench.sent())
+    assert {request[3:8] for request in probed} == {"30 32"}
+    assert len(probed) >= 5, "nor does it keep the other waiting"
+
+
 # what a write that was on the wire ends with
 
 

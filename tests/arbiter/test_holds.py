@@ -219,6 +219,19 @@ def test_r9_behind_a_sequence_goes_what_waits_in_a_lower_class() -> None:
     assert lower.started < command.started
 
 
+def test_r9_behind_an_urgent_sequence_of_another_program_goes_what_waits_in_a_lower_class() -> None:
+    table = Table()
+    bench, program = table.bench, LineClient()
+    hold = table.hold(program)
+    write = bench.ask(table.node, WRITE, priority=URGENT, client=hold)
+    bench.until_sent()
+    urgent = bench.ask(table.there, hcp2.Read(20), priority=URGENT, client=program)
+    command = bench.ask(table.there, hcp2.Read(21))
+    table.release(hold)
+    bench.served(urgent)
+    assert write.started < command.started < urgent.started
+
+
 def test_r10_polls_that_were_due_meanwhile_are_counted_as_missed() -> None:
     table = Table()
     bench = table.bench

@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.events import LatenessRaised
-from busmaster.arbiter.health import Health, NodeRecord
+from busmaster.arbiter.health import SILENT, Health, NodeRecord
+from busmaster.arbiter.in_step import MOST_UNHEARD
 from busmaster.arbiter.learned import (
-    AT_FIRST,
-    EPOCH,
-    LEAST,
-    LEAST_SILENCE,
     MARGIN,
-    NEVER,
     SLOWER,
     TRUSTED_AFTER,
     TRUSTED_AGAIN_AFTER,
-    LearnedTimes,
     Learning,
-    LegTimes,
 )
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.learning import LEARNED, Learned
 from busmaster.errors import NoReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
-from tests.arbiter.bench import ACK, LATENESS, TAU, Bench, reply_of, request_of, up
+from busmaster.protocols.msc import codec as msc
+from tests.arbiter.bench import ACK, FIVE, LATENESS, TAU, Bench, reply_of, request_of, up
 
 REQUEST = 8 * TAU
 TOOK = 0.004
@@ -67,69 +64,21 @@ def trusted(node: NodeRecord) -> bool:
 # how long
 
 
-def test_the_window_is_half_as_long_again_as_the_largest_reply_time_of_the_last_epochs_and_at_least_the_least() -> None:
-    times = LegTimes()
-    for place in range(TRUSTED_AFTER):
-        assert times.timing(TIMINGS.read, TAU, AT_FIRST) is TIMINGS.read, f"{place} replies are too few"
-        times.note(0.001, 0.002, 0.0)
-    assert times.timing(TIMINGS.read, TAU, AT_FIRST).window == LEAST
-    times.note(0.010, 0.012, 0.0)
-    learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
-    assert learned.window == pytest.approx(1.5 * 0.010 + 0.002)
-    assert learned.lateness == TIMINGS.read.lateness, "what is owed is owed for as long as the document says"
-    assert learned.silence == learned.byte_gap == pytest.approx(LEAST_SILENCE * TAU)
-    for _ in range(2 * EPOCH):
-        times.note(0.001, 0.002, 0.0)
-    assert times.window == LEAST
-
-
-def test_what_an_adapter_hands_over_late_or_in_pieces_is_waited_for() -> None:
-    times = LegTimes()
-    for _ in range(TRUSTED_AFTER):
-        times.note(0.001, 0.018, 0.004)
-    learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
-    assert learned.window == pytest.approx(0.018 + MARGIN)
-    assert learned.byte_gap == pytest.approx(0.008)
-
-
-def test_no_learned_time_exceeds_the_documents() -> None:
-    times = LegTimes()
-    for _ in range(TRUSTED_AFTER):
-        times.note(0.080, 0.080, 0.015)
-    learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
-    assert (learned.window, learned.byte_gap) == (TIMINGS.read.window, TIMINGS.read.byte_gap)
-
-
-def test_reads_and_writes_and_packets_are_kept_apart() -> None:
-    node = Learning()
-    for _ in range(TRUSTED_AFTER):
-        for command, took in ((hcp2.Read(1), 0.002), (hcp2.Write(1, (1,)), 0.04)):
-            node.timings(command, TIMINGS, AT_FIRST)
-            node.note(command, False, took, took, 0.0, TAU)
-        node.note(hcp2.Read(1), True, 0.02, 0.02, 0.0, TAU)
-    timings = node.timings(hcp2.Read(2), TIMINGS, AT_FIRST)
-    assert timings.read.window == pytest.approx(LEAST)
-    assert timings.packet.window == pytest.approx(0.032)
-    assert node.timings(hcp2.Write(1, (1,)), TIMINGS, AT_FIRST).write.window == TIMINGS.write.window
-    assert node.timings(hcp2.Read(2), TIMINGS, NEVER) == TIMINGS
-
-
-def test_the_silence_that_ends_a_reply_follows_the_baud_rate() -> None:
-    node = Learning()
-    node.timings(hcp2.Read(1), TIMINGS, AT_FIRST)
-    for byte_time in (TAU, 2 * TAU, TAU):
-        for _ in range(TRUSTED_AFTER):
-            node.note(hcp2.Read(1), False, 0.001, 0.001, 0.0, byte_time)
-        assert node.timings(hcp2.Read(1), TIMINGS, AT_FIRST).read.silence == pytest.approx(LEAST_SILENCE * byte_time)
-
-
-def test_what_an_earlier_run_has_learned_is_trusted_after_fewer_replies() -> None:
-    node = Learning()
-    node.begin_with([LearnedTimes("Read", False, 0.004, 0.004, 0.0, 0.008, True)])
-    for _ in range(TRUSTED_AGAIN_AFTER):
-        assert node.timings(hcp2.Read(1), TIMINGS, AT_FIRST).read.window == TIMINGS.read.window
-        node.note(hcp2.Read(1), False, 0.001, 0.001, 0.0, TAU)
-    assert node.timings(hcp2.Read(1), TIMINGS, AT_FIRST).read.window == pytest.approx(0.008)
+@pytest.mark.parametrize("pauses", [(0.007, 0.003), (0.003, 0.007)])
+def test_the_longest_pause_within_a_reply_is_learned_wherever_it_is(pauses: tuple[float, float]) -> None:
+    bench = Bench()
+    node = bench.arbiter.add_node(hcp2.PROFILE, 1, bench.now, LEARNED)
+    for _ in range(2):
+        read = bench.ask(node)
+        bench.until_sent()
+        bench.sent()
+        for piece, after in zip((FIVE[:6], FIVE[6:12], FIVE[12:]), (REQUEST + TOOK, *pauses), strict=True):
+            bench.hear(piece, after)
+        assert read.value == 5.0
+        bench.until_ready()
+        bench.wait(1.0)
+    [times] = learning(node).times(node.timings)
+    assert times.pause == pytest.approx(0.007)
 
 
 def test_nothing_is_learned_unless_it_is_asked_for() -> None:
@@ -168,6 +117,27 @@ def test_a_read_of_the_node_that_waits_anyway_goes_in_place_of_a_check_whatever_
     assert (bench.sent(), bench.arbiter.statistics(bench.now).checks) == (request_of(3), 0)
 
 
+def test_a_read_of_the_node_does_not_go_in_place_of_a_check_before_a_write_that_waits_for_the_node() -> None:
+    bench = Bench()
+    node = trained(bench)
+    bench.ask(node)
+    bench.ask(node, hcp2.Write(1, (7,)))
+    bench.ask(node, hcp2.Read(3), priority=Priority.BACKGROUND)
+    assert bench.sent() == request_of(1)
+    bench.until_sent()
+    assert (bench.sent(), bench.arbiter.statistics(bench.now).checks) == (request_of(10), 1)
+
+
+def test_r15_a_last_attempt_does_not_go_in_place_of_a_check() -> None:
+    bench = Bench()
+    node = trained(bench)
+    bench.ask(node)
+    bench.ask(node, hcp2.Read(3), retries=0, priority=Priority.BACKGROUND)
+    assert bench.sent() == request_of(1)
+    bench.until_sent()
+    assert (bench.sent(), bench.arbiter.statistics(bench.now).checks) == (request_of(10), 1)
+
+
 def test_another_node_that_answers_with_another_echo_is_asked_at_once() -> None:
     bench = Bench()
     node, other = trained(bench, 1), trained(bench, 2)
@@ -181,8 +151,10 @@ def test_another_node_that_answers_with_another_echo_is_asked_at_once() -> None:
     assert unlike.value == 9.0
 
 
-@pytest.mark.parametrize("retries", [0, 1, 2])
-def test_a_second_attempt_is_awaited_twice_as_long_and_the_last_as_long_as_the_document_says(retries: int) -> None:
+@pytest.mark.parametrize("retries", [0, 1, 2, 4])
+def test_a_second_attempt_is_awaited_twice_as_long_and_those_behind_and_the_last_as_long_as_the_document_says(
+    retries: int,
+) -> None:
     bench = Bench()
     node = trained(bench)
     asked = bench.ask(node, retries=retries)
@@ -197,7 +169,8 @@ def test_a_second_attempt_is_awaited_twice_as_long_and_the_last_as_long_as_the_d
         bench.to(bench.arbiter.poll_timeout())
         sent_at.append(bench.now)
     waited = [end - begin for begin, end in zip(sent_at[::2], sent_at[1::2], strict=True)]
-    windows = [*[WINDOW, 2 * WINDOW][:retries], TIMINGS.read.window]
+    windows = [WINDOW, 2 * WINDOW][:retries]
+    windows += [TIMINGS.read.window] * (retries + 1 - len(windows))
     assert waited == pytest.approx([REQUEST + window for window in windows])
     assert isinstance(asked.error, NoReply)
 
@@ -238,6 +211,21 @@ def test_r15_no_write_leaves_while_a_reply_may_still_come() -> None:
     assert write.error is None
 
 
+def test_r15_no_last_attempt_of_a_read_leaves_in_place_of_a_write_while_a_reply_may_still_come() -> None:
+    bench = Bench()
+    node, other, third = trained(bench, 1), trained(bench, 2), trained(bench, 3)
+    bench.ask(node, retries=1)
+    bench.ask(other, hcp2.Write(1, (7,)))
+    bench.ask(third, hcp2.Read(3), retries=0)
+    repeatable = bench.ask(node, hcp2.Read(4))
+    node.unheard = MOST_UNHEARD  # it is taken to be silent, and not asked for a check
+    bench.until_sent()
+    assert bench.sent() == request_of(1)
+    bench.until_sent()
+    assert bench.sent() == request_of(4)
+    assert repeatable.attempts == 1
+
+
 def test_r15_where_checks_are_in_vain_a_write_waits_for_the_documents_lateness() -> None:
     bench = Bench()
     node, other = trained(bench, 1), trained(bench, 2)
@@ -246,6 +234,24 @@ def test_r15_where_checks_are_in_vain_a_write_waits_for_the_documents_lateness()
     checks = [request_of(element) for element in (10, 11, 2, 3)]
     assert [request for request, _ in asked[:5]] == [request_of(1), *checks], "then it is taken to be silent"
     assert asked[5][1] - (asked[4][1] + REQUEST) >= LATENESS - 1e-9
+
+
+def test_r15_a_write_waits_for_the_packet_too_that_may_come_behind_a_late_ack() -> None:
+    bench = Bench()
+    node = bench.arbiter.add_node(msc.PROFILE, 1, bench.now, LEARNED)
+    read = msc.DataRead(2008)
+    for _ in range(TRUSTED_AFTER + 1):
+        answered = bench.ask(node, read)
+        bench.until_sent()
+        bench.sent()
+        bench.hear("06 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D", after=0.030)
+        assert (bench.ended(answered), bench.sent()) == (1, ACK)
+        bench.until_ready()
+    bench.ask(node, read, retries=1)
+    node.unheard = MOST_UNHEARD  # it is taken to be silent, and not asked for a check
+    [lost, after, *_] = requests_before(bench, bench.ask(bench.node(2, msc.PROFILE), msc.DataWrite(2024, 5)))
+    times = msc.PROFILE.timings
+    assert after[1] - lost[1] >= times.read.lateness + times.packet.lateness
 
 
 def test_r15_all_that_owe_are_asked_before_a_write_waits_for_a_lateness() -> None:
@@ -380,6 +386,20 @@ def test_a_straggler_brings_the_documents_times_back_until_enough_replies_have_c
     assert trusted(node)
 
 
+def test_a_node_that_is_heard_late_while_another_is_asked_is_not_silent() -> None:
+    bench = Bench()
+    node, other = trained(bench, 1), trained(bench, 2)
+    bench.ask(node)
+    bench.ask(other, hcp2.Read(3))
+    for request in (request_of(1), request_of(3, 2)):
+        bench.until_sent()
+        assert bench.sent() == request
+    node.unheard = SILENT
+    bench.hear(reply_of(1, 55), after=REQUEST + 0.002)
+    bench.until_sent()
+    assert node.unheard == 0
+
+
 def test_a_reply_later_than_three_quarters_of_its_window_does_so_too() -> None:
     bench = Bench()
     node = trained(bench)
@@ -387,10 +407,14 @@ def test_a_reply_later_than_three_quarters_of_its_window_does_so_too() -> None:
     assert not trusted(node)
 
 
-def test_a_node_that_has_always_been_as_slow_as_the_document_allows_is_trusted_all_the_same() -> None:
+@pytest.mark.parametrize("writes_window", [TIMINGS.write.window, 2 * TIMINGS.write.window])
+def test_a_node_that_has_always_been_as_slow_as_the_document_allows_is_trusted_all_the_same(
+    writes_window: float,
+) -> None:
     bench = Bench()
     slow = 0.9 * TIMINGS.read.window
-    node = bench.arbiter.add_node(hcp2.PROFILE, 1, bench.now, LEARNED)
+    write = replace(TIMINGS.write, window=writes_window, lateness=writes_window)
+    node = bench.arbiter.add_node(hcp2.PROFILE, 1, bench.now, Learned(replace(TIMINGS, write=write)))
     for number in range(TRUSTED_AFTER + 10):
         bench.served(bench.ask(node, hcp2.Read(10 + number % 2)), after=REQUEST + slow)
     assert trusted(node)

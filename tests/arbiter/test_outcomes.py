@@ -6,17 +6,30 @@ from typing import Any
 
 import pytest
 
-from busmaster.arbiter.events import LatenessLowered, LatenessRaised
+from busmaster.arbiter.events import LatenessLowered, LatenessRaised, Sampled
 from busmaster.arbiter.health import CALM_LATENESS, Health, NodeRecord
 from busmaster.arbiter.transaction import Priority
-from busmaster.contract.exchange import OTHER_FORMAT
+from busmaster.contract.exchange import OTHER_FORMAT, Command
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, GarbledReply, NoReply, Refused, Superseded, WriteUnconfirmed
 from busmaster.protocols._comms.codec import Reading, Writing
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
-from tests.arbiter.bench import ACK, FIVE, LATENESS, NAK, QUIET, READ_1_OF_NODE_1, TAU, WRITE_5, Bench, request_of, up
+from tests.arbiter.bench import (
+    ACK,
+    FIVE,
+    LATENESS,
+    NAK,
+    QUIET,
+    READ_1_OF_NODE_1,
+    TAU,
+    WRITE_5,
+    Bench,
+    lost,
+    request_of,
+    up,
+)
 
 REQUEST = 8 * TAU
 URGENT = Priority.URGENT
@@ -296,3 +309,30 @@ def test_r7_a_point_that_is_refused_in_two_cycles_is_polled_every_ten_seconds_fr
         if (cycle := int(bench.now - start)) not in cycles:
             cycles.append(cycle)
     assert cycles == [0, 1, 12, 23]
+
+
+@pytest.mark.parametrize("command", [hcp2.Read(3), write(5, idempotent=True)])
+def test_r15_what_may_be_repeated_is_asked_once_more_after_a_nak_that_may_be_anothers(command: Command[Any]) -> None:
+    bench = Bench()
+    node, other = up(bench), up(bench, 2)
+    lost(bench, other, write(5))
+    asked = bench.ask(node, command, retries=0, priority=Priority.URGENT)
+    bench.until_sent()
+    bench.sent()
+    bench.hear(NAK, after=0.002)
+    bench.served(asked)
+    assert (asked.error, asked.attempts) == (None, 2)
+
+
+def test_what_a_removed_poll_has_queued_is_never_sent_and_what_it_has_on_the_wire_reaches_nobody() -> None:
+    bench = Bench()
+    node = up(bench)
+    poll = bench.poll(node, 10.0, 3, 4)
+    bench.until_sent()
+    assert bench.sent() == request_of(3)
+    bench.arbiter.remove_poll(poll, bench.now)
+    bench.events.clear()
+    bench.answer()
+    bench.wait(20.0)
+    assert (bench.sent(), bench.cycles) == ("", [])
+    assert not any(isinstance(event, Sampled) for event in bench.events)

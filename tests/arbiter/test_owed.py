@@ -11,6 +11,7 @@ from busmaster.arbiter.in_step import ANY_BYTE, LAPSE, Awaited, InStep
 from busmaster.contract.profile import Profile
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp2 import codec as hcp2
+from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import BAD_CHECKSUM, FIVE
 
 ONE, TWO = b"\x0201", b"\x0202"
@@ -62,6 +63,15 @@ def test_r15_while_it_is_awaited_a_whole_reply_pays_however_short_the_part_that_
     payer = in_step.heard(bytes.fromhex("02 05 01 2C 32"), 0.1)
     assert payer is not None
     assert (payer.node, in_step.debts) == (drive, [])
+
+
+def test_r15_while_it_is_awaited_what_begins_with_a_byte_that_anybody_may_say_pays_nothing() -> None:
+    in_step = InStep()
+    drive, read = living(1, msc.PROFILE), msc.DataRead(2008)
+    keys = read.open(1, msc.PROFILE.timings).owed
+    in_step.owe(keys, drive, 0.0, 0.2, Awaited(read, 0.01, 0.02))
+    assert in_step.heard(bytes.fromhex("06 02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"), 0.1) is None
+    assert [debt.key for debt in in_step.debts] == [*keys, ANY_BYTE]
 
 
 def test_r15_while_it_is_awaited_a_damaged_reply_pays_nothing() -> None:

@@ -252,6 +252,18 @@ def test_r11_a_probe_that_is_answered_costs_what_it_took() -> None:
     assert bench.arbiter.dispatcher.probes.budget.tokens == pytest.approx(before + PROBE_COST - 0.004, abs=0.002)
 
 
+def test_r11_a_probe_that_was_free_gives_nothing_back() -> None:
+    bench = Bench()
+    record = dead(bench)
+    bench.until_sent()
+    bench.sent()
+    budget = bench.arbiter.dispatcher.probes.budget
+    budget.tokens = 0.1
+    bench.answer()
+    assert record.health is UP
+    assert budget.tokens == pytest.approx(0.1, abs=0.05), "but what the time since has earned"
+
+
 def test_r11_a_request_to_a_dead_node_is_tried_once_while_the_budget_allows_and_then_fails_at_once() -> None:
     bench = Bench()
     record = dead(bench)

@@ -12,6 +12,7 @@ from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import GarbledReply, LineNoisy, Refused
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import (
     ACK,
     ANOTHER_ELEMENT,
@@ -137,6 +138,21 @@ def test_r3_after_opening_the_port_an_earlier_masters_reply_is_waited_out() -> N
     assert bench.until_sent() == pytest.approx(LATENESS - 0.1)
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_r3_a_slower_node_is_waited_out_from_when_the_port_was_opened_be_it_added_then_or_later(known: bool) -> None:
+    slow = Timings.uniform(replace(hcp2.PROFILE.timings.read, lateness=0.700))
+    bench = Bench()
+    bench.wait(6.54)
+    node = bench.node(timings=slow) if known else None
+    bench.arbiter.line_down("unplugged", bench.now)
+    bench.arbiter.line_up(bench.now)
+    opened = bench.now
+    bench.wait(0.5)
+    bench.ask(node or bench.node(timings=slow))
+    bench.until_sent()
+    assert bench.now - opened == pytest.approx(0.700 + TAU)
+
+
 def test_r3_a_line_that_does_not_fall_silent_is_noisy_and_recovers_by_itself() -> None:
     bench = Bench()
     node = bench.node()
@@ -193,6 +209,20 @@ def test_r7_a_nak_that_was_noise_costs_no_value() -> None:
     bench.until_sent()
     bench.hear(SEVEN, after=0.004)
     assert read.value == 7.0
+
+
+def test_r7_after_a_nak_no_packet_is_waited_for_that_would_have_come_behind_an_ack() -> None:
+    slow = replace(msc.PROFILE.timings.packet, lateness=2.0)
+    bench = Bench()
+    node = bench.node(1, msc.PROFILE, replace(msc.PROFILE.timings, packet=slow))
+    read = bench.ask(node, msc.DataRead(2008))
+    while not bench.ended(read):
+        bench.until_sent()
+        length = len(bytes.fromhex(bench.sent())) * TAU
+        bench.hear(NAK, after=length + 0.010)
+    assert isinstance(read.error, Refused)
+    bench.ask(node, msc.DataRead(2008))
+    assert bench.until_sent() == pytest.approx(msc.PROFILE.timings.read.lateness + TAU - 0.010)
 
 
 def test_r7_a_nak_to_a_write_is_confirmed_at_once() -> None:

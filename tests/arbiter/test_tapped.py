@@ -42,7 +42,7 @@ def test_an_attempt_is_on_the_wire_from_its_request_to_its_end() -> None:
     bench.ask(node)
     attempt = bench.arbiter.attempt
     assert attempt is not None
-    assert (attempt.protocol, attempt.address, attempt.verdict) == ("hcp2", 1, None)
+    assert (attempt.protocol, attempt.address, attempt.verdict, attempt.late) == ("hcp2", 1, None, False)
     assert attempt.request == bytes.fromhex(READ_1_OF_NODE_1)
     bench.hear(FIVE, after=0.004)
     after = bench.arbiter.attempt

@@ -198,6 +198,17 @@ def test_r12_start_within_fails_a_request_without_touching_the_wire() -> None:
     assert bench.sent() == ""
 
 
+def test_r12_a_request_whose_time_to_start_is_over_is_not_sent_before_its_timer_is_looked_at_either() -> None:
+    bench = Bench()
+    node = bench.node()
+    bench.ask(node)
+    bench.sent()
+    waiting = bench.ask(node, start_by=bench.now + 0.030)
+    bench.arbiter.data_received(bytes.fromhex(FIVE), bench.now + 0.031)
+    assert bench.sent() == ""
+    assert isinstance(waiting.error, NotStarted)
+
+
 def test_r12_start_within_does_not_end_a_request_that_has_started() -> None:
     bench = Bench()
     read = bench.ask(bench.node(), start_by=bench.now + 0.010)
@@ -262,9 +273,11 @@ def test_r8_close_ends_whatever_waits_and_lets_the_exchange_on_the_wire_finish()
     bench = Bench()
     node = bench.node()
     on_wire, waiting = bench.ask(node), bench.ask(node)
+    poll = bench.poll(node, 0.1, 7)
     bench.arbiter.close(bench.now)
     bench.listen()
     assert isinstance(waiting.error, BusClosed)
+    assert not poll.active
     bench.hear(FIVE, after=0.004)
     assert on_wire.value == 5.0
     assert bench.arbiter.state is LineState.OFFLINE

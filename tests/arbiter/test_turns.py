@@ -189,6 +189,17 @@ def test_r9_a_program_cannot_starve_the_others_by_urgent_requests() -> None:
     assert served.index(other) == URGENT_RUN
 
 
+def test_r9_urgent_requests_that_come_one_by_one_yield_as_well() -> None:
+    desk = Desk()
+    one, other = desk.client(), desk.client()
+    desk.ask(other, 10)
+    served = []
+    for _ in range(2 * (URGENT_RUN + 1)):
+        desk.ask(one, 1 - desk.backlog.waiting(URGENT), URGENT)
+        served += desk.serve(1)
+    assert served == [*[one] * URGENT_RUN, other] * 2
+
+
 def test_r9_the_owners_urgent_requests_yield_to_nobody() -> None:
     desk = Desk()
     flood, other = desk.client(), desk.client()
@@ -208,6 +219,19 @@ def test_r9_urgent_requests_of_another_go_before_those_of_a_flood() -> None:
     desk.serve(100)
     desk.ask(other, 1, URGENT)
     assert other in desk.serve(1)
+
+
+def test_what_suits_is_picked_from_whom_had_the_least_and_else_from_another() -> None:
+    desk = Desk()
+    first, second = desk.client(), desk.client()
+    desk.ask(first, 3)
+    desk.ask(second, 3)
+    assert desk.serve(1) == [first]
+    picked = [
+        desk.backlog.pick(COMMAND, suits) for suits in (lambda _: True, lambda t: t.client is first, lambda _: False)
+    ]
+    assert [None if one is None else one.client for one in picked] == [second, first, None]
+    assert desk.backlog.waiting(COMMAND) == 3
 
 
 def test_what_is_given_back_is_the_next_to_go_whoever_waits() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from busmaster.contract.arguments import guess, is_decimal, meant, nearest, seconds, whole_number
+from busmaster.contract.arguments import guess, host_and_port, is_decimal, meant, nearest, seconds, whole_number
 from busmaster.errors import InvalidCommand
 
 
@@ -17,6 +17,19 @@ class Index:
 
     def __index__(self) -> int:
         return 5
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port"), [("127.0.0.1:5020", "127.0.0.1", 5020), ("[::1]:0", "::1", 0), ("a:65535", "a", 65535)]
+)
+def test_an_address_is_a_host_and_a_port(text: str, host: str, port: int) -> None:
+    assert host_and_port(text) == (host, port)
+
+
+@pytest.mark.parametrize("text", ["5020", ":5020", "host", "host:", "host:-1", "host:65536", "host:5020x"])
+def test_an_address_without_a_host_or_a_port_is_refused(text: str) -> None:
+    with pytest.raises(InvalidCommand, match="HOST:PORT"):
+        host_and_port(text)
 
 
 @pytest.mark.parametrize("value", [3, 5, 7, Index()])

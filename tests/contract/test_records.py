@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 from typing import Any
 
@@ -124,6 +125,11 @@ def test_a_record_never_changes_has_slots_and_is_equal_to_its_twin(record: Any) 
     assert not hasattr(record, "__dict__")
 
 
+@pytest.mark.parametrize("command", COMMANDS, ids=name_of)
+def test_what_a_command_shows_makes_it_again(command: Any) -> None:
+    assert eval(repr(command), vars(sys.modules[type(command).__module__])) == command  # noqa: S307
+
+
 @pytest.mark.parametrize("record", CHANGING, ids=name_of)
 def test_a_step_has_slots_and_compares_by_value(record: Any) -> None:
     assert replace(record) == record
@@ -134,6 +140,12 @@ def test_a_read_can_be_asked_for_its_places_and_what_it_tells_and_a_write_for_wh
     for command in (hcp.Read(1), hcp.Write(1, (5,)), mentor.Read(1, 17), mentor.Write(1, 17, 5)):
         asked = [isinstance(command, kind) for kind in (Placed, Telling, Changing)]
         assert asked == [not command.writes, not command.writes, command.writes]
+
+
+def test_learned_times_stay_within_those_that_they_were_given_and_else_within_the_protocols() -> None:
+    protocols, given = (Timings.uniform(replace(TIMING, window=window)) for window in (0.1, 0.12))
+    assert Learned().of(protocols) == Learned(protocols)
+    assert Learned(given).of(protocols) == Learned(given)
 
 
 def test_a_profile_never_changes() -> None:

@@ -2,9 +2,10 @@
 
     python -m tests.mutation --count 500 --seed 1 --jobs 2
 
-draws mutants of the arbiter, the contract, the wire, the codecs and the pump, runs the tests on each of them in a copy
-of what is committed, and writes each verdict into the session's file, from which the same command goes on after an
-interruption. `--report` only prints what the file holds. It wants the extra `mutation`, and hours.
+draws mutants of the arbiter, the contract, the wire, the codecs and the pump, asks the tests about each of them in a
+copy of what is committed, and writes each verdict into the session's file, from which the same command goes on after
+an interruption. `--report` only prints what the file holds. What is measured of the tests first, once for a commit, is
+kept beside it. It wants the extra `mutation`.
 """
 
 from __future__ import annotations
@@ -12,19 +13,23 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import subprocess
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from tests.mutation.asked import Measured
 from tests.mutation.places import ROOMS, Mutant, drawn
 from tests.mutation.trial import Copy, Verdict
 
 ROOT = Path(__file__).parents[2]
 EQUIVALENT = Path(__file__).with_name("equivalent.json")
-"""Survivors that change nothing anybody can see, or tune what is no promise: each with its reason."""
+"""Survivors that change nothing anybody can see, or tune what is no promise: each with its reason. Where it is said
+only what is replaced, that holds of whatever replaces it and is not noticed."""
 
 
 def main() -> None:
@@ -38,7 +43,7 @@ def main() -> None:
         "--session", type=Path, help="the file of verdicts (mutation-SEED.jsonl, not in the repository)"
     )
     parser.add_argument(
-        "--near", action="store_true", help="run only the tests nearest to each room: quick, a lower bound"
+        "--near", action="store_true", help="ask only the tests nearest to each room: quick, a lower bound"
     )
     parser.add_argument("--report", action="store_true", help="only print what the session's file holds")
     options = parser.parse_args()
@@ -52,30 +57,39 @@ def main() -> None:
 
 def try_all(mutants: list[Mutant], session: Path, options: argparse.Namespace) -> None:
     """Try them, some at once, each process in a copy of its own, and write each verdict as it comes."""
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        multiprocessing.Pool(options.jobs, start_in_a_copy, (Path(folder), options.near)) as pool,
-    ):
-        for number, (mutant, verdict) in enumerate(pool.imap_unordered(judged, mutants), 1):
-            fields = mutant.as_fields() | {"outcome": verdict.outcome, "seconds": verdict.seconds, "diff": verdict.diff}
-            with session.open("a") as file:
-                file.write(json.dumps(fields) + "\n")
-            say(f"{number}/{len(mutants)} {verdict.outcome:8} {verdict.seconds:6.0f} s  {mutant.module}:{mutant.line}")
+    with tempfile.TemporaryDirectory() as folder:
+        known = measured(Path(folder), options.near)
+        with multiprocessing.Pool(options.jobs, start_in_a_copy, (Path(folder), options.near, known)) as pool:
+            for number, (mutant, verdict) in enumerate(pool.imap_unordered(judged, mutants), 1):
+                with session.open("a") as file:
+                    file.write(json.dumps(mutant.as_fields() | asdict(verdict)) + "\n")
+                where = f"{mutant.module}:{mutant.line}"
+                say(f"{number}/{len(mutants)} {verdict.outcome:8} {verdict.seconds:6.1f} s  {where}  {verdict.test}")
 
 
-COPY: list[tuple[Copy, bool]] = []
-"""The copy of this process, and whether only the nearest tests are run in it."""
+def measured(folder: Path, near: bool) -> Path:
+    """Return the file with what is known of the tests of the commit that is checked out; measure them if it is not."""
+    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+    file = ROOT / f"mutation-{commit}{'-near' if near else ''}.json"
+    if not file.exists():
+        Copy(ROOT, folder / "measured").measure(near, file)
+    return file
 
 
-def start_in_a_copy(folder: Path, near: bool) -> None:
+COPY: list[tuple[Copy, bool, Measured]] = []
+"""The copy of this process, whether only the nearest tests are asked in it, and what is known of all tests."""
+
+
+def start_in_a_copy(folder: Path, near: bool, known: Path) -> None:
     """Make a process its copy."""
-    COPY.append((Copy(ROOT, folder / multiprocessing.current_process().name), near))
+    COPY.append((Copy(ROOT, folder / multiprocessing.current_process().name), near, Measured.read(known)))
 
 
 def judged(mutant: Mutant) -> tuple[Mutant, Verdict]:
     """Try it in this process's copy."""
-    copy, near = COPY[0]
-    return mutant, copy.tried(mutant, near)
+    copy, near, known = COPY[0]
+    return mutant, copy.tried(mutant, near, known)
 
 
 def read(session: Path) -> list[dict[str, Any]]:
@@ -101,7 +115,7 @@ def report(verdicts: Iterable[dict[str, Any]]) -> None:
     survivors = []
     for verdict in verdicts:
         outcome = verdict["outcome"]
-        if outcome == "survived" and changed(verdict) in excused:
+        if outcome == "survived" and (changed(verdict) in excused or replaced_in(verdict) in excused):
             outcome = "excused"
         if outcome == "survived":
             survivors.append(verdict)
@@ -125,6 +139,11 @@ def changed(verdict: dict[str, Any]) -> str:
     first = next(number for number, line in enumerate(lines) if line[:1] in "+-")
     shown = lines[max(first - 1, 0) : first] + [line for line in lines if line[:1] in "+-"]
     return "\n".join([verdict["module"], *(line[:1] + " " + line[1:].strip() for line in shown)])
+
+
+def replaced_in(verdict: dict[str, Any]) -> str:
+    """Return what `changed` does, but for what it was changed to."""
+    return "\n".join(line for line in changed(verdict).splitlines() if line[:1] != "+")
 
 
 if __name__ == "__main__":

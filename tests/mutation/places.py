@@ -1,7 +1,7 @@
 """What may be mutated, room by room, and a seeded sample of it.
 
-The operators are cosmic-ray's. Left out is what no test can notice: annotations, which are never evaluated here, and
-docstrings.
+The operators are cosmic-ray's. Left out is what no test can notice: annotations, which are never evaluated here,
+what only types are made of, and docstrings.
 """
 
 from __future__ import annotations
@@ -75,7 +75,8 @@ def mutants_of(room: str, path: Path, root: Path) -> Iterator[Mutant]:
 
 
 def inert_spans(source: str) -> list[Span]:
-    """Where annotations, docstrings and imports for types are: (line, column) from the first to behind the last."""
+    """Where annotations, docstrings, protocols and imports for types are: (line, column) from the first to behind the
+    last."""
     found: list[ast.AST] = []
     for node in ast.walk(ast.parse(source)):
         match node:
@@ -87,6 +88,8 @@ def inert_spans(source: str) -> list[Span]:
                 found.append(node.annotation)
                 if ast.unparse(node.annotation).endswith("TypeAlias") and node.value:
                     found.append(node.value)
+            case ast.ClassDef() if any(ast.unparse(base).startswith("Protocol") for base in node.bases):
+                found.append(node)
             case ast.If() if "TYPE_CHECKING" in ast.unparse(node.test):
                 found.append(node)
             case ast.Expr(value=ast.Constant(value=str())):

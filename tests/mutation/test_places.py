@@ -6,12 +6,19 @@ from tests.mutation.places import inert_spans
 
 SOURCE = '''"""Says what it is."""
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 if TYPE_CHECKING:
     from a import b
 
 Name: TypeAlias = int | str
+
+
+class Adder(Protocol):
+    @property
+    def limit(self) -> int: ...
+
+
 limit: int | None = 3
 
 
@@ -34,6 +41,8 @@ def test_annotations_docstrings_and_imports_for_types_are_left_out() -> None:
         [
             '"""Says what it is."""',
             "if TYPE_CHECKING:",
+            "class Adder(Protocol):",
+            "int",
             "TypeAlias",
             "int | str",
             "int | None",

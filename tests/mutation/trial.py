@@ -1,6 +1,6 @@
 """One mutant in a copy of the tree: do the tests notice it?
 
-They are asked in stages, the nearest first, each to its first failure: most mutants die in the first second.
+Those that run what is changed are asked, to the first failure: most mutants die in the first second.
 """
 
 from __future__ import annotations
@@ -11,22 +11,17 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator
 
+from tests.mutation.asked import NEAR, Measured, asked, changed_lines
 from tests.mutation.places import Mutant
-from tests.mutation.stages import stages_of
-
-PATIENCE = 5.0
-"""Times the usual run, after which a trial is over: a mutant that makes the tests hang is noticed."""
-LONGEST = 1800.0
-"""Seconds of the usual run: it is not known yet."""
-SHORTEST = 10.0
-"""Seconds that every trial may take: others compute too."""
+from tests.mutation.warm import UNLIKE
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,63 +30,83 @@ class Verdict:
 
     outcome: str
     seconds: float
+    test: str
+    """The test that noticed it."""
     diff: str
 
 
 class Copy:
-    """A copy of what is committed, where files may be changed, and a warm process that runs its tests."""
+    """A copy of what is committed, where files may be changed, and warm processes that run its tests."""
 
     def __init__(self, root: Path, folder: Path) -> None:
         subprocess.run(["git", "clone", "--quiet", "--shared", str(root), str(folder)], check=True)
         self.folder = folder
-        self._said = folder.with_name(f"{folder.name}.txt")
-        self._usual: dict[tuple[str, ...], float] = {}
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.mutation.warm", str(self._said)],
-            cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(folder), "CI": "true"},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        self._warm: dict[str, subprocess.Popen[str]] = {}
 
-    def tried(self, mutant: Mutant, near: bool) -> Verdict:
-        """Change the copy, run its tests (`near`: only the room's) to the first failure, and change it back."""
-        stages = stages_of(mutant.room, mutant.module, near, self.folder)
-        for stage in stages_of(mutant.room, mutant.module, True, self.folder):
-            self.usual(stage)
+    def measure(self, near: bool, file: Path) -> None:
+        """Write what is known of the tests into a file. Raises RuntimeError if they fail already."""
+        process = self._start("measure", str(file), *asked(near))
+        if process.wait() != 0:
+            raise RuntimeError(f"the tests fail without a mutant:\n{self._said('measure').read_text()[-2000:]}")
+
+    def tried(self, mutant: Mutant, near: bool, measured: Measured) -> Verdict:
+        """Change the copy, ask its tests (`near`: only the room's) to the first failure, and change it back."""
         start = time.monotonic()
         path = self.folder / mutant.module
         source = path.read_text()
         mutated = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
         if mutated is None or mutated == source:
-            return Verdict("impossible", 0.0, "")
+            return Verdict("impossible", 0.0, "", "")
         before = path.stat()
         path.write_text(mutated)
         try:
-            passes = all(self.passes(stage, self._usual.get(stage, LONGEST)) for stage in stages)
+            test = self._noticed_by(mutant, changed_lines(source, mutated), near, measured)
         finally:
             path.write_text(source)
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # the compiled original is valid again
         diff = difflib.unified_diff(source.splitlines(), mutated.splitlines(), lineterm="")
-        return Verdict("survived" if passes else "killed", round(time.monotonic() - start, 1), "\n".join(diff))
+        seconds = round(time.monotonic() - start, 1)
+        return Verdict("killed" if test else "survived", seconds, test or "", "\n".join(diff))
 
-    def usual(self, stage: tuple[str, ...]) -> float:
-        """Return the seconds that a stage takes without a mutant. Raises RuntimeError if it fails then already."""
-        if stage not in self._usual:
-            start = time.monotonic()
-            if not self.passes(stage, LONGEST, keeps=True):
-                raise RuntimeError(f"the tests fail without a mutant:\n{self._said.read_text()[-2000:]}")
-            self._usual[stage] = time.monotonic() - start
-        return self._usual[stage]
+    def _noticed_by(self, mutant: Mutant, lines: set[int], near: bool, measured: Measured) -> str | None:
+        """Return the test that notices what is changed now, or None."""
+        paths = list(NEAR[mutant.room]) if near else asked(near)
+        running = measured.running(mutant.module, lines)
+        if "" not in running:
+            tests = measured.quickest(running, paths)
+            if not tests:
+                return None
+            answer = self._answer("answer", asked(near), module=mutant.module, tests=tests)
+            if answer["status"] != UNLIKE:
+                return answer["test"] if answer["status"] else None
+        answer = self._answer("import", [], paths=paths, tests=measured.quickest(measured.seconds, paths))
+        return answer["test"] or "while they are collected" if answer["status"] else None
 
-    def passes(self, stage: tuple[str, ...], usual: float, keeps: bool = False) -> bool:
-        """Run tests, and return whether all passed in time; `keeps` what is compiled for the next run."""
-        request: IO[str] | None = self._process.stdin
-        answer: IO[str] | None = self._process.stdout
-        assert request is not None
-        assert answer is not None
-        limit = SHORTEST + PATIENCE * usual
-        request.write(json.dumps([limit, keeps, "-q", "-x", "-p", "no:cacheprovider", *stage]) + "\n")
-        request.flush()
-        return int(answer.readline()) == 0
+    def _answer(self, what: str, collected: Iterable[str], **request: Any) -> Any:
+        """Return what a warm process says to a request. It is started with what it has collected."""
+        if what not in self._warm:
+            self._warm[what] = self._start(what, *collected)
+        process = self._warm[what]
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(json.dumps(request) + "\n")
+        process.stdin.flush()
+        line = process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"the tests have ended:\n{self._said(what).read_text()[-2000:]}")
+        return json.loads(line)
+
+    def _start(self, what: str, *arguments: str) -> subprocess.Popen[str]:
+        """Start a warm process."""
+        return subprocess.Popen(
+            [sys.executable, "-m", "tests.mutation.warm", what, str(self._said(what)), *arguments],
+            cwd=self.folder,
+            env=os.environ | {"PYTHONPATH": str(self.folder), "CI": "true"},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def _said(self, what: str) -> Path:
+        """Return the file that a warm process speaks into."""
+        return self.folder.with_name(f"{self.folder.name}-{what}.txt")

@@ -160,7 +160,8 @@ def test_commands_say_what_they_do() -> None:
     assert str(Write(7, 300)) == "write parameter 7 = 300"
     assert (Read(7).writes, Read(7).idempotent) == (False, True)
     assert (Write(7, 1).writes, Write(7, 1).idempotent) == (True, False)
-    assert Read(7) == Read(7, maximum=9)
+    assert Read(7) == Read(7, maximum=9) == Read(7, minimum=0)
+    assert Write(7, 1) == Write(7, 1, maximum=9) == Write(7, 1, minimum=0)
 
 
 def test_a_write_waits_for_the_eeprom_and_the_line_has_one_drive() -> None:

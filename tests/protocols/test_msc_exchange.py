@@ -45,6 +45,11 @@ def says(step: object) -> bytes:
 # as IB-11A002 has it
 
 
+def test_a_read_is_owed_an_ack_and_its_packet_and_once_it_is_acked_its_packet_alone() -> None:
+    assert reading().owed == (ACK, *reading().answers)
+    assert acked().owed == acked().answers
+
+
 def test_a_read_is_an_ack_and_a_packet_that_the_host_acks() -> None:
     exchange = acked()
     assert exchange.feed(REPLY) == Done(1234, send=ACK)

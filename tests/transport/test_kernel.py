@@ -14,6 +14,7 @@ from typing import Any, cast
 import pytest
 import uvloop
 
+from busmaster import Bus, SerialPort
 from busmaster.arbiter.counters import DriverErrors
 from busmaster.transport import kernel
 from busmaster.transport.kernel import DELAYED_ACK, TIOCGICOUNT, Socket, open_port
@@ -99,6 +100,18 @@ async def test_the_drivers_counts_run_from_the_opening_or_the_reset_and_over_the
     port.reset()
     assert port.errors() == DriverErrors(0, 0, 0, 0, 0)
     await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_the_drivers_counts_begin_again_where_the_buss_statistics_are_reset(
+    pty_master: PtyMaster, driver: Driver
+) -> None:
+    driver.counts = {6: 10, 7: 0, 8: 0, 9: 0, 10: 0}
+    async with Bus(SerialPort(pty_master.path, baudrate=57600)) as bus:
+        driver.counts[6] += 1
+        assert bus.statistics().driver == DriverErrors(framing=1, parity=0, breaks=0, overruns=0, buffer_overruns=0)
+        bus.reset_statistics()
+        assert bus.statistics().driver == DriverErrors(0, 0, 0, 0, 0)
 
 
 @pytest.mark.asyncio

@@ -1,0 +1,100 @@
+"""What is learned of a node's replies, by itself and without a line: windows, silences, and until when they count."""
+
+from __future__ import annotations
+
+import pytest
+
+from busmaster.arbiter.learned import (
+    AT_FIRST,
+    EPOCH,
+    LEAST,
+    LEAST_SILENCE,
+    MARGIN,
+    NEVER,
+    TRUSTED_AFTER,
+    TRUSTED_AGAIN_AFTER,
+    LearnedTimes,
+    Learning,
+    LegTimes,
+)
+from busmaster.protocols.hcp2 import codec as hcp2
+from tests.arbiter.bench import TAU
+
+TIMINGS = hcp2.PROFILE.timings
+
+
+def test_the_window_is_half_as_long_again_as_the_largest_reply_time_of_the_last_epochs_and_at_least_the_least() -> None:
+    times = LegTimes()
+    for place in range(TRUSTED_AFTER):
+        assert times.timing(TIMINGS.read, TAU, AT_FIRST) is TIMINGS.read, f"{place} replies are too few"
+        times.note(0.001, 0.002, 0.0)
+    assert times.timing(TIMINGS.read, TAU, AT_FIRST).window == LEAST
+    times.note(0.010, 0.012, 0.0)
+    learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
+    assert learned.window == pytest.approx(1.5 * 0.010 + 0.002)
+    assert learned.lateness == TIMINGS.read.lateness, "what is owed is owed for as long as the document says"
+    assert learned.silence == learned.byte_gap == pytest.approx(LEAST_SILENCE * TAU)
+    for _ in range(2 * EPOCH):
+        times.note(0.001, 0.002, 0.0)
+    assert times.window == LEAST
+
+
+def test_what_an_adapter_hands_over_late_or_in_pieces_is_waited_for() -> None:
+    times = LegTimes()
+    for _ in range(TRUSTED_AFTER):
+        times.note(0.001, 0.018, 0.004)
+    learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
+    assert learned.window == pytest.approx(0.018 + MARGIN)
+    assert learned.byte_gap == pytest.approx(0.008)
+
+
+def test_a_reply_that_was_slower_than_any_is_forgotten_after_two_epochs() -> None:
+    node, read = Learning(), hcp2.Read(1)
+    node.timings(read, TIMINGS, AT_FIRST)
+    for _ in range(TRUSTED_AFTER):
+        node.note(read, False, 0.010, 0.010, 0.0, TAU)
+    assert node.timings(read, TIMINGS, AT_FIRST).read.window == pytest.approx(0.017)
+    for _ in range(2 * EPOCH):
+        node.note(read, False, 0.001, 0.001, 0.0, TAU)
+        window = node.timings(read, TIMINGS, AT_FIRST).read.window
+    assert window == LEAST
+
+
+def test_no_learned_time_exceeds_the_documents() -> None:
+    times = LegTimes()
+    for _ in range(TRUSTED_AFTER):
+        times.note(0.080, 0.080, 0.015)
+    learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
+    assert (learned.window, learned.byte_gap) == (TIMINGS.read.window, TIMINGS.read.byte_gap)
+
+
+def test_reads_and_writes_and_packets_are_kept_apart() -> None:
+    node = Learning()
+    for _ in range(TRUSTED_AFTER):
+        for command, took in ((hcp2.Read(1), 0.002), (hcp2.Write(1, (1,)), 0.04)):
+            node.timings(command, TIMINGS, AT_FIRST)
+            node.note(command, False, took, took, 0.0, TAU)
+        node.note(hcp2.Read(1), True, 0.02, 0.02, 0.0, TAU)
+    timings = node.timings(hcp2.Read(2), TIMINGS, AT_FIRST)
+    assert timings.read.window == pytest.approx(LEAST)
+    assert timings.packet.window == pytest.approx(0.032)
+    assert node.timings(hcp2.Write(1, (1,)), TIMINGS, AT_FIRST).write.window == TIMINGS.write.window
+    assert node.timings(hcp2.Read(2), TIMINGS, NEVER) == TIMINGS
+
+
+def test_the_silence_that_ends_a_reply_follows_the_baud_rate() -> None:
+    node = Learning()
+    node.timings(hcp2.Read(1), TIMINGS, AT_FIRST)
+    for byte_time in (TAU, 2 * TAU, TAU):
+        for _ in range(TRUSTED_AFTER):
+            node.note(hcp2.Read(1), False, 0.001, 0.001, 0.0, byte_time)
+        assert node.timings(hcp2.Read(1), TIMINGS, AT_FIRST).read.silence == pytest.approx(LEAST_SILENCE * byte_time)
+
+
+def test_what_an_earlier_run_has_learned_is_trusted_after_fewer_replies() -> None:
+    node = Learning()
+    node.begin_with([LearnedTimes("Read", False, 0.004, 0.004, 0.0, 0.008, True)])
+    for _ in range(TRUSTED_AGAIN_AFTER):
+        assert node.timings(hcp2.Read(1), TIMINGS, AT_FIRST).read.window == TIMINGS.read.window
+        node.note(hcp2.Read(1), False, 0.001, 0.001, 0.0, TAU)
+    assert node.timings(hcp2.Read(1), TIMINGS, AT_FIRST).read.window == pytest.approx(0.008)
