@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 from tests.proof.adversary import act, actions, window
 from tests.proof.instants import Bound, Instant, begin_run, instant, noted, set_unit, ticks
-from tests.proof.key import restore, save, share, simplify
+from tests.proof.forgotten import simplify
+from tests.proof.key import Parts, share
 from tests.proof.msc_world import MscWorld
 from tests.proof.setups import Setup
 from tests.proof.sharing_world import SharingWorld
@@ -77,10 +78,11 @@ class Explorer:
         begin_run([0])
         SCRIPT.begin(())
         world = world_of(setup)(instant(0, 0))
+        self._parts = Parts(world)
         world.pump()
         zone = origin()
         simplify(world, zone)
-        self._keep(-1, None, *save(world, zone))
+        self._keep(-1, None, *self._parts.save(zone))
 
     def _keep(self, parent: int, step: Step | None, key: bytes, zone: Zone) -> int:
         """Remember a state, unless one that is known holds it. Returns the place of either."""
@@ -97,7 +99,7 @@ class Explorer:
     def _expand(self, place: int) -> None:
         _, _, key, zone = self._states[place]
         begin_run(sample(zone))
-        world = restore(key)
+        world = self._parts.restore(key)
         possible = [(action, *window(world, action)) for action in actions(world)]
         goes_on = False
         for action, *bounds in possible:
@@ -115,7 +117,7 @@ class Explorer:
         while pieces:
             piece, script = pieces.pop()
             begin_run(sample(piece))
-            world = restore(key)
+            world = self._parts.restore(key)
             problem = ""
             outside = False
             try:
@@ -136,7 +138,7 @@ class Explorer:
             elif not outside:
                 waits = AnyTime.chosen[0] or world.held or world.unread or world.said
                 simplify(world, decided)
-                next_ = self._keep(place, (action, script), *save(world, decided))
+                next_ = self._keep(place, (action, script), *self._parts.save(decided))
                 if action == ("timer", "line") and not waits:
                     self._quiet.setdefault(place, set()).add(next_)
 

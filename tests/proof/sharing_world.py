@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import inf
 
+from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.clients import OWN, Hold, LineClient
 from busmaster.arbiter.state import OFFLINE
 from busmaster.arbiter.transaction import URGENT, Transaction
@@ -17,6 +18,7 @@ class SharingWorld(World):
 
     def __init__(self, now: Time) -> None:
         super().__init__(now)
+        self.arbiter.longest_hold = Arbiter.longest_hold  # each part has all that it will have
         self.clients: tuple[LineClient | None, ...] = (
             None,
             *(self.arbiter.add_client() for _ in range(self.setup.clients)),
