@@ -51,7 +51,10 @@ def actions(world: World) -> list[Action]:
 def _strays(world: World) -> list[Action]:
     if not (world.setup.may(setups.STRAYS) and world.strays):
         return []
-    return [("stray", bytes((byte,))) for byte in world.setup.stray_bytes]
+    several = world.setup.stray_bytes
+    if not (world.words_are_read or world.reads_late):
+        several = several[:1]  # nobody asks which it is
+    return [("stray", bytes((byte,))) for byte in several]
 
 
 def _bytes(world: World) -> list[Action]:

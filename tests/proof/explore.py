@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 
 from tests.proof.adversary import act, actions, window
-from tests.proof.instants import Bound, Instant, begin_run, instant, noted, set_unit, ticks
 from tests.proof.forgotten import simplify
+from tests.proof.instants import Bound, Instant, begin_run, instant, noted, set_unit, ticks
 from tests.proof.key import Parts, share
 from tests.proof.msc_world import MscWorld
 from tests.proof.setups import Setup
@@ -16,10 +17,24 @@ from tests.proof.sharing_world import SharingWorld
 from tests.proof.shipped import AnyTime, set_aside
 from tests.proof.wire import SCRIPT, Outside, Violation
 from tests.proof.world import Action, World
-from tests.proof.zones import Zone, at_most, copied, extended, less_than, opposite, origin, sample, tighten, within
+from tests.proof.zones import (
+    Zone,
+    at_most,
+    copied,
+    extended,
+    less_than,
+    opposite,
+    origin,
+    sample,
+    tighten,
+    united,
+    within,
+)
 
 Step = tuple[Action, tuple[int, ...]]
 """What happened, and what was chosen in it."""
+MOST_HISTORIES = 64
+"""Of one violation."""
 
 
 @dataclass
@@ -32,8 +47,8 @@ class Found:
     events: int = 0
     seconds: float = 0.0
     closed: bool = False
-    violations: dict[str, list[Step]] = field(default_factory=dict)
-    """The shortest history of each."""
+    violations: dict[str, list[list[Step]]] = field(default_factory=dict)
+    """Short histories of each: not every one need be possible."""
     left: int = 0
     """Zones whose events were not looked at yet."""
 
@@ -48,6 +63,10 @@ class Explorer:
         """The zones of each key, each with its place among the states."""
         self._states: list[tuple[int, Step | None, bytes, Zone]] = []
         """Where each came from, and how; its key and its zone."""
+        self._done = 0
+        """Those before have been looked at."""
+        self._held_by: dict[int, int] = {}
+        """Those that need not be, each with a later one that holds it."""
         self._quiet: dict[int, set[int]] = {}
         """Where each comes to where a deadline passes and nothing comes, waits for R15, or leaves."""
 
@@ -58,18 +77,19 @@ class Explorer:
             prepare(setup)
             began = time.perf_counter()
             self._begin(setup)
-            done = 0
-            while done < len(self._states) and len(found.violations) < violations:
+            while self._done < len(self._states) and len(found.violations) < violations:
                 found.seconds = time.perf_counter() - began
                 if found.seconds > limit:
                     break
-                if not done % 500:
-                    self._progress(found, done)
-                self._expand(done)
-                done += 1
+                if not self._done % 500:
+                    self._progress(found, self._done)
+                place = self._done
+                self._done += 1
+                if place not in self._held_by:
+                    self._expand(place)
             found.seconds = time.perf_counter() - began
-        found.closed = done == len(self._states)
-        found.left = len(self._states) - done
+        found.closed = self._done == len(self._states)
+        found.left = sum(place not in self._held_by for place in range(self._done, len(self._states)))
         if found.closed:
             self._check_progress()
         return found
@@ -91,9 +111,24 @@ class Explorer:
             if within(zone, other):
                 return place
         place = len(self._states)
+        at = 0
+        while at < len(known):
+            other, before = known[at]
+            if within(other, zone):
+                whole: Zone | None = zone
+            else:
+                whole = united(zone, other) if before >= self._done else None
+            if whole is None:
+                at += 1
+                continue
+            del known[at]
+            if before >= self._done:
+                self._held_by[before] = place
+            if whole is not zone:
+                zone, at = whole, 0
         known.append((zone, place))
         self._states.append((parent, step, key, zone))
-        self.found.keys, self.found.zones = len(self._seen), len(self._states)
+        self.found.keys, self.found.zones = len(self._seen), len(self._states) - len(self._held_by)
         return place
 
     def _expand(self, place: int) -> None:
@@ -108,7 +143,7 @@ class Explorer:
                 goes_on = True
                 self._happen(place, key, begun, action)
         if not goes_on:
-            self.found.violations.setdefault("progress: nothing can happen any more", self.path(place))
+            self.found.violations.setdefault("progress: nothing can happen any more", self._histories(place))
 
     def _happen(self, place: int, key: bytes, zone: Zone, action: Action) -> None:
         """Let one event happen in all its zone: piece by piece, each as one run decides."""
@@ -134,7 +169,9 @@ class Explorer:
                 before = tuple(chosen for chosen, _ in asked[:at])
                 pieces += [(decided, (*before, other)) for other in range(1, asked[at][1])]
             if problem:
-                self.found.violations.setdefault(problem, [*self.path(place), (action, script)])
+                found = self.found.violations
+                if problem not in found:
+                    found[problem] = self._histories(place, (action, script))
             elif not outside:
                 waits = AnyTime.chosen[0] or world.held or world.unread or world.said
                 simplify(world, decided)
@@ -142,11 +179,18 @@ class Explorer:
                 if action == ("timer", "line") and not waits:
                     self._quiet.setdefault(place, set()).add(next_)
 
+    def _holder(self, place: int) -> int:
+        """Return the state that was looked at in place of this one."""
+        while place in self._held_by:
+            place = self._held_by[place]
+        return place
+
     def _check_progress(self) -> None:
         """If nothing comes, deadlines lead to a request, or to a line that is READY: they never go round."""
-        follows = {place: len(next_) for place, next_ in self._quiet.items()}
+        quiet = {place: set(map(self._holder, next_)) for place, next_ in self._quiet.items()}
+        follows = {place: len(next_) for place, next_ in quiet.items()}
         before: dict[int, list[int]] = {}
-        for place, next_ in self._quiet.items():
+        for place, next_ in quiet.items():
             for other in next_:
                 before.setdefault(other, []).append(place)
         done = [place for place in before if place not in follows]
@@ -158,16 +202,26 @@ class Explorer:
                     done.append(other)
         round_ = [place for place, left in follows.items() if left]
         if round_:
-            self.found.violations["progress: deadlines go round and nothing leaves"] = self.path(min(round_))
+            self.found.violations["progress: deadlines go round and nothing leaves"] = self._histories(min(round_))
 
-    def path(self, place: int) -> list[Step]:
-        """Return how a state was come to."""
-        steps: list[Step] = []
-        while place >= 0:
-            place, step, _, _ = self._states[place]
-            if step is not None:
-                steps.append(step)
-        return steps[::-1]
+    def _histories(self, place: int, *last: Step) -> list[list[Step]]:
+        """Return how a state may have been come to. Of those of united zones some states alone can go on, so that these
+        are several."""
+        holds: dict[int, list[int]] = {}
+        for held, by in self._held_by.items():
+            holds.setdefault(by, []).append(held)
+
+        def histories(place: int) -> Iterator[list[Step]]:
+            ways = [place]
+            for way in ways:
+                ways += holds.get(way, ())
+                parent, step, _, _ = self._states[way]
+                if step is None:
+                    yield []
+                else:
+                    yield from ([*before, step] for before in histories(parent))
+
+        return [[*history, *last] for history in islice(histories(place), MOST_HISTORIES)]
 
 
 def prepare(setup: Setup) -> None:

@@ -16,7 +16,7 @@ from busmaster.arbiter.clients import OWN, Hold, LineClient
 from busmaster.arbiter.health import SILENT, NodeRecord
 from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo, Queue
 from busmaster.arbiter.shared_backlog import SharedBacklog
-from busmaster.arbiter.state import EXCHANGE, SETTLING
+from busmaster.arbiter.state import EXCHANGE, OFFLINE, SETTLING
 from busmaster.arbiter.transaction import BACKGROUND, COMMAND, ENDED, Transaction
 from busmaster.arbiter.turns import Turns
 from busmaster.arbiter.unasked import QUIET, STRAGGLER_MEMORY
@@ -57,6 +57,21 @@ class View:
             return first.rank <= second.rank
         return type(first) is not Instant and first != inf
 
+    def within_quarantine(self, time: Time, by: float) -> bool:
+        """Whether a silence of `by` seconds from `time` on is surely over when the quarantine is, or will be where the
+        line is down: it settles as it comes up, for the longest lateness of its nodes."""
+        world = self.world
+        arbiter = world.arbiter
+        if type(time) is not Instant:
+            return bool(time != inf)
+        if arbiter.state is OFFLINE:
+            longest = max(node.lateness for node in world.nodes) + arbiter._leg.latency + arbiter._leg.byte_time
+            return by <= longest and self.past(time)
+        until: Time = arbiter._quarantine
+        if type(until) is not Instant:
+            return False
+        return self.zone[time.base][until.base] <= 2 * (until.offset - time.offset - ticks(by)) + 1
+
 
 def transactions(world: World) -> list[Transaction]:
     arbiter = world.arbiter
@@ -86,9 +101,11 @@ def _timings(node: NodeRecord) -> tuple[ReplyTiming, ReplyTiming, ReplyTiming]:
 def past_legs(view: View) -> None:
     """`begin` sets all of a leg before any of it is read; outside an exchange only `end`, `out` and what follows are
     read. They are asked only whether they lie ahead: `past()` of now on, `out + quiet` of now on. What the port
-    holds moves all of them, so that they stay while it may."""
+    holds moves all of them, so that they stay while it may. A settle ends no sooner than the quarantine: what is over by
+    then is not asked for."""
     world = view.world
     arbiter, leg = world.arbiter, world.arbiter._leg
+    is_moved = world.setup.may(setups.HELD) or world.setup.may(setups.FROZEN)  # what has been said leaves later
     leg.first_bytes = b""  # read only where a node's times are learned, which none of these worlds has
     if view.past(leg.taint_until):
         leg.taint_until = -inf
@@ -98,7 +115,8 @@ def past_legs(view: View) -> None:
         leg.longest = 0
         if leg._follows is None:
             leg._follows_until = -inf
-            if view.past(leg.end, leg.timing.lateness + leg.latency + leg.byte_time):
+            lateness = leg.timing.lateness + leg.latency + leg.byte_time
+            if view.past(leg.end, lateness) or (not is_moved and view.within_quarantine(leg.end, lateness)):
                 leg.end = -inf
         elif view.past(leg._follows_until) and arbiter.state is SETTLING:
             pass  # a stray would start it anew
@@ -106,7 +124,10 @@ def past_legs(view: View) -> None:
         leg.reply_came = False  # it is not while something is asked
         leg._follows = None  # by `begin`
         leg._follows_until = -inf
-    if not world.setup.may(setups.HELD) and view.past(leg.out, longest_quiet(world), strictly=True):
+    quiet = longest_quiet(world)
+    if not world.setup.may(setups.HELD) and view.past(leg.out, quiet, strictly=True):
+        leg.out = -inf
+    if not is_moved and view.past(leg.out) and view.within_quarantine(leg.out, quiet):
         leg.out = -inf
 
 
@@ -117,9 +138,11 @@ def past_silences(view: View) -> None:
     asked = max(longest_quiet(world), longest_window(world) if world.setup.in_step else 0.0)
     if view.past(strays.last_byte, asked, strictly=True):
         strays.last_byte = -inf
+    if not world.setup.in_step and view.within_quarantine(strays.last_byte, asked):  # else it chooses what goes next
+        strays.last_byte = -inf
     if world.arbiter.noisy or not world.setup.in_step:  # see shipped.py
         strays._noise_since = -inf if strays._noise_since != inf else inf
-    if view.past(world.arbiter._quarantine):
+    if view.past(world.arbiter._quarantine) or world.arbiter.state is OFFLINE:  # `line_up` sets it
         world.arbiter._quarantine = -inf
     if world.arbiter.state is not SETTLING:
         world.arbiter._silent_at = -inf
@@ -311,10 +334,10 @@ def past_wire(view: View) -> None:
 
 
 def _past_words(world: World) -> None:
-    """Where nobody reads the words, only that something comes makes a difference, and whether a node has said it."""
-    if world.unread:
-        said = {origin for _, origin in world.unread} - {STRAY}
-        world.unread = ((0, OLD if said else STRAY),)
+    """Where nobody reads the words, only that something comes makes a difference, and whether a node has said it. Bytes
+    from nowhere that lie unread may be read in the next exchange."""
+    if any(origin != STRAY for _, origin in world.unread):
+        world.unread = ((0, OLD),)
     for reply in world.owed:
         if reply.kind == "reply":
             reply.data = bytes(len(reply.data))

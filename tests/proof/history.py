@@ -12,9 +12,9 @@ from typing import Any, TypeAlias
 
 from tests.proof.adversary import act, actions, window
 from tests.proof.explore import Step, constrained, prepare, split, world_of
+from tests.proof.forgotten import past_waiting, simplify
 from tests.proof.instants import begin_run, instant, noted, seconds
 from tests.proof.key import Parts
-from tests.proof.forgotten import past_waiting, simplify
 from tests.proof.setups import Setup
 from tests.proof.shipped import set_aside
 from tests.proof.wire import SCRIPT, Outside, Violation
@@ -30,20 +30,21 @@ JUST = 1e-9
 MOST_RUNS = 20_000
 
 
-def retell(setup: Setup, steps: Sequence[Step], problem: str) -> list[Call] | None:
-    """Return what is called and said until the problem comes, with times in seconds. None if it never does: then the
-    search had allowed more than is possible."""
+def retell(setup: Setup, histories: Sequence[Sequence[Step]], problem: str) -> list[Call] | None:
+    """Return what is called and said until the problem comes, with times in seconds, by the first history by which it
+    does. None if it never does: then the search had allowed more than is possible."""
     with set_aside(setup):
         prepare(setup)
-        begin_run([0])
-        SCRIPT.begin(())
-        world = world_of(setup)(instant(0, 0))
-        parts = Parts(world)
-        world.calls = []
-        world.note("comes up")
-        world.pump()
-        for end in _endings(parts, *_saved(parts, origin()), steps, problem):
-            return end
+        for steps in histories:
+            begin_run([0])
+            SCRIPT.begin(())
+            world = world_of(setup)(instant(0, 0))
+            parts = Parts(world)
+            world.calls = []
+            world.note("comes up")
+            world.pump()
+            for end in _endings(parts, *_saved(parts, origin()), steps, problem):
+                return end
     return None
 
 

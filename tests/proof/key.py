@@ -12,10 +12,10 @@ import io
 import pickle
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
-from itertools import chain, compress
-from operator import attrgetter, is_not
+from itertools import compress
+from operator import is_not
 from types import BuiltinFunctionType, FunctionType, MethodType, NoneType
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from busmaster.arbiter.clients import OWN, LineClient
 from busmaster.arbiter.health import Health
@@ -53,21 +53,22 @@ class Parts:
         self.place_of: dict[int, int] = {}
         """By the part's id."""
         self._find(world)
-        self._all = [(_getter(tuple(_names(part))), part) for part in self.parts]
         self._cells = [(part, name) for part in self.parts for name in _names(part)]
         self._places = range(len(self._cells))
         self._open_ended = [vars(part) for part in self.parts if hasattr(part, "__dict__")]
         self._attributes = sum(map(len, self._open_ended))
+        self._values = _reader(self._cells)
         values = self._values()
         times = Counter(map(id, values))
         several = [value for value in values if isinstance(value, list | deque) and times[id(value)] > 1]
         self._shared = {id(value): (value, list(value) if isinstance(value, list) else []) for value in several}
         """What lies in several parts, and what is in it whenever the world is saved: a queue is empty then."""
         self._usual = [self._usual_of(value) for value in values]
+        self._empty = _filler(self._cells, values, self._usual)
 
     def _find(self, value: Any) -> None:
-        if isinstance(value, list | tuple):
-            for one in value:
+        if isinstance(value, list | tuple | dict):
+            for one in value.values() if isinstance(value, dict) else value:
                 self._find(one)
         elif _is_part(value) and id(value) not in self.place_of:
             self.place_of[id(value)] = len(self.parts)
@@ -75,9 +76,6 @@ class Parts:
             _TABLE.setdefault(type(value), _reduce_part)
             for name in _names(value):
                 self._find(getattr(value, name))
-
-    def _values(self) -> list[Any]:
-        return list(chain.from_iterable([get(part) for get, part in self._all]))
 
     def _usual_of(self, value: Any) -> Any:
         """Return what is left out of a key where it lies: what is there at the beginning, if no world can change it."""
@@ -119,11 +117,7 @@ class Parts:
         """Return the world as it was again. Its instants are those of the run that was begun."""
         _open[0] = self
         held = iter(pickle.loads(key))
-        for place in compress(self._places, map(is_not, self._values(), self._usual)):
-            usual = self._usual[place]
-            if usual is not _ALTERS:
-                part, name = self._cells[place]
-                setattr(part, name, type(usual)() if type(usual) in _MADE_ANEW else usual)
+        self._empty()
         for several, content in self._shared.values():
             several.clear()
             several.extend(content)
@@ -147,8 +141,28 @@ def _names(part: Any) -> Iterable[str]:
     return [*slots, *getattr(part, "__dict__", ())]
 
 
-def _getter(names: Sequence[str]) -> Callable[[Any], tuple[Any, ...]]:
-    return attrgetter(*names) if len(names) > 1 else lambda part: tuple(getattr(part, name) for name in names)
+def _reader(cells: Sequence[tuple[Any, str]]) -> Callable[[], tuple[Any, ...]]:
+    """Return what reads all these attributes. It is compiled, as `_filler` is: each event needs both."""
+    source = ", ".join(f"part{place}.{name}" for place, (_, name) in enumerate(cells))
+    names = {f"part{place}": part for place, (part, _) in enumerate(cells)}
+    return _compiled(f"def compiled(): return {source}", names)
+
+
+def _filler(cells: Sequence[tuple[Any, str]], values: Sequence[Any], usual: Sequence[Any]) -> Callable[[], None]:
+    """Return what puts into each attribute what lies there usually, if anything does: what is there now, or an empty
+    one of its kind, made anew."""
+    source = ["def compiled():"]
+    names: dict[str, Any] = {}
+    for place, ((part, name), value, usually) in enumerate(zip(cells, values, usual, strict=True)):
+        if usually is not _ALTERS:
+            names |= {f"part{place}": part, f"value{place}": usually}
+            source.append(f"    part{place}.{name} = value{place}{'' if usually is value else '.copy()'}")
+    return _compiled("\n".join(source), names)
+
+
+def _compiled(source: str, names: dict[str, Any]) -> Callable[[], Any]:
+    exec(source, names)
+    return cast("Callable[[], Any]", names["compiled"])
 
 
 class _Places:

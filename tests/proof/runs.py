@@ -52,10 +52,10 @@ def explore(setup: Setup, limit: float) -> dict[str, Any]:
 
 
 def _violation(setup: Setup, found: Found, problem: str) -> dict[str, Any]:
-    steps = found.violations[problem]
-    calls = retell(setup, steps, problem)
+    histories = found.violations[problem]
+    calls = retell(setup, histories, problem)
     if calls is None:
-        return {"problem": problem, "history": f"not possible as it was found: {steps}", "test": ""}
+        return {"problem": problem, "history": f"not possible as it was found: {histories[0]}", "test": ""}
     return {"problem": problem, "history": told(calls), "test": as_test(setup, calls, problem)}
 
 

@@ -11,9 +11,9 @@ from typing import Any, TypeAlias
 
 from tests.proof.adversary import act, actions, window
 from tests.proof.explore import prepare, world_of
+from tests.proof.forgotten import FORGOTTEN, View, past_waiting, simplify
 from tests.proof.instants import Instant, begin_run, instant, ticks
 from tests.proof.key import Parts
-from tests.proof.forgotten import FORGOTTEN, View, past_waiting, simplify
 from tests.proof.setups import Setup
 from tests.proof.shipped import set_aside
 from tests.proof.wire import SCRIPT, Outside, Violation

@@ -354,13 +354,18 @@ class World:
         if self.arbiter.state is OFFLINE:
             return
         setup = self.setup
-        if self.frozen or setup.receive_latency or setup.may(setups.STALLS):
+        if self.reads_late:
             if not self.unread:
                 late = setup.receive_latency + (setup.stall if setup.may(setups.STALLS) else 0.0)
                 self.unread_by = inf if self.frozen else self.now + late
             self.unread += tuple((byte, origin) for byte in data)
             return
         self.read(data, origin)
+
+    @property
+    def reads_late(self) -> bool:
+        """What comes lies in the adapter or the kernel before it is read."""
+        return bool(self.frozen or self.setup.receive_latency or self.setup.may(setups.STALLS))
 
     def read(self, data: bytes, origin: str) -> None:
         """The pump reads them."""
