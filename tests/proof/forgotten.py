@@ -101,8 +101,8 @@ def _timings(node: NodeRecord) -> tuple[ReplyTiming, ReplyTiming, ReplyTiming]:
 def past_legs(view: View) -> None:
     """`begin` sets all of a leg before any of it is read; outside an exchange only `end`, `out` and what follows are
     read. They are asked only whether they lie ahead: `past()` of now on, `out + quiet` of now on. What the port
-    holds moves all of them, so that they stay while it may. A settle ends no sooner than the quarantine: what is over by
-    then is not asked for."""
+    holds moves all of them, so that they stay while it may. A settle ends no sooner than the quarantine: what is over
+    by then is not asked for."""
     world = view.world
     arbiter, leg = world.arbiter, world.arbiter._leg
     is_moved = world.setup.may(setups.HELD) or world.setup.may(setups.FROZEN)  # what has been said leaves later

@@ -15,17 +15,18 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import compress
 from operator import is_not
 from types import BuiltinFunctionType, FunctionType, MethodType, NoneType
-from typing import Any, Final, cast
+from typing import Any, ClassVar, Final, cast
 
 from busmaster.arbiter.clients import OWN, LineClient
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.schedule import Schedule
 from busmaster.arbiter.state import LineState
-from busmaster.arbiter.transaction import Phase, Priority
+from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from tests.proof.instants import Instant, instant, ticks
 from tests.proof.shipped import ANY_STEP, BUDGET, NO_COUNTERS, UNCOUNTED
+from tests.proof.wire import Owed, Ticket
 from tests.proof.world import World
 from tests.proof.zones import FREE, Zone, widened
 
@@ -160,9 +161,9 @@ def _filler(cells: Sequence[tuple[Any, str]], values: Sequence[Any], usual: Sequ
     return _compiled("\n".join(source), names)
 
 
-def _compiled(source: str, names: dict[str, Any]) -> Callable[[], Any]:
+def _compiled(source: str, names: dict[str, Any]) -> Callable[..., Any]:
     exec(source, names)
-    return cast("Callable[[], Any]", names["compiled"])
+    return cast("Callable[..., Any]", names["compiled"])
 
 
 class _Places:
@@ -244,6 +245,34 @@ def _reduce_part(value: Any) -> Any:
     return "OWN" if value is OWN else object.__reduce_ex__(value, 5)
 
 
+class _Slotted:
+    """A kind of which many come and go: pickled by what lies in its slots, without their names."""
+
+    every: ClassVar[list[_Slotted]] = []
+
+    def __init__(self, kind: type) -> None:
+        self.kind = kind
+        names = list(_names(kind.__new__(kind)))
+        several = ", ".join(f"one.{name}" for name in names)
+        self.read = _compiled(f"def compiled(one): return {several},", {})
+        self.fill = _compiled(f"def compiled(one, values): {several}, = values", {})
+        self.place = len(self.every)
+        self.every.append(self)
+
+    def reduce(self, one: Any) -> Any:
+        try:
+            return _refilled, (self.place, self.read(one))
+        except AttributeError:  # not all of them are filled
+            return object.__reduce_ex__(one, 5)
+
+
+def _refilled(place: int, values: tuple[Any, ...]) -> Any:
+    slotted = _Slotted.every[place]
+    one = slotted.kind.__new__(slotted.kind)
+    slotted.fill(one, values)
+    return one
+
+
 _TABLE: dict[type, Callable[[Any], Any]] = {
     LineClient: _reduce_part,
     Instant: _reduce_instant,
@@ -254,6 +283,7 @@ _TABLE: dict[type, Callable[[Any], Any]] = {
     Priority: _reduce_member,
     Phase: _reduce_member,
     Health: _reduce_member,
+    **{kind: _Slotted(kind).reduce for kind in (Transaction, Owed, Ticket)},
 }
 
 
