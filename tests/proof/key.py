@@ -252,7 +252,7 @@ class _Slotted:
 
     def __init__(self, kind: type) -> None:
         self.kind = kind
-        names = list(_names(kind.__new__(kind)))
+        names = list(_names(object.__new__(kind)))
         several = ", ".join(f"one.{name}" for name in names)
         self.read = _compiled(f"def compiled(one): return {several},", {})
         self.fill = _compiled(f"def compiled(one, values): {several}, = values", {})
@@ -268,7 +268,7 @@ class _Slotted:
 
 def _refilled(place: int, values: tuple[Any, ...]) -> Any:
     slotted = _Slotted.every[place]
-    one = slotted.kind.__new__(slotted.kind)
+    one: Any = object.__new__(slotted.kind)
     slotted.fill(one, values)
     return one
 
