@@ -30,8 +30,8 @@ class Quantiles:
 
 @dataclass(frozen=True, slots=True)
 class NodeStatistics:
-    """Counts of one node since the last reset. `attempts` = ok + no_reply + garbled + refused + those cut off by the
-    loss of the line; `failed` counts transactions that ended with an error, retries and all."""
+    """Counts of one node since the last reset. `attempts` are those that have ended: ok + no_reply + garbled + refused
+    + those cut off by the loss of the line; `failed` counts transactions that ended with an error, retries and all."""
 
     attempts: int
     ok: int
@@ -108,13 +108,12 @@ class LineStatistics:
 
 class NodeCounters:
     __slots__ = (
-        "attempts",
+        "cut_off",
         "failed",
         "garbled",
         "late",
         "latency",
         "no_reply",
-        "ok",
         "probes",
         "refused",
         "retries",
@@ -126,9 +125,19 @@ class NodeCounters:
 
     def reset(self) -> None:
         """Begin all counts anew."""
-        self.attempts = self.ok = self.late = self.no_reply = self.garbled = self.refused = 0
+        self.late = self.no_reply = self.garbled = self.refused = self.cut_off = 0
         self.retries = self.unheard = self.failed = self.probes = 0
         self.latency = Histogram()
+
+    @property
+    def ok(self) -> int:
+        """How many attempts succeeded: each has recorded its latency, and nothing else is counted for each value."""
+        return self.latency.count
+
+    @property
+    def attempts(self) -> int:
+        """How many attempts have ended, whatever came of them."""
+        return self.ok + self.no_reply + self.garbled + self.refused + self.cut_off
 
     def snapshot(self, lateness: float) -> NodeStatistics:
         """Return an immutable snapshot of the counts; `lateness` is the node's, in seconds."""

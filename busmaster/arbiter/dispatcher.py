@@ -173,7 +173,6 @@ class Dispatcher:
             if poll is not None and poll.started == -inf:
                 poll.started = now
                 poll.jitter.record(now - poll.due)
-        transaction.node.counters.attempts += 1
         transaction.phase = ON_WIRE
         transaction.attempts += 1
         transaction.started = now
@@ -199,7 +198,6 @@ class Dispatcher:
         self.unnoted = None
         node, now = transaction.node, transaction.last_byte
         counters = node.counters
-        counters.ok += 1
         counters.latency.record(now - transaction.started)
         if transaction.late:
             counters.late += 1
@@ -273,6 +271,7 @@ class Dispatcher:
 
     def cut_off(self, transaction: Transaction, error: BusError, now: float) -> None:
         """Fail a transaction under which the line was lost: a write may have been carried out."""
+        transaction.node.counters.cut_off += 1
         self._end(transaction, now, name_error(error, transaction))
 
     # clients

@@ -123,9 +123,11 @@ class LineMachine:
             self._take_unasked(data, now)
         elif self._trust.held is not None:  # two answers where one is due: neither is believed
             self._disbelieve(TWO_ANSWERS, Done(None, data, self._trust.held.send), now)
-        elif self._leg.begun or (data := self._begin_reply(data, now)):
+        elif self._leg.begun:
             self._unasked.last_byte = now
             self._take(data, now)
+        else:
+            self._begin_reply(data, now)
 
     def byte_marked(self, mark: Mark, now: float) -> None:
         """Note that the UART says that a byte came damaged, or a break: whatever it was, it is nobody's answer."""
@@ -221,8 +223,8 @@ class LineMachine:
             unasked.looked(now, self._deadlines.line)
         return True
 
-    def _begin_reply(self, data: bytes, now: float) -> bytes:
-        """Take the first bytes of a leg. Returns those that may be its reply."""
+    def _begin_reply(self, data: bytes, now: float) -> None:
+        """Take the first bytes of a leg: those of them that may be its reply begin it."""
         wire, leg = self._wire, self._leg
         transaction = wire.transaction
         assert transaction is not None
@@ -230,17 +232,17 @@ class LineMachine:
             self._counters.tainted += 1
             self._unasked.last_byte = now
             self._attempt_failed(FrameError(TOO_EARLY, heard=data), now)
-            return b""
+            return
         if not wire.answered:
             self._unasked.note(data, now, leg.quiet())
             wire.came_unasked = True
-            return b""
+            return
         if transaction.node.profile.noise_tolerant:
             heard, data = data, wire.without_noise(data)
             self._counters.noise_bytes += len(heard) - len(data)
-            self._unasked.last_byte = now  # noise that is passed over breaks a silence all the same
             if not data:
-                return b""
+                self._unasked.last_byte = now  # noise that is passed over breaks a silence all the same
+                return
         leg.begun = True
         leg.begun_at = now
         leg.first_bytes = data
@@ -248,7 +250,8 @@ class LineMachine:
             transaction.first_byte = now
         if now > leg.end + leg.timing.nominal + leg.latency:
             transaction.late = True
-        return data
+        self._unasked.last_byte = now
+        self._take(data, now)
 
     def _take(self, data: bytes | None, now: float) -> None:
         """Hand the reader these bytes, or the news (None) that none came in time, and do what it makes of them."""

@@ -35,7 +35,7 @@ PATIENCE = 2.0
 """Seconds for which a scrape waits for a loop that is busy."""
 OUTCOMES = ("ok", "no_reply", "garbled", "refused")
 COUNTS = {
-    "attempts": "Exchanges that were begun with this node",
+    "attempts": "Exchanges with this node that have ended",
     "late": "Replies after the nominal time, accepted all the same",
     "retries": "Reads that were tried again",
     "unheard": "Replies to callers that had gone",

@@ -34,8 +34,8 @@ _LONGER = 60
 _REFUSALS: Mapping[int, type[Refused]] = {NAK[0]: Refused}
 
 
-def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes], int]) -> int:
-    """Return where the ETX of a whole and valid telegram is; 0 if more bytes are needed.
+def find_field(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes], int]) -> bytes | None:
+    """Return the data of a whole and valid telegram, which may be followed by more; None if more bytes are needed.
 
     `header` is STX and the echo, without an ETX; `longest` the most data characters. Raises FrameError as soon as the
     bytes cannot become such a telegram; `whole` only if nothing but the checksum is wrong, and nothing follows. Of
@@ -44,28 +44,28 @@ def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes]
     start = len(header)
     if buffer[:start] != header:
         if header.startswith(buffer):
-            return 0
+            return None
         raise FrameError(f"wrong echo: {buffer[:start].hex(' ')} in place of {header.hex(' ')}", heard=buffer)
     head, _, tail = buffer.partition(ETX)  # which takes two thirds of the time of looking for its place
     field = head[start : start + longest + 1]
     if field.translate(_PRINTABLE) != field:
         raise FrameError("a control character within the data")
     if len(field) > longest:
-        return _await_end(head, tail, start, longest, check)
+        _await_end(head, tail, start, longest, check)
+        return None
     if not tail:
-        return 0
-    etx = len(head)
-    if tail[0] != check(buffer[1 : etx + 1]):
+        return None
+    if tail[0] != check(buffer[1 : len(head) + 1]):
         raise FrameError("bad checksum", whole=len(tail) == 1)
-    return etx
+    return field
 
 
-def _await_end(head: bytes, tail: bytes, start: int, longest: int, check: Callable[[bytes], int]) -> int:
-    """Return 0 while the end of data that are too long may still come; else raise what became of them."""
+def _await_end(head: bytes, tail: bytes, start: int, longest: int, check: Callable[[bytes], int]) -> None:
+    """Return while the end of data that are too long may still come; else raise what became of them."""
     field = head[start:]
     printable = field.translate(_PRINTABLE) == field
     if printable and not tail and len(field) <= longest + _LONGER:
-        return 0
+        return
     if printable and tail and tail[0] == check(head[1:] + ETX):
         raise other_format(len(head) + 2, f"{len(field)} characters of data where {longest} are the most")
     raise FrameError(f"more than {longest} characters of data")
@@ -132,12 +132,12 @@ class TelegramReader(SingleLeg, Generic[T]):
         if buffer[0] != _STX:
             self.reject(buffer)
         header = self.answers[0]
-        etx = find_etx(buffer, header, self.longest, self.check)
-        if not etx:
+        field = find_field(buffer, header, self.longest, self.check)
+        if field is None:
             return MORE
-        end = etx + 2
+        end = len(header) + len(field) + 2
         try:
-            value = self.parse(buffer[len(header) : etx])
+            value = self.parse(field)
         except FrameError as error:
             raise other_format(end, error.what, send=error.send, heard=error.heard) from None
         return Done(value) if len(buffer) == end else Done(value, buffer[end:])
@@ -178,6 +178,6 @@ __all__ = [
     "AcknowledgeReader",
     "SingleLeg",
     "TelegramReader",
-    "find_etx",
+    "find_field",
     "telegram_sizes",
 ]

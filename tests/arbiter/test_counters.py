@@ -46,3 +46,18 @@ def test_a_timeline_says_when_the_first_byte_of_a_reply_came_and_when_the_last()
     timeline = read.timeline()
     assert (timeline.started, timeline.first_byte) == (start, start + 0.004)
     assert timeline.last_byte == pytest.approx(start + 0.007)
+
+
+def test_attempts_are_those_that_have_ended_whatever_came_of_them() -> None:
+    bench = Bench()
+    node = bench.node()
+    bench.ask(node, hcp2.Read(1))
+    bench.sent()
+    assert node.counters.attempts == 0, "while it is under way"
+    bench.hear(FIVE, after=0.004)
+    assert (node.counters.ok, node.counters.attempts) == (1, 1)
+    bench.ask(node, hcp2.Read(1))
+    bench.sent()
+    bench.arbiter.line_down("unplugged", bench.now)
+    counts = node.counters.snapshot(0.0)
+    assert (counts.ok, counts.attempts, counts.fruitless, counts.failed) == (1, 2, 0, 1)

@@ -71,7 +71,7 @@ def test_a_lateness_of_zero_is_caught(protocol: str, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("protocol", ["hcp", "hcp2", "mentor", "dc104"])
 def test_a_wrong_echo_that_does_not_settle_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(readers, "find_etx", excusing(readers.find_etx))
+    monkeypatch.setattr(readers, "find_field", excusing(readers.find_field))
     monkeypatch.setattr(dc104.Reading, "feed", excusing(dc104.Reading.feed))
     assert "WRONG" in caught(protocol, "noise").problems[0]
 
@@ -85,16 +85,16 @@ def test_a_cancellation_that_clears_the_exchange_is_caught(protocol: str, monkey
 @EVERY_PROTOCOL
 def test_an_echo_that_is_not_looked_at_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The element check removed; for an MSC, that of unit and name."""
-    right, read = readers.find_etx, dc104.Reading.feed
+    right, read = readers.find_field, dc104.Reading.feed
 
-    def find_etx(buffer: bytes, header: bytes, *others: Any) -> int:
-        return right(buffer, buffer[: len(header)], *others) if len(buffer) >= len(header) else 0
+    def find_field(buffer: bytes, header: bytes, *others: Any) -> bytes | None:
+        return right(buffer, buffer[: len(header)], *others) if len(buffer) >= len(header) else None
 
     def feed(reading: dc104.Reading, data: bytes) -> Any:
         reading._parameter = (reading._buffer + data + b"\0\0")[1]
         return read(reading, data)
 
-    monkeypatch.setattr(readers, "find_etx", find_etx)
+    monkeypatch.setattr(readers, "find_field", find_field)
     monkeypatch.setattr(dc104.Reading, "feed", feed)
     monkeypatch.setattr(msc_exchange.Reply, "echoed_by", lambda reply, whole: len(whole) == reply.size)
     assert "WRONG" in caught(protocol, "wrong").problems[0]

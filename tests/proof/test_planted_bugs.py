@@ -221,17 +221,17 @@ def with_a_deadline_that_is_past(patch: Any) -> None:
 
 def with_damage_that_completes(patch: Any) -> None:
     """A checksum that is not looked at."""
-    right = readers.find_etx
+    right = readers.find_field
 
-    def find_etx(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes], int]) -> int:
+    def find_field(buffer: bytes, header: bytes, longest: int, check: Callable[[bytes], int]) -> bytes | None:
         try:
             return right(buffer, header, longest, check)
         except FrameError as error:
             if error.what == "bad checksum":
-                return len(buffer) - 2
+                return buffer[len(header) : -2]
             raise
 
-    patch.setattr(readers, "find_etx", find_etx)
+    patch.setattr(readers, "find_field", find_field)
 
 
 def with_two_said_at_once(patch: Any) -> None:
