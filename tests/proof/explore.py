@@ -61,8 +61,8 @@ class Explorer:
     def __init__(self, setup: Setup, progress: Callable[[Found, int], None] = lambda found, done: None) -> None:
         self.found = Found(setup)
         self._progress = progress
-        self._seen: dict[bytes, list[tuple[Zone, int]]] = {}
-        """The zones of each key, each with its place among the states."""
+        self._seen: dict[bytes, tuple[bytes, list[tuple[Zone, int]]]] = {}
+        """The one copy of each key, and its zones, each with its place among the states."""
         self._states: list[tuple[int, Step | None, bytes, Zone]] = []
         """Where each came from, and how; its key and its zone."""
         self._done = 0
@@ -108,7 +108,7 @@ class Explorer:
 
     def _keep(self, parent: int, step: Step | None, key: bytes, zone: Zone) -> int:
         """Remember a state, unless one that is known holds it. Returns the place of either."""
-        known = self._seen.setdefault(key, [])
+        key, known = self._seen.setdefault(key, (key, []))
         for other, place in known:
             if within(zone, other):
                 return place
