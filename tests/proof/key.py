@@ -17,11 +17,16 @@ from operator import is_not
 from types import BuiltinFunctionType, FunctionType, MethodType, NoneType
 from typing import Any, ClassVar, Final, cast
 
+from busmaster.arbiter.backlog import Backlog
 from busmaster.arbiter.clients import OWN, LineClient
 from busmaster.arbiter.health import Health
+from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo
 from busmaster.arbiter.schedule import Schedule
+from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Priority, Transaction
+from busmaster.arbiter.turns import Turns
+from busmaster.arbiter.turns import _Turn as Turn
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import ReplyTiming, Timings
 from tests.proof.instants import Instant, instant, ticks
@@ -39,6 +44,9 @@ NEVER_CHANGE: Final = (
     *(type(stand_in) for stand_in in (ANY_STEP, BUDGET, NO_COUNTERS, UNCOUNTED)),
 )
 """What has no inside that a world could change."""
+COME_AND_GO: Final = (Transaction, Owed, Ticket, Backlog, SharedBacklog, Fifo, EarliestDeadlineFirst, Turns, Turn)
+"""What is no part: also a backlog and its queues are made anew, as a line is shared or all that waits fails, and nobody
+asks any more what lies in those before."""
 _ALTERS: Final = object()
 """What lies there is never left out."""
 _MADE_ANEW: Final = (list, deque, dict, bytearray)
@@ -68,8 +76,8 @@ class Parts:
         self._empty = _filler(self._cells, values, self._usual)
 
     def _find(self, value: Any) -> None:
-        if isinstance(value, list | tuple | dict):
-            for one in value.values() if isinstance(value, dict) else value:
+        if isinstance(value, list | tuple):
+            for one in value:
                 self._find(one)
         elif _is_part(value) and id(value) not in self.place_of:
             self.place_of[id(value)] = len(self.parts)
@@ -134,7 +142,7 @@ def _is_as_it_was(shared: tuple[Any, list[Any]]) -> bool:
 
 def _is_part(value: Any) -> bool:
     ours = type(value).__module__.split(".")[0] in ("busmaster", "tests")
-    return ours and not isinstance(value, (*NEVER_CHANGE, Instant)) and value is not OWN
+    return ours and not isinstance(value, (*NEVER_CHANGE, *COME_AND_GO, Instant)) and value is not OWN
 
 
 def _names(part: Any) -> Iterable[str]:
@@ -283,7 +291,7 @@ _TABLE: dict[type, Callable[[Any], Any]] = {
     Priority: _reduce_member,
     Phase: _reduce_member,
     Health: _reduce_member,
-    **{kind: _Slotted(kind).reduce for kind in (Transaction, Owed, Ticket)},
+    **{kind: _Slotted(kind).reduce for kind in COME_AND_GO},
 }
 
 

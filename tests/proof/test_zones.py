@@ -10,7 +10,7 @@ from tests.proof.zones import FREE, Zone, at_most, extended, less_than, origin, 
 SIDE = 3
 POINTS = [(0.0, x, y) for x, y in product([half / 2 for half in range(-2 * SIDE - 2, 2 * SIDE + 3)], repeat=2)]
 """Of two instants beside x_0, at whole and half ticks, a little beyond all bounds."""
-PAIRS = 4000
+PAIRS = 500
 
 
 def random_zone(random: Random) -> Zone:
