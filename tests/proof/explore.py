@@ -16,7 +16,7 @@ from tests.proof.key import Parts, share
 from tests.proof.msc_world import MscWorld
 from tests.proof.setups import Setup
 from tests.proof.sharing_world import SharingWorld
-from tests.proof.shipped import AnyTime, set_aside
+from tests.proof.shipped import AnyTime, Looked, set_aside
 from tests.proof.wire import SCRIPT, Outside, Violation
 from tests.proof.world import Action, World
 from tests.proof.zones import (
@@ -70,7 +70,8 @@ class Explorer:
         self._held_by: dict[int, int] = {}
         """Those that need not be, each with a later one that holds it."""
         self._quiet: dict[int, set[int]] = {}
-        """Where each comes to where a deadline passes and nothing comes, waits for R15, or leaves."""
+        """Where each comes to where a deadline passes and nothing comes, waits for R15, or leaves. A look at a line
+        that settles is none: the end of the settle stands, and looks are some milliseconds apart."""
 
     def run(self, limit: float, violations: int = 8) -> Found:
         """Explore for at most so many seconds of a core, or until so many kinds of violation are found."""
@@ -175,7 +176,7 @@ class Explorer:
                 if problem not in found:
                     found[problem] = self._histories(place, (action, script))
             elif not outside:
-                waits = AnyTime.chosen[0] or world.held or world.unread or world.said
+                waits = AnyTime.chosen[0] or Looked.only[0] or world.held or world.unread or world.said
                 simplify(world, decided)
                 next_ = self._keep(place, (action, script), *self._parts.save(decided))
                 if action == ("timer", "line") and not waits:

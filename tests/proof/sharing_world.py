@@ -68,12 +68,6 @@ class SharingWorld(World):
                 self.sequence = None
                 self.held_until = -inf
 
-    def _check_rest(self) -> None:
-        deadlines = self.arbiter._deadlines
-        if deadlines.hold < self.now:  # it began long ago: what is overdue is due now, before any time passes
-            deadlines.hold = self.now
-        super()._check_rest()
-
     def is_held(self) -> bool:
         due: Time = self.arbiter._deadlines.hold
         return type(due) is Instant and not due > self.now + self.setup.longest_hold

@@ -192,14 +192,17 @@ class World:
     def _check_rest(self) -> None:
         """R8 and progress: nobody is forgotten, and the line's state has an end."""
         arbiter = self.arbiter
-        wire = arbiter._wire
+        wire, deadlines = arbiter._wire, arbiter._deadlines
+        for name in ("health", "hold"):
+            if getattr(deadlines, name) < self.now:  # what is overdue is due now, before any time passes
+                setattr(deadlines, name, self.now)
         held = [w for node in self.nodes for w in arbiter.dispatcher.writes.queues[node] if w.phase is PARKED]
         held += [transaction for queue in arbiter.dispatcher.backlog.queues for transaction in queue]
         held += [wire.transaction] if wire.transaction is not None else []
         if len(self.live) > sum(transaction.wanted and transaction.tag is not None for transaction in held):
             raise Violation("R8: a request is forgotten")
         if arbiter.state.name in ("EXCHANGE", "SETTLING", "HOLDOFF") and not self.frozen:
-            due: Time = arbiter._deadlines.line
+            due: Time = deadlines.line
             if type(due) is not Instant:
                 raise Violation(f"progress: {arbiter.state.name} has no end")
             if due > self.now + self._longest_deadline():
