@@ -16,17 +16,17 @@ class Addressed(Protocol):
 
     @property
     def line(self) -> str:
-        """The line on which it happened, "" where that is not known."""
+        """Return the name of the line on which it happened, "" where that is not known."""
         ...
 
     @property
     def label(self) -> str:
-        """What messages call the node, "" where it is about none."""
+        """Return what messages call the node, "" where it is about none."""
         ...
 
     @property
     def address(self) -> int:
-        """The node's address, None where it is about none."""
+        """Return the node's address, None where it is about none."""
         ...
 
 

@@ -41,6 +41,19 @@ def test_a_public_name_exists_and_has_a_docstring_of_its_own(name: str) -> None:
         assert not documentation.startswith(f"{name}("), f"{name} has only the one that a dataclass makes"
 
 
+@pytest.mark.parametrize("name", busmaster.__all__)
+def test_whatever_a_public_class_offers_says_what_it_is(name: str) -> None:
+    thing = getattr(busmaster, name)
+    if isinstance(thing, type) and thing.__module__.startswith("busmaster"):
+        offered = [each for each, member in vars(thing).items() if each[0] != "_" and is_called_or_asked(member)]
+        assert [each for each in offered if not inspect.getdoc(getattr(thing, each))] == []
+
+
+def is_called_or_asked(member: object) -> bool:
+    """Whether it is a method or a property: what a field is, the docstring of its class says."""
+    return isinstance(member, property | classmethod | staticmethod) or inspect.isfunction(member)
+
+
 def test_every_error_is_public() -> None:
     defined = {
         name

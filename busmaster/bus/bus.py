@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Callable, Coroutine, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, TypeVar
@@ -22,6 +22,7 @@ from busmaster.arbiter.tap import Tap
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.alarms import AlarmChanged, Alarms, BusEvent
 from busmaster.bus.node import Node
+from busmaster.bus.outlook import Outlook
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup, Sample, Stream
 from busmaster.bus.requester import checked_priority, checked_retries
@@ -30,10 +31,10 @@ from busmaster.bus.suitability import check_company, check_settings
 from busmaster.bus.taps import Taps
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.contract.learning import Learned
-from busmaster.contract.profile import LineSettings, Profile
+from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, InvalidCommand, LineDown
-from busmaster.planning import Plan, PlannedGroup, Read, bounds, plan_steps
+from busmaster.planning import Plan, PlannedGroup
 from busmaster.planning.merging import Merge, at_once
 from busmaster.transport.endpoints import Endpoint, is_paced
 from busmaster.transport.pump import Pump
@@ -102,6 +103,7 @@ class Bus:
         self._profiles: dict[str, Profile] = {}
         """Of the protocols on this line, by name."""
         self._groups: dict[str, PollGroup] = {}
+        self._outlook = Outlook(line, endpoint, self._nodes, self._groups)
         self._streams: list[Stream[BusEvent]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._connection: Connection | None = None
@@ -250,6 +252,7 @@ class Bus:
 
     @property
     def nodes(self) -> tuple[Node, ...]:
+        """Return the nodes that are on the line, in the order in which they were first asked for."""
         return tuple(self._nodes.values())
 
     @property
@@ -269,6 +272,7 @@ class Bus:
 
     @property
     def groups(self) -> tuple[PollGroup, ...]:
+        """Return the poll groups that run, or rest, in the order in which they were made."""
         return tuple(self._groups.values())
 
     def poll_group(
@@ -322,7 +326,7 @@ class Bus:
 
     @property
     def running(self) -> bool:
-        """Whether it is open, though its line may be down."""
+        """Return whether it is open, though its line may be down."""
         return self._line.running
 
     @property
@@ -332,6 +336,7 @@ class Bus:
 
     @property
     def state(self) -> LineState:
+        """Return what the line does: OFFLINE, READY, in an EXCHANGE, in the HOLDOFF between two, or SETTLING."""
         return self._arbiter.state
 
     def statistics(self) -> LineStatistics:
@@ -354,12 +359,12 @@ class Bus:
         loop goes on. While a line runs, await `plan_in_steps`.
         """
         self.check_loop()
-        return at_once(self._planning(more, could_merge))
+        return at_once(self._outlook.plan_steps(more, could_merge))
 
     async def plan_in_steps(self, *more: PlannedGroup, could_merge: Sequence[Merge] = ()) -> Plan:
         """Do what `plan` does, in steps of less than a millisecond between which exchanges go on."""
         self.check_loop()
-        steps = self._planning(more, could_merge)
+        steps = self._outlook.plan_steps(more, could_merge)
         done = 0
         while True:
             try:
@@ -380,26 +385,11 @@ class Bus:
         shorten it: those of the document may come back at any moment.
         """
         self.check_loop()
-        priority = checked_priority(priority)
-        backlog = self._arbiter.dispatcher.backlog
-        polls = self._arbiter.dispatcher.schedule.polls
-        polled = sum(len(poll.results) for poll in polls)
-        low = sum(len(poll.results) for poll in polls if poll.priority is Priority.BACKGROUND)
-        probed = any(node.health is not Health.UP for node in self._nodes.values())
-        bound = bounds(
-            self._asked(),
-            self.byte_time,
-            self.endpoint.receive_latency,
-            polls=1 + max(polled - low, backlog.waiting(Priority.POLL)),
-            background=probed + max(low, backlog.waiting(Priority.BACKGROUND)),
-            sharing=self._line.sharing,
-        )
-        longest = max((poll.patience for poll in polls if poll.results), default=1.0)
-        return bound.wait(priority, ahead=self._line.ahead(priority), patience=longest)
+        return self._outlook.worst_case_wait(checked_priority(priority))
 
     @property
     def alarms(self) -> Mapping[Point[Any], AlarmChanged | None]:
-        """What each polled point whose meaning has limits has left and is not back from; None for those within."""
+        """Return what each polled point with limits has left and is not back from; None for those within."""
         return self._line.alarms.states
 
     def overheard(self, samples: Mapping[Point[Any], Sample[Any]]) -> None:
@@ -445,38 +435,6 @@ class Bus:
 
     def _on_failed(self, cause: LineDown) -> None:
         self._on_event(PortFailed(cause.what, cause.hint, cause.__cause__))
-
-    def _settings(self) -> LineSettings:
-        if self.endpoint.settings is not None:
-            return self.endpoint.settings
-        return next((node.profile.line for node in self._nodes.values()), LineSettings(9600))
-
-    def _asked(self) -> list[Read]:
-        """Return every kind of command that was asked of a node, once for all nodes with the same timings."""
-        nodes = self._nodes.values()
-        asked = {
-            (id(node.record.profile), id(node.record.timings), kind): (node, command)
-            for node in nodes
-            for kind, command in node.kinds.items()
-        }
-        return [(node.planned(), command) for node, command in asked.values()]
-
-    def _planning(self, more: Sequence[PlannedGroup], could_merge: Sequence[Merge]) -> Generator[int, None, Plan]:
-        groups = []
-        for group in self.groups:
-            groups.append(group.planned())
-            yield len(groups[-1].reads)
-        latency = self.endpoint.receive_latency
-        return (
-            yield from plan_steps(
-                [*groups, *more],
-                line=self._settings(),
-                receive_latency=latency,
-                others=self._asked(),
-                could_merge=could_merge,
-                sharing=self._line.sharing,
-            )
-        )
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
         """Start a task of the bus's own: a task group would tie entering and leaving the bus to one task."""

@@ -130,7 +130,7 @@ class Meaning:
 
     @property
     def watched(self) -> bool:
-        """Whether it has a limit whose crossing is told."""
+        """Return whether it has a limit whose crossing is told."""
         return self.low is not None or self.high is not None
 
     @property
@@ -144,11 +144,12 @@ class Meaning:
 
     @property
     def by_exception(self) -> bool:
-        """Whether outputs are told only what is new."""
+        """Return whether outputs are told only what is new."""
         return self.deadband is not None or self.heartbeat is not None
 
     @property
     def names(self) -> bool:
+        """Return whether values, or bits of them, have names."""
         return bool(self.bits or self.labels)
 
     def named(self, value: Any) -> Any:

@@ -120,12 +120,12 @@ class Requester(Protocol):
 
     @property
     def line(self) -> str:
-        """The name of the line's port."""
+        """Return the name of the line's port."""
         ...
 
     @property
     def label(self) -> str:
-        """ "node 5", as messages call it."""
+        """Return what messages call it: "node 5"."""
         ...
 
     @property
@@ -140,7 +140,7 @@ class Requester(Protocol):
 
     @property
     def stops(self) -> int:
-        """How often it was told to stop, by whatever handle, of whatever program."""
+        """Return how often it was told to stop, by whatever handle, of whatever program."""
         ...
 
     def note_stop(self) -> None:
@@ -205,7 +205,9 @@ class NodeSource(Protocol):
 
     def node(
         self, profile: Profile, address: int, /, *, timings: Timings | Learned | None = None, retries: int | None = None
-    ) -> Requester: ...
+    ) -> Requester:
+        """Return the node at this address, as `Bus.node` does. Raises InvalidCommand."""
+        ...
 
 
 class SeveralRequests:

@@ -84,7 +84,7 @@ class Decoder:
 
     @property
     def unfinished(self) -> bool:
-        """Something is waiting for more bytes, or for silence."""
+        """Return whether something waits for more bytes, or for silence."""
         return bool(self._buffer or self._rejected)
 
     def _cut(self, frames: list[Frame], *, quiet: bool = False) -> None:

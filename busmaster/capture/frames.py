@@ -62,7 +62,7 @@ class Frame:
 
     @property
     def text(self) -> str:
-        """What it says, without the node: "read 100", "100 = 12.5", "NAK"."""
+        """Return what it says, without the node: "read 100", "100 = 12.5", "NAK"."""
         match self.kind:
             case Kind.READ:
                 return f"{self.command} {self.item}".rstrip()

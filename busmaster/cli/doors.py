@@ -41,7 +41,8 @@ def place_of(bind: str) -> tuple[str, int]:
 
 
 def following(line: str | None, *, read_only: bool) -> Following:
-    """Return what follows the line that is meant, and tells on standard error when it comes and goes.
+    """Return what follows the line that is meant, and tells on standard error when it comes and goes, and when it may
+    only be read.
 
     Raises UsageError where it is not clear which is meant. That it is not served yet is no error.
     """
@@ -54,7 +55,7 @@ def following(line: str | None, *, read_only: bool) -> Following:
 
     def tell() -> None:
         if isinstance(followed.state, Connected):
-            note(f"{followed.state.about['line']} is followed")
+            note(f"{followed.state.about['line']} is followed{', and may only be read' if followed.read_only else ''}")
         else:
             note(followed.state.why, Level.WARNING)
 

@@ -42,8 +42,6 @@ def command(line: str | None, read_only: bool, of_owner: bool) -> int:
     """
     if missing := what_is_missing():
         raise click.UsageError(f"the live view needs {missing}")
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise click.UsageError("top draws on a terminal: for values in a file or a pipe see busmaster poll and read")
     return until_ended(top, address_of(line), read_only, of_owner)
 
 
@@ -78,7 +76,8 @@ def address_of(line: str | None) -> str:
 async def top(address: str, read_only: bool = False, of_owner: bool = False) -> int:
     """Show a line until the person leaves, and return the exit status. While its owner is away that is shown.
 
-    Raises LineDown where its owner is not there at first, or, of the owner's own view, when it is gone.
+    Raises LineDown where its owner is not there at first, or, of the owner's own view, when it is gone; and UsageError
+    where the line is there, and no terminal.
     """
     from busmaster.cli.live import Screen
 
@@ -92,6 +91,10 @@ async def top(address: str, read_only: bool = False, of_owner: bool = False) -> 
         unwatch()
         if tasks[0].done():
             await tasks[0]
+        if not (sys.stdin.isatty() and sys.stdout.isatty()):
+            raise click.UsageError(
+                "top draws on a terminal: for values in a file or a pipe see busmaster poll and read"
+            )
         screen = Screen(following.picture, following, leave="end the run" if of_owner else "leave")
 
         def show_state() -> None:

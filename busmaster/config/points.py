@@ -61,7 +61,10 @@ class Scale:
         return read
 
     def write(self, value: Any) -> Any:
-        """Return the line's number, or run of numbers, for a value. Raises InvalidCommand for one that is too large."""
+        """Return the line's number, or run of numbers, for a value.
+
+        Raises InvalidCommand for one that is too large, and for true and false where the scale makes another number.
+        """
         if isinstance(value, list | tuple):
             return tuple(map(self.write, value))
         if type(value) is int or (type(value) is float and math.isfinite(value)):  # inf is the protocol's to refuse
@@ -70,6 +73,8 @@ class Scale:
                 return rounded(exact) if self.whole else float(exact)
             except OverflowError:
                 raise InvalidCommand(f"{value!r} is too large") from None
+        if isinstance(value, bool) and not self.trivial:
+            raise InvalidCommand(f"{value!r} is no number: write {int(value)} if that is meant")
         return value
 
 

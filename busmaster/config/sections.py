@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from busmaster.arbiter.transaction import Priority
+from busmaster.arbiter.transaction import Poll, Priority
 from busmaster.bus.suitability import check_company
 from busmaster.config.emulator import EmulatorSection, read_emulator
 from busmaster.config.keys import REQUIRED, Key, names_of
@@ -292,10 +292,15 @@ def _no_address(text: str) -> int:
 
 def _group(table: Table) -> GroupSection:
     table.only(*names_of(GROUP_KEYS))
+    period, phase = table.seconds("period"), table.seconds("phase", None)
+    with table.at("period"):
+        Poll(table.name, period)  # made for its complaints alone, which have the line here
+    with table.at("phase"):
+        Poll(table.name, period, phase=phase)
     group = GroupSection(
         name=table.name,
-        period=table.seconds("period"),
-        phase=table.seconds("phase", None),
+        period=period,
+        phase=phase,
         priority=PRIORITIES[table.choice("priority", PRIORITIES, "poll")],
         points=table.texts("points"),
         table=table,

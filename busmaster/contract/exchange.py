@@ -188,7 +188,9 @@ class Command(Protocol[T_co]):
         """Return True if it may be repeated without asking the caller: a read, or a level such as a reference."""
         ...
 
-    def open(self, address: int, timings: Timings, /) -> Exchange[T_co]: ...
+    def open(self, address: int, timings: Timings, /) -> Exchange[T_co]:
+        """Return one attempt at it, with the node at this address. Raises InvalidCommand where that cannot be."""
+        ...
 
 
 class Listener(Protocol):

@@ -17,7 +17,9 @@ class Placed(Protocol):
     """A read that says where it reads. What has no such read cannot be limited."""
 
     @property
-    def places(self) -> tuple[Hashable, ...]: ...
+    def places(self) -> tuple[Hashable, ...]:
+        """Return where it reads."""
+        ...
 
     def shown(self, values: Mapping[Hashable, Any], /) -> Any:
         """Return what it would return where its places hold these. Raises KeyError for a place that is missing."""

@@ -114,9 +114,8 @@ class Audience:
                 seat.put_exchanges(text)
 
     def _changed(self) -> None:
-        if self._line.is_connected:  # what is said from now on is of another owner, perhaps
+        if not self._line.is_connected:  # what is said next is of another owner, perhaps
             self._set = 0
-        else:
             self._exchanges = None
         for seat in self._seats:
             seat.put(("state", 0), self._state())

@@ -178,6 +178,7 @@ class Following:
         try:
             self._remote = remote
             self._change(Connected(remote.about))
+            remote.on_access.append(lambda: self._change(Connected(remote.about)))
             self._overview = await remote.overview(self._hear)
             await self._overview.over()
         finally:

@@ -24,6 +24,7 @@ from busmaster.doors.opcua_health import Health
 from busmaster.doors.opcua_space import Space, Variable
 from busmaster.doors.opcua_terms import CODES, GOOD, range_of, status_of_sample, status_of_write, type_of
 from busmaster.errors import BusError, InvalidCommand, LineDown
+from busmaster.gate.record import cut
 from busmaster.service.picture import Row
 from busmaster.service.remote import RemoteBus
 
@@ -253,12 +254,13 @@ class LineServer:
         value = _value(told.Value)
         if not _fits(told.Value, value, shown.variable.kind):
             return TYPE_MISMATCH
+        said = cut(str(value))
         try:
             await self._line.write(row.group, row.key, value)
         except (BusError, InvalidCommand) as error:
-            self._tell(f"{who}: {row.key} = {value}: {error}")
+            self._tell(f"{who}: {row.key} = {said}: {cut(str(error))}")
             return status_of_write(error)
-        self._tell(f"{who}: {row.key} = {value}: written")
+        self._tell(f"{who}: {row.key} = {said}: written")
         return status_of_write(None)
 
 

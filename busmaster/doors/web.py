@@ -32,6 +32,7 @@ from busmaster.errors import (
     NotStarted,
     Refused,
 )
+from busmaster.gate.record import cut
 from busmaster.service.messages import encoded
 from busmaster.service.picture import Row
 from busmaster.service.tcp import HostPort, listening
@@ -119,7 +120,7 @@ class Api:
         try:
             await self._line.write(row.group, row.key, value)
         except (BusError, InvalidCommand) as error:
-            self._tell(f"{row.key} = {value!r}, asked by {who}: {error}")
+            self._tell(f"{row.key} = {cut(repr(value))}, asked by {who}: {cut(str(error))}")
             raise
         self._tell(f"{row.key} = {value!r}, asked by {who}: written")
         return _json({"written": value})

@@ -8,13 +8,24 @@ from typing import Protocol
 class Chance(Protocol):
     """What the emulator uses of a seeded `random.Random`, which is handed in: the same seed, the same line."""
 
-    def random(self) -> float: ...
-    def uniform(self, a: float, b: float) -> float: ...
-    def randrange(self, start: int, stop: int) -> int: ...
-    def getrandbits(self, k: int) -> int: ...
+    def random(self) -> float:
+        """Return a number from 0 to below 1."""
+        ...
+
+    def uniform(self, a: float, b: float) -> float:
+        """Return a number from `a` to `b`."""
+        ...
+
+    def randrange(self, start: int, stop: int) -> int:
+        """Return a whole number from `start` to below `stop`."""
+        ...
+
+    def getrandbits(self, k: int) -> int:
+        """Return a whole number of `k` random bits."""
+        ...
 
 
-class NoChance:
+class NoChance(Chance):
     """Stands in where no random.Random was handed in: says so as soon as chance is needed."""
 
     def random(self) -> float:

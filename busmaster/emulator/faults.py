@@ -123,7 +123,7 @@ class Faults:
 
     @property
     def beyond(self) -> frozenset[str]:
-        """The faults in use that are outside R3's assumption: empty means that no wrong value may come of these."""
+        """Return the faults in use that are outside R3's assumption: where there are none, no value may be wrong."""
         return frozenset(name for name, _ in self.speaking) & BEYOND
 
     def __str__(self) -> str:

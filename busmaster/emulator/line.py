@@ -125,7 +125,7 @@ class Line:
 
     @property
     def devices(self) -> list[Device]:
-        """The devices on the line."""
+        """Return the devices on the line."""
         return self._attached.devices
 
     def add(self, device: Device) -> None:

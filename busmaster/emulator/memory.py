@@ -26,27 +26,27 @@ class MemoryPort:
 
     @property
     def name(self) -> str:
-        """What messages call the port."""
+        """Return what messages call the port."""
         return "the emulated line"
 
     @property
     def settings(self) -> LineSettings:
-        """Baud rate and framing of the emulated line."""
+        """Return baud rate and framing of the emulated line."""
         return self.line.settings
 
     @property
     def echo(self) -> bool:
-        """Whether what is sent is heard too."""
+        """Return whether what is sent is heard too."""
         return self.line.echo is not None
 
     @property
     def receive_latency(self) -> float:
-        """The seconds for which the emulated adapter may hold bytes back."""
+        """Return for how many seconds the emulated adapter may hold bytes back."""
         return self.line.latency
 
     @property
     def paced(self) -> bool:
-        """Whether bytes take their time on the wire."""
+        """Return whether bytes take their time on the wire."""
         return self.line.paced
 
     def presence(self) -> None:

@@ -26,16 +26,16 @@ from busmaster.errors import (
     WriteUnconfirmed,
 )
 from busmaster.gate.permission import EVERYTHING, Access, Permission
-from busmaster.gate.record import Outcome, WriteRecord, this_user
+from busmaster.gate.record import Outcome, WriteRecord, cut, this_user
 
 FRESH = 1.0
 """Seconds for which a command may wait that does not say until when it is meant."""
 MOST_AT_ONCE = 16
 """Commands of one door that may be on their way to their nodes."""
+LARGEST_KEPT = 1e100
+"""Of what is kept as a number; beyond it nobody means one, and its text is kept."""
 NEVER_SENT = (ArithmeticError, TypeError, ValueError, RecursionError)
 """What is raised of values of which no frame can be made, InvalidCommand among them."""
-LONGEST_SHOWN = 200
-"""Characters of a value, or of an error, that are kept of a write."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,19 +129,17 @@ class Gate:
 
     `record` is told of every one.
 
-    `access` says what other programs may do.
-
     `write` never raises but when it is cancelled: whatever somebody sends, it ends as a record.
     """
 
     def __init__(self, bus: Bus, *, read_only: bool = False, access: Access | None = None) -> None:
         self.read_only = read_only
         self.leaving = False
-        self.access = access or Access()
+        self._access = access or Access()
         self.safe_state: SafeWrites | None = None
         """What the line's file calls safe; None of a line without a file."""
         self.on_access: list[Callable[[], None]] = []
-        """Called when other tokens hold."""
+        """Called when other roles or tokens hold."""
         self.record: Callable[[WriteRecord], None] = lambda _: None
         self.bus = bus
         self._log = logging.getLogger("busmaster.audit")
@@ -149,11 +147,20 @@ class Gate:
         self._user = this_user()
         self._running: dict[str, int] = {}
 
+    @property
+    def access(self) -> Access:
+        """Return what other programs may do. Those of `on_access` are told when it is set."""
+        return self._access
+
+    @access.setter
+    def access(self, access: Access) -> None:
+        self._access = access
+        for tell in self.on_access:
+            tell()
+
     def take_secrets(self, secrets: Mapping[str, bytes]) -> None:
         """Have these tokens hold from now on, and no other: their digests by their names."""
         self.access = replace(self.access, secrets=secrets)
-        for tell in self.on_access:
-            tell()
 
     def refusal(self, wish: Wish) -> str:
         """Return why it is not let through, "" if it is."""
@@ -214,14 +221,14 @@ class Gate:
         record = WriteRecord(
             time=self.bus.wall_time(),
             door=wish.door,
-            by=wish.by[:LONGEST_SHOWN],
+            by=cut(wish.by),
             user=self._user,
             process=os.getpid(),
-            point=wish.name[:LONGEST_SHOWN],
+            point=cut(wish.name),
             before=before,
             value=_shown(wish.value),
             outcome=outcome,
-            error=error[:LONGEST_SHOWN],
+            error=cut(error),
             took=took,
             id=wish.id,
         )
@@ -240,5 +247,5 @@ def _before(point: Point[Any] | None) -> Any:
 def _shown(value: Any) -> Any:
     """Return the value as it fits into a record."""
     if isinstance(value, bytes):  # a command that was not read: as it came, but for what could harm a terminal
-        return repr(value.decode(errors="replace"))[1:-1][:LONGEST_SHOWN]
-    return value if isinstance(value, int | float) and abs(value) < 1e300 else repr(value)[:LONGEST_SHOWN]
+        return cut(repr(value.decode(errors="replace"))[1:-1])
+    return value if isinstance(value, int | float) and abs(value) < LARGEST_KEPT else cut(repr(value))

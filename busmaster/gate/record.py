@@ -7,6 +7,9 @@ import os
 from enum import Enum
 from typing import Any, NamedTuple
 
+LONGEST_SHOWN = 200
+"""Characters of each part, such as a value or an error, that are kept of a write."""
+
 
 class Outcome(Enum):
     """What became of a write."""
@@ -53,6 +56,11 @@ class WriteRecord(NamedTuple):
         why = f": {self.error}" if self.error else ""
         mark = f" [{self.id}]" if self.id else ""
         return f"{what} in {self.took:.3f} s by {self.door} {self.by}{mark}, {self.user} {self.process}{why}"
+
+
+def cut(text: str) -> str:
+    """Return a text as it is kept: of a long one its beginning, and how long it was."""
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}... ({len(text)} characters)"
 
 
 def this_user() -> str:

@@ -38,6 +38,8 @@ EXPIRY = "MessageExpiryInterval"
 PROPERTIES = "UserProperty"
 SENDER = "by"
 """The user property in which a sender may say who it is: no broker tells a subscriber, and nobody checks it."""
+BEGINNING = 100
+"""Bytes of a command that are kept where it is too long to be read."""
 LONGEST_SENDER = 100
 
 
@@ -117,7 +119,7 @@ class Commands:
             by=_sender(topic[:LONGEST_NAME], message),
             name=shown or name[:40],
             point=point,
-            value=bytes(message.payload[:LONGEST]).decode(errors="replace"),
+            value=_as_it_came(message.payload),
             arrived=self._looked,
         )
         try:
@@ -243,6 +245,13 @@ class Commands:
     async def _wait(self) -> None:
         self._something.clear()
         await self._something.wait()
+
+
+def _as_it_came(payload: bytes | bytearray) -> str:
+    """Return a command as it is kept until it is read; of one that is too long to be read its beginning."""
+    if len(payload) <= LONGEST:
+        return bytes(payload).decode(errors="replace")
+    return f"{bytes(payload[:BEGINNING]).decode(errors='replace')}... ({len(payload)} bytes)"
 
 
 def _sender(topic: str, message: Message | MQTTMessage) -> str:

@@ -135,12 +135,17 @@ def cycle_fields(snapshot: Snapshot, time_of: Callable[[float], float]) -> dict[
 
 
 def sample_fields(sample: Sample[Any]) -> dict[str, Any]:
-    """Return a value, or what went wrong, and whether it is late; and what the value is called, where it is."""
-    fields = {
+    """Return a value, or what went wrong, and whether it is late.
+
+    With it are what the value is called and what to try, where there is something to say.
+    """
+    fields: dict[str, Any] = {
         "value": json_value(sample.value),
         "error": None if sample.error is None else sample.error.what,
         "late": sample.quality is Quality.LATE,
     }
+    if sample.error is not None and sample.error.hint:
+        fields["hint"] = sample.error.hint
     return {**fields, **name_fields(sample.value)}
 
 

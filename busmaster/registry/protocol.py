@@ -138,7 +138,7 @@ class NodeKind:
 
     @property
     def profile(self) -> Profile:
-        """The profile of the protocol that has this kind of node."""
+        """Return the profile of the protocol that has this kind of node."""
         return self.protocol.profile
 
     def decimals(self, item: str) -> int:
@@ -169,7 +169,7 @@ class Protocol:
 
     @property
     def name(self) -> str:
-        """The name of the protocol, as `--protocol` takes it for its first kind of node."""
+        """Return the name of the protocol, as `--protocol` takes it for its first kind of node."""
         return self.profile.name
 
     def write_down(self, command: Command[Any]) -> dict[str, Any]:

@@ -33,6 +33,7 @@ from busmaster.service.messages import (
 from busmaster.service.outbox import Outbox
 from busmaster.service.overview import said_details
 from busmaster.service.peers import Peer
+from busmaster.service.reads import PlainRead
 from busmaster.service.requests import Requests
 from busmaster.service.streams import Broadcast, GroupBroadcast
 from busmaster.service.telling import point_of, protocol_of, said_statistics
@@ -74,6 +75,11 @@ class Client:
         return self.peer.permission(self._line.gate.access)
 
     @property
+    def read_only(self) -> bool:
+        """Return whether nothing that it writes is let through, as it is now."""
+        return self._line.gate.read_only or not self.permission.writes
+
+    @property
     def errands(self) -> tuple[Errand, ...]:
         """Return what it asked for that is not done yet."""
         return self._requests.errands
@@ -92,6 +98,10 @@ class Client:
         dropped = self.dropped.get(stream, 0)
         head = f'{{"jsonrpc":"2.0","method":"{method}","params":{{"stream":{stream},"dropped":{dropped},"body":'
         return f"{head}{body}}}}}"
+
+    def tell_access(self) -> None:
+        """Say what it may do now."""
+        self.outbox.put_latest("access", written({"method": "access", "params": {"read_only": self.read_only}}))
 
     def tell_stops(self, node: NodeRecord) -> None:
         """Say how often a node was told to stop, if this client knows it."""
@@ -122,8 +132,7 @@ class Client:
             return
         if isinstance(number, bool) or not isinstance(number, int):
             raise Malformed("the id of a request is a whole number")
-        if number in self._requests:
-            raise Malformed(f"request {number} is under way already")
+        self._requests.check_number(number)
         if method in ("request", "write"):
             self._requests.begin(number, params)
             return
@@ -136,6 +145,11 @@ class Client:
             self._refuse(number, refusal_of(method, error))
         else:
             self._tell_result(number, answer)
+
+    def take_read(self, number: int, read: PlainRead) -> None:
+        """Do what a message asks that is a plain read. Raises Malformed where one of its number is under way."""
+        self._requests.check_number(number)
+        self._requests.begin(number, read)
 
     def _notified(self, method: str, params: Mapping[str, Any]) -> None:
         match method:

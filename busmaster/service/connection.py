@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from busmaster.errors import InvalidCommand
-from busmaster.service.frames import look_at, text_frame
+from busmaster.service.frames import look_at, new_key, text_frame
 
 if TYPE_CHECKING:
     from websockets.client import ClientProtocol
@@ -83,6 +83,8 @@ class Connection(asyncio.BufferedProtocol):
         self._rest = bytearray()
         """The beginning of a frame that has not come whole."""
         self._longest = longest + LONGEST_HEAD
+        self._key = b"" if self._serves else new_key()
+        """For the mask of what is said next: an owner has none."""
         self._part: bytearray | None = None
         """The beginning of a message that comes in pieces."""
         self._is_text = True
@@ -104,7 +106,9 @@ class Connection(asyncio.BufferedProtocol):
         """Say a message: nothing where the connection ends already."""
         transport = self._transport
         if self._talks and transport is not None and not transport.is_closing():
-            transport.write(text_frame(text.encode(), not self._serves))
+            transport.write(text_frame(text.encode(), self._key))
+            if self._key:
+                self._key = new_key()  # already: what is said next is to wait for nothing
 
     def close(self, code: int = NORMAL, reason: str = "") -> None:
         """Say that this is the end, behind all that was said; the other end has CLOSE_WITHIN to agree."""

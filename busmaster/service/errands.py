@@ -20,6 +20,7 @@ from busmaster.gate.permission import Permission
 from busmaster.service.line import ServedLine
 from busmaster.service.messages import value_of
 from busmaster.service.peers import Peer
+from busmaster.service.reads import PlainRead
 from busmaster.service.telling import protocol_of
 
 OPTIONS = {"priority", "start_within", "finish_within", "retries", "idempotent"}
@@ -64,8 +65,8 @@ class Task(NamedTuple):
 
     node: Node
     command: Command[Any]
-    touches: Command[Any] | None
-    value: Any
+    touches: Command[Any] | None = None
+    value: Any = None
     """As the record of a write has it."""
     point: Point[Any] | None = None
 
@@ -87,9 +88,7 @@ class Task(NamedTuple):
         value = value_of(params["value"])
         assert isinstance(point.node, Node)
         try:
-            if point.encode is None:
-                raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
-            return cls(point.node, point.encode(value), point.command, value, point)
+            return cls(point.node, _encoded(point, value), point.command, value, point)
         except NEVER_SENT as error:
             by, permission = str(asker.peer), asker.permission
             wish = Wish(door=DOOR, by=by, name=point.key, point=point, value=value, permission=permission)
@@ -115,9 +114,9 @@ class Errand:
         line: ServedLine,
         asker: Asker,
         client: LineClient,
-        stops_seen: int | None,
-        stop: bool,
         asked: float,
+        stops_seen: int | None = None,
+        stop: bool = False,
     ) -> None:
         self.node = task.node
         self.command = task.command
@@ -138,8 +137,16 @@ class Errand:
         """What is done for a write, once it is begun."""
 
     @classmethod
-    def of(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Errand:
+    def of(cls, said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLine) -> Errand:
         """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
+        if not isinstance(said, PlainRead):
+            return cls._of_params(said, asker, line)
+        node = asker.node(said.protocol, said.address)
+        client = asker.client_of(None, node)
+        return cls(Task(node, said.command), {}, line=line, asker=asker, client=client, asked=line.bus.now())
+
+    @classmethod
+    def _of_params(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Errand:
         task = Task.of_point(params, asker, line) if "key" in params else Task.of_node(params, asker)
         node, command = task.node, task.command
         given: CommandOptions = params.get("options", {})
@@ -304,6 +311,22 @@ class Errand:
             command=command,
             permission=self._asker.permission,
         )
+
+
+def _encoded(point: Point[Any], value: Any) -> Command[Any]:
+    """Return the write of a value. Raises InvalidCommand for one that cannot be written.
+
+    True and false are that where the line would carry them as the numbers 1 and 0: who means a number says one.
+    """
+    if point.encode is None:
+        raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
+    command = point.encode(value)
+    if isinstance(value, bool) and isinstance(command, Changing):
+        is_state = any(isinstance(held, bool) for held in command.changes(point.node.profile).values())
+        if not is_state and str(command) == str(point.encode(int(value))):
+            said = str(value).lower()
+            raise InvalidCommand(f"{point.node.label}: {point.item} is a number, not {said}: write {int(value)}")
+    return command
 
 
 def _check_stop(node: Node, command: Command[Any]) -> bool:

@@ -31,26 +31,28 @@ def look_at(data: bytearray, masked: bool) -> tuple[int, bytes | None]:
     size = text + length
     if come < size or data[0] != TEXT or is_masked is not masked:
         return size, None
-    said = bytes(data[text:size])
-    return size, mask(said, data[begin:text]) if masked else said
+    said = data[text:size]
+    return size, mask(said, data[begin:text]) if masked else bytes(said)
 
 
-def text_frame(data: bytes, masked: bool) -> bytes:
-    """Return the frame of a text."""
-    length, flag = len(data), MASKED if masked else 0
+def text_frame(data: bytes, key: bytes) -> bytes:
+    """Return the frame of a text: with a mask, if there is a key for one."""
+    length, flag = len(data), MASKED if key else 0
     if length < SHORT:
         head = bytes((TEXT, flag | length))
     elif length < 1 << 16:
         head = bytes((TEXT, flag | SHORT)) + length.to_bytes(2, "big")
     else:
         head = bytes((TEXT, flag | LONG)) + length.to_bytes(8, "big")
-    if not masked:
-        return head + data
-    key = os.urandom(4)
-    return head + key + mask(data, key)
+    return head + key + mask(data, key) if key else head + data
 
 
-def mask(data: bytes, key: bytes | bytearray) -> bytes:
+def new_key() -> bytes:
+    """Return a key for the mask of one frame."""
+    return os.urandom(4)
+
+
+def mask(data: bytes | bytearray, key: bytes | bytearray) -> bytes:
     """Return data with a mask put on, or taken off."""
     length = len(data)
     keys = (key * (length // 4 + 1))[:length]

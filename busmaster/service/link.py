@@ -23,7 +23,7 @@ from busmaster.errors import (
 from busmaster.service.connection import AskingConnection
 from busmaster.service.failures import error_of
 from busmaster.service.folder import socket_path
-from busmaster.service.messages import LONGEST_ANSWER, VERSIONS, read, written
+from busmaster.service.messages import LONGEST_ANSWER, VERSIONS, numbered, read, words, written
 
 GRACE = 0.25
 """Seconds beyond `finish_within` in which the line's owner, who knows more, may say what became of a request."""
@@ -104,7 +104,7 @@ class Link:
         loop = asyncio.get_running_loop()
         self._asked[0] = hello = Asked(0, loop.create_future(), False, None, None)
         params = {"versions": list(VERSIONS), "program": program}
-        self._waiting.appendleft((written({"id": 0, "method": "hello", "params": params}), hello))
+        self._waiting.appendleft((numbered(words("hello", params), 0), hello))
         try:
             async with asyncio.timeout(CONNECT_WITHIN):
                 if place is None:
@@ -136,19 +136,22 @@ class Link:
                 self._waiting.append((text, None))
 
     def ask(
-        self,
-        method: str,
-        params: Mapping[str, Any],
-        *,
-        writes: bool = False,
-        node: Addressed | None = None,
-        command: Command[Any] | None = None,
+        self, method: str, params: Mapping[str, Any], *, writes: bool = False, node: Addressed | None = None
     ) -> Asked:
-        """Ask something, after all that was said before; its future has the answer. Raises LineDown or BusClosed."""
+        """Do what `put` does, for a method and its parameters."""
+        return self.put(words(method, params), writes, node)
+
+    def put(
+        self, question: str, writes: bool, node: Addressed | None = None, command: Command[Any] | None = None
+    ) -> Asked:
+        """Ask something in `words`, after all that was said before; its future has the answer.
+
+        Raises LineDown or BusClosed.
+        """
         if self._over is not None:
             self.check(node, command)
         self._count = number = self._count + 1
-        text = written({"id": number, "method": method, "params": params})
+        text = numbered(question, number)
         handed = self._passes(text)  # what is kept of it is made while the other end is at it already
         asked = Asked(number, asyncio.get_running_loop().create_future(), writes, node, command, handed)
         self._asked[number] = asked

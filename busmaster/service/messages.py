@@ -51,6 +51,8 @@ HELLO_WITHIN = 10.0
 LONGEST_REPLY = 5.0
 """Seconds for which a program may have the line wait for a reply: nothing else is sent meanwhile."""
 
+BEFORE_NUMBER = ',"id":'
+
 PARSE_ERROR, INVALID_REQUEST, NO_METHOD, INVALID_PARAMS, INTERNAL, BUS_ERROR = (
     -32700,
     -32600,
@@ -71,7 +73,17 @@ class Malformed(Exception):
 
 def written(message: Mapping[str, Any]) -> str:
     """Return a message as text. Raises TypeError for what cannot be said in it."""
-    return encoded({"jsonrpc": "2.0", **message})
+    return f'{{"jsonrpc":"2.0",{encoded(message)[1:]}'
+
+
+def words(method: str, params: Mapping[str, Any]) -> str:
+    """Return a question as text, up to its number. Raises TypeError for what cannot be said in it."""
+    return written({"method": method, "params": params})[:-1]
+
+
+def numbered(words: str, number: int) -> str:
+    """Return a question as text, with its number: behind the words, which may be the same as before."""
+    return f"{words}{BEFORE_NUMBER}{number}}}"
 
 
 def encoded(value: Any) -> str:

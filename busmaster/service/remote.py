@@ -74,7 +74,9 @@ class RemoteBus:
         self.line = ""
         """The name of the line's port, once it is entered."""
         self.about: Mapping[str, Any] = {}
-        """What the owner says of the line: its name, settings and process."""
+        """What the owner says of the line: its name, settings and process, and whether this program may only read."""
+        self.on_access: list[Callable[[], None]] = []
+        """Called when `about` says otherwise what this program may do. They must not block, nor raise."""
         self._link: Link | None = None
         self._ahead = 0.0
         """Seconds by which the clock of the owner's machine is ahead of this one, less what it took to hear that."""
@@ -317,6 +319,10 @@ class RemoteBus:
             node = self._nodes.get((params["protocol"], params["address"]))
             if node is not None:
                 node.stops = params["stops"]
+        elif method == "access":
+            self.about = {**self.about, **params}
+            for tell in self.on_access:
+                tell()
         elif method == "touched":
             self._touched[params["protocol"], params["address"]] = params["when"]
         elif method == "event":

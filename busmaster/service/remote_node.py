@@ -17,7 +17,8 @@ from busmaster.contract.profile import Profile
 from busmaster.errors import InvalidCommand
 from busmaster.planning.merging import Merge
 from busmaster.service.link import Link
-from busmaster.service.messages import value_of
+from busmaster.service.messages import value_of, words
+from busmaster.service.reads import words_of
 from busmaster.service.sequences import HoldsLine, Room, held_remotely, shortened
 from busmaster.service.telling import protocol_of
 
@@ -148,10 +149,8 @@ class RemoteNode:
         waited = await room.wait(chosen, self, command) if waits and not room.take() else 0.0
         try:
             left: Mapping[str, Any] = {**options, **shortened(chosen, waited)} if waited else options
-            params = self._said(command, left, touches, stops_seen, stop)
-            if sequence is not None:
-                params["sequence"] = sequence
-            asked = link.ask("request", params, writes=command.writes, node=self, command=command)
+            question = self._words(command, left, touches, stops_seen, stop, sequence)
+            asked = link.put(question, command.writes, self, command)
             value: T = value_of(await link.answer(asked, left.get("finish_within")))
             return value
         finally:
@@ -165,14 +164,19 @@ class RemoteNode:
         """
         return held_remotely(self, self._bus, checked_hold(max_hold, self.label))
 
-    def _said(
+    def _words(
         self,
         command: Command[Any],
         options: Mapping[str, Any],
         touches: Command[Any] | None,
         stops_seen: int | None,
         stop: bool,
-    ) -> dict[str, Any]:
+        sequence: int | None,
+    ) -> str:
+        """Return how a request is said. `asked` is left out where nothing is counted from it."""
+        more = options or stop or touches is not None or stops_seen is not None or sequence is not None
+        if not more and not getattr(command, "writes", True):
+            return words_of(self._profile.name, self._address, command)  # type: ignore[arg-type]  # it is hashable
         params: dict[str, Any] = {
             "protocol": self._profile.name,
             "address": self._address,
@@ -185,10 +189,12 @@ class RemoteNode:
             params["stops_seen"] = stops_seen
         if stop:
             params["stop"] = True
+        if sequence is not None:
+            params["sequence"] = sequence
         if options:
             given = {name: value for name, value in options.items() if value is not None}
             params["options"] = {name: given[name] for name in given if name not in LEFT_OUT}
-        return params
+        return words("request", params)
 
     def said_check(self, commands: Iterable[Command[Any]], stop: bool) -> dict[str, Any]:
         """Return writes of this node as the line is asked whether it would take them."""

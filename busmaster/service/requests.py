@@ -13,7 +13,8 @@ from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, W
 from busmaster.service.errands import Asker, Errand
 from busmaster.service.failures import REFUSED, refusal_of
 from busmaster.service.line import ServedLine
-from busmaster.service.messages import MOST_REQUESTS, MOST_URGENT
+from busmaster.service.messages import MOST_REQUESTS, MOST_URGENT, Malformed
+from busmaster.service.reads import PlainRead
 
 
 class Requests:
@@ -35,20 +36,21 @@ class Requests:
         """Those that wait for the safe state to be sent."""
         self._log = logging.getLogger("busmaster.service")
 
-    def __contains__(self, number: int) -> bool:
-        """Return whether something of this number is not answered yet."""
-        return number in self._errands or number in self._safe
+    def check_number(self, number: int) -> None:
+        """Raise Malformed for the number of something that is not answered yet."""
+        if number in self._errands or number in self._safe:
+            raise Malformed(f"request {number} is under way already")
 
     @property
     def errands(self) -> tuple[Errand, ...]:
         """Return what is to be done at its nodes."""
         return tuple(self._errands.values())
 
-    def begin(self, number: int, params: Mapping[str, Any]) -> None:
+    def begin(self, number: int, said: Mapping[str, Any] | PlainRead) -> None:
         """Have a command carried out."""
         try:
-            self._check_room(params)
-            errand = Errand.of(params, self._asker, self._line)
+            self._check_room(said)
+            errand = Errand.of(said, self._asker, self._line)
             self._errands[number] = errand
             errand.begin(partial(self._ended, number))
         except REFUSED as error:
@@ -89,9 +91,9 @@ class Requests:
 
     # inside
 
-    def _check_room(self, params: Mapping[str, Any]) -> None:
+    def _check_room(self, said: Mapping[str, Any] | PlainRead) -> None:
         waiting = len(self._errands) + len(self._safe)
-        if waiting >= MOST_REQUESTS and not (_is_urgent(params) and waiting < MOST_REQUESTS + MOST_URGENT):
+        if waiting >= MOST_REQUESTS and not (_is_urgent(said) and waiting < MOST_REQUESTS + MOST_URGENT):
             raise BacklogFull(f"{waiting} requests of this program are not answered yet")
 
     def _ended(self, number: int, errand: Errand, value: Any, error: BaseException | None) -> None:
@@ -117,5 +119,5 @@ class Requests:
             self._refuse(number, error if isinstance(error, Exception) else BusError(str(error)))
 
 
-def _is_urgent(params: Mapping[str, Any]) -> bool:
-    return bool(params.get("options", {}).get("priority") == Priority.URGENT)
+def _is_urgent(said: Mapping[str, Any] | PlainRead) -> bool:
+    return isinstance(said, Mapping) and bool(said.get("options", {}).get("priority") == Priority.URGENT)

@@ -153,7 +153,7 @@ class Service:
         self.bus.on_stop.append(self._tell_stop)
         self.line.journal.begin()
         self.bus.on_touched.append(self._tell_touched)
-        self.gate.on_access.append(self._let_go)
+        self.gate.on_access.append(self._tell_access)
         return self
 
     async def __aexit__(
@@ -162,7 +162,7 @@ class Service:
         """Let nobody in any more, tell all clients what became of their requests, and let them go."""
         self.bus.on_stop.remove(self._tell_stop)
         self.bus.on_touched.remove(self._tell_touched)
-        self.gate.on_access.remove(self._let_go)
+        self.gate.on_access.remove(self._tell_access)
         await self.line.safe_wishes.close()
         for server in self._servers:
             server.close()
@@ -242,10 +242,12 @@ class Service:
             return process_of(connected)
         return holder(connected, shown, self.gate.access)
 
-    def _let_go(self) -> None:
-        """Let those go whose token holds no more."""
+    def _tell_access(self) -> None:
+        """Let those go whose token holds no more, and tell the others what they may do now."""
         for client, visit in self._clients.items():
-            if not client.peer.may_stay(self.gate.access):
+            if client.peer.may_stay(self.gate.access):
+                client.tell_access()
+            else:
                 visit.connection.abort()
 
     def welcome(self, visit: Visit, said: Mapping[str, Any], /) -> Client:
@@ -312,7 +314,7 @@ class Service:
             "echo": owner.echo,
             "tcp": self.tcp_address,
             "process": owner.pid,
-            "read_only": self.gate.read_only or not client.permission.writes,
+            "read_only": client.read_only,
             "clients": len(self._clients),
             "state": state_text(self.bus),
             "nodes": nodes,

@@ -20,6 +20,7 @@ from busmaster.service.messages import (
     written,
 )
 from busmaster.service.peers import Peer
+from busmaster.service.reads import plain_read_of
 
 if TYPE_CHECKING:
     from websockets.http11 import Request
@@ -131,12 +132,14 @@ class Visit:
         if self._ended:
             return
         try:
-            said = read_request(self._messages.popleft())
+            message = self._messages.popleft()
             if self.client is None:
-                self.client = self._host.welcome(self, said)
+                self.client = self._host.welcome(self, read_request(message))
                 self._stranger.cancel()
+            elif (read := plain_read_of(message)) is not None:
+                self.client.take_read(*read)
             else:
-                self.client.take(said)
+                self.client.take(read_request(message))
         except Malformed as error:
             self._send_away(error)
         except Exception as bug:  # unheard, it would wait for ever to be read on, and keep its place

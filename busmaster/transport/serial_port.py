@@ -104,12 +104,12 @@ class SerialPort:
 
     @property
     def name(self) -> str:
-        """What messages call the port: its path."""
+        """Return what messages call the port: its path."""
         return self.path
 
     @property
     def settings(self) -> LineSettings:
-        """Baud rate and framing."""
+        """Return baud rate and framing."""
         return LineSettings(self.baudrate, self.bytesize, self.parity, self.stopbits)
 
     def presence(self) -> Hashable | None:

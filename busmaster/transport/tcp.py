@@ -54,13 +54,13 @@ class TcpPort:
 
     @property
     def name(self) -> str:
-        """What messages call the port: HOST:PORT."""
+        """Return what messages call the port: HOST:PORT."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{host}:{self.port}"
 
     @property
     def settings(self) -> LineSettings | None:
-        """For tau only: the framing is the server's business."""
+        """Return what tau is reckoned from: the framing is the server's business."""
         return None if self.baudrate is None else LineSettings(self.baudrate)
 
     def presence(self) -> None:

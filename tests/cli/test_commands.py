@@ -194,8 +194,11 @@ def test_poll_in_json_has_a_line_a_cycle_with_times_since_the_start(controllers:
     assert abs(datetime.now(UTC) - datetime.fromisoformat(last["time"])).days == 0
     assert 0 <= last["due"] <= last["started"] <= last["finished"] < time.monotonic() - began
     assert last["samples"]["1/outputs"] == {"value": 0, "error": None, "late": False}
-    assert last["samples"]["99/outputs"]["value"] is None
-    assert last["samples"]["99/outputs"]["error"]
+    silent = last["samples"]["99/outputs"]
+    assert list(silent) == ["value", "error", "late", "hint"]
+    assert silent["value"] is None
+    assert silent["error"]
+    assert silent["hint"]
 
 
 def test_poll_that_ends_without_a_value_ends_with_1(busmaster: Command, controllers: TcpServer) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import sqlite3
 import subprocess
@@ -143,6 +144,32 @@ def test_a_file_that_is_wrong_is_one_line_that_names_line_and_key_and_status_2(
     assert "does not exist" in missing.err
 
 
+@pytest.mark.parametrize("command", ["plan", "emulate"])
+@pytest.mark.parametrize(
+    ("before", "after", "complaint"),
+    [
+        (
+            "period = 0.02",
+            "period = 0",
+            "12: groups.fast.period: poll group 'fast': a period is at least 0.001 s, not 0",
+        ),
+        (
+            "[groups.slow]",
+            "[emulator.nodes.winder]\naxes = 9\n[groups.slow]",
+            "14: emulator.nodes.winder: a controller",
+        ),
+    ],
+)
+def test_plan_finds_wrong_what_emulate_does_at_the_same_place(
+    busmaster: Command, tmp_path: Path, command: str, before: str, after: str, complaint: str
+) -> None:
+    path = tmp_path / "line.toml"
+    path.write_text(TEXT.replace("PORT", "socket://127.0.0.1:1").replace(before, after))
+    outcome = busmaster(command, str(path))
+    assert (outcome.status, outcome.out) == (2, "")
+    assert outcome.err.startswith(f"busmaster: {path}:{complaint}")
+
+
 def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     text = (
         line.read_text()
@@ -155,6 +182,9 @@ def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     assert outcome.lines[0].startswith("Slitter: 127.0.0.1:")
     assert [row.split()[0] for row in outcome.lines[1:4]] == ["GROUP", "fast", "slow"]
     assert outcome.lines[4].startswith("it fits: the schedule asks for ")
+    healthy, dead = re.findall(r"([\d.]+) ms", outcome.lines[5])
+    assert float(healthy) < float(dead) < 200  # a lateness of HCP2, not a bound that no line comes near
+    assert outcome.lines[6].startswith("the bounds (R9), if every exchange took the longest that one can: urgent ")
     assert outcome.lines[-2].startswith("reply times are assumed, half of the nominal one, for ")
     assert outcome.lines[-1].startswith("with 1% of all frames lost it asks for ")
     assert 'with timing = "learned" (a window of 39.5 ms) for ' in outcome.lines[-1]
@@ -169,6 +199,7 @@ def test_plan_says_what_would_fit_where_it_does_not_and_ends_with_1(busmaster: C
     assert plan["fits"] is False
     assert [group["group"] for group in plan["groups"]] == ["fast", "slow"]
     assert plan["groups"][0]["values"] == 3
+    assert plan["typical_wait"] < plan["dead_wait"] < plan["worst_waits"]["urgent"]
     assert plan["worst_waits"].keys() == {"urgent", "command", "poll", "background"}
     assert plan["utilisation"] < plan["losses"]["learned_utilisation"] < plan["losses"]["utilisation"]
 

@@ -192,10 +192,20 @@ def test_top_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_top_without_a_terminal_is_wrong_usage(file: Path) -> None:
-    with started("top") as process:
+    with owner("serve", str(file)), started("top", "slitter") as process:
         _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 2
     assert err.startswith("busmaster: top draws on a terminal")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"), [("nobody", "no program of this user serves 'nobody', "), ("unix:/nobody", "no program serves ")]
+)
+def test_that_there_is_no_such_line_is_said_before_that_there_is_no_terminal(line: str, said: str) -> None:
+    with started("top", line) as process:
+        _, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
+    assert err.startswith(f"busmaster: {said}")
 
 
 def test_a_line_is_meant_by_its_name_its_file_its_port_or_its_address(

@@ -52,6 +52,13 @@ def test_of_a_run_every_value_is_scaled_and_words_and_flags_are_left_alone() -> 
     assert Scale.of(0.1, whole=True).write([0.1, 0.2]) == (1, 2)
 
 
+def test_true_is_no_number_that_is_scaled_and_where_nothing_is_scaled_it_stays_what_it_is() -> None:
+    for value in (True, False, [True]):
+        with pytest.raises(InvalidCommand, match="is no number"):
+            Scale.of(0.1).write(value)
+    assert Scale.of().write(True) is True
+
+
 def test_what_cannot_be_written_is_told_as_it_was_said_and_not_only_as_it_is_on_the_line() -> None:
     text = """
         port = "/dev/ttyUSB0"

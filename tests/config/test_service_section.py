@@ -176,10 +176,12 @@ def test_other_roles_are_taken_by_a_line_that_runs_and_another_port_is_not() -> 
         with pytest.raises(InvalidCommand, match=r"another \[service\] needs a restart"):
             await line.take(parse(f'{TEXT}[service]\nlisten = "127.0.0.1:7420"\n'))
         line.gate.take_secrets({"hmi": b"kept"})
+        line.gate.on_access.append(lambda: told.append(line.gate.access.users[0].writes))
         await line.take(parse(f'{TEXT}[service.users.{USER}]\nrole = "write"\n'))
 
+    told: list[bool] = []
     asyncio.run(run())
-    assert line.gate.access.users[0].writes
+    assert told == [True]
     assert line.gate.access.secrets == {"hmi": b"kept"}
 
 

@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from tempfile import mkdtemp
 from tests.docs.pages import ROOT, Block
 from tests.patience import PATIENCE
 from tests.ports import free_port
+from tests.printed import Printed
 
 ADDRESS = re.compile(r"\b(127\.0\.0\.1|localhost):(\d{4,5})\b")
 PORT_KEY = re.compile(r"^(port = )(\d{4,5})$", re.MULTILINE)
@@ -99,25 +99,12 @@ class Running:
             text=True,
             bufsize=1,
         )
-        self._said: list[str] = []
-        self._more = threading.Condition()
-        self._ended = False
-        self._reader = threading.Thread(target=self._read)
-        self._reader.start()
-
-    def _read(self) -> None:
         assert self.process.stdout is not None
-        for line in self.process.stdout:
-            with self._more:
-                self._said.append(line)
-                self._more.notify_all()
-        with self._more:
-            self._ended = True
-            self._more.notify_all()
+        self._printed = Printed(self.process.stdout)
 
     @property
     def output(self) -> str:
-        return "".join(self._said)
+        return "".join(f"{text}\n" for text in self._printed.texts())
 
     def await_lines(self, shown: str, vary: bool, replace: Replacing) -> bool:
         """Wait until it has said each line that is shown, or any where none is; False where they do not come.
@@ -130,9 +117,7 @@ class Running:
             lines = tidy(replace.shown(self.output)).splitlines(keepends=True)
             return bool(lines) and all(any(map(pattern.fullmatch, lines)) for pattern in patterns)
 
-        with self._more:
-            self._more.wait_for(lambda: self._ended or said(), PATIENCE)
-            return said()
+        return self._printed.wait_for(said)
 
     def interrupt(self) -> int:
         """End it as Ctrl-C does, and return its exit status, when all that it said is read."""
@@ -149,9 +134,7 @@ class Running:
             self.process.wait()
             raise
         finally:
-            self._reader.join(PATIENCE)
-            assert self.process.stdout is not None
-            self.process.stdout.close()
+            self._printed.join()
         return status
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +17,14 @@ from busmaster.bus.points import Point
 from busmaster.doors.following import Following
 from busmaster.doors.guard import Guard
 from busmaster.doors.web import application, serving
+from busmaster.gate.permission import Access, Permission
 from tests.patience import PATIENCE
 from tests.service.lines import Served, until
 
 ONE = "/api/points/axes/5/10"
 HERE = ("127.0.0.1", 0)
+READS = Access(users={os.getuid(): Permission("this user", False)})
+"""What an owner's file says where this user may only read."""
 
 
 @contextlib.asynccontextmanager

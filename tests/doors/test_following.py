@@ -10,7 +10,8 @@ import pytest
 from busmaster.doors import following
 from busmaster.doors.following import Connected, Following, Lost
 from busmaster.errors import InvalidCommand, LineDown, NotStarted
-from tests.doors.lines import assert_goes_on_alone, followed, poll, shows
+from busmaster.gate.permission import Access
+from tests.doors.lines import READS, assert_goes_on_alone, followed, poll, shows
 from tests.patience import PATIENCE
 from tests.service.lines import served, until
 
@@ -107,6 +108,24 @@ async def test_a_door_that_is_read_only_writes_nothing(tmp_path: Path) -> None:
         with pytest.raises(InvalidCommand, match="this door is read-only"):
             await door.write("axes", "5/10", 7)
         assert line.records == []
+
+
+@pytest.mark.asyncio
+async def test_a_door_is_told_when_its_role_is_changed_and_goes_on_with_its_picture(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, followed(tmp_path) as door:
+        poll(line)
+        await shows(door)
+        told: list[bool] = []
+        door.on_state(lambda: told.append(door.read_only))
+        picture = door.picture
+        line.gate.access = READS
+        await until(lambda: told == [True])
+        with pytest.raises(InvalidCommand, match="may read this line"):
+            await door.write("axes", "5/10", 7)
+        line.gate.access = Access()
+        await until(lambda: told == [True, False])
+        await door.write("axes", "5/10", 7)
+        assert door.picture is picture
 
 
 @pytest.mark.asyncio

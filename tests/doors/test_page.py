@@ -17,10 +17,10 @@ from busmaster.bus.limits import Limit
 from busmaster.bus.meaning import Meaning
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.line import Line
-from busmaster.gate.permission import digest_of
+from busmaster.gate.permission import Access, digest_of
 from busmaster.registry import make_device
 from tests.doors.browser import Browser, chromium, needs_chromium
-from tests.doors.lines import Page, page, poll, shows
+from tests.doors.lines import READS, Page, page, poll, shows
 from tests.service.lines import Served, served, until
 
 pytestmark = [needs_chromium(), pytest.mark.slow]
@@ -140,13 +140,18 @@ async def test_a_good_value_that_is_a_text_is_not_drawn_as_one_that_is_missing(
 
 
 def exchanges_are_drawn(browser: Browser) -> None:
-    """Wait until the line's lane has the colour of an exchange that was answered, between the rules."""
+    """Wait until the line's lane has the colour of exchanges that were answered in two places, between the rules."""
     browser.until(
         """(() => {
           const canvas = document.getElementById('wire-canvas'), pen = canvas.getContext('2d');
           const row = pen.getImageData(70, 30, canvas.width - 70, 1).data;
-          for (let at = 0; at < row.length; at += 4) if (`${row.slice(at, at + 3)}` === '0,114,178') return true;
-          return false;
+          let places = 0, within = false;
+          for (let at = 0; at < row.length; at += 4) {
+            const answered = `${row.slice(at, at + 3)}` === '0,114,178';
+            places += answered && !within;
+            within = answered;
+          }
+          return places > 1;
         })()"""
     )
 
@@ -183,6 +188,30 @@ async def test_a_write_that_the_line_refuses_is_said_in_its_words(browser: Brows
         await asyncio.to_thread(browser.click, "#point-rows button.name")
         await asyncio.to_thread(browser.until, "!document.getElementById('no-write').hidden")
         assert line.records == []
+
+
+@pytest.mark.asyncio
+async def test_what_the_doors_role_no_longer_allows_is_offered_no_longer(browser: Browser, tmp_path: Path) -> None:
+    async with shown(browser, tmp_path) as (line, _):
+        await asyncio.to_thread(browser.until, "!document.querySelector('#point-rows td:last-child button').hidden")
+        await asyncio.to_thread(browser.click, "#point-rows button.name")
+        await asyncio.to_thread(browser.type, "#new-value", "3")
+        await asyncio.to_thread(browser.press, ENTER)
+        await asyncio.to_thread(browser.until, "!document.getElementById('ask').hidden")
+        line.gate.access = READS
+        await asyncio.to_thread(browser.until, "!document.getElementById('no-write').hidden")
+        assert await asyncio.to_thread(browser.run, "return document.getElementById('go').hidden")
+        assert await asyncio.to_thread(browser.run, "return document.getElementById('ask').hidden")
+        assert await asyncio.to_thread(browser.text, "#mode") == "read-only"
+        await asyncio.to_thread(
+            browser.until,
+            "[...document.querySelectorAll('#point-rows td:last-child button')].every((one) => one.hidden)",
+        )
+        line.gate.access = Access()
+        await asyncio.to_thread(browser.until, "document.getElementById('no-write').hidden")
+        assert not await asyncio.to_thread(browser.run, "return document.getElementById('go').hidden")
+        assert line.records == []
+        assert browser.complaints() == []
 
 
 @pytest.mark.asyncio

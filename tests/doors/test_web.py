@@ -21,7 +21,7 @@ from busmaster.doors.audience import MOST_EXCHANGES, Seat
 from busmaster.doors.web import LONGEST_BODY, PAGE, serving
 from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Access, Permission, digest_of
-from tests.doors.lines import HERE, ONE, Page, assert_goes_on_alone, page, poll, shows
+from tests.doors.lines import HERE, ONE, READS, Page, assert_goes_on_alone, page, poll, shows
 from tests.service.lines import Served, served, until
 
 NETWORK = ("192.0.2.7", 8420)
@@ -104,6 +104,18 @@ async def test_a_write_passes_the_owners_gate_and_its_limits_hold(tmp_path: Path
         assert line.audit() == [("5/10", "written"), ("5/10", "refused")]
         assert of.writes[0] == "5/10 = 12.5, asked by a page from 127.0.0.1: written"
         assert len(of.writes) == 2
+
+
+@pytest.mark.asyncio
+async def test_of_nonsense_only_the_beginning_is_told(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        assert (await put(of, "x" * 4000))[0] == 400
+        [told] = of.writes
+        assert told.startswith("5/10 = 'xxx")
+        assert told.count("... (40") == 2  # the value, and the error that has it
+        assert len(told) < 600
 
 
 @pytest.mark.parametrize(
@@ -287,6 +299,23 @@ async def test_a_page_is_told_when_the_owner_goes_and_when_it_is_back(tmp_path: 
                 assert len(told["rows"]["rows"]) == 2
             while (await hear(stream, "state"))["state"]["connected"]:
                 pass
+
+
+@pytest.mark.asyncio
+async def test_a_page_is_told_when_the_doors_role_is_changed_and_one_that_comes_then_all_else(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line)
+        await shows(of.line)
+        async with stream_of(of) as stream:
+            assert not (await hear(stream, "state"))["state"]["read_only"]
+            line.gate.access = READS
+            assert (await hear(stream, "state"))["state"]["read_only"]
+            assert (await of.client.get("/api/line")).json()["read_only"]
+            await hear(stream, "frame")
+        async with stream_of(of) as stream:
+            told = await hear(stream, "state", "rows", "frame")
+            assert told["state"]["read_only"]
+            assert [row["key"] for row in told["rows"]["rows"]] == ["5/10", "5/outputs"]
 
 
 @pytest.mark.asyncio

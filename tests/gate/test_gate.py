@@ -103,6 +103,21 @@ def test_what_is_refused_unread_is_on_record_as_it_came_with_the_value_before_it
     at_a_gate(story)
 
 
+def test_of_nonsense_its_beginning_is_kept_and_how_long_it_was() -> None:
+    async def story(gate: Gate, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        for sent in ("x" * 60_000, (1,) * 8_000, 10**299, b"x" * 4_096):
+            gate.refuse(replace(wish(controller, 1), value=sent, by="b" * 300, name="n" * 300), "e" * 60_000)
+        for record, length in zip(records, (60_002, 24_000, 300, 4_096), strict=True):
+            assert record.value[200:] == f"... ({length} characters)"
+            assert record.error == f"{'e' * 200}... (60000 characters)"
+            assert (record.by, record.point) == (f"{'b' * 200}... (300 characters)", f"{'n' * 200}... (300 characters)")
+            assert len(record.text) < 1_200
+        gate.refuse(replace(wish(controller, 1), value=10**99), "too large")
+        assert records[-1].value == 10**99
+
+    at_a_gate(story)
+
+
 @pytest.mark.parametrize(
     ("polled", "written", "before"),
     [

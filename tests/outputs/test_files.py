@@ -80,7 +80,7 @@ def test_json_lines_are_cycles_and_events(tmp_path: Path) -> None:
     first, second = map(json.loads, written(path))
     assert first["samples"] == {
         "5/1": {"value": 12, "error": None, "late": False},
-        "5/2": {"value": None, "error": "no reply", "late": False},
+        "5/2": {"value": None, "error": "no reply", "late": False, "hint": NoReply.hint},
     }
     assert (first["group"], first["cycle"], first["missed"]) == ("axes", 1, 0)
     assert abs(first["started"] - time.time()) < PATIENCE

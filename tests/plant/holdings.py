@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.plant.brokers import Heard
-from tests.plant.programs import Line
+from tests.printed import Line
 
 Value = tuple[str, Any]
 """A point's key, and what it held: of telling drives each comes but once."""

@@ -23,7 +23,8 @@ from tests.plant.account import AUDIT, Counts, counts_of
 from tests.plant.brokers import PREFIX
 from tests.plant.holdings import Holding, json_lines, of_stdout
 from tests.plant.plant import HOLDERS, SETPOINT, Plant, Site, tail_of
-from tests.plant.programs import ROOT, Line
+from tests.plant.programs import ROOT
+from tests.printed import Line
 
 MINUTE = 60.0
 PERIODS = {"axes": 0.25, "health": 1.0}

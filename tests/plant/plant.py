@@ -25,8 +25,9 @@ from tests.disks import SmallDisk, small_disk
 from tests.plant.brokers import PREFIX, Broker, Heard, Subscriber
 from tests.plant.gateway import Gateway
 from tests.plant.holdings import Holding, of_csv, of_jsonl, of_mqtt, of_sqlite
-from tests.plant.programs import ENVIRONMENT, Line, Program, until
+from tests.plant.programs import ENVIRONMENT, Program, until
 from tests.ports import free_port
+from tests.printed import Line
 
 NODES = ("winder", "unwinder", "dancer")
 PERIODS = {"fast": 0.1, "slow": 0.5}

@@ -1,4 +1,4 @@
-"""A real program as a process of its own, whose lines are kept with the moment at which they came."""
+"""A real program as a process of its own."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
 from tests.patience import PATIENCE
+from tests.printed import Line, Printed
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "", "MALLOC_ARENA_MAX": "2"}
@@ -31,34 +31,6 @@ def until(fact: Callable[[], bool], what: str, seen: Callable[[], object] = str)
             raise AssertionError(f"it never came that {what}; what was: {seen()}")
         time.sleep(LOOK)
     return time.monotonic()
-
-
-class Line(NamedTuple):
-    """`when` is by the machine's steady clock, which all processes share."""
-
-    when: float
-    text: str
-
-
-class Lines:
-    """What comes from one stream, kept by a thread until the stream ends."""
-
-    def __init__(self, stream: IO[str]) -> None:
-        self.all: list[Line] = []
-        self._stream = stream
-        self._thread = threading.Thread(target=self._collect, daemon=True)
-        self._thread.start()
-
-    def _collect(self) -> None:
-        with self._stream:
-            for text in self._stream:
-                self.all.append(Line(time.monotonic(), text.rstrip("\n")))
-
-    def since(self, moment: float) -> list[Line]:
-        return [line for line in self.all[:] if line.when >= moment]
-
-    def join(self) -> None:
-        self._thread.join(PATIENCE)
 
 
 class Program:
@@ -90,8 +62,8 @@ class Program:
             start_new_session=not terminal,
         )
         assert self.popen.stderr is not None
-        self.err = Lines(self.popen.stderr)
-        self.out = Lines(self.popen.stdout) if self.popen.stdout is not None else None
+        self.err = Printed(self.popen.stderr)
+        self.out = Printed(self.popen.stdout) if self.popen.stdout is not None else None
 
     @property
     def runs(self) -> bool:
@@ -99,7 +71,7 @@ class Program:
 
     @property
     def told(self) -> list[str]:
-        return [line.text for line in self.err.all[:]]
+        return self.err.texts()
 
     def order(self, text: str) -> None:
         assert self.popen.stdin is not None

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from bisect import bisect_left
 from collections import defaultdict
@@ -19,6 +18,7 @@ from random import Random
 from typing import NamedTuple
 
 from tests.patience import PATIENCE
+from tests.printed import Printed
 from tests.real_wire.kinds import KINDS
 
 ROOT = Path(__file__).parents[2]
@@ -50,22 +50,18 @@ class Said(NamedTuple):
 
 
 class Process:
-    """One of ours: collects what it prints, and takes orders."""
+    """One of ours: what it prints is kept, and it takes orders."""
 
     def __init__(self, *arguments: str) -> None:
         command = [sys.executable, "-m", *arguments]
         self._popen = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        self.lines: list[str] = []
-        self._more = threading.Condition()
-        self._thread = threading.Thread(target=self._collect, daemon=True)
+        assert self._popen.stdout is not None
+        self.printed = Printed(self._popen.stdout)
 
     def path(self) -> str:
-        """Its first line. Once, before anything else."""
-        assert self._popen.stdout is not None
-        return self._popen.stdout.readline().strip()
-
-    def listen(self) -> None:
-        self._thread.start()
+        """The first line of one that begins with where it listens."""
+        assert self.printed.wait_for(lambda: len(self.printed) > 0), "it ended without a word"
+        return self.printed.texts()[0]
 
     def order(self, what: str) -> None:
         assert self._popen.stdin is not None
@@ -91,18 +87,18 @@ class Process:
 
     def wait_for(self, count: int, what: str, since: int) -> None:
         """Return when so many lines of that kind have come since the line `since`."""
-        limit = time.monotonic() + PATIENCE
-        with self._more:
-            place, seen = since, 0
-            while True:
-                while place < len(self.lines):
-                    seen += self.lines[place].startswith(what)
-                    place += 1
-                if seen >= count:
-                    return
-                if not self._more.wait(max(0.0, limit - time.monotonic())):
-                    recent = " | ".join(line.strip() for line in self.lines[-3:])
-                    raise AssertionError(f"only {seen} of {count} {what.strip()}s came within {PATIENCE:g} s: {recent}")
+        place, seen = since, 0
+
+        def enough() -> bool:
+            nonlocal place, seen
+            texts = self.printed.texts(place)
+            place += len(texts)
+            seen += sum(text.startswith(what) for text in texts)
+            return seen >= count
+
+        if not self.printed.wait_for(enough):
+            recent = " | ".join(self.printed.texts(-3))
+            raise AssertionError(f"only {seen} of {count} {what.strip()}s came within {PATIENCE:g} s: {recent}")
 
     def end(self) -> None:
         """Its input ends; then it does."""
@@ -113,17 +109,7 @@ class Process:
         except subprocess.TimeoutExpired:
             self._popen.kill()
             self._popen.wait()
-        if self._thread.ident is not None:
-            self._thread.join()
-        assert self._popen.stdout is not None
-        self._popen.stdout.close()
-
-    def _collect(self) -> None:
-        assert self._popen.stdout is not None
-        for line in self._popen.stdout:
-            with self._more:
-                self.lines.append(line)
-                self._more.notify_all()
+        self.printed.join()
 
 
 @dataclass
@@ -165,12 +151,10 @@ def trial(protocol: str, port: str, what: str, standstills: int, longest: float 
         if port != "memory":
             slaves = stack.enter_context(running("tests.real_wire.slaves", protocol, port))
             path = slaves.path()
-            slaves.listen()
         if what in ("requests", "replies", "both"):
             proxy = stack.enter_context(running("tests.real_wire.proxy", *path.removeprefix("socket://").split(":")))
             path = proxy.path()
         master = stack.enter_context(running("tests.real_wire.master", protocol, path))
-        master.listen()
         master.wait_for(SETTLED, "value", 0)
         begin, end = _switch(what, master, slaves, proxy)
         for _ in range(standstills):
@@ -179,13 +163,13 @@ def trial(protocol: str, port: str, what: str, standstills: int, longest: float 
             begun = time.monotonic()
             begin()
             time.sleep(lasting)  # this is what is tried
-            known = len(master.lines)
+            known = len(master.printed)
             end()
             verdict.standstills.append((begun, time.monotonic()))
             for address in KINDS[protocol].addresses:
                 master.wait_for(1, f"value {address} ", known)
             master.wait_for(chance.randrange(*BETWEEN), "value", known)
-    judge(protocol, verdict, [*master.lines, *(slaves.lines if slaves is not None else ())])
+    judge(protocol, verdict, [*master.printed.texts(), *(slaves.printed.texts(1) if slaves is not None else ())])
     return verdict
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from busmaster.service import link
-from busmaster.service.messages import written
+from busmaster.service.messages import numbered, written
 from tests.patience import PATIENCE
 from tests.service import schema
 
@@ -27,7 +27,7 @@ def _by_the_schema(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Hold what both sides say against the schema. What a test says by hand, rightly or not, is not held."""
     wrong: list[str] = []
     asked: dict[tuple[link.Link, int], str] = {}
-    ask, take = link.Link.ask, link.Link._take
+    put, take = link.Link.put, link.Link._take
 
     def note(check: Callable[[Any], None], said: Any) -> None:
         try:
@@ -35,13 +35,12 @@ def _by_the_schema(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         except schema.ValidationError as error:
             wrong.append(f"{said!r:.400}: {error.message:.400}")
 
-    def asked_for(self: link.Link, method: str, *arguments: Any, **options: Any) -> link.Asked:
-        request = ask(self, method, *arguments, **options)
-        asked[self, request.number] = method
+    def asked_for(self: link.Link, question: str, *arguments: Any, **options: Any) -> link.Asked:
+        request = put(self, question, *arguments, **options)
+        asked[self, request.number] = schema.heard(numbered(question, request.number))["method"]
         return request
 
-    def say(message: Mapping[str, Any]) -> str:
-        text = written(message)
+    def checked(text: str) -> str:
         note(schema.check_program, schema.heard(text))
         return text
 
@@ -53,8 +52,9 @@ def _by_the_schema(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
             note(lambda result: schema.check_result(method, result), said["result"])
         take(self, said)
 
-    monkeypatch.setattr(link.Link, "ask", asked_for)
+    monkeypatch.setattr(link.Link, "put", asked_for)
     monkeypatch.setattr(link.Link, "_take", hear)
-    monkeypatch.setattr("busmaster.service.link.written", say)
+    monkeypatch.setattr("busmaster.service.link.written", lambda message: checked(written(message)))
+    monkeypatch.setattr("busmaster.service.link.numbered", lambda question, number: checked(numbered(question, number)))
     yield
     assert not wrong

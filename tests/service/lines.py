@@ -123,7 +123,7 @@ class Raw:
         return said
 
     async def ask(self, method: str, **params: Any) -> dict[str, Any]:
-        await self.say(id=1, method=method, params=params)
+        await self.say(method=method, params=params, id=1)
         return await self.hear()
 
 

@@ -16,7 +16,7 @@ from websockets.uri import parse_uri
 
 from busmaster.service import connection
 from busmaster.service.connection import AskingConnection, Connection, ServedConnection
-from busmaster.service.frames import text_frame
+from busmaster.service.frames import new_key, text_frame
 from busmaster.testing import run_in_virtual_time
 
 LENGTHS = (0, 1, 125, 126, 127, 65535, 65536, 70000)
@@ -148,9 +148,9 @@ def test_messages_are_the_same_in_whatever_pieces_they_come(seed: int) -> None:
 def test_what_is_said_is_what_the_library_reads_and_the_other_way_round(length: int) -> None:
     text = "x" * length
     server = ServerProtocol(state=OPEN, max_size=None)
-    server.receive_data(text_frame(text.encode(), masked=True))
+    server.receive_data(text_frame(text.encode(), new_key()))
     asker = ClientProtocol(parse_uri("ws://localhost/"), state=OPEN, max_size=None)
-    asker.receive_data(text_frame(text.encode(), masked=False))
+    asker.receive_data(text_frame(text.encode(), b""))
     for core in (server, asker):
         [frame] = core.events_received()
         assert isinstance(frame, Frame)

@@ -291,6 +291,21 @@ def test_other_roles_hold_at_once_for_who_is_there(tmp_path: Path) -> None:
     on_a_socket(tmp_path, Access(), story)
 
 
+def test_other_roles_are_told_to_who_is_there(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with asyncio.timeout(PATIENCE), served(tmp_path) as line, connect(line.address) as remote:
+            told: list[bool] = []
+            remote.on_access.append(lambda: told.append(remote.about["read_only"]))
+            assert not remote.about["read_only"]
+            line.gate.access = Access(users={os.getuid(): Permission("user me", False)})
+            await until(lambda: told == [True])
+            line.gate.access = Access()
+            await until(lambda: told == [True, False])
+            assert remote.about["name"] == line.service.name  # and all else is as it was
+
+    asyncio.run(run())
+
+
 def test_what_a_command_does_not_say_it_changes_is_allowed_with_its_whole_node_alone() -> None:
     class Odd:
         writes = True

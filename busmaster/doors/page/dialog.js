@@ -21,25 +21,32 @@ export class PointDialog {
   }
 
   async open(row, may) {
-    Object.assign(this, { row, may, details: null });
+    Object.assign(this, { row, details: null, allowed: "" });
     by("point-name").textContent = `${row.node} ${row.item} (${row.key})`;
     by("point-unit").textContent = by("new-unit").textContent = row.unit;
     field.value = "";
-    this.ask(null);
     this.outcome("");
     by("write-limits").textContent = "";
     by("point-facts").replaceChildren();
-    const why = why_not(row, may);
-    form.querySelectorAll("p").forEach((line) => { line.hidden = Boolean(why); });
+    this.allow(may);
+    this.draw();
+    box.showModal();
+    (by("go").hidden ? by("shut") : field).focus();
+    await this.load(row);
+  }
+
+  // Called whenever something else may be allowed: who could write this may not be let through any more.
+  allow(may) {
+    if (!this.row) return;
+    const why = why_not(this.row, may), allowed = JSON.stringify([why, may.wants_token]);
+    if (allowed === this.allowed) return;
+    this.allowed = allowed;
+    form.querySelectorAll("p:not(#outcome)").forEach((line) => { line.hidden = Boolean(why); });
     by("go").hidden = Boolean(why);
-    by("ask").hidden = true;
     by("token-line").hidden = Boolean(why) || !may.wants_token;
     by("no-write").textContent = why;
     by("no-write").hidden = !why;
-    this.draw();
-    box.showModal();
-    (why ? by("shut") : field).focus();
-    await this.load(row);
+    this.ask(null);
   }
 
   async load(row) {

@@ -54,6 +54,10 @@ async function ask_what_may_be() {
   } catch { /* the door has gone: asked again when it is back */ }
 }
 
+function allowed() {
+  return { ...may, read_only: may.read_only || Boolean(line.frame?.read_only) };
+}
+
 // what is drawn
 
 function trouble() {
@@ -71,7 +75,7 @@ function draw_head(wrong) {
   by("trouble").hidden = !wrong;
   if (by("trouble").textContent !== wrong) by("trouble").textContent = wrong;
   document.documentElement.dataset.state = state;
-  by("mode").textContent = may.read_only || frame?.read_only ? "read-only" : "";
+  by("mode").textContent = allowed().read_only ? "read-only" : "";
   if (!frame) return;
   by("title").textContent = frame.title;
   document.title = `${state === "ready" ? "" : "✕ "}${frame.title}`;
@@ -158,7 +162,7 @@ function make_row() {
   cells.remark = cell("remark");
   cells.last = cell("", cells.write);
   cells.trend.setAttribute("role", "img");
-  for (const button of [cells.name, cells.write]) button.addEventListener("click", () => dialog.open(cells.fact, { ...may, read_only: may.read_only || line.frame?.read_only }));
+  for (const button of [cells.name, cells.write]) button.addEventListener("click", () => dialog.open(cells.fact, allowed()));
   return cells;
 }
 
@@ -178,7 +182,7 @@ function fill_row(cells, row, ink, periods) {
   set_text(cells.age, age === null ? "" : old ? `${age.toFixed(age < 10 ? 1 : 0)} s` : "");
   const qualities = { late: "came late", stale: "older than a write" };
   set_text(cells.remark, row.error ? `✕ ${row.error}` : row.alarm ? `▲ ${row.alarm} limit` : qualities[row.quality] ?? "");
-  cells.write.hidden = !row.writable || may.read_only || line.frame?.read_only;
+  cells.write.hidden = !row.writable || allowed().read_only;
   const last = row.past.at(-1)?.[0];
   if (cells.drawn !== last || cells.ink !== ink.ink) {
     cells.drawn = last;
@@ -199,6 +203,7 @@ function draw() {
   draw_groups();
   draw_events();
   draw_points();
+  dialog.allow(allowed());
   dialog.draw(line);
 }
 

@@ -1,0 +1,81 @@
+"""What can be said of a bus in advance: whether what is polled fits its line, and how long a request can wait."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+
+from busmaster.arbiter.health import Health
+from busmaster.arbiter.transaction import Priority
+from busmaster.bus.node import Node
+from busmaster.bus.polling import PollGroup
+from busmaster.bus.shared_line import SharedLine
+from busmaster.contract.profile import LineSettings
+from busmaster.planning import Plan, PlannedGroup, Read, bounds, plan_steps
+from busmaster.planning.merging import Merge
+from busmaster.transport.endpoints import Endpoint
+
+
+class Outlook:
+    """The outlook of one bus. `nodes` and `groups` are its own, as they are when it is asked."""
+
+    def __init__(
+        self,
+        line: SharedLine,
+        endpoint: Endpoint,
+        nodes: Mapping[tuple[str, int], Node],
+        groups: Mapping[str, PollGroup],
+    ) -> None:
+        self._line = line
+        self._endpoint = endpoint
+        self._nodes = nodes
+        self._groups = groups
+
+    def plan_steps(self, more: Sequence[PlannedGroup], could_merge: Sequence[Merge]) -> Generator[int, None, Plan]:
+        """Reckon what becomes of the groups, and of `more`, as `planning.plan_steps` does."""
+        groups = []
+        for group in tuple(self._groups.values()):
+            groups.append(group.planned())
+            yield len(groups[-1].reads)
+        return (
+            yield from plan_steps(
+                [*groups, *more],
+                line=self._settings(),
+                receive_latency=self._endpoint.receive_latency,
+                others=self._asked(),
+                could_merge=could_merge,
+                sharing=self._line.sharing,
+            )
+        )
+
+    def worst_case_wait(self, priority: Priority) -> float:
+        """Return how long, in seconds, a request of this class, made now, waits at most until it is sent (R9)."""
+        arbiter = self._line.arbiter
+        backlog = arbiter.dispatcher.backlog
+        polls = arbiter.dispatcher.schedule.polls
+        polled = sum(len(poll.results) for poll in polls)
+        low = sum(len(poll.results) for poll in polls if poll.priority is Priority.BACKGROUND)
+        probed = any(node.health is not Health.UP for node in self._nodes.values())
+        bound = bounds(
+            self._asked(),
+            arbiter.byte_time,
+            self._endpoint.receive_latency,
+            polls=1 + max(polled - low, backlog.waiting(Priority.POLL)),
+            background=probed + max(low, backlog.waiting(Priority.BACKGROUND)),
+            sharing=self._line.sharing,
+        )
+        longest = max((poll.patience for poll in polls if poll.results), default=1.0)
+        return bound.wait(priority, ahead=self._line.ahead(priority), patience=longest)
+
+    def _settings(self) -> LineSettings:
+        if self._endpoint.settings is not None:
+            return self._endpoint.settings
+        return next((node.profile.line for node in self._nodes.values()), LineSettings(9600))
+
+    def _asked(self) -> list[Read]:
+        """Return every kind of command that was asked of a node, once for all nodes with the same timings."""
+        asked = {
+            (id(node.record.profile), id(node.record.timings), kind): (node, command)
+            for node in self._nodes.values()
+            for kind, command in node.kinds.items()
+        }
+        return [(node.planned(), command) for node, command in asked.values()]
