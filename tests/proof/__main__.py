@@ -1,7 +1,8 @@
 """Explore the worlds: `python -m tests.proof`.
 
 What has been found is written to a file, a line a world, so that a run that was broken off goes on where it was: a
-world is explored again only when the code of the core, or of the proof, has changed since.
+world is explored again only when the code of the core, or of the proof, has changed since, or when it was not closed
+and has more time now.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.proof", description=__doc__)
     parser.add_argument("--worlds", default=",".join(GROUPS), help=f"groups, of {', '.join(GROUPS)}; or part of a name")
     parser.add_argument("--minutes", type=float, default=30.0, help="for all of them")
-    parser.add_argument("--each", type=float, default=150.0, help="seconds for one world")
+    parser.add_argument("--each", type=float, default=60.0, help="seconds of a core for one world")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--file", type=Path, default=Path("proof.jsonl"), help="what was found; read on the next run")
     parser.add_argument("--table", action="store_true", help="print what is known as a table")

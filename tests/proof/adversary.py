@@ -5,11 +5,11 @@ from __future__ import annotations
 from math import inf
 from typing import cast
 
-from busmaster.arbiter.state import OFFLINE
+from busmaster.arbiter.state import OFFLINE, SETTLING
 from tests.proof import setups
 from tests.proof.instants import Instant
 from tests.proof.msc_world import MscWorld
-from tests.proof.shipped import AnyTime, Asker, Decided, Ranks
+from tests.proof.shipped import AnyTime, Asker, Decided, Looked, Ranks
 from tests.proof.wire import SCRIPT, STRAY, Owed, Time
 from tests.proof.world import Action, World
 
@@ -51,7 +51,10 @@ def actions(world: World) -> list[Action]:
 def _strays(world: World) -> list[Action]:
     if not (world.setup.may(setups.STRAYS) and world.strays):
         return []
-    return [("stray", bytes((byte,))) for byte in world.setup.stray_bytes]
+    several = world.setup.stray_bytes
+    if not (world.words_are_read or world.reads_late):
+        several = several[:1]  # nobody asks which it is
+    return [("stray", bytes((byte,))) for byte in several]
 
 
 def _bytes(world: World) -> list[Action]:
@@ -138,6 +141,7 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
     world.ended = []
     SCRIPT.begin(script)
     arbiter, what = world.arbiter, action[0]
+    settles_until: Time = arbiter._silent_at if arbiter.state is SETTLING else None
     if what == "timer":
         unread = bool(world.unread) and world.setup.may(setups.STALLS)
         if arbiter.line_due(world.now):
@@ -184,6 +188,7 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
         world.do(action)
     if not world.frozen:
         world.pump()
+    Looked.only[0] = arbiter.state is SETTLING and arbiter._silent_at is settles_until
 
 
 def _byte(world: World, place: int, what: object) -> None:

@@ -2,23 +2,41 @@
 
 from __future__ import annotations
 
+import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import islice
 
 from tests.proof.adversary import act, actions, window
+from tests.proof.forgotten import simplify
 from tests.proof.instants import Bound, Instant, begin_run, instant, noted, set_unit, ticks
-from tests.proof.key import restore, save, share, simplify
+from tests.proof.key import Parts, share
 from tests.proof.msc_world import MscWorld
 from tests.proof.setups import Setup
 from tests.proof.sharing_world import SharingWorld
-from tests.proof.shipped import AnyTime, set_aside
+from tests.proof.shipped import AnyTime, Looked, set_aside
 from tests.proof.wire import SCRIPT, Outside, Violation
 from tests.proof.world import Action, World
-from tests.proof.zones import Zone, at_most, copied, extended, less_than, opposite, origin, sample, tighten, within
+from tests.proof.zones import (
+    Zone,
+    at_most,
+    copied,
+    extended,
+    less_than,
+    opposite,
+    origin,
+    sample,
+    tighten,
+    united,
+    within,
+)
 
 Step = tuple[Action, tuple[int, ...]]
 """What happened, and what was chosen in it."""
+MOST_HISTORIES = 64
+"""Of one violation."""
 
 
 @dataclass
@@ -31,8 +49,8 @@ class Found:
     events: int = 0
     seconds: float = 0.0
     closed: bool = False
-    violations: dict[str, list[Step]] = field(default_factory=dict)
-    """The shortest history of each."""
+    violations: dict[str, list[list[Step]]] = field(default_factory=dict)
+    """Short histories of each: not every one need be possible."""
     left: int = 0
     """Zones whose events were not looked at yet."""
 
@@ -43,32 +61,38 @@ class Explorer:
     def __init__(self, setup: Setup, progress: Callable[[Found, int], None] = lambda found, done: None) -> None:
         self.found = Found(setup)
         self._progress = progress
-        self._seen: dict[bytes, list[tuple[Zone, int]]] = {}
-        """The zones of each key, each with its place among the states."""
+        self._seen: dict[bytes, tuple[bytes, list[tuple[Zone, int]]]] = {}
+        """The one copy of each key, and its zones, each with its place among the states."""
         self._states: list[tuple[int, Step | None, bytes, Zone]] = []
         """Where each came from, and how; its key and its zone."""
+        self._done = 0
+        """Those before have been looked at."""
+        self._held_by: dict[int, int] = {}
+        """Those that need not be, each with a later one that holds it."""
         self._quiet: dict[int, set[int]] = {}
-        """Where each comes to where a deadline passes and nothing comes, waits for R15, or leaves."""
+        """Where each comes to where a deadline passes and nothing comes, waits for R15, or leaves. A look at a line
+        that settles is none: the end of the settle stands, and looks are some milliseconds apart."""
 
     def run(self, limit: float, violations: int = 8) -> Found:
-        """Explore for at most so many seconds, or until so many kinds of violation are found."""
-        setup, found = self.found.setup, self.found
-        with set_aside(setup):
-            prepare(setup)
-            began = time.perf_counter()
-            self._begin(setup)
-            done = 0
-            while done < len(self._states) and len(found.violations) < violations:
-                found.seconds = time.perf_counter() - began
+        """Explore for at most so many seconds of a core, or until so many kinds of violation are found."""
+        found = self.found
+        with set_aside(found.setup), _without_collections():
+            prepare(found.setup)
+            began = time.process_time()
+            self._begin(found.setup)
+            while self._done < len(self._states) and len(found.violations) < violations:
+                found.seconds = time.process_time() - began
                 if found.seconds > limit:
                     break
-                if not done % 500:
-                    self._progress(found, done)
-                self._expand(done)
-                done += 1
-            found.seconds = time.perf_counter() - began
-        found.closed = done == len(self._states)
-        found.left = len(self._states) - done
+                if not self._done % 500:
+                    self._progress(found, self._done)
+                place = self._done
+                self._done += 1
+                if place not in self._held_by:
+                    self._expand(place)
+            found.seconds = time.process_time() - began
+        found.closed = self._done == len(self._states)
+        found.left = sum(place not in self._held_by for place in range(self._done, len(self._states)))
         if found.closed:
             self._check_progress()
         return found
@@ -77,27 +101,43 @@ class Explorer:
         begin_run([0])
         SCRIPT.begin(())
         world = world_of(setup)(instant(0, 0))
+        self._parts = Parts(world)
         world.pump()
         zone = origin()
         simplify(world, zone)
-        self._keep(-1, None, *save(world, zone))
+        self._keep(-1, None, *self._parts.save(zone))
 
     def _keep(self, parent: int, step: Step | None, key: bytes, zone: Zone) -> int:
         """Remember a state, unless one that is known holds it. Returns the place of either."""
-        known = self._seen.setdefault(key, [])
+        key, known = self._seen.setdefault(key, (key, []))
         for other, place in known:
             if within(zone, other):
                 return place
         place = len(self._states)
+        at = 0
+        while at < len(known):
+            other, before = known[at]
+            if within(other, zone):
+                whole: Zone | None = zone
+            else:
+                whole = united(zone, other) if before >= self._done else None
+            if whole is None:
+                at += 1
+                continue
+            del known[at]
+            if before >= self._done:
+                self._held_by[before] = place
+            if whole is not zone:
+                zone, at = whole, 0
         known.append((zone, place))
         self._states.append((parent, step, key, zone))
-        self.found.keys, self.found.zones = len(self._seen), len(self._states)
+        self.found.keys, self.found.zones = len(self._seen), len(self._states) - len(self._held_by)
         return place
 
     def _expand(self, place: int) -> None:
         _, _, key, zone = self._states[place]
         begin_run(sample(zone))
-        world = restore(key)
+        world = self._parts.restore(key)
         possible = [(action, *window(world, action)) for action in actions(world)]
         goes_on = False
         for action, *bounds in possible:
@@ -106,7 +146,7 @@ class Explorer:
                 goes_on = True
                 self._happen(place, key, begun, action)
         if not goes_on:
-            self.found.violations.setdefault("progress: nothing can happen any more", self.path(place))
+            self.found.violations.setdefault("progress: nothing can happen any more", self._histories(place))
 
     def _happen(self, place: int, key: bytes, zone: Zone, action: Action) -> None:
         """Let one event happen in all its zone: piece by piece, each as one run decides."""
@@ -115,7 +155,7 @@ class Explorer:
         while pieces:
             piece, script = pieces.pop()
             begin_run(sample(piece))
-            world = restore(key)
+            world = self._parts.restore(key)
             problem = ""
             outside = False
             try:
@@ -132,19 +172,28 @@ class Explorer:
                 before = tuple(chosen for chosen, _ in asked[:at])
                 pieces += [(decided, (*before, other)) for other in range(1, asked[at][1])]
             if problem:
-                self.found.violations.setdefault(problem, [*self.path(place), (action, script)])
+                found = self.found.violations
+                if problem not in found:
+                    found[problem] = self._histories(place, (action, script))
             elif not outside:
-                waits = AnyTime.chosen[0] or world.held or world.unread or world.said
+                waits = AnyTime.chosen[0] or Looked.only[0] or world.held or world.unread or world.said
                 simplify(world, decided)
-                next_ = self._keep(place, (action, script), *save(world, decided))
+                next_ = self._keep(place, (action, script), *self._parts.save(decided))
                 if action == ("timer", "line") and not waits:
                     self._quiet.setdefault(place, set()).add(next_)
 
+    def _holder(self, place: int) -> int:
+        """Return the state that was looked at in place of this one."""
+        while place in self._held_by:
+            place = self._held_by[place]
+        return place
+
     def _check_progress(self) -> None:
         """If nothing comes, deadlines lead to a request, or to a line that is READY: they never go round."""
-        follows = {place: len(next_) for place, next_ in self._quiet.items()}
+        quiet = {place: set(map(self._holder, next_)) for place, next_ in self._quiet.items()}
+        follows = {place: len(next_) for place, next_ in quiet.items()}
         before: dict[int, list[int]] = {}
-        for place, next_ in self._quiet.items():
+        for place, next_ in quiet.items():
             for other in next_:
                 before.setdefault(other, []).append(place)
         done = [place for place in before if place not in follows]
@@ -156,16 +205,38 @@ class Explorer:
                     done.append(other)
         round_ = [place for place, left in follows.items() if left]
         if round_:
-            self.found.violations["progress: deadlines go round and nothing leaves"] = self.path(min(round_))
+            self.found.violations["progress: deadlines go round and nothing leaves"] = self._histories(min(round_))
 
-    def path(self, place: int) -> list[Step]:
-        """Return how a state was come to."""
-        steps: list[Step] = []
-        while place >= 0:
-            place, step, _, _ = self._states[place]
-            if step is not None:
-                steps.append(step)
-        return steps[::-1]
+    def _histories(self, place: int, *last: Step) -> list[list[Step]]:
+        """Return how a state may have been come to. Of those of united zones some states alone can go on, so that these
+        are several."""
+        holds: dict[int, list[int]] = {}
+        for held, by in self._held_by.items():
+            holds.setdefault(by, []).append(held)
+
+        def histories(place: int) -> Iterator[list[Step]]:
+            ways = [place]
+            for way in ways:
+                ways += holds.get(way, ())
+                parent, step, _, _ = self._states[way]
+                if step is None:
+                    yield []
+                else:
+                    yield from ([*before, step] for before in histories(parent))
+
+        return [[*history, *last] for history in islice(histories(place), MOST_HISTORIES)]
+
+
+@contextmanager
+def _without_collections() -> Iterator[None]:
+    """Nearly all that is made is kept: to look for what is not would take a fifth of the time."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def prepare(setup: Setup) -> None:

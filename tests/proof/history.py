@@ -12,8 +12,9 @@ from typing import Any, TypeAlias
 
 from tests.proof.adversary import act, actions, window
 from tests.proof.explore import Step, constrained, prepare, split, world_of
+from tests.proof.forgotten import past_waiting, simplify
 from tests.proof.instants import begin_run, instant, noted, seconds
-from tests.proof.key import past_waiting, restore, save, simplify
+from tests.proof.key import Parts
 from tests.proof.setups import Setup
 from tests.proof.shipped import set_aside
 from tests.proof.wire import SCRIPT, Outside, Violation
@@ -29,23 +30,25 @@ JUST = 1e-9
 MOST_RUNS = 20_000
 
 
-def retell(setup: Setup, steps: Sequence[Step], problem: str) -> list[Call] | None:
-    """Return what is called and said until the problem comes, with times in seconds. None if it never does: then the
-    search had allowed more than is possible."""
+def retell(setup: Setup, histories: Sequence[Sequence[Step]], problem: str) -> list[Call] | None:
+    """Return what is called and said until the problem comes, with times in seconds, by the first history by which it
+    does. None if it never does: then the search had allowed more than is possible."""
     with set_aside(setup):
         prepare(setup)
-        begin_run([0])
-        SCRIPT.begin(())
-        world = world_of(setup)(instant(0, 0))
-        world.calls = []
-        world.note("comes up")
-        world.pump()
-        for end in _endings(*_saved(world, origin()), steps, problem):
-            return end
+        for steps in histories:
+            begin_run([0])
+            SCRIPT.begin(())
+            world = world_of(setup)(instant(0, 0))
+            parts = Parts(world)
+            world.calls = []
+            world.note("comes up")
+            world.pump()
+            for end in _endings(parts, *_saved(parts, origin()), steps, problem):
+                return end
     return None
 
 
-def _endings(key: bytes, zone: Zone, steps: Sequence[Step], problem: str) -> Iterator[list[Call]]:
+def _endings(parts: Parts, key: bytes, zone: Zone, steps: Sequence[Step], problem: str) -> Iterator[list[Call]]:
     """Depth first: `stack` holds states, each with the number of steps that led to it."""
     stack = [(0, key, zone)]
     for _ in range(MOST_RUNS):
@@ -54,14 +57,14 @@ def _endings(key: bytes, zone: Zone, steps: Sequence[Step], problem: str) -> Ite
         done, key, zone = stack.pop()
         action, script = steps[done]
         begin_run(sample(zone))
-        world = restore(key)
+        world = parts.restore(key)
         begun = constrained(zone, *window(world, action)) if action in actions(world) else None
         pieces = [begun] if begun is not None else []
         while pieces:
             piece = pieces.pop()
             values = sample(piece)
             begin_run(values)
-            world = restore(key)
+            world = parts.restore(key)
             what = ""
             try:
                 act(world, action, instant(len(zone), 0), instant(len(zone) + 1, 0), script)
@@ -75,12 +78,12 @@ def _endings(key: bytes, zone: Zone, steps: Sequence[Step], problem: str) -> Ite
             if last and what == problem:
                 yield _timed(world, decided)
             elif not (last or what):
-                stack.append((done + 1, *_saved(world, decided)))
+                stack.append((done + 1, *_saved(parts, decided)))
 
 
-def _saved(world: World, zone: Zone) -> tuple[bytes, Zone]:
-    simplify(world, zone, [past_waiting])
-    return save(world, zone, exact=True)
+def _saved(parts: Parts, zone: Zone) -> tuple[bytes, Zone]:
+    simplify(parts.world, zone, [past_waiting])
+    return parts.save(zone, exact=True)
 
 
 def _timed(world: World, zone: Zone) -> list[Call]:

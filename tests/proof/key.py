@@ -1,383 +1,212 @@
-"""The key of a state: the whole world, with its times taken out into a zone, and without what can make no difference.
+"""The key of a state: the whole world, with its times taken out into a zone.
 
-Each thing that is left out has its argument beside it. `tests/proof/test_key.py` compares worlds that were restored
-from their key with those that were not, and shows that a wrong one is noticed.
+A world is made of parts that are there from its beginning to its end, and of what lies in them. The key is what lies
+in each attribute of each part, unless that is what lay there at the beginning; whatever is no part (a request, a reply,
+a queue) is pickled as a whole. So nothing can be forgotten, and a world is put back by filling its parts again.
 """
 
 from __future__ import annotations
 
+import enum
 import io
 import pickle
-from collections import OrderedDict, defaultdict, deque
-from collections.abc import Callable
-from itertools import count
-from math import inf
-from typing import Any
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sequence
+from itertools import compress
+from operator import is_not
+from types import BuiltinFunctionType, FunctionType, MethodType, NoneType
+from typing import Any, ClassVar, Final, cast
 
-from busmaster.arbiter import in_step
-from busmaster.arbiter.clients import OWN, Hold, LineClient
-from busmaster.arbiter.health import SILENT, Health, NodeRecord
-from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo, Queue
+from busmaster.arbiter.backlog import Backlog
+from busmaster.arbiter.clients import OWN, LineClient
+from busmaster.arbiter.health import Health
+from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo
 from busmaster.arbiter.schedule import Schedule
 from busmaster.arbiter.shared_backlog import SharedBacklog
-from busmaster.arbiter.state import EXCHANGE, SETTLING, LineState
-from busmaster.arbiter.transaction import BACKGROUND, COMMAND, ENDED, Phase, Priority, Transaction
+from busmaster.arbiter.state import LineState
+from busmaster.arbiter.transaction import Phase, Priority, Transaction
 from busmaster.arbiter.turns import Turns
-from busmaster.arbiter.unasked import QUIET, STRAGGLER_MEMORY
+from busmaster.arbiter.turns import _Turn as Turn
 from busmaster.contract.profile import Profile
 from busmaster.contract.timing import ReplyTiming, Timings
-from busmaster.errors import LineNoisy
-from tests.proof import setups
-from tests.proof.instants import Instant, Past, instant, past, ticks
-from tests.proof.sharing_world import SharingWorld
-from tests.proof.wire import OLD, STRAY, Time
+from tests.proof.instants import Instant, instant, ticks
+from tests.proof.shipped import ANY_STEP, BUDGET, NO_COUNTERS, UNCOUNTED
+from tests.proof.wire import Owed, Ticket
 from tests.proof.world import World
 from tests.proof.zones import FREE, Zone, widened
 
 LONGEST = 1.5
 """Seconds beyond which it is not told apart how long ago something was, or is to be; or twice R15's wait."""
+NEVER_CHANGE: Final = (
+    *(NoneType, bool, int, float, str, bytes, enum.Enum, type, FunctionType, BuiltinFunctionType),
+    *(Profile, ReplyTiming, Timings),
+    Schedule,  # polls are not explored
+    *(type(stand_in) for stand_in in (ANY_STEP, BUDGET, NO_COUNTERS, UNCOUNTED)),
+)
+"""What has no inside that a world could change."""
+COME_AND_GO: Final = (Transaction, Owed, Ticket, Backlog, SharedBacklog, Fifo, EarliestDeadlineFirst, Turns, Turn)
+"""What is no part: also a backlog and its queues are made anew, as a line is shared or all that waits fails, and nobody
+asks any more what lies in those before."""
+_ALTERS: Final = object()
+"""What lies there is never left out."""
+_MADE_ANEW: Final = (list, deque, dict, bytearray)
+"""What lies there is usually an empty one of these."""
 
 
-def noisy() -> LineNoisy:
-    return LineNoisy("the line is noisy")
+class Parts:
+    """The parts of one world, which is saved and put back again and again."""
 
-
-class View:
-    """A world, and what its zone says of its times."""
-
-    def __init__(self, world: World, zone: Zone) -> None:
+    def __init__(self, world: World) -> None:
         self.world = world
-        self.zone = zone
-        self.now: Instant = world.now
+        self.parts: list[Any] = []
+        self.place_of: dict[int, int] = {}
+        """By the part's id."""
+        self._find(world)
+        self._cells = [(part, name) for part in self.parts for name in _names(part)]
+        self._places = range(len(self._cells))
+        self._open_ended = [vars(part) for part in self.parts if hasattr(part, "__dict__")]
+        self._attributes = sum(map(len, self._open_ended))
+        self._values = _reader(self._cells)
+        values = self._values()
+        times = Counter(map(id, values))
+        several = [value for value in values if isinstance(value, list | deque) and times[id(value)] > 1]
+        self._shared = {id(value): (value, list(value) if isinstance(value, list) else []) for value in several}
+        """What lies in several parts, and what is in it whenever the world is saved: a queue is empty then."""
+        self._usual = [self._usual_of(value) for value in values]
+        self._empty = _filler(self._cells, values, self._usual)
 
-    def past(self, time: Time, by: float = 0.0, strictly: bool = False) -> bool:
-        """Whether it is surely `by` seconds ago."""
-        if type(time) is not Instant:
-            return bool(time != inf)
-        bound = self.zone[time.base][self.now.base]
-        return bound <= 2 * (self.now.offset - time.offset - ticks(by)) + (not strictly)
+    def _find(self, value: Any) -> None:
+        if isinstance(value, list | tuple):
+            for one in value:
+                self._find(one)
+        elif _is_part(value) and id(value) not in self.place_of:
+            self.place_of[id(value)] = len(self.parts)
+            self.parts.append(value)
+            _TABLE.setdefault(type(value), _reduce_part)
+            for name in _names(value):
+                self._find(getattr(value, name))
 
-    def before(self, first: Time, second: Time) -> bool:
-        """Whether the one is surely not after the other."""
-        if type(first) is Instant and type(second) is Instant:
-            return self.zone[first.base][second.base] <= 2 * (second.offset - first.offset) + 1
-        if type(first) is Past and type(second) is Past:
-            return first.rank <= second.rank
-        return type(first) is not Instant and first != inf
+    def _usual_of(self, value: Any) -> Any:
+        """Return what is left out of a key where it lies: what is there at the beginning, if no world can change it."""
+        if type(value) in _MADE_ANEW and not value and id(value) not in self._shared:
+            return type(value)()
+        fixed = isinstance(value, NEVER_CHANGE) or id(value) in self.place_of or id(value) in self._shared
+        fixed = fixed or (isinstance(value, MethodType) and id(value.__self__) in self.place_of)
+        fixed = fixed or (type(value) is tuple and all(self._usual_of(one) is one for one in value))
+        return value if fixed else _ALTERS
 
+    def save(self, zone: Zone, exact: bool = False) -> tuple[bytes, Zone]:
+        """Return the key of the world, which is simple already, and the zone of the instants that are in it. Instant 0
+        is now.
 
-def transactions(world: World) -> list[Transaction]:
-    arbiter = world.arbiter
-    every = [t for queue in arbiter.dispatcher.backlog.queues for t in queue]
-    every += [t for node in world.nodes for t in arbiter.dispatcher.writes.queues[node]]
-    return every if arbiter._wire.transaction is None else [arbiter._wire.transaction, *every]
+        Unless it is to be `exact`, the zone is widened where it is LONGEST.
+        """
+        assert sum(map(len, self._open_ended)) == self._attributes, "a part has got one attribute more"
+        assert all(map(_is_as_it_was, self._shared.values())), "what several parts hold has changed"
+        _PLACES.begin(zone, self.world.now)
+        held: list[Any] = []
+        values, every_usual = self._values(), self._usual
+        for place in compress(self._places, map(is_not, values, every_usual)):
+            value, usual = values[place], every_usual[place]
+            if type(value) is Instant:
+                held += (~place, *_PLACES.place(value))
+            elif type(value) is not type(usual) or value != usual:
+                held += (place, value)
+        _open[0] = self
+        into = io.BytesIO()
+        pickler = pickle.Pickler(into, 5)
+        pickler.dispatch_table = _TABLE
+        pickler.dump(held)
+        kept = _PLACES.kept
+        small = [[FREE if zone[i][j] >= FREE else zone[i][j] + 2 * (a - b) for j, b in kept] for i, a in kept]
+        lapse = 2 * self.world.setup.lapse
+        return into.getvalue(), small if exact else widened(small, ticks(max(LONGEST, lapse)))
 
-
-def longest_quiet(world: World) -> float:
-    """No silence after which something is over is longer, whoever is asked next."""
-    leg = world.arbiter._leg
-    gaps = [t.byte_gap for node in world.nodes for t in _timings(node)]
-    return max(QUIET, leg.timing.byte_gap, *gaps) + leg.latency + leg.byte_time
-
-
-def longest_window(world: World) -> float:
-    return max(t.window for node in world.nodes for t in _timings(node)) + world.arbiter._leg.latency
-
-
-def _timings(node: NodeRecord) -> tuple[ReplyTiming, ReplyTiming, ReplyTiming]:
-    return node.timings.read, node.timings.write, node.timings.packet
-
-
-# what is left out, and why
-
-
-def past_legs(view: View) -> None:
-    """`begin` sets all of a leg before any of it is read; outside an exchange only `end`, `out` and what follows are
-    read. They are asked only whether they lie ahead: `past()` of now on, `out + quiet` of now on. What the port
-    holds moves all of them, so that they stay while it may."""
-    world = view.world
-    arbiter, leg = world.arbiter, world.arbiter._leg
-    leg.first_bytes = b""  # read only where a node's times are learned, which none of these worlds has
-    if view.past(leg.taint_until):
-        leg.taint_until = -inf
-    if arbiter.state is not EXCHANGE:
-        leg.begun = False
-        leg.begun_at = leg.taint_until = -inf
-        leg.longest = 0
-        if leg._follows is None:
-            leg._follows_until = -inf
-            if view.past(leg.end, leg.timing.lateness + leg.latency + leg.byte_time):
-                leg.end = -inf
-        elif view.past(leg._follows_until) and arbiter.state is SETTLING:
-            pass  # a stray would start it anew
-    else:
-        leg.reply_came = False  # it is not while something is asked
-        leg._follows = None  # by `begin`
-        leg._follows_until = -inf
-    if not world.setup.may(setups.HELD) and view.past(leg.out, longest_quiet(world), strictly=True):
-        leg.out = -inf
-
-
-def past_silences(view: View) -> None:
-    """Of the last byte is asked whether it is a silence ago, or a window; of the noise, whether it lasts too long,
-    while the line is not NOISY already; of the quarantine, whether it is over; of the settle, nothing once it is."""
-    world, strays = view.world, view.world.arbiter._unasked
-    asked = max(longest_quiet(world), longest_window(world) if world.setup.in_step else 0.0)
-    if view.past(strays.last_byte, asked, strictly=True):
-        strays.last_byte = -inf
-    if world.arbiter.noisy or not world.setup.in_step:  # see shipped.py
-        strays._noise_since = -inf if strays._noise_since != inf else inf
-    if view.past(world.arbiter._quarantine):
-        world.arbiter._quarantine = -inf
-    if world.arbiter.state is not SETTLING:
-        world.arbiter._silent_at = -inf
-    world.arbiter._up_at = -inf  # for nodes that are added later
-    if not world.frozen:
-        world.arbiter._wire.output.said_at = -inf  # set with what is said next, and read when that is written
+    def restore(self, key: bytes) -> World:
+        """Return the world as it was again. Its instants are those of the run that was begun."""
+        _open[0] = self
+        held = iter(pickle.loads(key))
+        self._empty()
+        for several, content in self._shared.values():
+            several.clear()
+            several.extend(content)
+        for place in held:
+            part, name = self._cells[place if place >= 0 else ~place]
+            setattr(part, name, next(held) if place >= 0 else instant(next(held), next(held)))
+        return self.world
 
 
-def past_stragglers(view: View) -> None:
-    """Who was not answered is blamed within STRAGGLER_MEMORY; where nobody's lateness is raised, never."""
-    strays = view.world.arbiter._unasked
-    trust, leg = view.world.arbiter._trust, view.world.arbiter._leg
-    if not leg.goes_on:
-        trust._unheard = None  # what comes is not asked whether it is that reply
-    if not view.world.setup.in_step and trust._unheard is None:
-        strays.run.clear()  # else `InStep.heard` alone reads it
-    one = strays.unanswered_one
-    if one is not None and not (view.world.setup.may(setups.RAISED) and not view.past(one[1], STRAGGLER_MEMORY, True)):
-        strays.unanswered_one = None
-    if strays.unanswered_one is None:
-        strays._looked = -inf
-        strays._look_at = inf
+def _is_as_it_was(shared: tuple[Any, list[Any]]) -> bool:
+    return list(shared[0]) == shared[1]
 
 
-def past_requests(view: View) -> None:
-    """Of a request's times only `started` is read, on the wire: where something is owed, or exchanges have a limit.
-    `deadline` orders polls and probes alone, `queued` counts where there is a `start_by`, and its order where a
-    sequence may wait for a write that was asked before. Of attempts, whether there were any."""
-    world = view.world
-    owed = world.setup.in_step and bool(world.arbiter._in_step.debts)
-    limited = world.kind.profile.exchange_limit is not None or owed
-    ranks = _ranks_of_queued(view) if world.setup.longest_hold else {}
-    for transaction in transactions(world):
-        transaction.queued = ranks.get(transaction, 0.0)
-        _past_request(transaction)
-        if not (limited and transaction is world.arbiter._wire.transaction) and not world.frozen:
-            transaction.started = -inf
+def _is_part(value: Any) -> bool:
+    ours = type(value).__module__.split(".")[0] in ("busmaster", "tests")
+    return ours and not isinstance(value, (*NEVER_CHANGE, *COME_AND_GO, Instant)) and value is not OWN
 
 
-def _past_request(transaction: Transaction) -> None:
-    transaction.first_byte = transaction.last_byte = transaction.ended_at = transaction.refused_until = -inf
-    transaction.exchanges_ahead = 0
-    transaction.settling_ahead = 0.0
-    transaction.refused_cycles = 0
-    transaction.late = False
-    transaction.attempts = min(transaction.attempts, 1)
-    if transaction.priority <= COMMAND:
-        transaction.deadline = inf
+def _names(part: Any) -> Iterable[str]:
+    slots = [name for kind in type(part).__mro__ for name in kind.__dict__.get("__slots__", ())]
+    return [*slots, *getattr(part, "__dict__", ())]
 
 
-def _ranks_of_queued(view: View) -> dict[Transaction, Time]:
-    """In what order they were asked; times, where that is not known."""
-    waiting = list(dict.fromkeys(transactions(view.world)))
-    if not all(_ordered(view, a.queued, b.queued) for a in waiting for b in waiting):
-        return {one: one.queued for one in waiting}
-    return {one: past(sum(not view.before(one.queued, other.queued) for other in waiting), 0) for one in waiting}
+def _reader(cells: Sequence[tuple[Any, str]]) -> Callable[[], tuple[Any, ...]]:
+    """Return what reads all these attributes. It is compiled, as `_filler` is: each event needs both."""
+    source = ", ".join(f"part{place}.{name}" for place, (_, name) in enumerate(cells))
+    names = {f"part{place}": part for place, (part, _) in enumerate(cells)}
+    return _compiled(f"def compiled(): return {source}", names)
 
 
-def past_nodes(view: View) -> None:
-    """Of a node's times, the order of the last replies is read and nothing else, as long as its health is not."""
-    world = view.world
-    replied = [node for node in world.nodes if node.last_reply != -inf]
-    replied.sort(key=lambda node: sum(view.before(other.last_reply, node.last_reply) for other in replied))
-    if all(_ordered(view, a.last_reply, b.last_reply) for a in replied for b in replied):
-        for rank, node in enumerate(replied):
-            node.last_reply = past(rank, 0)  # type: ignore[assignment]  # a rank in place of a time
-    for node in world.nodes:
-        node.failed_at = node.up_since = -inf
-        node.lateness_until = inf  # an hour: coming down again is left out
-        node.unheard = min(node.unheard, SILENT) if world.setup.in_step else 0  # only R15 asks
-        node.replies = 0
-        if view.past(node.probe_at):
-            node.probe_at = -inf
-        node.probed_at = -inf if len(world.nodes) == 1 else node.probed_at
+def _filler(cells: Sequence[tuple[Any, str]], values: Sequence[Any], usual: Sequence[Any]) -> Callable[[], None]:
+    """Return what puts into each attribute what lies there usually, if anything does: what is there now, or an empty
+    one of its kind, made anew."""
+    source = ["def compiled():"]
+    names: dict[str, Any] = {}
+    for place, ((part, name), value, usually) in enumerate(zip(cells, values, usual, strict=True)):
+        if usually is not _ALTERS:
+            names |= {f"part{place}": part, f"value{place}": usually}
+            source.append(f"    part{place}.{name} = value{place}{'' if usually is value else '.copy()'}")
+    return _compiled("\n".join(source), names)
 
 
-def _ordered(view: View, first: Time, second: Time) -> bool:
-    return view.before(first, second) or view.before(second, first)
-
-
-def past_debts(view: View) -> None:
-    """Of a debt that has lapsed is asked only how long it was in time, and whether it was so before the request that
-    is on the wire. Of doubts, whether they are over; of what was said, whether it is SAID_MEMORY ago."""
-    world, book = view.world, view.world.arbiter._in_step
-    if not world.setup.in_step:
-        return
-    on_wire = world.arbiter._wire.transaction
-    for debt in book.debts:
-        if debt.until != inf and view.past(debt.until):
-            debt.until = -inf
-        if not (view.past(debt.asked, in_step.LAPSE, strictly=True) and view.past(debt.over)):
-            continue
-        asked: Time = debt.asked
-        over: Time = debt.over
-        if type(asked) is Instant and (on_wire is None or view.before(over, on_wire.started)):
-            apart = over - asked
-            if type(apart) is float:
-                asked, over = past(0, 0), past(0, ticks(apart))
-                debt.asked, debt.over = asked, over
-    book._doubted = [entry for entry in book._doubted if not view.past(entry[1])]
-    if view.past(book._doubt_until):
-        book._doubt_until = -inf
-    while book._said and view.past(book._said[0][1], in_step.SAID_MEMORY, strictly=True):
-        book._said.popleft()
-
-
-def past_waiting(view: View) -> None:
-    """Queues are what waits in them, in order; turns of lower classes count where there are such; why a line is down
-    is for people."""
-    world = view.world
-    arbiter, dispatcher = world.arbiter, world.arbiter.dispatcher
-    arbiter._cause = ""
-    queues = dispatcher.writes.queues
-    dispatcher.writes.queues = defaultdict(deque, {node: queues[node] for node in world.nodes})
-    if arbiter.noisy:
-        dispatcher.fault = noisy
-    for queue in dispatcher.backlog.queues:
-        _past_queue(queue)
-    backlog = dispatcher.backlog
-    if not world.setup.may(setups.HEALTH):
-        backlog._streak = 0
-    backlog._streak_before, backlog._rotated_before = 0, BACKGROUND
-    if isinstance(backlog, SharedBacklog) and isinstance(world, SharingWorld):
-        _past_turns(view, backlog, world.ranks)
-
-
-def _past_queue(queue: Queue) -> None:
-    if isinstance(queue, Turns):
-        for turn in queue._turns.values():
-            _past_queue(turn.queue)
-    elif isinstance(queue, Fifo):
-        queue._entries = deque(queue)
-    elif isinstance(queue, EarliestDeadlineFirst) and not queue.live:
-        queue._entries = []
-        queue._order = count()
-
-
-def _past_turns(view: View, backlog: SharedBacklog, ranks: dict[LineClient, int]) -> None:
-    """What turns cost is counted by nobody, in what order they were had neither. Of what was taken out last it is asked
-    whether a sequence begins with it, in which class, and since when, unless that is longer ago than it may last: then
-    it is over as it begins. How it ended is not."""
-    backlog._payer = None
-    last = backlog._last
-    hold = None if last is None else last.client
-    if last is None or not isinstance(hold, Hold) or hold.holds or hold.over:
-        backlog._last, backlog._attempts, backlog._since = None, 0, -inf
-    else:
-        if view.past(backlog._since, hold.longest):
-            backlog._since = -inf
-        if last.phase is ENDED:
-            _past_request(last)
-            last.queued, last.started, last.tag, last.value, last.error = 0.0, -inf, None, None, None
-            last.retried = last.refusals = 0
-            last.wanted, last.unsure = True, False
-    for turns in backlog._turns:
-        kept = [turn for turn in turns._turns.values() if turn.queue.live or turn is turns._next or turn.client is OWN]
-        turns._turns = OrderedDict((turn.client, turn) for turn in sorted(kept, key=lambda turn: ranks[turn.client]))
-
-
-def past_wire(view: View) -> None:
-    """The adversary's own state: a reply that is too late never comes; what was heard is judged within its exchange;
-    what an attempt was to be answered with, while it is on the wire."""
-    world = view.world
-    world.owed = [reply for reply in world.owed if not view.past(reply.hi)]
-    for reply in world.owed:
-        if view.past(reply.lo):
-            reply.lo = -inf
-    if not world.words_are_read:
-        _past_words(world)
-    if not world.unread:
-        world.unread_by = -inf
-    if view.past(world.said_by):
-        world.said_by = -inf
-    if view.past(world.hold_until):
-        world.hold_until = -inf
-    if isinstance(world, SharingWorld) and view.past(world.held_until, strictly=True):
-        world.held_until = past(0, 0)
-    on_wire = world.arbiter._wire.transaction
-    if on_wire is None and not world.frozen:
-        world.by = None
-        world.forged = False
-        world.cancels = 1
-    for ticket in world.live:
-        if (on_wire is None or ticket is not on_wire.tag) and not world.frozen:
-            ticket.place = -1
-            ticket.before = False
-    world.said = b""
-    world.ended = []
-
-
-def _past_words(world: World) -> None:
-    """Where nobody reads the words, only that something comes makes a difference, and whether a node has said it."""
-    if world.unread:
-        said = {origin for _, origin in world.unread} - {STRAY}
-        world.unread = ((0, OLD if said else STRAY),)
-    for reply in world.owed:
-        if reply.kind == "reply":
-            reply.data = bytes(len(reply.data))
-            reply.ticket = None
-
-
-FORGOTTEN: list[Callable[[View], None]] = [
-    past_legs,
-    past_silences,
-    past_stragglers,
-    past_requests,
-    past_nodes,
-    past_debts,
-    past_waiting,
-    past_wire,
-]
-
-
-# saving and restoring
+def _compiled(source: str, names: dict[str, Any]) -> Callable[..., Any]:
+    exec(source, names)
+    return cast("Callable[..., Any]", names["compiled"])
 
 
 class _Places:
     """Where each instant that is kept stands in the zone: a base each, and offsets from it."""
 
     def __init__(self) -> None:
-        self.canonical: list[tuple[int, int]] = []
-        self.of: dict[int, tuple[int, int]] = {}
+        self._zone: Zone = []
+        self._of: dict[int, tuple[int, int]] = {}
+        """Of each of the zone's instants that was met: its place among those kept, and the offset of that."""
         self.kept: list[tuple[int, int]] = []
 
     def begin(self, zone: Zone, now: Instant) -> None:
-        self.canonical = [_first_at_fixed_distance(zone, i) for i in range(len(zone))]
-        self.of.clear()
+        self._zone = zone
+        self._of.clear()
         self.kept.clear()
         self.place(now)
 
     def place(self, time: Instant) -> tuple[int, int]:
-        base, shift = self.canonical[time.base]
-        offset = time.offset + shift
-        known = self.of.get(base)
+        known = self._of.get(time.base)
         if known is None:
-            known = self.of[base] = len(self.kept), offset
-            self.kept.append((base, offset))
-        return known[0], offset - known[1]
+            known = self._of[time.base] = self._found(time.base, time.offset)
+        return known[0], time.offset - known[1]
+
+    def _found(self, base: int, offset: int) -> tuple[int, int]:
+        """An instant at a fixed distance from one that is kept is told by that one."""
+        row = self._zone[base]
+        for place, (other, at) in enumerate(self.kept):
+            bound = row[other]
+            if bound & 1 and bound < FREE and self._zone[other][base] == 2 - bound:
+                return place, at - (bound >> 1)
+        self.kept.append((base, offset))
+        return len(self.kept) - 1, offset
 
 
 _PLACES = _Places()
-
-
-def _first_at_fixed_distance(zone: Zone, i: int) -> tuple[int, int]:
-    row = zone[i]
-    for j in range(i):
-        bound = row[j]
-        if bound & 1 and bound < FREE and zone[j][i] == 2 - bound:
-            return j, bound >> 1
-    return i, 0
 
 
 def _reduce_instant(time: Instant) -> tuple[Any, ...]:
@@ -404,24 +233,56 @@ def _reduce_shared(value: Any) -> tuple[Any, ...]:
     return _recall, (place,)
 
 
-def _reduce_unchanged(value: Any) -> tuple[Any, ...]:
-    """Of a kind that no world changes: polls are not explored."""
-    if type(value) not in _share_of:
-        _share_of[type(value)] = len(_shared)
-        _shared.append(value)
-    return _recall, (_share_of[type(value)],)
-
-
 def _reduce_member(member: Any) -> str:
     return str(member.name)
 
 
-def _reduce_client(client: LineClient) -> Any:
-    return "OWN" if client is OWN else object.__reduce_ex__(client, 5)
+_open: list[Any] = [None]
+"""The Parts of the world that is saved or put back."""
+
+
+def _part(place: int) -> Any:
+    return _open[0].parts[place]
+
+
+def _reduce_part(value: Any) -> Any:
+    """Others of its kind may come and go: these are no parts."""
+    place = _open[0].place_of.get(id(value))
+    if place is not None:
+        return _part, (place,)
+    return "OWN" if value is OWN else object.__reduce_ex__(value, 5)
+
+
+class _Slotted:
+    """A kind of which many come and go: pickled by what lies in its slots, without their names."""
+
+    every: ClassVar[list[_Slotted]] = []
+
+    def __init__(self, kind: type) -> None:
+        self.kind = kind
+        names = list(_names(object.__new__(kind)))
+        several = ", ".join(f"one.{name}" for name in names)
+        self.read = _compiled(f"def compiled(one): return {several},", {})
+        self.fill = _compiled(f"def compiled(one, values): {several}, = values", {})
+        self.place = len(self.every)
+        self.every.append(self)
+
+    def reduce(self, one: Any) -> Any:
+        try:
+            return _refilled, (self.place, self.read(one))
+        except AttributeError:  # not all of them are filled
+            return object.__reduce_ex__(one, 5)
+
+
+def _refilled(place: int, values: tuple[Any, ...]) -> Any:
+    slotted = _Slotted.every[place]
+    one: Any = object.__new__(slotted.kind)
+    slotted.fill(one, values)
+    return one
 
 
 _TABLE: dict[type, Callable[[Any], Any]] = {
-    LineClient: _reduce_client,
+    LineClient: _reduce_part,
     Instant: _reduce_instant,
     Profile: _reduce_shared,
     ReplyTiming: _reduce_shared,
@@ -430,7 +291,7 @@ _TABLE: dict[type, Callable[[Any], Any]] = {
     Priority: _reduce_member,
     Phase: _reduce_member,
     Health: _reduce_member,
-    Schedule: _reduce_unchanged,
+    **{kind: _Slotted(kind).reduce for kind in COME_AND_GO},
 }
 
 
@@ -438,31 +299,3 @@ def share(commands: Any) -> None:
     """Commands are values that never change: they are pickled by their place."""
     for command in commands:
         _TABLE[type(command)] = _reduce_shared
-
-
-def simplify(world: World, zone: Zone, forgotten: list[Callable[[View], None]] | None = None) -> None:
-    """Drop from a world, in place, what can make no difference."""
-    view = View(world, zone)
-    for forget in FORGOTTEN if forgotten is None else forgotten:
-        forget(view)
-
-
-def save(world: World, zone: Zone, exact: bool = False) -> tuple[bytes, Zone]:
-    """Return the key of a world that is simple already, and the zone of the instants that are in it. Instant 0 is now.
-
-    Unless it is to be `exact`, the zone is widened where it is LONGEST.
-    """
-    _PLACES.begin(zone, world.now)
-    into = io.BytesIO()
-    pickler = pickle.Pickler(into, 5)
-    pickler.dispatch_table = _TABLE
-    pickler.dump(world)
-    kept = _PLACES.kept
-    small = [[FREE if zone[i][j] >= FREE else zone[i][j] + 2 * (a - b) for j, b in kept] for i, a in kept]
-    return into.getvalue(), small if exact else widened(small, ticks(max(LONGEST, 2 * world.setup.lapse)))
-
-
-def restore(key: bytes) -> World:
-    """Return the world again. Its instants are those of the run that was begun."""
-    world: World = pickle.loads(key)
-    return world

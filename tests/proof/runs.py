@@ -52,10 +52,10 @@ def explore(setup: Setup, limit: float) -> dict[str, Any]:
 
 
 def _violation(setup: Setup, found: Found, problem: str) -> dict[str, Any]:
-    steps = found.violations[problem]
-    calls = retell(setup, steps, problem)
+    histories = found.violations[problem]
+    calls = retell(setup, histories, problem)
     if calls is None:
-        return {"problem": problem, "history": f"not possible as it was found: {steps}", "test": ""}
+        return {"problem": problem, "history": f"not possible as it was found: {histories[0]}", "test": ""}
     return {"problem": problem, "history": told(calls), "test": as_test(setup, calls, problem)}
 
 
@@ -80,21 +80,29 @@ def table(results: Iterable[dict[str, Any]]) -> Iterator[str]:
 
 
 def known(path: Path, code: str) -> dict[str, dict[str, Any]]:
-    """What an earlier run has found of this very code."""
+    """What earlier runs have found of this very code, each world as far as it was ever explored."""
     if not path.exists():
         return {}
     results = [json.loads(line) for line in path.read_text().splitlines()]
+    results.sort(key=lambda result: (result["closed"], result["events"]))
     return {result["world"]: result for result in results if result["code"] == code}
+
+
+def is_done(result: dict[str, Any] | None, each: float) -> bool:
+    """Whether no more would be found of a world in so many seconds."""
+    return result is not None and bool(result["closed"] or result["violations"] or result["seconds"] >= each)
 
 
 def run(
     setups: Sequence[Setup], jobs: int, minutes: float, each: float, path: Path, say: Callable[[str], None]
 ) -> list[dict[str, Any]]:
-    """Explore what is not known yet, `jobs` at a time, for at most so many minutes; tell and write each result."""
+    """Explore what is not known yet, `jobs` at a time, for about so many minutes; tell and write each result. A world
+    has `each` seconds of a core at the most, and is begun again where it had fewer before."""
     code = fingerprint()
-    results = known(path, code)
-    todo = [setup for setup in setups if setup.name not in results]
+    before = known(path, code)
+    todo = [setup for setup in setups if not is_done(before.get(setup.name), each)]
     say(f"{len(setups)} worlds, {len(setups) - len(todo)} of them known from before")
+    count = len(setups) - len(todo)
     until = time.monotonic() + 60 * minutes
     with ProcessPoolExecutor(jobs, max_tasks_per_child=1) as pool, path.open("a") as file:
         running: set[Future[dict[str, Any]]] = set()
@@ -110,8 +118,9 @@ def run(
                     say(f"a world was not explored: {bug!r}")
                     continue
                 result = {"code": code, **future.result()}
-                results[result["world"]] = result
                 file.write(json.dumps(result) + "\n")
                 file.flush()
-                say(f"[{len(results):3}/{len(setups)}] {line_of(result)}")
+                count += 1
+                say(f"[{count:3}/{len(setups)}] {line_of(result)}")
+    results = known(path, code)
     return [results[setup.name] for setup in setups if setup.name in results]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import inf
 
+from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.clients import OWN, Hold, LineClient
 from busmaster.arbiter.state import OFFLINE
 from busmaster.arbiter.transaction import URGENT, Transaction
@@ -17,6 +18,7 @@ class SharingWorld(World):
 
     def __init__(self, now: Time) -> None:
         super().__init__(now)
+        self.arbiter.longest_hold = Arbiter.longest_hold  # each part has all that it will have
         self.clients: tuple[LineClient | None, ...] = (
             None,
             *(self.arbiter.add_client() for _ in range(self.setup.clients)),
@@ -65,12 +67,6 @@ class SharingWorld(World):
             if on_wire is None or on_wire.client is not sequence:
                 self.sequence = None
                 self.held_until = -inf
-
-    def _check_rest(self) -> None:
-        deadlines = self.arbiter._deadlines
-        if deadlines.hold < self.now:  # it began long ago: what is overdue is due now, before any time passes
-            deadlines.hold = self.now
-        super()._check_rest()
 
     def is_held(self) -> bool:
         due: Time = self.arbiter._deadlines.hold

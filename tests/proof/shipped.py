@@ -211,6 +211,12 @@ def _untimed(right: Callable[..., None]) -> Callable[..., None]:
     return note_reply
 
 
+class Looked:
+    """Whether the line was only looked at in this step: it settles on, until the same time as before."""
+
+    only: ClassVar[list[bool]] = [False]
+
+
 class Decided:
     """Whether an answer was taken for one in this step: a value, an acknowledgement, a refusal."""
 

@@ -10,7 +10,7 @@ import pytest
 
 from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.state import EXCHANGE
-from tests.proof.key import FORGOTTEN, View, transactions
+from tests.proof.forgotten import FORGOTTEN, View, transactions
 from tests.proof.kinds import READ, WRITE, WRITE_THERE
 from tests.proof.setups import (
     BEYOND,

@@ -330,8 +330,8 @@ def test_output_that_is_let_go_unseen_is_outside_what_is_assumed_and_would_be_fo
 def test_a_violation_is_told_in_times_and_bytes_and_as_a_test_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     with_a_cancellation_that_clears_the_exchange(monkeypatch)
     setup = replace(LINE, adversary=(CANCELS,))
-    (problem, steps), *_ = Explorer(setup).run(LIMIT, violations=1).violations.items()
-    calls = retell(setup, steps, problem)
+    (problem, histories), *_ = Explorer(setup).run(LIMIT, violations=1).violations.items()
+    calls = retell(setup, histories, problem)
     assert calls is not None
     assert "says 07 30 31" in told(calls)
     assert "may still come until here" in told(calls)

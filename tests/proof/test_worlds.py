@@ -18,9 +18,9 @@ LIMIT = 600.0
 @pytest.mark.parametrize("setup", list(quick()), ids=lambda setup: setup.name)
 def test_nothing_breaks_a_promise_in_a_world_that_is_explored_to_the_end(setup: Setup) -> None:
     found = Explorer(setup).run(LIMIT)
-    for problem, steps in found.violations.items():
-        calls = retell(setup, steps, problem)
-        pytest.fail(f"{problem}\n{told(calls) if calls is not None else steps}")
+    for problem, histories in found.violations.items():
+        calls = retell(setup, histories, problem)
+        pytest.fail(f"{problem}\n{told(calls) if calls is not None else histories[0]}")
     assert found.closed
 
 

@@ -11,8 +11,9 @@ from typing import Any, TypeAlias
 
 from tests.proof.adversary import act, actions, window
 from tests.proof.explore import prepare, world_of
+from tests.proof.forgotten import FORGOTTEN, View, past_waiting, simplify
 from tests.proof.instants import Instant, begin_run, instant, ticks
-from tests.proof.key import FORGOTTEN, View, past_waiting, restore, save, simplify
+from tests.proof.key import Parts
 from tests.proof.setups import Setup
 from tests.proof.shipped import set_aside
 from tests.proof.wire import SCRIPT, Outside, Violation
@@ -40,11 +41,12 @@ def walk(setup: Setup, seed: int, forgotten: Sequence[Forgetting] = FORGOTTEN) -
         begin_run([0])
         SCRIPT.begin(())
         world = world_of(setup)(instant(0, 0))
+        parts = Parts(world)
         world.pump()
         twins: list[tuple[World, int]] = []
         for step in range(STEPS):
             if step % TWIN_EVERY == random.randrange(TWIN_EVERY):
-                twins = [*twins[1 - TWINS :], (_twin(world, list(forgotten)), world.now.offset)]
+                twins = [*twins[1 - TWINS :], (_twin(parts, list(forgotten)), world.now.offset)]
             happens = _choose(world, random)
             if happens is None:
                 break
@@ -64,11 +66,12 @@ def walk(setup: Setup, seed: int, forgotten: Sequence[Forgetting] = FORGOTTEN) -
     return compared
 
 
-def _twin(world: World, forgotten: list[Forgetting]) -> World:
-    simplify(world, origin(), [past_waiting])
-    copy = restore(save(world, origin(), exact=True)[0])
+def _twin(parts: Parts, forgotten: list[Forgetting]) -> World:
+    simplify(parts.world, origin(), [past_waiting])
+    of_twin = Parts(type(parts.world)(instant(0, 0)))
+    copy = of_twin.restore(parts.save(origin(), exact=True)[0])
     simplify(copy, origin(), forgotten)
-    return restore(save(copy, origin(), exact=True)[0])
+    return of_twin.restore(of_twin.save(origin(), exact=True)[0])
 
 
 def _drop_too_late(world: World) -> None:

@@ -192,14 +192,17 @@ class World:
     def _check_rest(self) -> None:
         """R8 and progress: nobody is forgotten, and the line's state has an end."""
         arbiter = self.arbiter
-        wire = arbiter._wire
+        wire, deadlines = arbiter._wire, arbiter._deadlines
+        for name in ("health", "hold"):
+            if getattr(deadlines, name) < self.now:  # what is overdue is due now, before any time passes
+                setattr(deadlines, name, self.now)
         held = [w for node in self.nodes for w in arbiter.dispatcher.writes.queues[node] if w.phase is PARKED]
         held += [transaction for queue in arbiter.dispatcher.backlog.queues for transaction in queue]
         held += [wire.transaction] if wire.transaction is not None else []
         if len(self.live) > sum(transaction.wanted and transaction.tag is not None for transaction in held):
             raise Violation("R8: a request is forgotten")
         if arbiter.state.name in ("EXCHANGE", "SETTLING", "HOLDOFF") and not self.frozen:
-            due: Time = arbiter._deadlines.line
+            due: Time = deadlines.line
             if type(due) is not Instant:
                 raise Violation(f"progress: {arbiter.state.name} has no end")
             if due > self.now + self._longest_deadline():
@@ -354,13 +357,18 @@ class World:
         if self.arbiter.state is OFFLINE:
             return
         setup = self.setup
-        if self.frozen or setup.receive_latency or setup.may(setups.STALLS):
+        if self.reads_late:
             if not self.unread:
                 late = setup.receive_latency + (setup.stall if setup.may(setups.STALLS) else 0.0)
                 self.unread_by = inf if self.frozen else self.now + late
             self.unread += tuple((byte, origin) for byte in data)
             return
         self.read(data, origin)
+
+    @property
+    def reads_late(self) -> bool:
+        """What comes lies in the adapter or the kernel before it is read."""
+        return bool(self.frozen or self.setup.receive_latency or self.setup.may(setups.STALLS))
 
     def read(self, data: bytes, origin: str) -> None:
         """The pump reads them."""

@@ -85,6 +85,18 @@ def within(inner: Zone, outer: Zone) -> bool:
     return True
 
 
+def united(first: Zone, second: Zone) -> Zone | None:
+    """Return the zone of all instants that are in the one or in the other; None if these are no zone."""
+    whole = [[max(pair) for pair in zip(mine, theirs, strict=True)] for mine, theirs in zip(first, second, strict=True)]
+    for i, (row, bounds) in enumerate(zip(first, whole, strict=True)):
+        for j, bound in enumerate(row):
+            if bound < bounds[j]:
+                beyond = copied(whole)
+                if tighten(beyond, j, i, opposite(bound)) and not within(beyond, second):
+                    return None
+    return whole
+
+
 def widened(zone: Zone, longest: int) -> Zone:
     """Return a zone that holds all of this one, in which no bound is longer than so many ticks: so there are finitely
     many. What is added may be no more than what is possible: a proof stays one, a violation is looked at again."""
