@@ -28,9 +28,10 @@ def number_text(value: float) -> str:
         return str(int(value))
     if not math.isfinite(value):
         return str(value)
-    text = format(Decimal(repr(value)), "f")
-    if "." in text:
-        text = text.rstrip("0").rstrip(".")
+    text = repr(value)
+    if "e" in text:
+        text = format(Decimal(text), "f")
+    text = text.removesuffix(".0")
     return "0" if text == "-0" else text
 
 
