@@ -13,7 +13,7 @@ from busmaster.contract.learning import Learned
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
 
-VERSIONS = (1,)
+VERSIONS = (2,)
 """Of what is said. The first message of a client says which ones it knows, and the highest that both know holds."""
 LONGEST_REQUEST = 1 << 16
 """Bytes of one message of a client: what it takes to understand one holds up the line."""

@@ -330,7 +330,7 @@ async def test_the_wire_is_looked_at_only_while_a_page_wants_it(tmp_path: Path) 
             told = (await hear(one, "exchanges"))["exchanges"]
             while not told["exchanges"]:
                 told = (await hear(one, "exchanges"))["exchanges"]
-            assert told["exchanges"][0]["verdict"] == "ok"
+            assert "ok" in told["exchanges"][0]
             await one.send('{"exchanges":false}')
             await hear(other, "exchanges")
             assert tapped(line)

@@ -135,7 +135,7 @@ async def raw(line: Served, *, hello: bool = True, **options: Any) -> AsyncItera
     async with unix_connect(path, **options) as connection:
         client = Raw(connection)
         if hello:
-            assert (await client.ask("hello", versions=[1]))["result"]["version"] == 1
+            assert (await client.ask("hello", versions=[2]))["result"]["version"] == 2
         yield client
 
 

@@ -248,7 +248,7 @@ def test_a_version_that_is_not_spoken_is_said(tmp_path: Path) -> None:
     async def story(line: Served) -> None:
         async with raw(line, hello=False) as client:
             said = await client.ask("hello", versions=[0, 99])
-            assert said["error"]["message"] == "versions [0, 99] are not spoken here, but [1]"
+            assert said["error"]["message"] == "versions [0, 99] are not spoken here, but [2]"
         async with raw(line, hello=False) as client:
             assert "the first message is hello" in (await client.ask("groups"))["error"]["message"]
 

@@ -132,7 +132,7 @@ def test_other_languages_name_the_port_by_its_address(tmp_path: Path) -> None:
     async def story(line: Served, address: str) -> None:
         known = {"Authorization": f"Bearer {SECRETS['hmi']}"}
         async with connect_websocket(address.replace("tcp://", "ws://"), additional_headers=known) as connection:
-            said = await Raw(connection).ask("hello", versions=[1])
+            said = await Raw(connection).ask("hello", versions=[2])
             assert said["result"]["version"] == 1
 
     on_a_port(tmp_path, story)

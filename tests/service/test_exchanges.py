@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -13,7 +13,7 @@ from busmaster import Hcp2Controller, RemoteBus
 from busmaster.arbiter.tap import Attempt, Verdict
 from busmaster.errors import NoReply
 from busmaster.protocols.hcp2 import codec as hcp2
-from busmaster.service.exchanges import MOST_BYTES, MOST_KEPT, Listener, said_passage
+from busmaster.service.exchanges import HEARD_AT_ONCE, MOST_BYTES, MOST_KEPT, Listener, said_passage
 from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, until
 from tests.service.schema import check
 
@@ -26,17 +26,38 @@ def tapped(line: Served) -> bool:
     return line.bus.pump.tap is not None
 
 
+class Told(NamedTuple):
+    """An exchange as it is told; times are in microseconds."""
+
+    said: list[tuple[int, str, str]]
+    bytes: int
+    ended: int
+    protocol: str
+    address: int
+    command: str
+    writes: bool
+    purpose: str
+    request: int
+    attempt: int
+    verdict: str
+    result: str
+    late: bool
+    settled: int
+
+    @property
+    def begun(self) -> int:
+        return self.said[0][0]
+
+
 class Heard:
-    """The exchanges that were told."""
+    """The exchanges that were told and that a caller has asked for."""
 
     def __init__(self) -> None:
-        self.exchanges: list[Mapping[str, Any]] = []
+        self.exchanges: list[Told] = []
 
     def __call__(self, body: Mapping[str, Any]) -> None:
-        self.exchanges += body["exchanges"]
-
-    def of(self, purpose: str = "") -> list[Mapping[str, Any]]:
-        return [one for one in self.exchanges if one.get("purpose") == purpose and one.get("request")]
+        told = [Told(*one) for one in body["exchanges"] if len(one) == len(Told._fields)]
+        self.exchanges += [one for one in told if not one.purpose]
 
 
 def test_each_exchange_is_told_with_what_was_said_and_what_came_of_it(tmp_path: Path) -> None:
@@ -44,17 +65,26 @@ def test_each_exchange_is_told_with_what_was_said_and_what_came_of_it(tmp_path: 
         heard = Heard()
         await remote.exchanges(heard)
         await until(lambda: tapped(line))
+        before = line.bus.now()
         controller = Hcp2Controller(remote, 5)
         await controller.write(1, 2.5)
         await controller.read(1)
-        await until(lambda: len(heard.of()) == 2)
-        write, read = heard.of()
-        assert (write["command"], write["writes"], write["verdict"]) == ("write element 1 = 2.5", True, "ok")
-        assert (read["address"], read["result"], read["attempt"]) == (5, "2.5", 1)
-        assert read["begun"] <= read["said"][0][0] <= read["said"][-1][0] <= read["ended"]
-        assert read["said"][0][1] == "master"
-        assert any(who == "node" for _, who, _ in read["said"])
-        assert bytes.fromhex(read["said"][0][2]) == hcp2.Read(1).open(5, PATIENT).request
+        after = line.bus.now()
+        await until(lambda: len(heard.exchanges) == 2)
+        write, read = heard.exchanges
+        assert (write.protocol, write.command, write.writes, write.verdict) == (
+            "hcp2",
+            "write element 1 = 2.5",
+            True,
+            "ok",
+        )
+        assert (read.address, read.result, read.request, read.attempt, read.late) == (5, "2.5", 2, 1, False)
+        assert write.ended <= read.begun <= read.said[-1][0] <= read.ended
+        assert before <= write.begun / 1e6 <= read.ended / 1e6 <= after
+        assert read.said[0][1] == "master"
+        assert any(who == "node" for _, who, _ in read.said)
+        assert bytes.fromhex(read.said[0][2]) == hcp2.Read(1).open(5, PATIENT).request
+        assert read.bytes == sum(len(bytes.fromhex(data)) for _, _, data in read.said)
 
     on_a_served_line(tmp_path, story)
 
@@ -67,11 +97,11 @@ def test_attempts_at_a_node_that_does_not_answer_are_told_and_the_line_settles_b
         absent = Hcp2Controller(remote, ABSENT)
         with pytest.raises(NoReply) as caught:
             await absent.read(1)
-        await until(lambda: len(heard.of()) == caught.value.attempts)
-        first, second, *_ = told = heard.of()
-        assert [(one["attempt"], one["verdict"]) for one in told] == [(n + 1, "no reply") for n in range(len(told))]
-        assert {one["request"] for one in told} == {first["request"]}
-        assert 0 < second["settled"] - first["settled"] <= second["begun"] - first["ended"] + 0.01
+        await until(lambda: len(heard.exchanges) == caught.value.attempts)
+        first, second, *_ = told = heard.exchanges
+        assert [(one.attempt, one.verdict) for one in told] == [(n + 1, "no reply") for n in range(len(told))]
+        assert {one.request for one in told} == {first.request}
+        assert 0 < second.settled - first.settled <= second.begun - first.ended + 10_000
 
     on_a_served_line(tmp_path, story)
 
@@ -98,20 +128,28 @@ def test_what_nobody_asked_for_and_what_is_long_is_told_within_bounds() -> None:
     listener.transmitted(0.0, b"ask", one)
     one.end(Verdict.OK, None, 0.0)
     for number in range(3):
-        listener.received(float(number), b"x" * MOST_BYTES, None)
-    _, passage = listener.take()
+        listener.received(1.5 + number, b"x" * MOST_BYTES, None)
+    [_, passage], _ = listener.take()
     told = json.loads(json.dumps(said_passage(passage)))
     check("unasked", told)
-    assert (told["begun"], told["ended"], told["bytes"]) == (0.0, 0.0, 3 * MOST_BYTES)
-    assert len(bytes.fromhex(told["said"][0][2])) == MOST_BYTES
-    assert listener.take() == []
+    assert told == [[[1_500_000, "node", b"x".hex() * MOST_BYTES]], 3 * MOST_BYTES]
+    assert listener.take() == ([], 0)
+
+
+def test_of_a_flood_no_more_is_kept_than_is_told() -> None:
+    listener = Listener()
+    listener.transmitted(0.0, b"ask", attempt())
+    for number in range(10 * HEARD_AT_ONCE):
+        listener.received(float(number), b"x" * 1000, None)
+        assert len(listener._heard) < HEARD_AT_ONCE
+    assert sum(len(passage.said) for passage in listener._passages) <= 2
 
 
 def test_of_too_many_exchanges_the_oldest_are_left_out_and_counted() -> None:
     listener = Listener()
     for number in range(MOST_KEPT + 3):
         listener.transmitted(float(number), b"x", attempt())
-    assert listener.lost == 3
+    assert listener.take() == ([], 3)
 
 
 def test_what_closes_an_exchange_belongs_to_it() -> None:
@@ -120,4 +158,6 @@ def test_what_closes_an_exchange_belongs_to_it() -> None:
     listener.received(1.1, b"answer", one)
     listener.transmitted(1.2, b"ack", None)
     listener.received(1.3, b"!", None)
-    assert [len(passage.said) for passage in listener._passages] == [3, 1]
+    one.end(Verdict.OK, None, 1.2)
+    passages, _ = listener.take()
+    assert [len(passage.said) for passage in passages] == [3, 1]

@@ -7,6 +7,10 @@ import { milliseconds } from "./line.js";
 const KEPT_SECONDS = 31;
 const MOST_KEPT = 20000;
 const LATER = 0.4; // seconds: what is on the wire now is told when it is over
+const PLACES = [
+  "said", "bytes", "ended", "protocol", "address", "command", "writes", "purpose", "request", "attempt", "verdict", "result", "late",
+  "settled",
+];
 const LANE = 14, LINE_LANE = 26, SCALE = 16, LEFT = 64;
 
 export class Wire {
@@ -20,7 +24,7 @@ export class Wire {
 
   hear({ exchanges, left_out, now }) {
     let before = this.exchanges.findLast((one) => one.verdict);
-    for (const one of exchanges) {
+    for (const one of exchanges.map(exchange_of)) {
       if (one.verdict) {
         one.settling = before ? Math.max(0, Math.min(one.settled - before.settled, one.begun - before.ended)) : 0;
         one.after = before?.ended ?? one.begun;
@@ -194,6 +198,16 @@ export class Wire {
     this.tip.textContent = text;
     this.said.textContent = text.replaceAll("\n", " · ");
   }
+}
+
+// An exchange as it is told, by names and in seconds; without a verdict, bytes that nobody had asked for.
+function exchange_of(values) {
+  const one = Object.fromEntries(values.map((value, place) => [PLACES[place], value]));
+  one.said = one.said.map(([when, ...rest]) => [when / 1e6, ...rest]);
+  one.begun = one.said[0][0];
+  one.ended = one.verdict ? one.ended / 1e6 : one.said.at(-1)[0];
+  if (one.verdict) one.settled /= 1e6;
+  return one;
 }
 
 function kind_of(one) {
