@@ -91,21 +91,22 @@ class Listener:
     def _put_in_order(self) -> None:
         heard, self._heard = self._heard, []
         for now, by_master, data, attempt in heard:
-            self._has_begun = self._has_begun or attempt is not None
-            if attempt is None and by_master:
-                if self._last is not None:
-                    self._last.add(now, by_master, data)
-            elif self._has_begun:
-                self._passage(attempt).add(now, by_master, data)
+            passage = self._last
+            if attempt is not None or (self._has_begun and not by_master):
+                if passage is None or passage.attempt is not attempt:
+                    passage = self._begin(attempt)
+            elif passage is None:
+                continue
+            passage.add(now, by_master, data)
 
-    def _passage(self, attempt: Attempt | None) -> Passage:
-        if self._last is None or self._last.attempt is not attempt:
-            self._last = Passage(attempt)
-            self._passages.append(self._last)
-            if len(self._passages) > MOST_KEPT:
-                self._passages.popleft()
-                self._lost += 1
-        return self._last
+    def _begin(self, attempt: Attempt | None) -> Passage:
+        self._has_begun = True
+        self._last = passage = Passage(attempt)
+        self._passages.append(passage)
+        if len(self._passages) > MOST_KEPT:
+            self._passages.popleft()
+            self._lost += 1
+        return passage
 
 
 class ExchangesBroadcast(Broadcast):
