@@ -133,7 +133,7 @@ def test_other_languages_name_the_port_by_its_address(tmp_path: Path) -> None:
         known = {"Authorization": f"Bearer {SECRETS['hmi']}"}
         async with connect_websocket(address.replace("tcp://", "ws://"), additional_headers=known) as connection:
             said = await Raw(connection).ask("hello", versions=[2])
-            assert said["result"]["version"] == 1
+            assert said["result"]["version"] == 2
 
     on_a_port(tmp_path, story)
 
