@@ -255,7 +255,7 @@ async def serving(application: Any, listen: HostPort) -> AsyncIterator[str]:
             timeout_graceful_shutdown=CLOSE_WITHIN,
             ws="websockets-sansio",
             ws_max_size=LONGEST_MESSAGE,
-            ws_per_message_deflate=False,  # it takes longer than all else that is done for a page
+            ws_per_message_deflate=False,  # it takes as long as all else that is done for a page
         )
         server = _Server(config)
         task = asyncio.ensure_future(server.serve(sockets=[opened]))
