@@ -116,7 +116,8 @@ def past_legs(view: View) -> None:
         if leg._follows is None:
             leg._follows_until = -inf
             lateness = leg.timing.lateness + leg.latency + leg.byte_time
-            if view.past(leg.end, lateness) or (not is_moved and view.within_quarantine(leg.end, lateness)):
+            is_over = view.past(leg.end, lateness) and not (world.held or arbiter._wire.output.held or world.frozen)
+            if is_over or (not is_moved and view.within_quarantine(leg.end, lateness)):
                 leg.end = -inf
         elif view.past(leg._follows_until) and arbiter.state is SETTLING:
             pass  # a stray would start it anew
