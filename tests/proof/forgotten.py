@@ -203,7 +203,7 @@ def _ranks_of_queued(view: View) -> dict[Transaction, Time]:
 
 
 def past_nodes(view: View) -> None:
-    """Of a node's times, the order of the last replies is read and nothing else, as long as its health is not."""
+    """Of a node's times, the order of the last replies is read and nothing else: when it is probed is set aside."""
     world = view.world
     replied = [node for node in world.nodes if node.last_reply != -inf]
     replied.sort(key=lambda node: sum(view.before(other.last_reply, node.last_reply) for other in replied))
@@ -212,12 +212,10 @@ def past_nodes(view: View) -> None:
             node.last_reply = past(rank, 0)  # type: ignore[assignment]  # a rank in place of a time
     for node in world.nodes:
         node.failed_at = node.up_since = -inf
+        node.probe_at = inf
         node.lateness_until = inf  # an hour: coming down again is left out
         node.unheard = min(node.unheard, SILENT) if world.setup.in_step else 0  # only R15 asks
         node.replies = 0
-        if view.past(node.probe_at):
-            node.probe_at = -inf
-        node.probed_at = -inf if len(world.nodes) == 1 else node.probed_at
 
 
 def _ordered(view: View, first: Time, second: Time) -> bool:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, TypeAlias
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.clients import LineClient
+from busmaster.arbiter.health import DOWN
 from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import EXCHANGE, OFFLINE
 from busmaster.arbiter.transaction import PARKED, URGENT, Transaction
@@ -193,9 +194,8 @@ class World:
         """R8 and progress: nobody is forgotten, and the line's state has an end."""
         arbiter = self.arbiter
         wire, deadlines = arbiter._wire, arbiter._deadlines
-        for name in ("health", "hold"):
-            if getattr(deadlines, name) < self.now:  # what is overdue is due now, before any time passes
-                setattr(deadlines, name, self.now)
+        if deadlines.hold < self.now:  # what is overdue is due now, before any time passes
+            deadlines.hold = self.now
         held = [w for node in self.nodes for w in arbiter.dispatcher.writes.queues[node] if w.phase is PARKED]
         held += [transaction for queue in arbiter.dispatcher.backlog.queues for transaction in queue]
         held += [wire.transaction] if wire.transaction is not None else []
@@ -414,6 +414,13 @@ class World:
     @property
     def on_wire(self) -> Transaction | None:
         return self.arbiter._wire.transaction if self.arbiter.state is EXCHANGE else None
+
+    @property
+    def may_probe(self) -> bool:
+        """A node is down, and no probe is out."""
+        dispatcher = self.arbiter.dispatcher
+        usable = dispatcher.fault is None and dispatcher.probes._running is None
+        return usable and any(node.health is DOWN for node in self.nodes)
 
     def ask_urgently(self) -> None:
         self.urgent = 0
