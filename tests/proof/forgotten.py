@@ -101,11 +101,12 @@ def _timings(node: NodeRecord) -> tuple[ReplyTiming, ReplyTiming, ReplyTiming]:
 def past_legs(view: View) -> None:
     """`begin` sets all of a leg before any of it is read; outside an exchange only `end`, `out` and what follows are
     read. They are asked only whether they lie ahead: `past()` of now on, `out + quiet` of now on. What the port
-    holds moves all of them, so that they stay while it may. A settle ends no sooner than the quarantine: what is over
+    holds moves all of them, so that they stay while it does. A settle ends no sooner than the quarantine: what is over
     by then is not asked for."""
     world = view.world
     arbiter, leg = world.arbiter, world.arbiter._leg
     is_moved = world.setup.may(setups.HELD) or world.setup.may(setups.FROZEN)  # what has been said leaves later
+    is_unsaid = bool(world.held or arbiter._wire.output.held or world.frozen)
     leg.first_bytes = b""  # read only where a node's times are learned, which none of these worlds has
     if view.past(leg.taint_until):
         leg.taint_until = -inf
@@ -116,7 +117,7 @@ def past_legs(view: View) -> None:
         if leg._follows is None:
             leg._follows_until = -inf
             lateness = leg.timing.lateness + leg.latency + leg.byte_time
-            is_over = view.past(leg.end, lateness) and not (world.held or arbiter._wire.output.held or world.frozen)
+            is_over = view.past(leg.end, lateness) and not is_unsaid
             if is_over or (not is_moved and view.within_quarantine(leg.end, lateness)):
                 leg.end = -inf
         elif view.past(leg._follows_until) and arbiter.state is SETTLING:
@@ -126,10 +127,32 @@ def past_legs(view: View) -> None:
         leg._follows = None  # by `begin`
         leg._follows_until = -inf
     quiet = longest_quiet(world)
-    if not world.setup.may(setups.HELD) and view.past(leg.out, quiet, strictly=True):
+    if not is_unsaid and view.past(leg.out, quiet, strictly=True):
         leg.out = -inf
     if not is_moved and view.past(leg.out) and view.within_quarantine(leg.out, quiet):
         leg.out = -inf
+
+
+def past_times_that_wait(view: View) -> None:
+    """While the port holds what was said, and is asked again and again, its leg lies further and further back. It is to
+    be moved to where that leaves, as a whole, so that only its distances count: it need lie no further back than what
+    is asked of it until then. The settle begins anew there, too."""
+    world, arbiter = view.world, view.world.arbiter
+    leg = arbiter._leg
+    if world.setup.in_step or not arbiter._wire.output.held:
+        return
+    if view.past(arbiter._silent_at):
+        arbiter._silent_at = -inf
+    timing = leg.timing
+    reply = timing.window + timing.byte_gap + leg.longest * leg.byte_time
+    longest = max(timing.lateness + leg.byte_time, reply, longest_quiet(world)) + leg.latency
+    if view.past(leg.end, longest) and view.past(leg.out, longest):
+        lasts: Time = leg.out - leg.end
+        if type(lasts) is float:
+            leg.end = view.now - longest
+            leg.out = leg.end + lasts
+            if leg.begun and view.past(leg.begun_at, longest):
+                leg.begun_at = leg.end
 
 
 def past_silences(view: View) -> None:
@@ -345,6 +368,7 @@ def _past_words(world: World) -> None:
 
 FORGOTTEN: list[Callable[[View], None]] = [
     past_legs,
+    past_times_that_wait,
     past_silences,
     past_stragglers,
     past_requests,
