@@ -17,7 +17,7 @@ from busmaster.arbiter.health import SILENT, NodeRecord
 from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo, Queue
 from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.state import EXCHANGE, OFFLINE, SETTLING
-from busmaster.arbiter.transaction import BACKGROUND, COMMAND, ENDED, Transaction
+from busmaster.arbiter.transaction import BACKGROUND, ENDED, Transaction
 from busmaster.arbiter.turns import Turns
 from busmaster.arbiter.unasked import QUIET, STRAGGLER_MEMORY
 from busmaster.contract.timing import ReplyTiming
@@ -124,6 +124,8 @@ def past_legs(view: View) -> None:
             pass  # a stray would start it anew
     else:
         leg.reply_came = False  # it is not while something is asked
+        if not leg.begun and arbiter._trust.held is None:
+            leg.begun_at = -inf  # with its first byte
         leg._follows = None  # by `begin`
         leg._follows_until = -inf
     quiet = longest_quiet(world)
@@ -193,8 +195,9 @@ def past_stragglers(view: View) -> None:
 
 def past_requests(view: View) -> None:
     """Of a request's times only `started` is read, on the wire: where something is owed, or exchanges have a limit.
-    `deadline` orders polls and probes alone, `queued` counts where there is a `start_by`, and its order where a
-    sequence may wait for a write that was asked before. Of attempts, whether there were any."""
+    `deadline` orders polls and probes alone, and of these there is one at a time; `queued` counts where there is a
+    `start_by`, and its order where a sequence may wait for a write that was asked before. Of attempts, whether there
+    were any."""
     world = view.world
     owed = world.setup.in_step and bool(world.arbiter._in_step.debts)
     limited = world.kind.profile.exchange_limit is not None or owed
@@ -213,8 +216,7 @@ def _past_request(transaction: Transaction) -> None:
     transaction.refused_cycles = 0
     transaction.late = False
     transaction.attempts = min(transaction.attempts, 1)
-    if transaction.priority <= COMMAND:
-        transaction.deadline = inf
+    transaction.deadline = inf
 
 
 def _ranks_of_queued(view: View) -> dict[Transaction, Time]:
@@ -297,9 +299,10 @@ def _past_queue(queue: Queue) -> None:
             _past_queue(turn.queue)
     elif isinstance(queue, Fifo):
         queue._entries = deque(queue)
-    elif isinstance(queue, EarliestDeadlineFirst) and not queue.live:
-        queue._entries = []
-        queue._order = count()
+    elif isinstance(queue, EarliestDeadlineFirst):
+        assert queue.live < 2
+        queue._entries = [(inf, 0, transaction) for transaction in queue]
+        queue._order = count(1)
 
 
 def _past_turns(view: View, backlog: SharedBacklog, ranks: dict[LineClient, int]) -> None:
