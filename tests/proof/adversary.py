@@ -24,7 +24,7 @@ def actions(world: World) -> list[Action]:
     possible: list[Action] = []
     if arbiter._deadlines.line != inf:
         possible.append(("timer", "line"))
-    if arbiter._deadlines.health != inf:
+    if world.may_probe:
         possible.append(("timer", "health"))
     if arbiter._deadlines.hold != inf:
         possible.append(("timer", "hold"))
@@ -112,7 +112,7 @@ def window(world: World, action: Action) -> tuple[list[Time], list[Time], list[T
     what = action[0]
     if not world.frozen:
         slack = setup.stall if setup.may(setups.STALLS) else 0.0
-        latest = [due + slack for due in (deadlines.line, deadlines.health, deadlines.hold) if due != inf]
+        latest = [due + slack for due in (deadlines.line, deadlines.hold) if due != inf]
         if world.unread:
             latest.append(world.unread_by)
     if what == "timer":
@@ -143,6 +143,8 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
     arbiter, what = world.arbiter, action[0]
     settles_until: Time = arbiter._silent_at if arbiter.state is SETTLING else None
     if what == "timer":
+        if action[1] == "health":
+            arbiter._deadlines.health = world.now
         unread = bool(world.unread) and world.setup.may(setups.STALLS)
         if arbiter.line_due(world.now):
             world.tell_unsent_if(asked=True)

@@ -17,7 +17,7 @@ from busmaster.arbiter.health import SILENT, NodeRecord
 from busmaster.arbiter.queues import EarliestDeadlineFirst, Fifo, Queue
 from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.state import EXCHANGE, OFFLINE, SETTLING
-from busmaster.arbiter.transaction import BACKGROUND, COMMAND, ENDED, Transaction
+from busmaster.arbiter.transaction import BACKGROUND, ENDED, Transaction
 from busmaster.arbiter.turns import Turns
 from busmaster.arbiter.unasked import QUIET, STRAGGLER_MEMORY
 from busmaster.contract.timing import ReplyTiming
@@ -101,11 +101,12 @@ def _timings(node: NodeRecord) -> tuple[ReplyTiming, ReplyTiming, ReplyTiming]:
 def past_legs(view: View) -> None:
     """`begin` sets all of a leg before any of it is read; outside an exchange only `end`, `out` and what follows are
     read. They are asked only whether they lie ahead: `past()` of now on, `out + quiet` of now on. What the port
-    holds moves all of them, so that they stay while it may. A settle ends no sooner than the quarantine: what is over
+    holds moves all of them, so that they stay while it does. A settle ends no sooner than the quarantine: what is over
     by then is not asked for."""
     world = view.world
     arbiter, leg = world.arbiter, world.arbiter._leg
     is_moved = world.setup.may(setups.HELD) or world.setup.may(setups.FROZEN)  # what has been said leaves later
+    is_unsaid = bool(world.held or arbiter._wire.output.held or world.frozen)
     leg.first_bytes = b""  # read only where a node's times are learned, which none of these worlds has
     if view.past(leg.taint_until):
         leg.taint_until = -inf
@@ -116,19 +117,44 @@ def past_legs(view: View) -> None:
         if leg._follows is None:
             leg._follows_until = -inf
             lateness = leg.timing.lateness + leg.latency + leg.byte_time
-            if view.past(leg.end, lateness) or (not is_moved and view.within_quarantine(leg.end, lateness)):
+            is_over = view.past(leg.end, lateness) and not is_unsaid
+            if is_over or (not is_moved and view.within_quarantine(leg.end, lateness)):
                 leg.end = -inf
         elif view.past(leg._follows_until) and arbiter.state is SETTLING:
             pass  # a stray would start it anew
     else:
         leg.reply_came = False  # it is not while something is asked
+        if not leg.begun and arbiter._trust.held is None:
+            leg.begun_at = -inf  # with its first byte
         leg._follows = None  # by `begin`
         leg._follows_until = -inf
     quiet = longest_quiet(world)
-    if not world.setup.may(setups.HELD) and view.past(leg.out, quiet, strictly=True):
+    if not is_unsaid and view.past(leg.out, quiet, strictly=True):
         leg.out = -inf
     if not is_moved and view.past(leg.out) and view.within_quarantine(leg.out, quiet):
         leg.out = -inf
+
+
+def past_times_that_wait(view: View) -> None:
+    """While the port holds what was said, and is asked again and again, its leg lies further and further back. It is to
+    be moved to where that leaves, as a whole, so that only its distances count: it need lie no further back than what
+    is asked of it until then. The settle begins anew there, too."""
+    world, arbiter = view.world, view.world.arbiter
+    leg = arbiter._leg
+    if world.setup.in_step or not arbiter._wire.output.held:
+        return
+    if view.past(arbiter._silent_at):
+        arbiter._silent_at = -inf
+    timing = leg.timing
+    reply = timing.window + timing.byte_gap + leg.longest * leg.byte_time
+    longest = max(timing.lateness + leg.byte_time, reply, longest_quiet(world)) + leg.latency
+    if view.past(leg.end, longest) and view.past(leg.out, longest):
+        lasts: Time = leg.out - leg.end
+        if type(lasts) is float:
+            leg.end = view.now - longest
+            leg.out = leg.end + lasts
+            if leg.begun and view.past(leg.begun_at, longest):
+                leg.begun_at = leg.end
 
 
 def past_silences(view: View) -> None:
@@ -169,8 +195,9 @@ def past_stragglers(view: View) -> None:
 
 def past_requests(view: View) -> None:
     """Of a request's times only `started` is read, on the wire: where something is owed, or exchanges have a limit.
-    `deadline` orders polls and probes alone, `queued` counts where there is a `start_by`, and its order where a
-    sequence may wait for a write that was asked before. Of attempts, whether there were any."""
+    `deadline` orders polls and probes alone, and of these there is one at a time; `queued` counts where there is a
+    `start_by`, and its order where a sequence may wait for a write that was asked before. Of attempts, whether there
+    were any."""
     world = view.world
     owed = world.setup.in_step and bool(world.arbiter._in_step.debts)
     limited = world.kind.profile.exchange_limit is not None or owed
@@ -189,8 +216,7 @@ def _past_request(transaction: Transaction) -> None:
     transaction.refused_cycles = 0
     transaction.late = False
     transaction.attempts = min(transaction.attempts, 1)
-    if transaction.priority <= COMMAND:
-        transaction.deadline = inf
+    transaction.deadline = inf
 
 
 def _ranks_of_queued(view: View) -> dict[Transaction, Time]:
@@ -202,7 +228,7 @@ def _ranks_of_queued(view: View) -> dict[Transaction, Time]:
 
 
 def past_nodes(view: View) -> None:
-    """Of a node's times, the order of the last replies is read and nothing else, as long as its health is not."""
+    """Of a node's times, the order of the last replies is read and nothing else: when it is probed is set aside."""
     world = view.world
     replied = [node for node in world.nodes if node.last_reply != -inf]
     replied.sort(key=lambda node: sum(view.before(other.last_reply, node.last_reply) for other in replied))
@@ -211,12 +237,10 @@ def past_nodes(view: View) -> None:
             node.last_reply = past(rank, 0)  # type: ignore[assignment]  # a rank in place of a time
     for node in world.nodes:
         node.failed_at = node.up_since = -inf
+        node.probe_at = inf
         node.lateness_until = inf  # an hour: coming down again is left out
         node.unheard = min(node.unheard, SILENT) if world.setup.in_step else 0  # only R15 asks
         node.replies = 0
-        if view.past(node.probe_at):
-            node.probe_at = -inf
-        node.probed_at = -inf if len(world.nodes) == 1 else node.probed_at
 
 
 def _ordered(view: View, first: Time, second: Time) -> bool:
@@ -275,9 +299,10 @@ def _past_queue(queue: Queue) -> None:
             _past_queue(turn.queue)
     elif isinstance(queue, Fifo):
         queue._entries = deque(queue)
-    elif isinstance(queue, EarliestDeadlineFirst) and not queue.live:
-        queue._entries = []
-        queue._order = count()
+    elif isinstance(queue, EarliestDeadlineFirst):
+        assert queue.live < 2
+        queue._entries = [(inf, 0, transaction) for transaction in queue]
+        queue._order = count(1)
 
 
 def _past_turns(view: View, backlog: SharedBacklog, ranks: dict[LineClient, int]) -> None:
@@ -328,7 +353,6 @@ def past_wire(view: View) -> None:
     for ticket in world.live:
         if (on_wire is None or ticket is not on_wire.tag) and not world.frozen:
             ticket.place = -1
-            ticket.before = False
     world.said = b""
     world.ended = []
 
@@ -346,6 +370,7 @@ def _past_words(world: World) -> None:
 
 FORGOTTEN: list[Callable[[View], None]] = [
     past_legs,
+    past_times_that_wait,
     past_silences,
     past_stragglers,
     past_requests,

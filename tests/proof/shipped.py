@@ -2,8 +2,8 @@
 
 - Counters and histograms: nothing that is decided depends on them. They do arithmetic that no zone can tell.
 - How long a node's replies take, as it is learned: `NodeRecord.latest` may say whatever the world names.
-- Health and the budget of probes: whether a failure is held against a node, and whether a probe is paid for, may or
-  may not be. Without HEALTH no failure is.
+- Health and probes: a failure may be held against a node, or not, and a node that is down is probed at any time, or
+  asked for a caller's sake, or not. Without HEALTH no failure is held against anybody.
 - How far a straggler raises its node's lateness: to either of two values, or (without RAISED) not at all.
 - What is owed (R15), unless the world is `in_step`: whatever is asked of it, the answer may be yes or no; and what goes
   next may be the first that waits, another, a check, or nothing until any time. So whatever R15 does is among what is
@@ -25,6 +25,7 @@ from busmaster.arbiter.choice import Choice, Chosen
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import DOWN, SUSPECT, UP, NodeRecord
+from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.shared_backlog import URGENT_RUN
 from busmaster.arbiter.transaction import Transaction
 from busmaster.arbiter.turns import Turns
@@ -34,7 +35,6 @@ from tests.proof.setups import HEALTH, HOLDS, NOISE, RAISED, Setup
 from tests.proof.wire import choose
 
 RAISED_TO = (0.25, LONGEST_LATENESS)
-PROBED_AFTER = 0.1
 
 
 class _Uncounted:
@@ -79,7 +79,7 @@ class _NoCounters:
 
 
 class _Budget:
-    """Stands for the budget of probes: it may pay, or not."""
+    """Stands for the budget of probes: it may pay for a caller's request, or not."""
 
     probe = 0.0
     tokens = 1.0
@@ -94,9 +94,6 @@ class _Budget:
 
     def take(self, *arguments: Any) -> bool:
         return not choose(2)
-
-    def wait_for(self, *arguments: Any) -> float:
-        return PROBED_AFTER
 
     def __reduce__(self) -> str:
         return "BUDGET"
@@ -197,6 +194,8 @@ def set_aside(setup: Setup) -> Iterator[None]:
     if setup.may(HEALTH):
         put(health, "note_success", _may_be_up)
         put(health, "flaps", lambda node, now: bool(choose(2)))
+        put(Probes, "plan", _at_any_time)
+        put(Probes, "next", _of_any_node)
     try:
         yield
     finally:
@@ -360,12 +359,18 @@ def _may_fail(node: NodeRecord, now: float, jitter: Callable[[], float]) -> None
     if held_against and node.health is not DOWN:
         node.failures = 1
         node.health = SUSPECT if held_against == 1 else DOWN
-    if node.health is DOWN:
-        node.probed_at = now
-        node.probe_at = now + PROBED_AFTER
 
 
 def _may_be_up(node: NodeRecord, now: float) -> None:
     node.failures = 0
     if node.health is not SUSPECT or not choose(2):
         node.health = UP
+
+
+def _at_any_time(probes: Probes) -> None:
+    """When a node that is down is probed is for the adversary to say."""
+
+
+def _of_any_node(probes: Probes, now: float, usable: bool, idle: bool) -> Transaction:
+    down = [node for node in probes.nodes if node.health is DOWN]
+    return probes._probe(down[choose(len(down))], 0.0, now)

@@ -17,6 +17,7 @@ from tests.proof.setups import (
     CANCELS,
     ECHO_FAULTS,
     FLIPS,
+    HEALTH,
     HELD,
     IDLE,
     LOSS,
@@ -35,13 +36,14 @@ PACED = replace(HCP2, paced=True, adversary=(STRAYS, NAKS), retries=1)
 ECHOES = replace(HCP2, echo=True, adversary=(ECHO_FAULTS, STRAYS))
 LATE = replace(HCP2, receive_latency=0.016, adversary=(STALLS, FLIPS))
 QUEUES = replace(HCP2, commands=(READ, WRITE, WRITE_THERE), depth=2, adversary=(IDLE, URGENT, NAKS), retries=1)
-HOLDS = replace(HCP2, adversary=(HELD,))
+HOLDS = replace(HCP2, adversary=(HELD, STRAYS))
+DIES = replace(HCP2, commands=(READ, WRITE_THERE), adversary=(HEALTH, URGENT, LOST, NAKS))
 MSC = replace(HCP2, kind="msc", lapse=2.5, adversary=(STRAYS, FLIPS), lost_acknowledgements=1)
 OWES = replace(HCP2, in_step=True, adversary=(BEYOND, NAKS), beyond=0.3)
 SHARED = replace(QUEUES, clients=1, adversary=(URGENT, CANCELS, LOST))
 SEQUENCES = replace(HCP2, clients=1, longest_hold=0.3, adversary=(URGENT, CANCELS, LOST), retries=1)
 EVERY = {"hcp2": HCP2, "paced": PACED, "echo": ECHOES, "late": LATE, "queues": QUEUES, "held": HOLDS, "msc": MSC}
-EVERY |= {"shared": SHARED, "sequences": SEQUENCES}
+EVERY |= {"shared": SHARED, "sequences": SEQUENCES, "dies": DIES}
 WALKS = 40
 pytestmark = pytest.mark.timeout(300)
 

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, TypeAlias
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.clients import LineClient
+from busmaster.arbiter.health import DOWN
 from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import EXCHANGE, OFFLINE
 from busmaster.arbiter.transaction import PARKED, URGENT, Transaction
@@ -193,9 +194,8 @@ class World:
         """R8 and progress: nobody is forgotten, and the line's state has an end."""
         arbiter = self.arbiter
         wire, deadlines = arbiter._wire, arbiter._deadlines
-        for name in ("health", "hold"):
-            if getattr(deadlines, name) < self.now:  # what is overdue is due now, before any time passes
-                setattr(deadlines, name, self.now)
+        if deadlines.hold < self.now:  # what is overdue is due now, before any time passes
+            deadlines.hold = self.now
         held = [w for node in self.nodes for w in arbiter.dispatcher.writes.queues[node] if w.phase is PARKED]
         held += [transaction for queue in arbiter.dispatcher.backlog.queues for transaction in queue]
         held += [wire.transaction] if wire.transaction is not None else []
@@ -238,7 +238,7 @@ class World:
         error = transaction.error
         self.ended.append(f"{transaction.value} {type(error).__name__}")
         if error is not None:
-            if ticket.writes and ticket.may_be_done and not isinstance(error, WriteUnconfirmed):
+            if ticket.writes and ticket.undenied and not isinstance(error, WriteUnconfirmed):
                 if self.forged:
                     raise Outside
                 raise Violation(f"R7: a write that may have been carried out ends as {type(error).__name__}")
@@ -277,11 +277,13 @@ class World:
         """R9, as a request leaves: here nobody holds the line."""
 
     def _judge_order(self, ticket: Ticket) -> None:
-        """R7: no write overtakes an earlier one of its client to its node."""
+        """R7: no write overtakes an earlier one of its client to its node; what has ended, and is told with the next
+        events, is not overtaken."""
+        over = [event.tag for event in self.arbiter.events if type(event) is Transaction]
         for other in self.live:
             if other is ticket:
                 return
-            alike = other.node == ticket.node and other.client is ticket.client
+            alike = other.node == ticket.node and other.client is ticket.client and other not in over
             if other.writes and ticket.writes and alike and not other.sent and not ticket.sent:
                 raise Violation("R7: a write overtakes an earlier one to its node")
 
@@ -297,8 +299,7 @@ class World:
             self._judge_turn(transaction)
             self._judge_order(ticket)
             ticket.sent = True
-            ticket.before = ticket.may_be_done
-            ticket.may_be_done = True
+            ticket.undenied += 1
         if self.setup.may(setups.HELD) and choose(2):
             self.held = (out, ticket)
         else:
@@ -395,7 +396,7 @@ class World:
     def refuse(self, reply: Owed) -> bytes:
         """The node says NAK in place of this reply: it has carried nothing out."""
         if reply.ticket is not None and reply.own:
-            reply.ticket.may_be_done = reply.ticket.before
+            reply.ticket.undenied -= 1
         return NAK
 
     @property
@@ -412,6 +413,13 @@ class World:
     @property
     def on_wire(self) -> Transaction | None:
         return self.arbiter._wire.transaction if self.arbiter.state is EXCHANGE else None
+
+    @property
+    def may_probe(self) -> bool:
+        """A node is down, and no probe is out."""
+        dispatcher = self.arbiter.dispatcher
+        usable = dispatcher.fault is None and dispatcher.probes._running is None
+        return usable and any(node.health is DOWN for node in self.nodes)
 
     def ask_urgently(self) -> None:
         self.urgent = 0

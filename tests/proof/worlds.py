@@ -48,12 +48,13 @@ def quick() -> Iterator[Setup]:
     """What continuous integration explores: each kind of line, and each feature that breaks a wire, alone."""
     for kind in ("hcp", "mentor", "dc104", "msc"):
         yield _line(kind)
-    for feature in (LOST, MARKS, CANCELS, STRAYS, FLIPS):
+    for feature in (LOST, MARKS, CANCELS, STRAYS, FLIPS, HELD):
         yield _line("hcp2", feature)
     for feature in (FLIPS, MARKS, STRAYS):
         yield _line("msc", feature)
     yield replace(_line(commands=(READ, WRITE_THERE)), second_timing=True)
     yield replace(_line("dc104"), receive_latency=0.016)
+    yield _line("hcp2", URGENT, HEALTH, commands=(WRITE,))
     yield replace(_line("hcp2", ECHO_FAULTS), echo=True)
     yield replace(_line("hcp2", STRAYS, commands=(WRITE,)), paced=True)
     yield replace(_line("msc"), lost_acknowledgements=1)
