@@ -120,6 +120,8 @@ def window(world: World, action: Action) -> tuple[list[Time], list[Time], list[T
     elif what in ("byte", "echo", "all", "whole"):
         reply = world.owed[action[1]]
         more = len(reply.data) - 1 if what in ("all", "whole") else 0
+        if setup.receive_latency:  # all that an adapter holds is read within the latency of its first byte
+            more = 0
         earliest.append(reply.lo + more * world.byte_time)
         (latest if reply.kind == "echo" else before).append(reply.hi + more * reply.gap)
     return _instants(earliest), _instants(latest), _instants(before)

@@ -26,14 +26,6 @@ class MscWorld(World):
     def begin_exchange(self) -> None:
         """What is said is sorted out in `leaves`: the host's ACKs begin nothing."""
 
-    def _begins(self) -> None:
-        self.by = None
-        self.forged = False
-        self.strays = self.cancels = 1
-        self.losses = self.setup.lost_acknowledgements
-        for reply in self.owed:
-            reply.own = False
-
     def leaves(self, out: bytes, ticket: Ticket | None, end: Time) -> None:
         """Byte by byte: an ACK or NAK of the host, or a whole request."""
         at = self.now if not isinstance(self.said_by, Instant) else max(self.now, self.said_by)
@@ -74,7 +66,8 @@ class MscWorld(World):
         resent = getattr(exchange, "_resends", 0) > 0
         if not resent:
             self._judge_msc()
-            self._begins()
+            self.begin_anew()
+            self.losses = self.setup.lost_acknowledgements
         unit = request[1]
         for reply in [r for r in self.owed if r.kind == "again" and r.unit == unit and not r.begun]:
             if not choose(2):  # else it has not heard the request

@@ -18,6 +18,7 @@ from busmaster.arbiter.output import Output
 from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.transaction import Transaction
 from busmaster.arbiter.trust import Trust
+from busmaster.arbiter.unasked import UnaskedBytes
 from busmaster.contract.exchange import FrameError
 from busmaster.protocols.msc.exchange import is_sound
 from busmaster.wire import readers
@@ -41,8 +42,10 @@ from tests.proof.setups import (
     LOSS,
     LOST,
     NAKS,
+    NOISE,
     STALLS,
     STRAYS,
+    URGENT,
     Assumptions,
     Setup,
 )
@@ -135,6 +138,28 @@ def with_a_damaged_ack_that_is_none(patch: Any) -> None:
 
     patch.setattr(Leg, "came_unasked", lambda leg, now: None)
     patch.setattr(LineMachine, "_take_unasked", in_settling)
+
+
+def with_a_nak_that_gives_nothing_up(patch: Any) -> None:
+    """As it was: behind a NAK no ACK was thought to come, and no packet."""
+    right = LineMachine._refused
+
+    def refused(line: LineMachine, refusal: Any, now: float) -> None:
+        with patch.context() as within:
+            within.setattr(Leg, "give_up", lambda leg, later: None)
+            right(line, refusal, now)
+
+    patch.setattr(LineMachine, "_refused", refused)
+
+
+def with_packets_in_noise_that_nobody_answers(patch: Any) -> None:
+    """As it was: a packet that came on a noisy line was said again into the next exchange."""
+    right = UnaskedBytes.reply_to
+
+    def reply_to(unasked: UnaskedBytes, data: bytes, noisy: bool) -> bytes:
+        return b"" if noisy else right(unasked, data, noisy)
+
+    patch.setattr(UnaskedBytes, "reply_to", reply_to)
 
 
 def with_any_late_packet_for_the_reply(patch: Any) -> None:
@@ -290,6 +315,8 @@ def with_what_a_sequence_leaves_behind(patch: Any) -> None:
         (with_a_stray_that_uses_up_the_packet, replace(MSC, adversary=(STRAYS,)), "R1"),
         (without_the_packet_behind_an_ack, MSC, "R1"),
         (with_a_damaged_ack_that_is_none, replace(MSC, adversary=(FLIPS,)), "R1"),
+        (with_a_nak_that_gives_nothing_up, replace(MSC, adversary=(STRAYS, URGENT)), "R1"),
+        (with_packets_in_noise_that_nobody_answers, replace(MSC, adversary=(STRAYS, NOISE)), "R3"),
         (with_any_late_packet_for_the_reply, replace(MSC, commands=(READ, READ_THERE), lost_acknowledgements=1), "R1"),
         (with_a_late_ack_for_the_reply, MSC, "R1"),
         (with_an_end_that_any_answer_moves, replace(LINE, adversary=(STRAYS,)), "R1"),

@@ -39,7 +39,7 @@ class Ticket:
         """Of the value with which its last attempt is answered; -1 before any."""
         self.sent = False
         self.undenied = 0
-        """How often it was said to a node that took it and has not refused it: so often it may have been carried out."""
+        """How often its node took it and has not refused it: it may have been carried out as often."""
 
 
 class Owed:

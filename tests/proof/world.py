@@ -323,10 +323,14 @@ class World:
         if any(echo.hi > self.now for echo in self.owed if echo.kind == "echo"):
             raise Violation("R1: the echo of an earlier request is still to come as the next one leaves")
         self._judge_request(replies)
-        for reply in replies:
-            reply.own = False
+        self.begin_anew()
         if not self.setup.beyond:
             self.owed = []
+
+    def begin_anew(self) -> None:
+        """A request begins: whatever was said or lies unread is not its answer."""
+        for reply in self.owed:
+            reply.own = False
         self.unread = tuple((byte, OLD if origin == OWN else origin) for byte, origin in self.unread)
         self.by = None
         self.forged = False

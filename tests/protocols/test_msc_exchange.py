@@ -414,10 +414,11 @@ def test_the_end_of_a_packet_that_was_asked_for_again_is_passed_over_and_not_ask
     assert exchange.feed(REPLY) == Done(1234, send=ACK)
 
 
-def test_fewer_bytes_than_a_packet_has_before_it_are_passed_over_and_not_asked_for_again() -> None:
+@pytest.mark.parametrize("noise", [NAK, REPLY[:1], REPLY[:7]])
+def test_fewer_bytes_than_a_packet_has_before_it_are_passed_over_and_not_asked_for_again(noise: bytes) -> None:
     """Another unit's NAK, say: a NAK of ours would have the packet said twice, into the next exchange."""
     exchange = acked()
-    assert exchange.feed(NAK) is MORE
+    assert exchange.feed(noise) is MORE
     assert says(exchange.expired(True)) == b""
     assert exchange.feed(REPLY) == Done(1234, send=ACK)
 

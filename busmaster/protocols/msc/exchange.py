@@ -214,8 +214,7 @@ class PacketExchange(Generic[T]):
             raise self._other or FrameError("no packet followed the ACK", send=ACK)
         # Fewer bytes than any packet has are none: noise, another unit's NAK, the end of one that was asked for again
         # already. A NAK would have the packet that is still to come said twice, into the next exchange.
-        passed_over = self._lost and arrived < FRAMING
-        return self._ask_again(FrameError(what, send=ACK), b"" if passed_over else NAK)
+        return self._ask_again(FrameError(what, send=ACK), NAK if arrived >= FRAMING else b"")
 
     def abandon(self) -> FrameError | Refused:
         """Return what to fail the attempt with in place of the last Expect's `send`, which must not have been sent.
