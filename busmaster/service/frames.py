@@ -10,6 +10,8 @@ TEXT = 0x81
 """The first byte of a message of text in one piece."""
 MASKED = 0x80
 SHORT, LONG = 126, 127
+NO_MASK = bytes(4)
+"""The key of a mask that changes nothing."""
 
 
 def look_at(data: bytearray, masked: bool) -> tuple[int, bytes | None]:
@@ -54,6 +56,8 @@ def new_key() -> bytes:
 
 def mask(data: bytes | bytearray, key: bytes | bytearray) -> bytes:
     """Return data with a mask put on, or taken off."""
+    if key == NO_MASK:
+        return bytes(data)
     length = len(data)
     keys = (key * (length // 4 + 1))[:length]
     return (int.from_bytes(data, "little") ^ int.from_bytes(keys, "little")).to_bytes(length, "little")

@@ -183,7 +183,10 @@ class Link:
     # what the connection tells
 
     def _connect(self) -> AskingConnection:
-        self._connection = AskingConnection(self, token=self._token, longest=LONGEST_ANSWER, read_at_once=READ_AT_ONCE)
+        is_tcp = self.address.startswith(TCP)
+        self._connection = AskingConnection(
+            self, masks=is_tcp, token=self._token, longest=LONGEST_ANSWER, read_at_once=READ_AT_ONCE
+        )
         return self._connection
 
     def opened(self) -> None:
