@@ -86,6 +86,11 @@ def numbered(words: str, number: int) -> str:
     return f"{words}{BEFORE_NUMBER}{number}}}"
 
 
+def answered(number: int, result: Any) -> str:
+    """Return the answer to a question as text. Raises TypeError for a result that cannot be said in it."""
+    return f'{{"jsonrpc":"2.0","id":{number},"result":{encoded(result)}}}'
+
+
 def encoded(value: Any) -> str:
     """Return a value as JSON. Raises TypeError for what it cannot say."""
     try:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from busmaster.contract.exchange import Command
 from busmaster.service.failures import REFUSED
-from busmaster.service.messages import BEFORE_NUMBER, numbered, read, words
+from busmaster.service.messages import BEFORE_NUMBER, read, words
 from busmaster.service.telling import protocol_of
 
 KEPT = 1024
@@ -45,7 +45,7 @@ def plain_read_of(message: str | bytes) -> tuple[int, PlainRead] | None:
     if not said.endswith("}}") or not digits.isdecimal():  # a plain one ends with its command and its number
         return None
     number = int(digits)
-    asked = _asked_in(said) if message == numbered(said, number) else None
+    asked = _asked_in(said) if rest == f"{number}}}" else None
     return None if asked is None else (number, asked)
 
 

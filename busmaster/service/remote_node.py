@@ -124,18 +124,17 @@ class RemoteNode:
         If the connection is lost meanwhile, a write raises WriteUnconfirmed, or NotStarted where it was not handed over
         yet, and a read LineDown. Cancelling it cancels it there.
         """
-        return self.ask(command, None, touches=touches, stops_seen=stops_seen, stop=stop, **options)
+        return self.ask(command, None, touches, stops_seen, stop, options)
 
     async def ask(
         self,
         command: Command[T],
         sequence: int | None,
-        /,
-        *,
         touches: Command[Any] | None,
         stops_seen: int | None,
         stop: bool,
-        **options: Unpack[CommandOptions],
+        options: CommandOptions,
+        /,
     ) -> T:
         """Do what `request` does, within a sequence of this program, if it is given the number of one."""
         chosen = RequestOptions.of(options, self.label) if options else ORDINARY

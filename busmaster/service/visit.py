@@ -137,7 +137,7 @@ class Visit:
                 self.client = self._host.welcome(self, read_request(message))
                 self._stranger.cancel()
             elif (read := plain_read_of(message)) is not None:
-                self.client.take_read(*read)
+                self.client.requests.begin(*read)
             else:
                 self.client.take(read_request(message))
         except Malformed as error:
