@@ -158,7 +158,8 @@ class Visit:
         """Have the next message taken, or read more, unless it leaves too many answers unread."""
         if self._queued or self._ended:
             return
-        if self.client is not None and self.client.outbox.crowded:
+        # What waits for a client does so behind a full connection, and hardly one is.
+        if self.connection.full and self.client is not None and self.client.outbox.crowded:
             self.connection.pause()  # `writable` comes here again
         elif self._messages:
             self._queued = True
