@@ -112,6 +112,10 @@ class Reading:
     loop that a future takes is a part of what a program waits beyond what the line takes.
     """
 
+    __slots__ = ("_client", "_options", "_over", "_stops_seen", "_told", "_transaction", "command", "given_up", "node")
+
+    _told: Told
+
     def __init__(
         self,
         node: Node,
@@ -126,7 +130,6 @@ class Reading:
         self._client = client
         self._stops_seen = stops_seen
         self._options = options
-        self._told: Told
         self._transaction: Transaction | None = None
         self._over = False
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Set as AbstractSet
-from functools import partial
 from math import inf, isnan
 from typing import Any
 
@@ -96,9 +95,9 @@ def answered(number: int, result: Any) -> str:
 def encoded(value: Any) -> str:
     """Return a value as JSON. Raises TypeError for what it cannot say."""
     try:
-        return "".join(_encode(value))
+        return "".join(_encode(value, 0))
     except ValueError:  # a number that JSON does not have
-        return "".join(_encode(_finite(value)))
+        return "".join(_encode(_finite(value), 0))
 
 
 def read(text: str | bytes) -> dict[str, Any]:
@@ -189,19 +188,20 @@ def _said_set(value: Any) -> dict[str, list[Any]]:
     raise TypeError(f"a {type(value).__name__} cannot be said")
 
 
-def _encoder() -> Callable[[Any], Iterable[str]]:
-    """Return what makes the parts of a value's text. It is made once: Python does so anew for each value, which takes
-    longer than to use it.
+def _encoder() -> Callable[..., Iterable[str]]:
+    """Return what makes the parts of a value's text, which is not indented: 0. It is made once: Python does so anew for
+    each value, which takes longer than to use it.
     """
     usual = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_said_set)
     text = json.encoder.encode_basestring_ascii
     try:
         make = json.encoder.c_make_encoder  # type: ignore[attr-defined]  # undocumented
-        encode = make(None, usual.default, text, None, ":", ",", False, False, False)
+        encode: Callable[..., Iterable[str]] = make(None, usual.default, text, None, ":", ",", False, False, False)
     except (AttributeError, TypeError):  # another Python
         return usual.iterencode
-    return partial(encode, _current_indent_level=0)
+    return encode
 
 
-_decode = json.JSONDecoder().scan_once  # a third of what `loads` takes, which looks for other encodings and blanks
+_decode: Callable[[str, int], tuple[Any, int]] = json.JSONDecoder().scan_once  # type: ignore[attr-defined]  # undocumented
+"""What a text has from a place on, and where that ends: a third of what `loads` takes, which looks for more."""
 _encode = _encoder()

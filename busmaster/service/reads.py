@@ -17,6 +17,9 @@ KEPT = 1024
 SHORT = 256
 """Characters of a message whose words are kept: no read takes more."""
 
+END = f"}}}}{BEFORE_NUMBER}"
+"""With what the words of a plain read end, before its number: nothing is behind its command."""
+
 
 class PlainRead(NamedTuple):
     """A read of which nothing is said but what it reads, and where. Its command is built, and so checked."""
@@ -40,9 +43,9 @@ def plain_read_of(message: str | bytes) -> tuple[int, PlainRead] | None:
     """Return the number of a message that is a plain read, and that; None for any other, and for a bad one."""
     if not isinstance(message, str) or len(message) > SHORT:
         return None
-    said, _, rest = message.rpartition(BEFORE_NUMBER)
+    said, _, rest = message.rpartition(END)
     digits = rest[:-1]
-    if not said.endswith("}}") or not digits.isdecimal():  # a plain one ends with its command and its number
+    if not digits.isdecimal():
         return None
     number = int(digits)
     asked = _asked_in(said) if rest == f"{number}}}" else None
@@ -51,9 +54,9 @@ def plain_read_of(message: str | bytes) -> tuple[int, PlainRead] | None:
 
 @lru_cache(KEPT)
 def _asked_in(said: str) -> PlainRead | None:
-    """Return the plain read that is asked in these words, whatever their number; None if none is."""
+    """Return the plain read that is asked in these words, up to END, whatever its number; None if none is."""
     try:
-        message = read(f"{said}}}")
+        message = read(f"{said}}}}}}}")
         params = message["params"]
         if message.keys() != {"jsonrpc", "method", "params"} or message["method"] != "request":
             return None
