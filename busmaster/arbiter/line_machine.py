@@ -343,7 +343,7 @@ class LineMachine:
         self._trust.owe(self._wire, heard=not no_reply, whole=error.whole or both)
         if error.send:
             self._wire.say(error.send, now)
-        self._end_exchange(failed=True)
+        self._end_exchange()
         if bug is None:
             self.dispatcher.attempt_failed(transaction, no_reply, error, now, doubted)
         else:
@@ -370,9 +370,9 @@ class LineMachine:
         else:
             self._settle(now, begun=confirmed and certain)
 
-    def _end_exchange(self, failed: bool = False) -> None:
+    def _end_exchange(self) -> None:
         wire = self._wire
-        if failed and wire.exchange is not None:
+        if wire.exchange is not None:
             self._leg.give_up(wire.exchange.later)
             self._leg.came_unasked(self._unasked.last_byte)  # what came in place of the reply may have been it, damaged
         wire.transaction = wire.exchange = self._trust.held = None
@@ -408,6 +408,7 @@ class LineMachine:
         """End a holdoff or a settle."""
         if self.state is SETTLING:
             self._leg.settled()
+            self._trust.settled()
             self._hear_out(self._unasked.silent(), now)
             if self._answer_unasked(self._unasked.reply_to_silence(), now):
                 return
@@ -428,8 +429,7 @@ class LineMachine:
             return
         self._leg.reply_came = self._leg.goes_on and self._trust.is_late_reply(bytes(unasked.run), now)
         self._settle(now)
-        if not self.noisy:  # on a noisy line nothing is sent, not even an ACK
-            self._answer_unasked(unasked.reply_to(data), now)
+        self._answer_unasked(unasked.reply_to(data, self.noisy), now)
         if unasked.babbling(now) and not self.noisy:
             self.noisy = True
             self._counters.noisy += 1
@@ -483,7 +483,7 @@ class LineMachine:
         if transaction is not None:
             self._wire.output.discard()
             self._trust.owe(self._wire, heard=True)
-            self._end_exchange(failed=True)
+            self._end_exchange()
             self.dispatcher.cut_off(transaction, self._offline(), now)
 
     def _enter(self, state: LineState, now: float) -> None:

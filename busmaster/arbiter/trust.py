@@ -87,6 +87,10 @@ class Trust:
         unheard = not heard and transaction.first_byte == -inf
         self._unheard = (transaction.command, transaction.node, leg.end) if unheard else None
 
+    def settled(self) -> None:
+        """Note that nothing of what was asked last can come any more."""
+        self._unheard = None
+
     def is_late_reply(self, run: bytes, now: float) -> bool:
         """Return whether these bytes are all of the late reply to what was asked last, and nothing else.
 

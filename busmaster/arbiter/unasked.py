@@ -119,9 +119,13 @@ class UnaskedBytes:
 
     # what may be owed an answer: MSC sends a packet again until it is ACKed
 
-    def reply_to(self, data: bytes) -> bytes:
-        """Return what must be said to these bytes, if anything."""
+    def reply_to(self, data: bytes, noisy: bool) -> bytes:
+        """Return what must be said to these bytes now, if anything. On a `noisy` line nothing is, not even an ACK, but
+        they may be a packet's, which would come again: it is answered when the line is silent."""
         if self.listener is None:
+            return b""
+        if noisy:
+            self._listening = True
             return b""
         try:
             step = self.listener.feed(data)
@@ -132,7 +136,7 @@ class UnaskedBytes:
         return step.send if isinstance(step, Done) else b""
 
     def reply_to_silence(self) -> bytes:
-        """Return what must be said to a packet that was cut off, if anything."""
+        """Return what must be said to a packet that was cut off, or came in noise, if anything."""
         if self.listener is None or not self._listening:
             return b""
         self._listening = False

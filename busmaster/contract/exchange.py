@@ -201,7 +201,7 @@ class Listener(Protocol):
         ...
 
     def expired(self) -> Done[None]:
-        """Say what becomes of a byte gap that ran out in mid-frame."""
+        """Say what becomes of a byte gap that ran out in mid-frame, or behind noise in which a frame may have been."""
         ...
 
 

@@ -117,12 +117,13 @@ class Api:
         row, value = self._row(request), await _value(request)
         client = request.client.host if request.client is not None else "?"
         who = f"{f'token {by}' if by else 'a page'} from {client}"
+        asked = f"{row.key} = {cut(repr(value))}, asked by {who}"
         try:
             await self._line.write(row.group, row.key, value)
         except (BusError, InvalidCommand) as error:
-            self._tell(f"{row.key} = {cut(repr(value))}, asked by {who}: {cut(str(error))}")
+            self._tell(f"{asked}: {cut(str(error))}")
             raise
-        self._tell(f"{row.key} = {value!r}, asked by {who}: written")
+        self._tell(f"{asked}: written")
         return _json({"written": value})
 
     async def stream(self, socket: WebSocket) -> None:

@@ -10,7 +10,7 @@ from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority
 from busmaster.contract.timing import ReplyTiming, Timings
-from busmaster.errors import NoReply, WriteUnconfirmed
+from busmaster.errors import NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
@@ -20,6 +20,7 @@ REQUEST = 8 * TAU
 JUST = 1e-6
 READ_2008 = "02 01 00 08 00 00 44 52 45 41 44 2C 07 D8 02 74"
 REPLY_1234 = "02 01 00 0A 00 00 44 52 45 41 44 2C 00 00 04 D2 02 6D"
+FLAG_IS_ON = "02 01 00 08 00 00 52 46 4C 41 47 2C 00 01 01 A2"
 MSC_TAU = 10 / 9600
 MSC_REQUEST = 16 * MSC_TAU
 
@@ -285,6 +286,69 @@ def test_r3_noise_does_not_use_up_the_knowledge_that_a_packet_follows_its_ack() 
     assert bench.sent() == ""
     bench.hear(REPLY_1234)
     assert bench.sent() == ACK
+
+
+def test_r3_a_nak_may_be_noise_before_the_ack_and_its_packet_is_waited_for_anew() -> None:
+    """The fourth NAK is nobody's: the unit's ACK comes 0.9 s after the request, and its packet up to a second later."""
+    bench, node = msc_line()
+    read = bench.ask(node, msc.DataRead(2008))
+    bench.ask(node, msc.DataRead(2012))
+    for _ in range(4):
+        bench.sent()
+        bench.hear("15", after=MSC_REQUEST)
+    assert isinstance(read.error, Refused)
+    bench.hear(ACK, after=0.9)
+    assert bench.until_sent() == pytest.approx(1.0 + MSC_TAU)
+
+
+def test_r3_a_nak_for_which_an_urgent_write_ends_a_read_may_be_noise_before_the_ack() -> None:
+    bench, node = msc_line()
+    bench.ask(node, msc.DataRead(2008))
+    bench.ask(node, msc.SetFlag(5), priority=Priority.URGENT)
+    bench.sent()
+    bench.hear("15", after=MSC_REQUEST)
+    assert bench.sent() == "", "the read is not said again while something urgent waits"
+    bench.hear(ACK, after=0.9)
+    assert bench.until_sent() == pytest.approx(1.0 + MSC_TAU)
+
+
+def test_r3_what_comes_behind_a_nak_is_not_the_late_reply_of_an_earlier_read() -> None:
+    bench, node = msc_line()
+    bench.ask(node, msc.ReadFlag(5))
+    unheard = bench.ask(node, msc.DataRead(2008), retries=0)
+    bench.ask(node, msc.ReadFlag(5))
+    bench.sent()
+    bench.hear(f"{ACK} {FLAG_IS_ON}", after=MSC_REQUEST)
+    bench.sent()
+    bench.until_sent()
+    assert isinstance(unheard.error, NoReply)
+    bench.sent()
+    bench.hear(f"{ACK} {FLAG_IS_ON}", after=MSC_REQUEST)
+    assert bench.sent() == ACK
+    bench.until_ready()
+    refused = bench.ask(node, msc.DataRead(2008))
+    bench.ask(node, msc.SetFlag(5))
+    for _ in range(4):
+        bench.sent()
+        bench.hear("15", after=MSC_REQUEST)
+    assert isinstance(refused.error, Refused)
+    bench.hear(f"{ACK} {REPLY_1234}", after=0.5)
+    assert bench.sent() == ACK
+    assert bench.until_sent() == pytest.approx(1.0 + MSC_TAU), "of what was refused nothing has come for certain"
+
+
+def test_r3_a_packet_that_came_in_noise_is_acknowledged_when_the_line_is_silent() -> None:
+    """Else its unit would say it again, half a second to a second later, into the exchange of another."""
+    bench, _ = msc_line()
+    for _ in range(80):
+        bench.hear("FF", after=0.015)
+    assert bench.arbiter.noisy
+    bench.hear(REPLY_1234, after=0.015)
+    assert bench.sent() == "", "nothing is said into noise"
+    assert bench.until_sent() <= 0.2
+    assert bench.sent() == ACK
+    bench.until_ready()
+    assert bench.sent() == "", "once"
 
 
 def test_r3_a_request_behind_two_acks_that_are_still_being_said_is_out_behind_both() -> None:

@@ -328,7 +328,6 @@ def past_wire(view: View) -> None:
     for ticket in world.live:
         if (on_wire is None or ticket is not on_wire.tag) and not world.frozen:
             ticket.place = -1
-            ticket.before = False
     world.said = b""
     world.ended = []
 

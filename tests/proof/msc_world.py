@@ -80,7 +80,9 @@ class MscWorld(World):
             if not choose(2):  # else it has not heard the request
                 self.owed.remove(reply)
         if any(reply.unit == unit for reply in self.owed):
-            return  # it is busy
+            if ticket is not None:
+                ticket.undenied -= 1  # it is busy, and takes none
+            return
         answers = [self.kind.answer(request, place) for place in range(2)]
         place = choose(2) if ticket is not None and answers[0] != answers[1] else 0
         if ticket is not None:

@@ -6,7 +6,7 @@ import ast
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -93,6 +93,12 @@ def is_done(result: dict[str, Any] | None, each: float) -> bool:
     return result is not None and bool(result["closed"] or result["violations"] or result["seconds"] >= each)
 
 
+def to_explore(setups: Sequence[Setup], before: Mapping[str, dict[str, Any]], each: float) -> list[Setup]:
+    """Return the worlds of which more would be found; those first that were never begun."""
+    wanted = [setup for setup in setups if not is_done(before.get(setup.name), each)]
+    return sorted(wanted, key=lambda setup: setup.name in before)
+
+
 def run(
     setups: Sequence[Setup], jobs: int, minutes: float, each: float, path: Path, say: Callable[[str], None]
 ) -> list[dict[str, Any]]:
@@ -100,7 +106,7 @@ def run(
     has `each` seconds of a core at the most, and is begun again where it had fewer before."""
     code = fingerprint()
     before = known(path, code)
-    todo = [setup for setup in setups if not is_done(before.get(setup.name), each)]
+    todo = to_explore(setups, before, each)
     say(f"{len(setups)} worlds, {len(setups) - len(todo)} of them known from before")
     count = len(setups) - len(todo)
     until = time.monotonic() + 60 * minutes

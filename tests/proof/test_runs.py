@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from tests.proof.runs import is_done, known
+from tests.proof.runs import is_done, known, to_explore
+from tests.proof.worlds import worlds
 
 OPEN: dict[str, Any] = {
     "code": "this",
@@ -46,3 +47,9 @@ def test_a_world_is_begun_again_only_if_more_would_be_found(
     result: dict[str, Any] | None, each: float, done: bool
 ) -> None:
     assert is_done(result, each) == done
+
+
+def test_what_was_never_begun_is_explored_before_what_was_left_open() -> None:
+    one, other, third = worlds(["quick"])[:3]
+    before = {one.name: OPEN, third.name: CLOSED}
+    assert to_explore([one, other, third], before, 60.0) == [other, one]

@@ -29,7 +29,7 @@ class Outside(Exception):
 class Ticket:
     """One request as its caller knows it: what would be true of its outcome."""
 
-    __slots__ = ("before", "client", "may_be_done", "node", "place", "sent", "writes")
+    __slots__ = ("client", "node", "place", "sent", "undenied", "writes")
 
     def __init__(self, node: int, writes: bool, client: LineClient | None = None) -> None:
         self.client = client
@@ -38,10 +38,8 @@ class Ticket:
         self.place = -1
         """Of the value with which its last attempt is answered; -1 before any."""
         self.sent = False
-        self.may_be_done = False
-        """An attempt left that the node has not refused: what it asks may have been carried out."""
-        self.before = False
-        """The same, before its last attempt."""
+        self.undenied = 0
+        """How often it was said to a node that took it and has not refused it: so often it may have been carried out."""
 
 
 class Owed:

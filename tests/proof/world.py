@@ -238,7 +238,7 @@ class World:
         error = transaction.error
         self.ended.append(f"{transaction.value} {type(error).__name__}")
         if error is not None:
-            if ticket.writes and ticket.may_be_done and not isinstance(error, WriteUnconfirmed):
+            if ticket.writes and ticket.undenied and not isinstance(error, WriteUnconfirmed):
                 if self.forged:
                     raise Outside
                 raise Violation(f"R7: a write that may have been carried out ends as {type(error).__name__}")
@@ -297,8 +297,7 @@ class World:
             self._judge_turn(transaction)
             self._judge_order(ticket)
             ticket.sent = True
-            ticket.before = ticket.may_be_done
-            ticket.may_be_done = True
+            ticket.undenied += 1
         if self.setup.may(setups.HELD) and choose(2):
             self.held = (out, ticket)
         else:
@@ -395,7 +394,7 @@ class World:
     def refuse(self, reply: Owed) -> bytes:
         """The node says NAK in place of this reply: it has carried nothing out."""
         if reply.ticket is not None and reply.own:
-            reply.ticket.may_be_done = reply.ticket.before
+            reply.ticket.undenied -= 1
         return NAK
 
     @property
