@@ -20,7 +20,7 @@ from typing import Any, cast
 
 from benchmarks.watch import Watch, watched
 from busmaster import Bus, PollGroup, Requester, SerialPort, Service
-from busmaster.bus.node import Journey, Node
+from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.protocols.modbus.codec import PROFILE, ReadRegisters
 
@@ -65,7 +65,7 @@ class Bare(asyncio.BufferedProtocol):
         return self._buffer
 
     def buffer_updated(self, count: int) -> None:
-        self._node.begin_reading(READ, Journey(), self)
+        self._node.begin_reading(READ, self)
 
     def done(self) -> bool:
         return False

@@ -252,7 +252,7 @@ class Node:
         try:
             value: T = await future
         except asyncio.CancelledError:
-            self._give_up(transaction)
+            self.give_up(transaction)
             raise
         return value
 
@@ -312,27 +312,22 @@ class Node:
     def begin_reading(
         self,
         command: Command[Any],
-        journey: Journey,
         reader: Waiter,
+        options: RequestOptions = ORDINARY,
         *,
         stops_seen: int | None = None,
         client: LineClient | None = None,
-        **options: Unpack[CommandOptions],
-    ) -> None:
-        """Begin a request of what writes nothing; `reader` is told what became of it, perhaps before this returns, and
-        calls `give_up` when it waits no longer.
+    ) -> Transaction:
+        """Begin a request of what writes nothing; `reader` is told what became of it, perhaps before this returns.
 
-        Raises what `request` raises before anything is sent, and HoldEnded as `followed_request`.
+        It returns what says how far it has come, and what `give_up` takes when the reader waits no longer. Raises what
+        `request` raises before anything is sent, and HoldEnded as `followed_request`.
         """
-        self._within(client, command)
-        chosen = self._options(options) if options else ORDINARY
-        journey.transaction = self._prepared(command, chosen, stops_seen=stops_seen, client=client)
-        self.shared.pump.begin(journey.transaction, reader)
-
-    def give_up(self, journey: Journey) -> None:
-        """Cancel what nobody waits for any more."""
-        if journey.transaction is not None:
-            self._give_up(journey.transaction)
+        if isinstance(client, Hold):
+            self._within(client, command)
+        transaction = self._prepared(command, options, stops_seen=stops_seen, client=client)
+        self.shared.pump.begin(transaction, reader)
+        return transaction
 
     async def _timed(
         self,
@@ -350,7 +345,7 @@ class Node:
         try:
             return await future, transaction.timeline()
         except asyncio.CancelledError:
-            self._give_up(transaction)
+            self.give_up(transaction)
             raise
 
     def _options(self, given: CommandOptions) -> RequestOptions:
@@ -399,7 +394,7 @@ class Node:
             client,
         )
 
-    def _give_up(self, transaction: Transaction) -> None:
+    def give_up(self, transaction: Transaction) -> None:
         """Cancel what nobody waits for any more. A write that is on the wire ends before anything else can be read."""
         line = self.shared
         line.pump.cancel(transaction)
@@ -415,7 +410,7 @@ class Node:
         try:
             await future
         except asyncio.CancelledError:
-            self._give_up(transaction)
+            self.give_up(transaction)
             raise
         except Refused:
             return True

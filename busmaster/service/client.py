@@ -15,7 +15,7 @@ from busmaster.bus.requester import Requester, checked_priority
 from busmaster.contract.arguments import seconds, whole_number
 from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Permission
-from busmaster.service.errands import Errand
+from busmaster.service.errands import Errand, Writing, errand_of
 from busmaster.service.failures import REFUSED, refusal_of, said_error
 from busmaster.service.line import ServedLine
 from busmaster.service.messages import (
@@ -27,13 +27,13 @@ from busmaster.service.messages import (
     MOST_STREAMS,
     NO_METHOD,
     Malformed,
+    answered,
     timings_of,
     written,
 )
 from busmaster.service.outbox import Outbox
 from busmaster.service.overview import said_details
 from busmaster.service.peers import Peer
-from busmaster.service.reads import PlainRead
 from busmaster.service.requests import Requests
 from busmaster.service.streams import Broadcast, GroupBroadcast
 from busmaster.service.telling import point_of, protocol_of, said_statistics
@@ -59,10 +59,11 @@ class Client:
         let through."""
         self._refused: dict[NodeKey, str] = {}
         """Why a node that it named may not be asked as it said; its requests are refused until it names it rightly."""
-        self._requests = Requests(self, line, self._tell_result, self._refuse)
+        self.requests = Requests(self, line, self._tell_result, self._refuse)
+        """What it has asked of the line."""
         self._streams: dict[int, Broadcast] = {}
         self._groups: dict[int, PollGroup] = {}
-        self._turn = line.bus.shared.add_client(line.share)
+        self.turn = line.bus.shared.add_client(line.share)
         """What its requests take turns by, with those of the others."""
         self._holds: dict[int, Hold | str] = {}
         """Its sequences that nobody comes between, by the number that it gave them; or why one could not be begun."""
@@ -82,7 +83,7 @@ class Client:
     @property
     def errands(self) -> tuple[Errand, ...]:
         """Return what it asked for that is not done yet."""
-        return self._requests.errands
+        return self.requests.errands
 
     # what is said to it
 
@@ -132,13 +133,13 @@ class Client:
             return
         if isinstance(number, bool) or not isinstance(number, int):
             raise Malformed("the id of a request is a whole number")
-        self._requests.check_number(number)
         if method in ("request", "write"):
-            self._requests.begin(number, params)
+            self.requests.begin(number, params)
             return
         if method == "safe":
-            self._requests.begin_safe(number, params)
+            self.requests.begin_safe(number, params)
             return
+        self.requests.check_number(number)
         try:
             answer = self._answer(method, params)
         except REFUSED as error:
@@ -146,15 +147,10 @@ class Client:
         else:
             self._tell_result(number, answer)
 
-    def take_read(self, number: int, read: PlainRead) -> None:
-        """Do what a message asks that is a plain read. Raises Malformed where one of its number is under way."""
-        self._requests.check_number(number)
-        self._requests.begin(number, read)
-
     def _notified(self, method: str, params: Mapping[str, Any]) -> None:
         match method:
             case "cancel":
-                self._requests.cancel(params.get("id"))
+                self.requests.cancel(params.get("id"))
             case "end":
                 self._end_stream(params.get("stream", -1))
             case "hold":
@@ -177,7 +173,9 @@ class Client:
                 if len(params["commands"]) > MOST_CHECKED:
                     raise InvalidCommand(f"{MOST_CHECKED} writes are checked at once, and no more")
                 for command in params["commands"]:
-                    Errand.of({**params, "command": command}, self, self._line).check()
+                    errand = errand_of({**params, "command": command}, self, self._line)
+                    if isinstance(errand, Writing):
+                        errand.check()
                 return None
             case "now":
                 return self._line.bus.now()
@@ -273,7 +271,7 @@ class Client:
     # answers
 
     def _tell_result(self, number: int, result: Any) -> None:
-        self.outbox.put(written({"id": number, "result": result}))
+        self.outbox.put(answered(number, result))
 
     def _refuse(self, number: int, error: Exception) -> None:
         self.outbox.put(written({"id": number, "error": said_error(error)}))
@@ -283,7 +281,7 @@ class Client:
     def client_of(self, sequence: int | None, node: Node) -> LineClient:
         """Return whose turn a request takes. Raises InvalidCommand for a sequence that this client does not have."""
         if sequence is None:
-            return self._turn
+            return self.turn
         hold = self._holds.get(sequence)
         if isinstance(hold, str):
             raise InvalidCommand(hold)
@@ -308,7 +306,7 @@ class Client:
             raise InvalidCommand(
                 f"{node.label}: {self.permission.who} may not hold the line for it: who may write to it does"
             )
-        return node.hold(seconds(params["max_hold"], "max_hold"), self._turn)
+        return node.hold(seconds(params["max_hold"], "max_hold"), self.turn)
 
     def _release(self, sequence: int) -> None:
         hold = self._holds.pop(sequence, None)
@@ -374,16 +372,16 @@ class Client:
 
     def release(self) -> None:
         """Tell it truthfully what becomes of all that it asked for: the service ends, and the bus perhaps with it."""
-        self._requests.end()
+        self.requests.end()
 
     async def leave(self) -> None:
         """End all that it asked for, and give back its nodes."""
         for stream in list(self._streams):
             self._end_stream(stream)
-        await self._requests.give_up()
+        await self.requests.give_up()
         for sequence in list(self._holds):
             self._release(sequence)
-        self._line.bus.shared.remove_client(self._turn)
+        self._line.bus.shared.remove_client(self.turn)
         for node in self._nodes.values():
             self._line.bus.give_back(node)
         self._nodes.clear()

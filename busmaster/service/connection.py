@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from busmaster.errors import InvalidCommand
-from busmaster.service.frames import look_at, new_key, text_frame
+from busmaster.service.frames import NO_MASK, look_at, new_key, text_frame
 
 if TYPE_CHECKING:
     from websockets.client import ClientProtocol
@@ -83,8 +83,10 @@ class Connection(asyncio.BufferedProtocol):
         self._rest = bytearray()
         """The beginning of a frame that has not come whole."""
         self._longest = longest + LONGEST_HEAD
-        self._key = b"" if self._serves else new_key()
+        self._key = b""
         """For the mask of what is said next: an owner has none."""
+        self._masks = False
+        """Whether each message has another key."""
         self._part: bytearray | None = None
         """The beginning of a message that comes in pieces."""
         self._is_text = True
@@ -107,7 +109,7 @@ class Connection(asyncio.BufferedProtocol):
         transport = self._transport
         if self._talks and transport is not None and not transport.is_closing():
             transport.write(text_frame(text.encode(), self._key))
-            if self._key:
+            if self._masks:
                 self._key = new_key()  # already: what is said next is to wait for nothing
 
     def close(self, code: int = NORMAL, reason: str = "") -> None:
@@ -288,16 +290,23 @@ class ServedConnection(Connection):
 
 
 class AskingConnection(Connection):
-    """The end of whoever connects, and shows a token if he has one."""
+    """The end of whoever connects, and shows a token if he has one.
+
+    `masks`: what it says passes where something between the two ends could take it for something else. In the kernel is
+    nothing, and each end is spared the time of a mask.
+    """
 
     _core: ClientProtocol
     _serves = False
 
-    def __init__(self, hearer: Hearer, *, token: str | None = None, longest: int, read_at_once: int) -> None:
+    def __init__(
+        self, hearer: Hearer, *, masks: bool, token: str | None = None, longest: int, read_at_once: int
+    ) -> None:
         _, client, parse_uri = check_installed()
         core = client(parse_uri(_ANY_URI), max_size=longest, logger=_quiet())
         super().__init__(core, hearer, longest=longest, read_at_once=read_at_once)
-
+        self._masks = masks
+        self._key = new_key() if masks else NO_MASK
         self._token = token
 
     @property

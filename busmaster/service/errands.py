@@ -8,13 +8,14 @@ from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.transaction import Transaction
 from busmaster.bus.node import Journey, Node
 from busmaster.bus.points import Point
-from busmaster.bus.requester import CommandOptions, RequestOptions
+from busmaster.bus.requester import ORDINARY, CommandOptions, RequestOptions
 from busmaster.contract.arguments import seconds
 from busmaster.contract.exchange import Command
 from busmaster.contract.places import Changing, Placed
-from busmaster.errors import BusError, InvalidCommand, NotStarted, WriteUnconfirmed
+from busmaster.errors import InvalidCommand, NotStarted, WriteUnconfirmed
 from busmaster.gate.gate import FRESH, NEVER_SENT, Wish, outcome_of
 from busmaster.gate.permission import Permission
 from busmaster.service.line import ServedLine
@@ -41,6 +42,11 @@ class Asker(Protocol):
 
     def node(self, name: str, address: int, /) -> Node:
         """Return a node of the line. Raises InvalidCommand."""
+        ...
+
+    @property
+    def turn(self) -> LineClient:
+        """Return what its requests take turns by, but for those of its sequences."""
         ...
 
     def client_of(self, sequence: int | None, node: Node, /) -> LineClient:
@@ -101,112 +107,56 @@ Told: TypeAlias = Callable[["Errand", Any, BaseException | None], object]
 """Hears the end of an errand: its value, or its error; neither of one that was given up, see there."""
 
 
-class Errand:
-    """One command with its options, for one client. Of a read it is told itself what became of that: at once, for the
-    turn of the loop that a future takes is a part of what a program waits beyond what the line takes.
+class Reading:
+    """A command that writes nothing, for one client. It is told itself what became of it: at once, for the turn of the
+    loop that a future takes is a part of what a program waits beyond what the line takes.
     """
+
+    __slots__ = ("_client", "_options", "_over", "_stops_seen", "_told", "_transaction", "command", "given_up", "node")
+
+    _told: Told
 
     def __init__(
         self,
-        task: Task,
-        options: CommandOptions,
-        *,
-        line: ServedLine,
-        asker: Asker,
+        node: Node,
+        command: Command[Any],
         client: LineClient,
-        asked: float,
         stops_seen: int | None = None,
-        stop: bool = False,
+        options: RequestOptions = ORDINARY,
     ) -> None:
-        self.node = task.node
-        self.command = task.command
-        self.journey = Journey()
-        self._task = task
-        self._options = options
-        self._line = line
-        self._asker = asker
+        self.node = node
+        self.command = command
+        self.given_up = False
         self._client = client
         self._stops_seen = stops_seen
-        self._stop = stop
-        self._asked = asked
-        self._begun = False
-        self._told: Told
+        self._options = options
+        self._transaction: Transaction | None = None
         self._over = False
-        self.given_up = False
-        self.writing: asyncio.Task[Any] | None = None
-        """What is done for a write, once it is begun."""
-
-    @classmethod
-    def of(cls, said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLine) -> Errand:
-        """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
-        if not isinstance(said, PlainRead):
-            return cls._of_params(said, asker, line)
-        node = asker.node(said.protocol, said.address)
-        client = asker.client_of(None, node)
-        return cls(Task(node, said.command), {}, line=line, asker=asker, client=client, asked=line.bus.now())
-
-    @classmethod
-    def _of_params(cls, params: Mapping[str, Any], asker: Asker, line: ServedLine) -> Errand:
-        task = Task.of_point(params, asker, line) if "key" in params else Task.of_node(params, asker)
-        node, command = task.node, task.command
-        given: CommandOptions = params.get("options", {})
-        if given:
-            if not set(given) <= OPTIONS:
-                raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
-            RequestOptions.of(given, node.label)  # checked here, before it may wait
-        now, stops_seen = line.bus.now(), params.get("stops_seen")
-        return cls(
-            task,
-            given,
-            line=line,
-            asker=asker,
-            client=asker.client_of(params.get("sequence"), node),
-            stops_seen=None if stops_seen is None else stops_seen + asker.stops_before(node),
-            stop=params.get("stop") is True and _check_stop(node, command),
-            asked=min(now, seconds(params.get("asked", now), "asked")),
-        )
 
     @property
-    def text(self) -> str:
-        return str(self.command)
-
-    def check(self) -> None:
-        """Raise InvalidCommand for a write that would be refused now: a record is kept of that."""
-        wish = self._wish()
-        try:
-            if self.command.writes and (refusal := self._line.gate.refusal(wish)):
-                raise InvalidCommand(f"{self.node.label}: {refusal}")
-            self.node.check(self.command, stop=self._stop)
-        except InvalidCommand as error:
-            self._line.gate.refuse(wish, str(error))
-            raise
+    def sent(self) -> bool:
+        """Return whether an attempt of it was handed to the line."""
+        return self._transaction is not None and self._transaction.attempts > 0
 
     def begin(self, told: Told) -> None:
-        """Have it done; `told` hears its end once, perhaps before this returns. Every write passes the gate.
+        """Have it done; `told` hears its end once, perhaps before this returns.
 
         Raises BusError or InvalidCommand where nothing could be begun.
         """
         self._told = told
-        if self.command.writes:
-            if self._asker.takes_stop(self.node):
-                self._stop_node()
-            self.writing = asyncio.ensure_future(self._write())
-            self.writing.add_done_callback(self._written)
-        else:
-            self.node.begin_reading(
-                self.command, self.journey, self, stops_seen=self._stops_seen, client=self._client, **self._left()
-            )
+        self._transaction = self.node.begin_reading(
+            self.command, self, self._options, stops_seen=self._stops_seen, client=self._client
+        )
 
     def cancel(self) -> None:
         """Give it up: what is on the wire runs out unheard."""
-        if self.writing is not None:
-            self.writing.cancel()
-        elif not self._over:
-            self.node.give_up(self.journey)
+        if not self._over:
+            if self._transaction is not None:
+                self.node.give_up(self._transaction)
             self._over = self.given_up = True
             self._told(self, None, None)
 
-    # what the line tells of a read
+    # what the line tells
 
     def done(self) -> bool:
         """Return whether nobody waits for it any more."""
@@ -221,6 +171,68 @@ class Errand:
         """Hear why nothing was."""
         self._over = True
         self._told(self, None, error)
+
+
+class Writing:
+    """A command that writes, with its options, for one client. It passes the gate."""
+
+    def __init__(
+        self,
+        task: Task,
+        options: CommandOptions,
+        *,
+        line: ServedLine,
+        asker: Asker,
+        client: LineClient,
+        asked: float,
+        stops_seen: int | None,
+        stop: bool,
+    ) -> None:
+        self.node = task.node
+        self.command = task.command
+        self.given_up = False
+        self.doing: asyncio.Task[Any] | None = None
+        """What is done for it, once it is begun."""
+        self._journey = Journey()
+        self._task = task
+        self._options = options
+        self._line = line
+        self._asker = asker
+        self._client = client
+        self._asked = asked
+        self._stops_seen = stops_seen
+        self._stop = stop
+        self._begun = False
+        self._told: Told
+
+    @property
+    def sent(self) -> bool:
+        """Return whether an attempt of it was handed to the line."""
+        return self._journey.sent
+
+    def check(self) -> None:
+        """Raise InvalidCommand for a write that would be refused now: a record is kept of that."""
+        wish = self._wish()
+        try:
+            if refusal := self._line.gate.refusal(wish):
+                raise InvalidCommand(f"{self.node.label}: {refusal}")
+            self.node.check(self.command, stop=self._stop)
+        except InvalidCommand as error:
+            self._line.gate.refuse(wish, str(error))
+            raise
+
+    def begin(self, told: Told) -> None:
+        """Have it done; `told` hears its end once."""
+        self._told = told
+        if self._asker.takes_stop(self.node):
+            self._stop_node()
+        self.doing = asyncio.ensure_future(self._write())
+        self.doing.add_done_callback(self._written)
+
+    def cancel(self) -> None:
+        """Give it up: what is on the wire runs out unheard."""
+        if self.doing is not None:
+            self.doing.cancel()
 
     # inside
 
@@ -249,17 +261,17 @@ class Errand:
                 raise NotStarted(
                     f"it came {age:.1f} s after it was asked for",
                     node=self.node,
-                    command=self.text,
+                    command=str(self.command),
                     hint="see whether the program that asked, or the one that owns the line, stood still meanwhile",
                 )
             value = await self.node.followed_request(
                 self.command,
-                self.journey,
+                self._journey,
                 touches=self._task.touches,
                 stops_seen=self._stops_seen,
                 stop=self._stop,
                 client=self._client,
-                **self._left(),
+                **_left(self._options, self._line.bus.now() - self._asked),
             )
         except BaseException as error:
             passage.end(self._truth(error))
@@ -267,31 +279,13 @@ class Errand:
         passage.end(None)
         return value
 
-    def unforeseen(self, bug: Exception) -> BusError:
-        """Return the error for a request that failed by a mistake in the program."""
-        what = f"the program that owns the line failed: {type(bug).__name__}: {bug}"
-        kind = WriteUnconfirmed if self.command.writes and self.journey.sent else BusError
-        return kind(what, node=self.node, command=self.text)
-
     def _truth(self, error: BaseException) -> BaseException:
         """Return what is kept of a write that ended so: one that was given up may never have been sent."""
         if isinstance(error, Exception):
             return error
-        if self.journey.sent:
+        if self.sent:
             return WriteUnconfirmed("its program gave up before it was answered")
         return NotStarted("its program gave up before it was sent")
-
-    def _left(self) -> CommandOptions:
-        """Return the options, less the time that the request took to come here."""
-        if not self._options:
-            return {}
-        options: dict[str, Any] = dict(self._options)
-        age = self._line.bus.now() - self._asked
-        for name in ("start_within", "finish_within"):
-            limit = options.get(name)
-            if isinstance(limit, int | float):
-                options[name] = max(0.0, limit - age)
-        return cast("CommandOptions", options)
 
     def _wish(self) -> Wish:
         """Return what is on record of it: by the name of a point and in its unit, where the owner polls that."""
@@ -311,6 +305,39 @@ class Errand:
             command=command,
             permission=self._asker.permission,
         )
+
+
+Errand: TypeAlias = Reading | Writing
+
+
+def errand_of(said: Mapping[str, Any] | PlainRead, asker: Asker, line: ServedLine) -> Errand:
+    """Return what a client asks for. Raises InvalidCommand for what the protocol does not have."""
+    if isinstance(said, PlainRead):
+        return Reading(asker.node(said.protocol, said.address), said.command, asker.turn)
+    task = Task.of_point(said, asker, line) if "key" in said else Task.of_node(said, asker)
+    node, command = task.node, task.command
+    given = cast("CommandOptions", said.get("options") or {})
+    if not set(given) <= OPTIONS:
+        raise InvalidCommand(f"a request has the options {', '.join(sorted(OPTIONS))}, not {', '.join(given)}")
+    RequestOptions.of(given, node.label)  # checked here, before it may wait
+    now, stops_seen = line.bus.now(), said.get("stops_seen")
+    stops_seen = None if stops_seen is None else stops_seen + asker.stops_before(node)
+    client = asker.client_of(said.get("sequence"), node)
+    stop = said.get("stop") is True and _check_stop(node, command)
+    asked = min(now, seconds(said.get("asked", now), "asked"))
+    if not command.writes:
+        return Reading(node, command, client, stops_seen, RequestOptions.of(_left(given, now - asked), node.label))
+    return Writing(task, given, line=line, asker=asker, client=client, asked=asked, stops_seen=stops_seen, stop=stop)
+
+
+def _left(options: CommandOptions, age: float) -> CommandOptions:
+    """Return the options of a request, less the seconds since it was asked for."""
+    left: dict[str, Any] = dict(options)
+    for name in ("start_within", "finish_within"):
+        limit = left.get(name)
+        if isinstance(limit, int | float):
+            left[name] = max(0.0, limit - age)
+    return cast("CommandOptions", left)
 
 
 def _encoded(point: Point[Any], value: Any) -> Command[Any]:

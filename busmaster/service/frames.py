@@ -10,6 +10,8 @@ TEXT = 0x81
 """The first byte of a message of text in one piece."""
 MASKED = 0x80
 SHORT, LONG = 126, 127
+NO_MASK = bytes(4)
+"""The key of a mask that changes nothing."""
 
 
 def look_at(data: bytearray, masked: bool) -> tuple[int, bytes | None]:
@@ -26,13 +28,13 @@ def look_at(data: bytearray, masked: bool) -> tuple[int, bytes | None]:
         begin = 4 if length == SHORT else 10
         if come < begin:
             return begin, None
-        length = int.from_bytes(data[2:begin], "big")
+        length = data[2] << 8 | data[3] if length == SHORT else int.from_bytes(data[2:begin], "big")
     text = begin + 4 if is_masked else begin
     size = text + length
     if come < size or data[0] != TEXT or is_masked is not masked:
         return size, None
-    said = data[text:size]
-    return size, mask(said, data[begin:text]) if masked else bytes(said)
+    said, key = bytes(data[text:size]), data[begin:text]
+    return size, mask(said, key) if masked and key != NO_MASK else said
 
 
 def text_frame(data: bytes, key: bytes) -> bytes:
@@ -41,10 +43,10 @@ def text_frame(data: bytes, key: bytes) -> bytes:
     if length < SHORT:
         head = bytes((TEXT, flag | length))
     elif length < 1 << 16:
-        head = bytes((TEXT, flag | SHORT)) + length.to_bytes(2, "big")
+        head = bytes((TEXT, flag | SHORT, length >> 8, length & 0xFF))
     else:
         head = bytes((TEXT, flag | LONG)) + length.to_bytes(8, "big")
-    return head + key + mask(data, key) if key else head + data
+    return head + key + (mask(data, key) if key and key != NO_MASK else data)
 
 
 def new_key() -> bytes:
@@ -52,7 +54,7 @@ def new_key() -> bytes:
     return os.urandom(4)
 
 
-def mask(data: bytes | bytearray, key: bytes | bytearray) -> bytes:
+def mask(data: bytes, key: bytes | bytearray) -> bytes:
     """Return data with a mask put on, or taken off."""
     length = len(data)
     keys = (key * (length // 4 + 1))[:length]

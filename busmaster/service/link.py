@@ -183,7 +183,10 @@ class Link:
     # what the connection tells
 
     def _connect(self) -> AskingConnection:
-        self._connection = AskingConnection(self, token=self._token, longest=LONGEST_ANSWER, read_at_once=READ_AT_ONCE)
+        is_tcp = self.address.startswith(TCP)
+        self._connection = AskingConnection(
+            self, masks=is_tcp, token=self._token, longest=LONGEST_ANSWER, read_at_once=READ_AT_ONCE
+        )
         return self._connection
 
     def opened(self) -> None:
@@ -274,7 +277,7 @@ class Link:
         if "method" in said:
             self._on_news(said["method"], said["params"])
             return
-        asked = self._asked.get(said["id"]) if said.get("id") is not None else None
+        asked = self._asked.get(said.get("id"))  # type: ignore[arg-type]  # whatever the other end says
         if asked is None:
             return
         # Understood first: whoever asked for what is not understood is told so when the conversation ends for it.

@@ -54,21 +54,26 @@ class Outbox:
 
     def put(self, text: str) -> None:
         """Say this: it is never dropped."""
-        if not self._passes(text):
+        if self._letters or self._way.full:
             self._letters[_Letter(text)] = None
+        else:
+            self._way.say(text)
 
     def put_latest(self, key: Hashable, text: str) -> None:
         """Say this in place of what was to be said of the same thing, if that still waits."""
         letter = self._latest.get(key)
         if letter is not None:
             letter.text = text
-        elif not self._passes(text):
+        elif self._letters or self._way.full:
             self._latest[key] = letter = _Letter(text, key)
             self._letters[letter] = None
+        else:
+            self._way.say(text)
 
     def put_news(self, key: Hashable, text: str) -> None:
         """Say this of one of its streams, unless it does not keep up."""
-        if self._passes(text):
+        if not self._letters and not self._way.full:
+            self._way.say(text)
             return
         while len(self._news) >= MOST_UNREAD:
             oldest = self._news.popleft()
@@ -87,10 +92,3 @@ class Outbox:
             elif self._latest.get(letter.key) is letter:
                 del self._latest[letter.key]
             self._way.say(letter.text)
-
-    def _passes(self, text: str) -> bool:
-        """Say it at once where nothing waits before it; return whether that was so."""
-        if self._letters or self._way.full:
-            return False
-        self._way.say(text)
-        return True

@@ -9,13 +9,16 @@ from typing import Any, NamedTuple
 
 from busmaster.contract.exchange import Command
 from busmaster.service.failures import REFUSED
-from busmaster.service.messages import BEFORE_NUMBER, numbered, read, words
+from busmaster.service.messages import BEFORE_NUMBER, read, words
 from busmaster.service.telling import protocol_of
 
 KEPT = 1024
 """Reads whose words are kept, the last that were asked, whoever asked."""
 SHORT = 256
 """Characters of a message whose words are kept: no read takes more."""
+
+END = f"}}}}{BEFORE_NUMBER}"
+"""With what the words of a plain read end, before its number: nothing is behind its command."""
 
 
 class PlainRead(NamedTuple):
@@ -40,20 +43,20 @@ def plain_read_of(message: str | bytes) -> tuple[int, PlainRead] | None:
     """Return the number of a message that is a plain read, and that; None for any other, and for a bad one."""
     if not isinstance(message, str) or len(message) > SHORT:
         return None
-    said, _, rest = message.rpartition(BEFORE_NUMBER)
+    said, _, rest = message.rpartition(END)
     digits = rest[:-1]
-    if not said.endswith("}}") or not digits.isdecimal():  # a plain one ends with its command and its number
+    if not digits.isdecimal():
         return None
     number = int(digits)
-    asked = _asked_in(said) if message == numbered(said, number) else None
+    asked = _asked_in(said) if rest == f"{number}}}" else None
     return None if asked is None else (number, asked)
 
 
 @lru_cache(KEPT)
 def _asked_in(said: str) -> PlainRead | None:
-    """Return the plain read that is asked in these words, whatever their number; None if none is."""
+    """Return the plain read that is asked in these words, up to END, whatever its number; None if none is."""
     try:
-        message = read(f"{said}}}")
+        message = read(f"{said}}}}}}}")
         params = message["params"]
         if message.keys() != {"jsonrpc", "method", "params"} or message["method"] != "request":
             return None

@@ -7,10 +7,11 @@ from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
 from typing import Any, Protocol, TypeVar, Unpack
 
+from busmaster.arbiter.transaction import URGENT
 from busmaster.bus.exclusive import checked_hold
 from busmaster.bus.limits import Limit
 from busmaster.bus.points import Point
-from busmaster.bus.requester import ORDINARY, CommandOptions, Priority, Requester, RequestOptions
+from busmaster.bus.requester import ORDINARY, CommandOptions, Requester, RequestOptions
 from busmaster.bus.samples import Sample
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
@@ -124,18 +125,17 @@ class RemoteNode:
         If the connection is lost meanwhile, a write raises WriteUnconfirmed, or NotStarted where it was not handed over
         yet, and a read LineDown. Cancelling it cancels it there.
         """
-        return self.ask(command, None, touches=touches, stops_seen=stops_seen, stop=stop, **options)
+        return self.ask(command, None, touches, stops_seen, stop, options)
 
     async def ask(
         self,
         command: Command[T],
         sequence: int | None,
-        /,
-        *,
         touches: Command[Any] | None,
         stops_seen: int | None,
         stop: bool,
-        **options: Unpack[CommandOptions],
+        options: CommandOptions,
+        /,
     ) -> T:
         """Do what `request` does, within a sequence of this program, if it is given the number of one."""
         chosen = RequestOptions.of(options, self.label) if options else ORDINARY
@@ -145,11 +145,15 @@ class RemoteNode:
             raise InvalidCommand(f"{self.label}: the safe state is sent by the program that owns the line")
         link, room = self._bus.opened(self, command), self._bus.room
         # What is of a sequence waits for nothing else of this program, which waits for the sequence.
-        waits = sequence is None and chosen.priority is not Priority.URGENT
+        waits = sequence is None and chosen.priority is not URGENT
         waited = await room.wait(chosen, self, command) if waits and not room.take() else 0.0
         try:
             left: Mapping[str, Any] = {**options, **shortened(chosen, waited)} if waited else options
-            question = self._words(command, left, touches, stops_seen, stop, sequence)
+            more = left or stop or touches is not None or stops_seen is not None or sequence is not None
+            if more or getattr(command, "writes", True):
+                question = self._words(command, left, touches, stops_seen, stop, sequence)
+            else:
+                question = words_of(self._profile.name, self._address, command)  # type: ignore[arg-type]  # is hashable
             asked = link.put(question, command.writes, self, command)
             value: T = value_of(await link.answer(asked, left.get("finish_within")))
             return value
@@ -173,10 +177,7 @@ class RemoteNode:
         stop: bool,
         sequence: int | None,
     ) -> str:
-        """Return how a request is said. `asked` is left out where nothing is counted from it."""
-        more = options or stop or touches is not None or stops_seen is not None or sequence is not None
-        if not more and not getattr(command, "writes", True):
-            return words_of(self._profile.name, self._address, command)  # type: ignore[arg-type]  # it is hashable
+        """Return how a request is said that is no plain read."""
         params: dict[str, Any] = {
             "protocol": self._profile.name,
             "address": self._address,

@@ -10,7 +10,7 @@ from typing import Any
 
 from busmaster.bus.requester import Priority
 from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
-from busmaster.service.errands import Asker, Errand
+from busmaster.service.errands import Asker, Errand, Writing, errand_of
 from busmaster.service.failures import REFUSED, refusal_of
 from busmaster.service.line import ServedLine
 from busmaster.service.messages import MOST_REQUESTS, MOST_URGENT, Malformed
@@ -31,73 +31,77 @@ class Requests:
         self._line = line
         self._answer = answer
         self._refuse = refuse
-        self._errands: dict[int, Errand] = {}
-        self._safe: set[int] = set()
-        """Those that wait for the safe state to be sent."""
+        self._under_way: dict[int, Errand | None] = {}
+        """What is not answered yet, by its number: None is the safe state, which is being sent."""
         self._log = logging.getLogger("busmaster.service")
 
     def check_number(self, number: int) -> None:
         """Raise Malformed for the number of something that is not answered yet."""
-        if number in self._errands or number in self._safe:
+        if number in self._under_way:
             raise Malformed(f"request {number} is under way already")
 
     @property
     def errands(self) -> tuple[Errand, ...]:
         """Return what is to be done at its nodes."""
-        return tuple(self._errands.values())
+        return tuple(errand for errand in self._under_way.values() if errand is not None)
 
     def begin(self, number: int, said: Mapping[str, Any] | PlainRead) -> None:
-        """Have a command carried out."""
+        """Have a command carried out. Raises Malformed for the number of something that is not answered yet."""
+        under_way = self._under_way
+        if number in under_way:  # as check_number does: this is done for every request
+            self.check_number(number)
         try:
-            self._check_room(said)
-            errand = Errand.of(said, self._asker, self._line)
-            self._errands[number] = errand
+            if len(under_way) >= MOST_REQUESTS:
+                self._check_room(said)
+            under_way[number] = errand = errand_of(said, self._asker, self._line)
             errand.begin(partial(self._ended, number))
         except REFUSED as error:
-            self._errands.pop(number, None)
+            under_way.pop(number, None)
             self._refuse(number, refusal_of("request", error))
 
     def begin_safe(self, number: int, params: Mapping[str, Any]) -> None:
-        """Have the safe state sent."""
+        """Have the safe state sent. Raises Malformed for the number of something that is not answered yet."""
+        self.check_number(number)
         try:
             self._check_room({})
             sending = self._line.safe_wishes.begin(params["writes"], self._asker.peer)
         except REFUSED as error:
             self._refuse(number, refusal_of("safe", error))
         else:
-            self._safe.add(number)
+            self._under_way[number] = None
             sending.add_done_callback(partial(self._safe_sent, number))
 
     def cancel(self, number: object) -> None:
         """Give up a command: it is not answered. What is no number of one means nothing."""
-        errand = self._errands.get(number)  # type: ignore[call-overload]  # whatever a program says
+        errand = self._under_way.get(number)  # type: ignore[call-overload]  # whatever a program says
         if errand is not None:
             errand.cancel()
 
     def end(self) -> None:
         """Tell it truthfully what becomes of all that: the service ends, and the bus perhaps with it."""
-        for number, errand in list(self._errands.items()):
-            errand.cancel()
-            unsure = errand.command.writes and errand.journey.sent
-            kind: type[BusError] = WriteUnconfirmed if unsure else BusClosed
-            self._refuse(number, kind("the program that owns the line ends", node=errand.node, command=errand.text))
+        for number, errand in list(self._under_way.items()):
+            if errand is not None:
+                errand.cancel()
+                self._refuse(number, _untold(errand, BusClosed, "the program that owns the line ends"))
 
     async def give_up(self) -> None:
         """Give up all of it, and return when nothing of it is under way. The safe state goes on."""
         for errand in self.errands:
             errand.cancel()
-        while writing := [errand.writing for errand in self.errands if errand.writing is not None]:
-            await asyncio.wait(writing)
+        while doing := [
+            errand.doing for errand in self.errands if isinstance(errand, Writing) and errand.doing is not None
+        ]:
+            await asyncio.wait(doing)
 
     # inside
 
     def _check_room(self, said: Mapping[str, Any] | PlainRead) -> None:
-        waiting = len(self._errands) + len(self._safe)
+        waiting = len(self._under_way)
         if waiting >= MOST_REQUESTS and not (_is_urgent(said) and waiting < MOST_REQUESTS + MOST_URGENT):
             raise BacklogFull(f"{waiting} requests of this program are not answered yet")
 
     def _ended(self, number: int, errand: Errand, value: Any, error: BaseException | None) -> None:
-        del self._errands[number]
+        del self._under_way[number]
         if errand.given_up:
             return
         try:
@@ -108,15 +112,23 @@ class Requests:
             self._refuse(number, refusal)
         except Exception as bug:  # of a protocol: the client is told, and the line goes on
             self._log.exception("a request of %s failed", self._asker.peer)
-            self._refuse(number, errand.unforeseen(bug))
+            what = f"the program that owns the line failed: {type(bug).__name__}: {bug}"
+            self._refuse(number, _untold(errand, BusError, what))
 
     def _safe_sent(self, number: int, sending: asyncio.Task[dict[str, Any]]) -> None:
-        self._safe.discard(number)
+        del self._under_way[number]
         error = WriteUnconfirmed("the program that owns the line ends") if sending.cancelled() else sending.exception()
         if error is None:
             self._answer(number, sending.result())
         else:
             self._refuse(number, error if isinstance(error, Exception) else BusError(str(error)))
+
+
+def _untold(errand: Errand, kind: type[BusError], what: str) -> BusError:
+    """Return the error for one whose end nobody will tell: `kind`, unless it may have written."""
+    if errand.command.writes and errand.sent:
+        kind = WriteUnconfirmed
+    return kind(what, node=errand.node, command=str(errand.command))
 
 
 def _is_urgent(said: Mapping[str, Any] | PlainRead) -> bool:

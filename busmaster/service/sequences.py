@@ -81,12 +81,11 @@ class AsksInSequence(Requester, Protocol):
         self,
         command: Command[T],
         sequence: int,
-        /,
-        *,
         touches: Command[Any] | None,
         stops_seen: int | None,
         stop: bool,
-        **options: Unpack[CommandOptions],
+        options: CommandOptions,
+        /,
     ) -> T:
         """Run one command within a sequence."""
         ...
@@ -134,6 +133,4 @@ class _HeldRemoteNode(HeldNode):
         **options: Unpack[CommandOptions],
     ) -> T:
         """Run one command within the sequence, see `HeldNode.request`."""
-        return await self._asks.ask(
-            command, self._sequence, touches=touches, stops_seen=stops_seen, stop=stop, **options
-        )
+        return await self._asks.ask(command, self._sequence, touches, stops_seen, stop, options)

@@ -137,7 +137,7 @@ class Visit:
                 self.client = self._host.welcome(self, read_request(message))
                 self._stranger.cancel()
             elif (read := plain_read_of(message)) is not None:
-                self.client.take_read(*read)
+                self.client.requests.begin(*read)
             else:
                 self.client.take(read_request(message))
         except Malformed as error:
@@ -158,7 +158,8 @@ class Visit:
         """Have the next message taken, or read more, unless it leaves too many answers unread."""
         if self._queued or self._ended:
             return
-        if self.client is not None and self.client.outbox.crowded:
+        # What waits for a client does so behind a full connection, and hardly one is.
+        if self.connection.full and self.client is not None and self.client.outbox.crowded:
             self.connection.pause()  # `writable` comes here again
         elif self._messages:
             self._queued = True

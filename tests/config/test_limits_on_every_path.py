@@ -32,7 +32,7 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.modbus import codec as modbus
 from busmaster.protocols.msc import codec as msc
-from busmaster.service.errands import Errand
+from busmaster.service.errands import errand_of
 from busmaster.service.line import ServedLine
 from busmaster.service.peers import Process
 from busmaster.testing.virtual_time import run_in_virtual_time
@@ -182,6 +182,10 @@ class Person:
     def node(self, name: str, address: int, /) -> Node:
         raise AssertionError("a person names points")
 
+    @property
+    def turn(self) -> LineClient:
+        raise AssertionError("a person reads nothing")
+
     def client_of(self, sequence: int | None, node: Node, /) -> LineClient:
         return node.shared.add_client(1.0)
 
@@ -198,7 +202,7 @@ class Person:
 def by_key(name: str) -> Callable[[Plant, int], Awaitable[None]]:
     async def write(plant: Plant, value: int) -> None:
         params = {"group": "all", "key": f"drive/{name}", "value": value}
-        errand = Errand.of(params, Person(), ServedLine(plant.line.bus, plant.line.gate, 1.0, ""))
+        errand = errand_of(params, Person(), ServedLine(plant.line.bus, plant.line.gate, 1.0, ""))
         ended: asyncio.Future[BaseException | None] = asyncio.get_running_loop().create_future()
         errand.begin(lambda _, __, error: ended.set_result(error))
         if (error := await ended) is not None:

@@ -20,6 +20,7 @@ def _unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine may take longer over a write than that is fresh: a test that asks for just this says its age."""
     for door in ("busmaster.service.errands", "busmaster.gate.gate"):
         monkeypatch.setattr(f"{door}.FRESH", PATIENCE)
+    monkeypatch.setattr("busmaster.service.remote_overview.SOON", PATIENCE)
 
 
 @pytest.fixture(autouse=True)

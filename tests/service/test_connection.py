@@ -218,7 +218,7 @@ def test_one_that_is_silent_between_two_pings_is_let_go_and_one_that_is_not_read
 def test_one_who_asks_hears_why_it_is_refused() -> None:
     def story() -> None:
         ear, wire = Ear(), Wire()
-        end = AskingConnection(ear, longest=LONGEST, read_at_once=512)
+        end = AskingConnection(ear, masks=True, longest=LONGEST, read_at_once=512)
         end.connection_made(wire)
         give(end, b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 3\r\n\r\nno\n", lambda: 7)
         end.eof_received()

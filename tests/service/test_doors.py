@@ -22,6 +22,7 @@ from busmaster.emulator.line import Line
 from busmaster.errors import InvalidCommand, LineDown
 from busmaster.gate.permission import Access, Permission, digest_of
 from busmaster.service import peers
+from busmaster.service.frames import NO_MASK, text_frame
 from tests.patience import PATIENCE
 from tests.service.lines import Raw, Served, served, until
 
@@ -215,6 +216,33 @@ def test_a_token_is_for_tcp_and_is_one_word() -> None:
         connect("unix:/run/line.sock", token="a-token-of-the-hmi-0001")
     with pytest.raises(InvalidCommand, match="without spaces"):
         connect("tcp://127.0.0.1:7420", token="two\r\nwords")
+
+
+def test_what_is_said_by_tcp_has_another_mask_each_time_and_in_the_kernel_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys: list[bytes] = []
+
+    def framed(data: bytes, key: bytes) -> bytes:
+        if key:  # a program's: an owner has none
+            keys.append(key)
+        return text_frame(data, key)
+
+    async def read_by(address: str, token: str | None = None) -> list[bytes]:
+        keys.clear()
+        async with connect(address, token=token) as remote:
+            for _ in range(5):
+                assert await Hcp2Controller(remote, 5).read(1) == 0
+        assert len(keys) > 5
+        return keys
+
+    async def story(line: Served, address: str) -> None:
+        assert set(await read_by(line.address)) == {NO_MASK}
+        masks = await read_by(address, SECRETS["logger"])
+        assert len(set(masks) - {NO_MASK}) == len(masks)
+
+    monkeypatch.setattr("busmaster.service.connection.text_frame", framed)
+    on_a_port(tmp_path, story)
 
 
 # who a process is, as the kernel says

@@ -141,10 +141,10 @@ def test_of_plain_reads_too_so_many_may_be_unanswered_and_each_has_a_number_of_i
             [owner] = line.service.clients
             read = PlainRead("hcp2", 5, READ)
             for number in range(MOST_REQUESTS):
-                owner.take_read(number, read)
+                owner.requests.begin(number, read)
             with pytest.raises(Malformed, match="request 0 is under way already"):
-                owner.take_read(0, read)
-            owner.take_read(MOST_REQUESTS, read)
+                owner.requests.begin(0, read)
+            owner.requests.begin(MOST_REQUESTS, read)
             assert len(owner.errands) == MOST_REQUESTS
             said = await client.hear()
             assert (said["id"], said["error"]["data"]["error"]) == (MOST_REQUESTS, "BacklogFull")
