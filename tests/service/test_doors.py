@@ -302,11 +302,14 @@ def test_a_users_own_role_goes_before_those_of_groups_and_those_in_their_order(
 
 
 def test_the_kernel_says_which_groups_a_process_has() -> None:
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        process = peers.process_of(ours)
-    assert (process.pid, process.uid, process.gids[0]) == (os.getpid(), os.getuid(), os.getgid())
-    assert set(process.gids) == {os.getgid(), *os.getgroups()}
+    async def story() -> None:
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            process = peers.process_of(ours)
+        assert (process.pid, process.uid, process.gids[0]) == (os.getpid(), os.getuid(), os.getgid())
+        assert set(process.gids) == {os.getgid(), *os.getgroups()}
+
+    asyncio.run(story())
 
 
 def test_other_roles_hold_at_once_for_who_is_there(tmp_path: Path) -> None:
