@@ -123,6 +123,26 @@ async def test_on_hovering_an_exchange_says_what_was_said_and_the_arrow_keys_go_
 
 
 @pytest.mark.asyncio
+async def test_where_another_node_is_asked_the_lane_of_a_node_says_with_whom_the_line_is_busy(
+    browser: Browser, tmp_path: Path
+) -> None:
+    async with forty(tmp_path), page(tmp_path) as of:
+        await shows(of.line)
+        await asyncio.to_thread(browser.open, of.url)
+        await asyncio.to_thread(
+            browser.until,
+            """(() => {
+              const canvas = document.getElementById('wire-canvas'), box = canvas.getBoundingClientRect();
+              for (let x = 70; x < box.width; x++) {
+                const at = { clientX: box.left + x, clientY: box.top + 50, bubbles: true };
+                canvas.dispatchEvent(new PointerEvent('pointermove', at));
+                if (document.getElementById('tip').textContent === 'busy with node 20') return true;
+              }
+            })()""",
+        )
+
+
+@pytest.mark.asyncio
 async def test_a_good_value_that_is_a_text_is_not_drawn_as_one_that_is_missing(
     browser: Browser, tmp_path: Path
 ) -> None:

@@ -176,6 +176,8 @@ export class Wire {
   }
 
   between(when) {
+    const now = this.exchanges.find((one) => one.verdict && one.begun <= when && when < one.ended);
+    if (now) return `busy with ${label_of(now, this.lanes)}`;
     const next = this.exchanges.find((one) => one.verdict && one.begun > when);
     if (next && when < next.after + next.settling) return `the line settled for ${milliseconds(next.settling)}: what was still to come is waited out`;
     return next && next.after < when ? `idle for ${milliseconds(next.begun - next.after - next.settling)}` : "idle";
@@ -220,16 +222,20 @@ function kind_of(one) {
 function told(one, nodes) {
   const said = one.said.map(([when, who, hex]) => `${who === "master" ? "→" : "←"} +${milliseconds(when - one.begun)}  ${spelled(hex)}`);
   if (!one.verdict) return [`unasked: ${one.bytes} bytes that nobody had asked for`, ...said].join("\n");
-  const node = nodes.find((node) => node.protocol === one.protocol && node.address === one.address);
   const answer = one.verdict === "ok" ? one.result || "done" : `${one.verdict}: ${one.result}`;
   const why = one.purpose ? `for ${one.purpose}` : "asked by a program";
   const first = one.said.find(([, who]) => who === "node");
   return [
-    `${node?.label ?? `${one.protocol} ${one.address}`}: ${one.command} = ${answer}`,
+    `${label_of(one, nodes)}: ${one.command} = ${answer}`,
     `${why}, request ${one.request}${one.attempt > 1 ? `, RETRY: attempt ${one.attempt}` : ""}${one.late ? ", LATE" : ""}`,
     `${milliseconds(one.ended - one.begun, 2)} in all${first ? `, first byte after ${milliseconds(first[0] - one.begun, 2)}` : ", nothing came"}`,
     ...said,
   ].join("\n");
+}
+
+function label_of(one, nodes) {
+  const node = nodes.find((node) => node.protocol === one.protocol && node.address === one.address);
+  return node?.label ?? `${one.protocol} ${one.address}`;
 }
 
 function spelled(hex) {
