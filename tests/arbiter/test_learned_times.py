@@ -17,6 +17,7 @@ from busmaster.arbiter.learned import (
     Learning,
     LegTimes,
 )
+from busmaster.arbiter.leg import Leg
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import TAU
 
@@ -46,6 +47,14 @@ def test_what_an_adapter_hands_over_late_or_in_pieces_is_waited_for() -> None:
     learned = times.timing(TIMINGS.read, TAU, AT_FIRST)
     assert learned.window == pytest.approx(0.018 + MARGIN)
     assert learned.byte_gap == pytest.approx(0.008)
+
+
+def test_a_pause_is_what_is_between_two_pieces_of_a_reply_however_early_they_come() -> None:
+    leg = Leg(TIMINGS.read, 0.0, TAU)
+    leg.begun_at = 0.01
+    for now in (0.01, 0.02, 0.025):
+        leg.note_pause(now)
+    assert leg.pause == pytest.approx(0.01)
 
 
 def test_a_reply_that_was_slower_than_any_is_forgotten_after_two_epochs() -> None:

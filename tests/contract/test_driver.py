@@ -101,6 +101,10 @@ def test_noise_before_a_reply_is_left_out_for_a_profile_that_tolerates_it() -> N
     assert isinstance(strict.error, FrameError)
 
 
+def test_of_noise_alone_an_exchange_is_told_nothing() -> None:
+    assert Driver(Odd(Done(1)), noise_tolerant=True).feed(b"\x00").ending is None
+
+
 @dataclass
 class Odd:
     """An exchange whose every step is the same; none is a bug of its own."""
