@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import io
+import json
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +13,7 @@ from types import ModuleType
 
 import pytest
 
-from tests.mutation.warm import functions_by_file, replaced
+from tests.mutation.warm import answer, functions_by_file, replaced
 
 SOURCE = """\
 from functools import lru_cache
@@ -78,3 +81,16 @@ def test_methods_are_replaced_and_what_is_cached_and_what_a_function_has_made(mo
 def test_what_is_on_other_lines_or_needs_other_variables_is_not_replaced(module: ModuleType) -> None:
     assert not change(module, "LIMIT = 3\n", "LIMIT = (\n    3)\n")
     assert not change(module, "value < limit", "value < 3")
+
+
+def test_a_pty_that_a_mutants_test_opens_and_closes_does_not_end_it() -> None:
+    def judged(*request: object) -> int:
+        controller, terminal = os.openpty()
+        os.close(os.open(os.ttyname(terminal), os.O_RDWR))
+        os.close(terminal)
+        os.close(controller)
+        return 0
+
+    answers = io.StringIO()
+    answer({"tests": {}}, answers, judged)
+    assert json.loads(answers.getvalue()) == {"status": 0, "test": ""}

@@ -166,7 +166,7 @@ def answer(request: Any, answers: Any, judged: Callable[[Any, mmap.mmap], int]) 
     with tempfile.TemporaryDirectory(prefix="m-") as folder:
         child = os.fork()
         if child == 0:
-            os.setsid()
+            os.setpgid(0, 0)  # not setsid: a pty that a test opens would become its terminal, and end it by a hangup
             os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
             tempfile.tempdir = os.environ["TMPDIR"] = os.environ["XDG_RUNTIME_DIR"] = folder
             try:
