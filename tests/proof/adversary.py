@@ -123,6 +123,8 @@ def window(world: World, action: Action) -> tuple[list[Time], list[Time], list[T
         if setup.receive_latency:  # all that an adapter holds is read within the latency of its first byte
             more = 0
         earliest.append(reply.lo + more * world.byte_time)
+        if setup.beyond:  # all of it comes within that: else its end could come when R15 owes it no more
+            more = 0
         (latest if reply.kind == "echo" else before).append(reply.hi + more * reply.gap)
     return _instants(earliest), _instants(latest), _instants(before)
 

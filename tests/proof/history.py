@@ -71,7 +71,7 @@ def _endings(parts: Parts, key: bytes, zone: Zone, steps: Sequence[Step], proble
             except Violation as violation:
                 what = str(violation)
             except Outside:
-                continue
+                what = "outside"
             decided, others = split(piece, noted)
             pieces += others
             last = done == len(steps) - 1
