@@ -338,13 +338,18 @@ def _past_turns(view: View, backlog: SharedBacklog, ranks: dict[LineClient, int]
         turns._turns = OrderedDict((turn.client, turn) for turn in sorted(kept, key=lambda turn: ranks[turn.client]))
 
 
+def past_replies(view: View) -> None:
+    """A reply that is too late never comes: those behind it, where they keep their order, may."""
+    view.world.owed = [reply for reply in view.world.owed if not view.past(reply.hi)]
+
+
 def past_wire(view: View) -> None:
-    """The adversary's own state: a reply that is too late never comes; what was heard is judged within its exchange;
-    what an attempt was to be answered with, while it is on the wire."""
+    """The adversary's own state: what was heard is judged within its exchange; what an attempt was to be answered with,
+    while it is on the wire; when a reply may come, until it may."""
     world = view.world
-    world.owed = [reply for reply in world.owed if not view.past(reply.hi)]
     for reply in world.owed:
-        if view.past(reply.lo):
+        lasts = (len(reply.data) - 1) * world.byte_time if world.setup.whole else 0.0
+        if view.past(reply.lo, lasts):
             reply.lo = -inf
     if not world.words_are_read:
         _past_words(world)
@@ -389,6 +394,7 @@ FORGOTTEN: list[Callable[[View], None]] = [
     past_debts,
     past_holds_back,
     past_waiting,
+    past_replies,
     past_wire,
 ]
 

@@ -104,7 +104,8 @@ class Setup:
     bits: tuple[int, ...] = tuple(range(8))
     stall: float = 0.030
     beyond: float = 0.0
-    """Seconds after its request within which all of a reply comes, where that is later than its lateness."""
+    """Seconds after its request within which all of a reply comes, where the line may have gone on before: later than
+    its lateness, or than a learned window."""
     lapse: float = 0.4
     """In place of LAPSE: fewer debts at a time."""
     alike: int = 2

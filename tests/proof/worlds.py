@@ -133,12 +133,13 @@ def msc_pairs() -> Iterator[Setup]:
 
 
 def in_step() -> Iterator[Setup]:
-    """What is owed told by the shipping code, and replies that come after their lateness, in order (R15)."""
+    """What is owed told by the shipping code, and replies that come after their lateness, in order (R15); or within it,
+    where the line goes on after a learned window."""
     for commands in ((READ,), (WRITE,), (READ, READ_UNLIKE), (READ, WRITE), (READ, READ_THERE)):
         one = replace(_line("hcp2", BEYOND, commands=commands), in_step=True, whole=True, lapse=0.25, beyond=0.24)
         yield one
         if READ in commands:  # where nothing is repeated, nothing is awaited for a learned time
-            yield replace(one, retries=1, learned=LEARNED)
+            yield replace(one, adversary=(), retries=1, learned=LEARNED, lapse=0.2, beyond=0.15)
 
 
 GROUPS = {
