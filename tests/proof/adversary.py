@@ -8,8 +8,9 @@ from typing import cast
 from busmaster.arbiter.state import OFFLINE, SETTLING
 from tests.proof import setups
 from tests.proof.instants import Instant
+from tests.proof.learned_windows import AnyTime
 from tests.proof.msc_world import MscWorld
-from tests.proof.shipped import AnyTime, Asker, Decided, Looked, Ranks
+from tests.proof.shipped import Asker, Decided, Looked, Ranks
 from tests.proof.wire import SCRIPT, STRAY, Owed, Time
 from tests.proof.world import Action, World
 

@@ -2,13 +2,7 @@
 
 - Counters and histograms: nothing that is decided depends on them. They do arithmetic that no zone can tell.
 - How long a node's replies take, as it is learned: `NodeRecord.latest` may say whatever the world names.
-- Learned windows (`Setup.learned`): what is known of a node may be anything, so nothing is noted, and nothing gone back
-  from. What is awaited on an attempt that is repeated is any time between the least and the longest that may be
-  learned (each times what that attempt has of it), and another one each time: whatever was learned is among it. The
-  last attempt of a read, writes, and what has not answered yet have the document's, as it ships. The silence that ends
-  a reply is the shortest that is learned: what may come is then the most. Nothing goes back to the document's times,
-  where nobody has failed: they have worlds of their own. What waits longer than a window is told by any such window;
-  how late a reply is no later than usual, by the least or the longest one.
+- Learned windows: see learned_windows.py.
 - Health and probes: a failure may be held against a node, or not, and a node that is down is probed at any time, or
   asked for a caller's sake, or not. Without HEALTH no failure is held against anybody.
 - How far a straggler raises its node's lateness: to either of two values, or (without RAISED) not at all.
@@ -24,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, ClassVar
 
@@ -33,19 +26,15 @@ from busmaster.arbiter.choice import Choice, Chosen
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.health import DOWN, SUSPECT, UP, NodeRecord
-from busmaster.arbiter.learned import AT_LAST, LEAST_SILENCE, NEVER, Learning
-from busmaster.arbiter.leg import Leg
-from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.probes import Probes
 from busmaster.arbiter.shared_backlog import URGENT_RUN
 from busmaster.arbiter.transaction import Transaction
 from busmaster.arbiter.turns import Turns
 from busmaster.arbiter.unasked import LONGEST_LATENESS, STRAGGLER_MEMORY, STRAGGLER_SHARE, UnaskedBytes
 from busmaster.contract.exchange import Command
-from busmaster.contract.timing import ReplyTiming, Timings
-from tests.proof.kinds import KINDS
+from tests.proof.learned_windows import AnyTime, learned_windows
 from tests.proof.setups import HEALTH, HOLDS, NOISE, RAISED, Setup
-from tests.proof.wire import Outside, choose
+from tests.proof.wire import choose
 
 RAISED_TO = (0.25, LONGEST_LATENESS)
 
@@ -153,43 +142,6 @@ class AnyStep:
     """Whether an answer may be held until another could have come."""
 
 
-class AnyTime:
-    """Stands for the time until which the line is held back."""
-
-    at: ClassVar[list[float]] = [0.0]
-    """Any time from now on, of the run."""
-    chosen: ClassVar[list[bool]] = [False]
-    """It was waited for in this step."""
-
-
-@dataclass(frozen=True)
-class AnyWindow:
-    """Stands for a learned window: any from the least to the longest, in seconds, each time that one is awaited."""
-
-    least: float
-    longest: float
-
-    def __radd__(self, start: Any) -> Any:
-        """Return any time within it behind `start`: the one that is any time from now on, where it is one of these. An
-        event begins one leg at the most, and no reply goes on in pieces."""
-        ends = AnyTime.at[0]
-        if ends < start + self.least or ends > start + self.longest:
-            raise Outside
-        return ends
-
-    def __lt__(self, time: Any) -> bool:
-        """Whether it was over in that time."""
-        return bool(time > self.least and (time > self.longest or choose(2)))
-
-    def __mul__(self, number: float) -> AnyWindow:
-        return self  # a message, or who has become slower: of both is nothing asked
-
-    __rmul__ = __mul__
-
-    def __format__(self, how: str) -> str:
-        return "any"
-
-
 ANY_STEP = AnyStep()
 
 
@@ -229,13 +181,8 @@ def set_aside(setup: Setup) -> Iterator[None]:
     put(NodeRecord, "note_reply", _untimed(NodeRecord.note_reply) if setup.in_step else _notes_nothing)
     put(NodeRecord, "latest", _as_learned(NodeRecord.latest, setup))
     if setup.learned is not None:
-        assert setup.in_step, "only R15 makes learned windows safe"
-        assert setup.whole, "how long a reply goes on is no learned window"
-        put(Learning, "timings", _any_times(*setup.learned, KINDS[setup.kind]().profile.line.byte_time))
-        put(OnWire, "learn", _learns_nothing)
-        put(Learning, "was_late", _learns_nothing)
-        put(Learning, "was_away", _learns_nothing)
-        put(Leg, "gap_over", _is_whole)
+        for owner, name, stand_in in learned_windows(setup):
+            put(owner, name, stand_in)
     put(UnaskedBytes, "blame", _may_raise if setup.may(RAISED) else _raises_nothing)
     if not setup.may(RAISED):
         put(UnaskedBytes, "unanswered", _blames_nobody)
@@ -372,39 +319,6 @@ def _as_learned(right: Callable[[NodeRecord, float], float], setup: Setup) -> Ca
         return said
 
     return latest
-
-
-def _learns_nothing(*arguments: Any) -> None:
-    """What is known of a node may be anything, and is never gone back from."""
-
-
-def _any_times(least: float, longest: float, byte_time: float) -> Callable[..., Timings]:
-    """Return what says with which times a command is opened: nothing depends on the command itself."""
-    given: dict[tuple[Timings, int], Timings] = {}
-
-    def timings(learning: Learning, command: object, document: Timings, patience: int) -> Timings:
-        if patience == NEVER:
-            return document
-        found = given.get((document, patience))
-        if found is None:
-            read = awaited(document.read, patience)
-            found = given[document, patience] = Timings(read, awaited(document.write, AT_LAST), read)
-        return found
-
-    def awaited(document: ReplyTiming, patience: int) -> ReplyTiming:
-        """Return the document's times with a learned silence, and but for the last attempt with any window."""
-        silence = min(document.byte_gap, LEAST_SILENCE * byte_time)
-        first, last = min(patience * least, document.window), min(patience * longest, document.window)
-        timing = replace(document, nominal=min(document.nominal, first), byte_gap=silence, silence=silence)
-        if first < last:
-            object.__setattr__(timing, "window", AnyWindow(first, last))  # no number, as it must be
-        return timing
-
-    return timings
-
-
-def _is_whole(leg: Leg, now: float) -> float:
-    raise AssertionError("a reply goes on, though these are whole")
 
 
 def _may_raise(strays: UnaskedBytes, first_byte: float) -> None:

@@ -11,7 +11,7 @@ import pytest
 from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.state import EXCHANGE
 from tests.proof.forgotten import FORGOTTEN, View, transactions
-from tests.proof.kinds import READ, READ_UNLIKE, WRITE, WRITE_THERE
+from tests.proof.kinds import READ, WRITE, WRITE_THERE
 from tests.proof.setups import (
     BEYOND,
     CANCELS,
@@ -41,9 +41,7 @@ HOLDS = replace(HCP2, adversary=(HELD, STRAYS))
 DIES = replace(HCP2, commands=(READ, WRITE_THERE), adversary=(HEALTH, URGENT, LOST, NAKS))
 MSC = replace(HCP2, kind="msc", lapse=2.5, adversary=(STRAYS, FLIPS), lost_acknowledgements=1)
 OWES = replace(HCP2, in_step=True, adversary=(BEYOND, NAKS), beyond=0.3)
-LEARNS = replace(
-    OWES, commands=(READ, WRITE), adversary=(), beyond=0.15, lapse=0.2, retries=1, whole=True, learned=LEARNED
-)
+LEARNS = replace(OWES, adversary=(), beyond=0.15, lapse=0.2, retries=1, whole=True, learned=LEARNED)
 SHARED = replace(QUEUES, clients=1, adversary=(URGENT, CANCELS, LOST))
 SEQUENCES = replace(HCP2, clients=1, longest_hold=0.3, adversary=(URGENT, CANCELS, LOST), retries=1)
 EVERY = {"hcp2": HCP2, "paced": PACED, "echo": ECHOES, "late": LATE, "queues": QUEUES, "held": HOLDS, "msc": MSC}
@@ -120,10 +118,6 @@ def without_what_is_awaited(view: View) -> None:
         debt.awaited = None
 
 
-def without_when_it_was_held_back(view: View) -> None:
-    view.world.arbiter._choice._held_since = -inf
-
-
 def without_lapse(view: View) -> None:
     for debt in view.world.arbiter._in_step.debts:
         debt.asked = inf
@@ -167,7 +161,6 @@ def without_when_it_began(view: View) -> None:
         (without_debts, OWES),
         (without_lapse, OWES),
         (without_what_is_awaited, LEARNS),
-        (without_when_it_was_held_back, replace(LEARNS, commands=(READ, WRITE, READ_UNLIKE), depth=2)),
         (without_what_is_held, HOLDS),
         (without_what_is_being_said, MSC),
         (without_what_began, SEQUENCES),

@@ -96,10 +96,10 @@ def _choose(world: World, random: Random) -> tuple[Action, int, int] | None:
         if low <= high:
             edges = [low, min(low + 1, high), max(high - 1, low), high, random.randint(low, high)]
             now = random.choice(edges)
-            later = (0, 1, random.randint(0, ticks(LONGEST_WAIT)))
+            later = random.choice((0, 1, random.randint(0, ticks(LONGEST_WAIT))))
             if world.setup.learned is not None:  # what is any time is a window's end
-                later = tuple(random.randint(*map(ticks, WINDOWS)) for _ in later)
-            return action, now, now + random.choice(later)
+                later = random.randint(*map(ticks, WINDOWS))
+            return action, now, now + later
     return None
 
 
