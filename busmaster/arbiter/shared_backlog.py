@@ -139,12 +139,15 @@ class SharedBacklog(Backlog):
         if self._payer is not None:
             turns, client = self._payer
             turns.charge(client, now - self._since)
+        self._begin_hold()
+        self._since = now
+
+    def _begin_hold(self) -> None:
         last = self._last
         if last is not None and last.attempts > self._attempts:
             hold = last.client
             if isinstance(hold, Hold) and not (hold.holds or hold.over):
                 self._hold_for(hold, last.priority)
-        self._since = now
 
     def _hold_for(self, hold: Hold, priority: Priority) -> None:
         hold.priority = priority
@@ -198,5 +201,6 @@ class SharedBacklog(Backlog):
         empty = Backlog()
         empty.queues = new_queues()
         self._begin(empty)
+        self._begin_hold()  # before what is known of the request that has left is forgotten
         self._payer = self._last = None
         return drained

@@ -8,8 +8,9 @@ from random import Random
 
 import pytest
 
-from busmaster.arbiter.alike import LONGEST_STEADY
+from busmaster.arbiter.alike import LONGEST_STEADY, Alike
 from busmaster.arbiter.transaction import Transaction
+from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import TAU, Bench, reply_of, up
 
 REQUEST = 8 * TAU
@@ -175,3 +176,14 @@ def test_r15_a_node_that_has_just_become_slower_is_checked_before_its_times_are_
 def test_r15_a_line_that_was_steady_is_found_out_at_once() -> None:
     line = Saturated(KINDS["one"], twice=(70, 0.0009)).run(200)
     assert 0 < len(line.wrong) <= 3
+
+
+def test_a_byte_from_before_the_request_says_nothing_of_the_time_that_a_node_usually_takes() -> None:
+    bench = Bench(paced=True)
+    node = up(bench)
+    node.usual = None
+    alike = Alike(bench.arbiter._wire)
+    alike.node = node
+    bench.arbiter._leg.end = 1.0
+    assert not alike.another(hcp2.Read(1).open(1, hcp2.PROFILE.timings), 0.99, 1.0)
+    assert node.usual is None

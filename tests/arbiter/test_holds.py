@@ -308,6 +308,22 @@ def test_r8_a_lost_line_ends_what_waits_of_a_sequence_and_what_waits_for_it() ->
     assert bench.served(bench.ask(table.there)).error is None
 
 
+def test_r9_a_sequence_has_begun_with_the_request_that_left_though_the_line_is_lost_before_it_is_answered() -> None:
+    table = Table()
+    bench, hold = table.bench, table.hold(longest=5.0)
+    bench.ask(table.node, WRITE, client=hold)
+    bench.until_sent()
+    bench.sent()
+    table.arbiter.line_down("pulled out", bench.now)
+    table.arbiter.line_up(bench.now)
+    other, confirms = bench.ask(table.node), bench.ask(table.node, hcp2.Read(2), client=hold)
+    bench.served(confirms)
+    assert table.is_silent()
+    assert other.attempts == 0
+    table.release(hold)
+    bench.served(other)
+
+
 @pytest.mark.parametrize("begins_with", [WRITE, hcp2.Read(1)])
 def test_r7_a_sequence_does_not_overtake_an_earlier_write_of_its_program_to_the_node(
     begins_with: hcp2.Write | hcp2.Read,

@@ -153,6 +153,17 @@ def test_r15_an_ack_and_the_replies_behind_it_pay_what_is_owed(behind: list[int]
     assert in_step.debts == []
 
 
+@pytest.mark.parametrize("behind", ["", "FF"])
+def test_r15_of_several_who_pay_at_once_the_first_is_told(behind: str) -> None:
+    in_step, bench = InStep(), Bench()
+    first, second = up(bench, 1), up(bench, 2)
+    in_step.owe((bytes.fromhex(ACK),), first, 0.0, 0.15)
+    in_step.owe((bytes.fromhex(reply_of(2, 5)),), second, 0.0, 0.15)
+    payer = in_step.heard(bytes.fromhex(ACK + reply_of(2, 5) + behind), 1.0)
+    assert payer is not None
+    assert payer.node is first
+
+
 @pytest.mark.parametrize("bytewise", [False, True])
 def test_r15_a_debt_is_paid_by_its_own_reply_in_place_of_another(bytewise: bool) -> None:
     bench = Bench()

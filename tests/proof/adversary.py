@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf
 from typing import cast
 
-from busmaster.arbiter.state import OFFLINE, SETTLING
+from busmaster.arbiter.state import OFFLINE, READY, SETTLING
 from tests.proof import setups
 from tests.proof.instants import Instant
 from tests.proof.learned_windows import AnyTime
@@ -195,7 +195,8 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
         world.do(action)
     if not world.frozen:
         world.pump()
-    Looked.only[0] = arbiter.state is SETTLING and arbiter._silent_at is settles_until
+    settles_on = arbiter.state is SETTLING and arbiter._silent_at is settles_until
+    Looked.only[0] = settles_on or arbiter.state is READY
 
 
 def _byte(world: World, place: int, what: object) -> None:

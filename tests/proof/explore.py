@@ -72,7 +72,8 @@ class Explorer:
         """Those that need not be, each with a later one that holds it."""
         self._quiet: dict[int, set[int]] = {}
         """Where each comes to where a deadline passes and nothing comes, waits for R15, or leaves. A look at a line
-        that settles is none: the end of the settle stands, and looks are some milliseconds apart."""
+        that settles is none: the end of the settle stands, and looks are some milliseconds apart. Where the line is
+        READY there is nothing more to come to, though it is looked at as long as a straggler may come."""
 
     def run(self, limit: float, violations: int = 8) -> Found:
         """Explore for at most so many seconds of a core, or until so many kinds of violation are found."""

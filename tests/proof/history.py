@@ -127,6 +127,10 @@ def as_test(setup: Setup, calls: Sequence[Call], problem: str) -> str:
         "goes down": "arbiter.line_down('lost', {time})",
         "asks": "arbiter.submit(Transaction(nodes[commands[{detail}][0]], commands[{detail}][1]), {time})",
         "asks urgently": "arbiter.submit(Transaction(nodes[0], commands[{detail}][1], URGENT), {time})",
+        "begins": "hold = arbiter.exclusive(nodes[0], None, {longest})",
+        "asks in sequence": "arbiter.submit("
+        "Transaction(nodes[commands[{detail}][0]], commands[{detail}][1], client=hold), {time})",
+        "releases": "arbiter.release(hold, {time})",
         "hears": "arbiter.data_received(bytes.fromhex({words!r}), {time})",
         "hears a damaged byte": "arbiter.byte_marked(Mark.DAMAGED, {time})",
         "is due": "arbiter.handle_timeout(max({time}, arbiter.poll_timeout()), unread={detail})",
@@ -141,7 +145,8 @@ def as_test(setup: Setup, calls: Sequence[Call], problem: str) -> str:
             lines.append(f"    assert arbiter.poll_transmit() is None, {problem!r}")
         else:
             when = round(time + number * JUST, 12)
-            way = ways[what].format(time=when, words=words, detail=detail, paced=setup.paced)
+            given = {"time": when, "words": words, "detail": detail}
+            way = ways[what].format(**given, paced=setup.paced, longest=setup.longest_hold)
             lines.append(f"    {way}")
     return "\n".join(lines)
 

@@ -207,7 +207,7 @@ def _untimed(right: Callable[..., None]) -> Callable[..., None]:
 
 
 class Looked:
-    """Whether the line was only looked at in this step: it settles on, until the same time as before."""
+    """Whether the line was only looked at in this step: it settles on, until the same time as before, or is READY."""
 
     only: ClassVar[list[bool]] = [False]
 
