@@ -8,8 +8,9 @@ from typing import cast
 from busmaster.arbiter.state import OFFLINE, READY, SETTLING
 from tests.proof import setups
 from tests.proof.instants import Instant
+from tests.proof.learned_windows import AnyTime
 from tests.proof.msc_world import MscWorld
-from tests.proof.shipped import AnyTime, Asker, Decided, Looked, Ranks
+from tests.proof.shipped import Asker, Decided, Looked, Ranks
 from tests.proof.wire import SCRIPT, STRAY, Owed, Time
 from tests.proof.world import Action, World
 
@@ -123,6 +124,8 @@ def window(world: World, action: Action) -> tuple[list[Time], list[Time], list[T
         if setup.receive_latency:  # all that an adapter holds is read within the latency of its first byte
             more = 0
         earliest.append(reply.lo + more * world.byte_time)
+        if setup.beyond:  # all of it comes within that: else its end could come when R15 owes it no more
+            more = 0
         (latest if reply.kind == "echo" else before).append(reply.hi + more * reply.gap)
     return _instants(earliest), _instants(latest), _instants(before)
 

@@ -13,10 +13,11 @@ from tests.proof.adversary import act, actions, window
 from tests.proof.forgotten import simplify
 from tests.proof.instants import Bound, Instant, begin_run, instant, noted, set_unit, ticks
 from tests.proof.key import Parts, share
+from tests.proof.learned_windows import AnyTime
 from tests.proof.msc_world import MscWorld
 from tests.proof.setups import Setup
 from tests.proof.sharing_world import SharingWorld
-from tests.proof.shipped import AnyTime, Looked, set_aside
+from tests.proof.shipped import Looked, set_aside
 from tests.proof.wire import SCRIPT, Outside, Violation
 from tests.proof.world import Action, World
 from tests.proof.zones import (

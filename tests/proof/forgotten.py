@@ -107,7 +107,7 @@ def past_legs(view: View) -> None:
     arbiter, leg = world.arbiter, world.arbiter._leg
     is_moved = world.setup.may(setups.HELD) or world.setup.may(setups.FROZEN)  # what has been said leaves later
     is_unsaid = bool(world.held or arbiter._wire.output.held or world.frozen)
-    leg.first_bytes = b""  # read only where a node's times are learned, which none of these worlds has
+    leg.first_bytes = b""  # read only by what learns from them: see shipped.py
     if view.past(leg.taint_until):
         leg.taint_until = -inf
     if arbiter.state is not EXCHANGE:
@@ -235,11 +235,12 @@ def past_nodes(view: View) -> None:
     if all(_ordered(view, a.last_reply, b.last_reply) for a in replied for b in replied):
         for rank, node in enumerate(replied):
             node.last_reply = past(rank, 0)  # type: ignore[assignment]  # a rank in place of a time
+    unheard = SILENT if world.setup.learned is None else in_step.MOST_UNHEARD + 1
     for node in world.nodes:
         node.failed_at = node.up_since = -inf
         node.probe_at = inf
         node.lateness_until = inf  # an hour: coming down again is left out
-        node.unheard = min(node.unheard, SILENT) if world.setup.in_step else 0  # only R15 asks
+        node.unheard = min(node.unheard, unheard) if world.setup.in_step else 0  # only R15 asks
         node.replies = 0
 
 
@@ -271,6 +272,16 @@ def past_debts(view: View) -> None:
         book._doubt_until = -inf
     while book._said and view.past(book._said[0][1], in_step.SAID_MEMORY, strictly=True):
         book._said.popleft()
+
+
+def past_holds_back(view: View) -> None:
+    """Of when the first request went before one that is held back is asked whether it is a lateness ago; it is set anew
+    before that where none has gone. When the last byte came is set before it is asked."""
+    choice = view.world.arbiter._choice
+    choice._last_byte = -inf
+    lateness = max(node.lateness for node in view.world.nodes)
+    if not choice._gone_before or view.past(choice._held_since, lateness):
+        choice._held_since = -inf
 
 
 def past_waiting(view: View) -> None:
@@ -327,13 +338,18 @@ def _past_turns(view: View, backlog: SharedBacklog, ranks: dict[LineClient, int]
         turns._turns = OrderedDict((turn.client, turn) for turn in sorted(kept, key=lambda turn: ranks[turn.client]))
 
 
+def past_replies(view: View) -> None:
+    """A reply that is too late never comes: those behind it, where they keep their order, may."""
+    view.world.owed = [reply for reply in view.world.owed if not view.past(reply.hi)]
+
+
 def past_wire(view: View) -> None:
-    """The adversary's own state: a reply that is too late never comes; what was heard is judged within its exchange;
-    what an attempt was to be answered with, while it is on the wire."""
+    """The adversary's own state: what was heard is judged within its exchange; what an attempt was to be answered with,
+    while it is on the wire; when a reply may come, until it may."""
     world = view.world
-    world.owed = [reply for reply in world.owed if not view.past(reply.hi)]
     for reply in world.owed:
-        if view.past(reply.lo):
+        lasts = (len(reply.data) - 1) * world.byte_time if world.setup.whole else 0.0
+        if view.past(reply.lo, lasts):
             reply.lo = -inf
     if not world.words_are_read:
         _past_words(world)
@@ -376,7 +392,9 @@ FORGOTTEN: list[Callable[[View], None]] = [
     past_requests,
     past_nodes,
     past_debts,
+    past_holds_back,
     past_waiting,
+    past_replies,
     past_wire,
 ]
 

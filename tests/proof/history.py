@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from tests.proof.adversary import act, actions, window
 from tests.proof.explore import Step, constrained, prepare, split, world_of
-from tests.proof.forgotten import past_waiting, simplify
+from tests.proof.forgotten import past_replies, past_waiting, simplify
 from tests.proof.instants import begin_run, instant, noted, seconds
 from tests.proof.key import Parts
 from tests.proof.setups import Setup
@@ -71,7 +71,7 @@ def _endings(parts: Parts, key: bytes, zone: Zone, steps: Sequence[Step], proble
             except Violation as violation:
                 what = str(violation)
             except Outside:
-                continue
+                what = "outside"
             decided, others = split(piece, noted)
             pieces += others
             last = done == len(steps) - 1
@@ -82,7 +82,7 @@ def _endings(parts: Parts, key: bytes, zone: Zone, steps: Sequence[Step], proble
 
 
 def _saved(parts: Parts, zone: Zone) -> tuple[bytes, Zone]:
-    simplify(parts.world, zone, [past_waiting])
+    simplify(parts.world, zone, [past_waiting, past_replies])
     return parts.save(zone, exact=True)
 
 

@@ -126,6 +126,8 @@ class Instant:
             raise TypeError(f"{self!r} and {other!r} have no sum that a zone can tell")
         if other == inf or other == -inf:
             return other
+        if not isinstance(other, (int, float)):
+            return NotImplemented
         return instant(self.base, self.offset + ticks(other))
 
     __radd__ = __add__
@@ -172,6 +174,8 @@ class Span:
         return False
 
     def __gt__(self, other: float) -> bool:
+        if not isinstance(other, (int, float)):
+            return NotImplemented
         if other in (inf, -inf):
             return other == -inf
         limit = ticks(other) - self.offset

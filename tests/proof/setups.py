@@ -104,7 +104,8 @@ class Setup:
     bits: tuple[int, ...] = tuple(range(8))
     stall: float = 0.030
     beyond: float = 0.0
-    """Seconds after its request within which a reply comes, where that is later than its lateness."""
+    """Seconds after its request within which all of a reply comes, where the line may have gone on before: later than
+    its lateness, or than a learned window."""
     lapse: float = 0.4
     """In place of LAPSE: fewer debts at a time."""
     alike: int = 2
@@ -115,6 +116,8 @@ class Setup:
     """In place of SAID_MEMORY."""
     slowest: tuple[float, ...] = (0.0,)
     """What a node's slowest reply may be known to be, each time that it is asked for; 0 if it was never timed."""
+    learned: tuple[float, float] | None = None
+    """The least and the longest window that may have been learned of a node's replies: any between them is awaited."""
     lost_acknowledgements: int = 0
     """Of an MSC's packets: how many closing ACKs of the host are lost in an exchange."""
     retransmissions: int = 1
@@ -148,7 +151,9 @@ class Setup:
         if not self.assumptions.held_until_asked:
             parts.append("let go unseen")
         if self.slowest != (0.0,):
-            parts.append("learned")
+            parts.append("replies timed")
+        if self.learned is not None:
+            parts.append("learned windows")
         if self.lost_acknowledgements:
             parts.append(f"lost ACKs {self.lost_acknowledgements}")
         parts += ["cuts"] if self.cuts else []

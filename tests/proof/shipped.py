@@ -2,6 +2,7 @@
 
 - Counters and histograms: nothing that is decided depends on them. They do arithmetic that no zone can tell.
 - How long a node's replies take, as it is learned: `NodeRecord.latest` may say whatever the world names.
+- Learned windows: see learned_windows.py.
 - Health and probes: a failure may be held against a node, or not, and a node that is down is probed at any time, or
   asked for a caller's sake, or not. Without HEALTH no failure is held against anybody.
 - How far a straggler raises its node's lateness: to either of two values, or (without RAISED) not at all.
@@ -31,6 +32,7 @@ from busmaster.arbiter.transaction import Transaction
 from busmaster.arbiter.turns import Turns
 from busmaster.arbiter.unasked import LONGEST_LATENESS, STRAGGLER_MEMORY, STRAGGLER_SHARE, UnaskedBytes
 from busmaster.contract.exchange import Command
+from tests.proof.learned_windows import AnyTime, learned_windows
 from tests.proof.setups import HEALTH, HOLDS, NOISE, RAISED, Setup
 from tests.proof.wire import choose
 
@@ -140,15 +142,6 @@ class AnyStep:
     """Whether an answer may be held until another could have come."""
 
 
-class AnyTime:
-    """Stands for the time until which the line is held back."""
-
-    at: ClassVar[list[float]] = [0.0]
-    """Any time from now on, of the run."""
-    chosen: ClassVar[list[bool]] = [False]
-    """It was waited for in this step."""
-
-
 ANY_STEP = AnyStep()
 
 
@@ -186,7 +179,10 @@ def set_aside(setup: Setup) -> Iterator[None]:
     put(alike, "LONGEST_STEADY", setup.alike + 1)
     put(alike.Alike, "_was_untimely", _may_be_untimely)
     put(NodeRecord, "note_reply", _untimed(NodeRecord.note_reply) if setup.in_step else _notes_nothing)
-    put(NodeRecord, "latest", _as_learned(NodeRecord.latest, setup.slowest))
+    put(NodeRecord, "latest", _as_learned(NodeRecord.latest, setup))
+    if setup.learned is not None:
+        for owner, name, stand_in in learned_windows(setup):
+            put(owner, name, stand_in)
     put(UnaskedBytes, "blame", _may_raise if setup.may(RAISED) else _raises_nothing)
     if not setup.may(RAISED):
         put(UnaskedBytes, "unanswered", _blames_nobody)
@@ -311,8 +307,12 @@ def _notes_nothing(*arguments: Any) -> None:
     """Which reads are asked to prove that the line is in step is for the world to say."""
 
 
-def _as_learned(right: Callable[[NodeRecord, float], float], slowest: tuple[float, ...]) -> Callable[..., float]:
+def _as_learned(right: Callable[[NodeRecord, float], float], setup: Setup) -> Callable[..., float]:
+    slowest = setup.slowest
+
     def latest(node: NodeRecord, unknown: float) -> float:
+        if setup.learned is not None:
+            return setup.learned[choose(2)]
         node.slowest = slowest[choose(len(slowest))]
         said = right(node, unknown)
         node.slowest = 0.0

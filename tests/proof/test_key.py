@@ -30,6 +30,7 @@ from tests.proof.setups import (
     Setup,
 )
 from tests.proof.twins import Differs, walk
+from tests.proof.worlds import LEARNED
 
 HCP2 = Setup(commands=(READ, WRITE), adversary=(STRAYS, LOST, CANCELS, LOSS))
 PACED = replace(HCP2, paced=True, adversary=(STRAYS, NAKS), retries=1)
@@ -40,6 +41,7 @@ HOLDS = replace(HCP2, adversary=(HELD, STRAYS))
 DIES = replace(HCP2, commands=(READ, WRITE_THERE), adversary=(HEALTH, URGENT, LOST, NAKS))
 MSC = replace(HCP2, kind="msc", lapse=2.5, adversary=(STRAYS, FLIPS), lost_acknowledgements=1)
 OWES = replace(HCP2, in_step=True, adversary=(BEYOND, NAKS), beyond=0.3)
+LEARNS = replace(OWES, adversary=(), beyond=0.15, lapse=0.2, retries=1, whole=True, learned=LEARNED)
 SHARED = replace(QUEUES, clients=1, adversary=(URGENT, CANCELS, LOST))
 SEQUENCES = replace(HCP2, clients=1, longest_hold=0.3, adversary=(URGENT, CANCELS, LOST), retries=1)
 EVERY = {"hcp2": HCP2, "paced": PACED, "echo": ECHOES, "late": LATE, "queues": QUEUES, "held": HOLDS, "msc": MSC}
@@ -48,7 +50,7 @@ WALKS = 40
 pytestmark = pytest.mark.timeout(300)
 
 
-@pytest.mark.parametrize("setup", [*EVERY.values(), OWES], ids=[*EVERY, "owes"])
+@pytest.mark.parametrize("setup", [*EVERY.values(), OWES, LEARNS], ids=[*EVERY, "owes", "learns"])
 def test_a_world_that_was_restored_from_its_key_has_the_same_fate(setup: Setup) -> None:
     assert sum(walk(setup, seed) for seed in range(WALKS)) > WALKS
 
@@ -111,6 +113,11 @@ def without_debts(view: View) -> None:
     del view.world.arbiter._in_step.debts[1:]
 
 
+def without_what_is_awaited(view: View) -> None:
+    for debt in view.world.arbiter._in_step.debts:
+        debt.awaited = None
+
+
 def without_lapse(view: View) -> None:
     for debt in view.world.arbiter._in_step.debts:
         debt.asked = inf
@@ -153,6 +160,7 @@ def without_when_it_began(view: View) -> None:
         (without_doubt, HCP2),
         (without_debts, OWES),
         (without_lapse, OWES),
+        (without_what_is_awaited, LEARNS),
         (without_what_is_held, HOLDS),
         (without_what_is_being_said, MSC),
         (without_what_began, SEQUENCES),

@@ -11,6 +11,7 @@ import pytest
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.dispatcher import Dispatcher
+from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.leg import Leg
 from busmaster.arbiter.line_machine import LineMachine
 from busmaster.arbiter.on_wire import OnWire
@@ -49,6 +50,7 @@ from tests.proof.setups import (
     Assumptions,
     Setup,
 )
+from tests.proof.worlds import LEARNED
 
 LIMIT = 300.0
 """Seconds: a few of an idle core, and a busy one is ten times slower."""
@@ -56,6 +58,7 @@ pytestmark = pytest.mark.timeout(LIMIT + 30)
 LINE = Setup(commands=(READ, WRITE))
 MSC = Setup(kind="msc", commands=(READ,), lapse=2.5)
 LATE = replace(LINE, receive_latency=0.016)
+LEARNS = Setup(commands=(READ,), in_step=True, whole=True, lapse=0.2, beyond=0.15, retries=1, learned=LEARNED)
 SEQUENCES = replace(LINE, commands=(READ,), longest_hold=0.3)
 TURNS = replace(LINE, commands=(READ, WRITE_THERE), second_timing=True)
 
@@ -298,6 +301,17 @@ def with_what_a_sequence_leaves_behind(patch: Any) -> None:
     patch.setattr(Dispatcher, "end_hold", end_hold)
 
 
+def without_what_is_owed(patch: Any) -> None:
+    """Nothing is in the way of what could be an earlier request's answer, as where learned windows had no R15."""
+    patch.setattr(InStep, "owe", lambda in_step, *arguments: None)
+
+
+def with_a_last_attempt_that_is_not_waited_for(patch: Any) -> None:
+    """Nobody waits until what is owed is late: what is forgiven then may come all the same."""
+    patch.setattr(InStep, "awaited_until", lambda in_step, last_byte, answers=None: -inf)
+    patch.setattr(InStep, "over", lambda in_step, answers: -inf)
+
+
 @pytest.mark.parametrize(
     ("plant", "setup", "rule"),
     [
@@ -333,6 +347,8 @@ def with_what_a_sequence_leaves_behind(patch: Any) -> None:
         (without_sequences, SEQUENCES, "R9"),
         (with_a_sequence_that_never_ends, SEQUENCES, "progress"),
         (with_what_a_sequence_leaves_behind, SEQUENCES, "R8"),
+        (without_what_is_owed, LEARNS, "R3"),
+        (with_a_last_attempt_that_is_not_waited_for, LEARNS, "R3"),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )

@@ -26,6 +26,8 @@ TWIN_EVERY = 4
 TWINS = 3
 LONGEST_WAIT = 0.4
 """Seconds, where nothing bounds a wait."""
+WINDOWS = (0.0075, 0.1)
+"""Seconds in which a learned window may end, behind a request that begins now."""
 
 
 class Differs(AssertionError):
@@ -94,7 +96,10 @@ def _choose(world: World, random: Random) -> tuple[Action, int, int] | None:
         if low <= high:
             edges = [low, min(low + 1, high), max(high - 1, low), high, random.randint(low, high)]
             now = random.choice(edges)
-            return action, now, now + random.choice((0, 1, random.randint(0, ticks(LONGEST_WAIT))))
+            later = random.choice((0, 1, random.randint(0, ticks(LONGEST_WAIT))))
+            if world.setup.learned is not None:  # what is any time is a window's end
+                later = random.randint(*map(ticks, WINDOWS))
+            return action, now, now + later
     return None
 
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, TypeAlias
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.health import DOWN
+from busmaster.arbiter.learned import Learning
 from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.state import EXCHANGE, OFFLINE
 from busmaster.arbiter.transaction import PARKED, URGENT, Transaction
@@ -72,6 +73,7 @@ class World:
             timings = Timings.uniform(SECOND_TIMING) if setup.second_timing and place else None
             address = place + 1 if profile.addressed else 0
             node = arbiter.add_node(profile, address, 0.0, timings=timings, retries=setup.retries)
+            node.learning = Learning() if setup.learned is not None else None
             node.counters = NO_COUNTERS  # type: ignore[assignment]  # a stand-in that counts nothing
         self.nodes = tuple(arbiter.dispatcher.nodes)
         self.now = now
@@ -339,7 +341,10 @@ class World:
     def leaves(self, out: bytes, ticket: Ticket | None, end: Time) -> None:
         """The last byte of it is on the wire at `end`: from there its node has the lateness."""
         assumed, byte_time = self.setup.assumptions, self.byte_time
-        timing = self.arbiter._leg.timing
+        timing, transaction = self.arbiter._leg.timing, self.arbiter._wire.transaction
+        if timing.silence is not None and transaction is not None:  # what is learned of a node binds it to nothing
+            timings = transaction.node.timings
+            timing = timings.write if transaction.writes else timings.read
         answers = [self.kind.answer(out, place) for place in range(2)]
         place = choose(2) if ticket is not None and answers[0] != answers[1] else 0
         if ticket is not None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
 
+from busmaster.arbiter.learned import LEAST
 from tests.proof.kinds import READ, READ_THERE, READ_UNLIKE, WRITE, WRITE_THERE
 from tests.proof.setups import (
     ALL,
@@ -35,6 +36,8 @@ from tests.proof.setups import (
 
 LAPSES = {"dc104": 1.5, "mentor": 0.8, "msc": 2.5}
 """In place of LAPSE: longer than the longest lateness."""
+LEARNED = (LEAST, 0.1)
+"""Seconds: the least window that is ever learned, and the document's."""
 DAMAGE: tuple[tuple[int, int | None], ...] = ((0, 0), (1, 1), (3, 0), (6, 5), (13, 0), (17, 0), (9, None))
 """Of an MSC's packet of 18 bytes: STX, unit, length, name, data and checksum hit, and a byte lost."""
 
@@ -130,9 +133,13 @@ def msc_pairs() -> Iterator[Setup]:
 
 
 def in_step() -> Iterator[Setup]:
-    """What is owed told by the shipping code, and replies that come after their lateness, in order (R15)."""
+    """What is owed told by the shipping code, and replies that come after their lateness, in order (R15); or within it,
+    where the line goes on after a learned window."""
     for commands in ((READ,), (WRITE,), (READ, READ_UNLIKE), (READ, WRITE), (READ, READ_THERE)):
-        yield replace(_line("hcp2", BEYOND, commands=commands), in_step=True, whole=True, lapse=0.25, beyond=0.24)
+        one = replace(_line("hcp2", BEYOND, commands=commands), in_step=True, whole=True, lapse=0.25, beyond=0.24)
+        yield one
+        if READ in commands:  # where nothing is repeated, nothing is awaited for a learned time
+            yield replace(one, adversary=(), retries=1, learned=LEARNED, lapse=0.2, beyond=0.15)
 
 
 GROUPS = {
