@@ -157,13 +157,14 @@ def test_a_babbling_line_is_not_listened_to_without_end() -> None:
         exchange.feed(b"\xaa")
 
 
-def test_a_packet_that_is_longer_than_any_may_be_is_another_format_if_its_check_is_right() -> None:
-    what = "249 bytes came, right in their check but of another format: 241 bytes of data where 240 are the most"
+@pytest.mark.parametrize("data", [241, 255])
+def test_a_packet_that_is_longer_than_any_may_be_is_another_format_if_its_check_is_right(data: int) -> None:
+    of_another_format = f"right in their check but of another format: {data} bytes of data where 240 are the most"
     for chunk in (1, 99, 999):
         exchange = acked()
         with pytest.raises(FrameError) as error:
-            feed_in_chunks(exchange, packet(1, b"DREAD," + bytes(235)), chunk)
-        assert error.value.what == what
+            feed_in_chunks(exchange, packet(1, b"DREAD," + bytes(data - 6)), chunk)
+        assert error.value.what == f"{data + 8} bytes came, {of_another_format}"
         assert (error.value.hint, error.value.send, error.value.whole) == (OTHER_FORMAT, ACK, False)
 
 
