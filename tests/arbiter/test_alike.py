@@ -187,3 +187,11 @@ def test_a_byte_from_before_the_request_says_nothing_of_the_time_that_a_node_usu
     bench.arbiter._leg.end = 1.0
     assert not alike.another(hcp2.Read(1).open(1, hcp2.PROFILE.timings), 0.99, 1.0)
     assert node.usual is None
+
+
+def test_a_pause_in_which_an_answer_too_many_would_have_come_begins_the_count_anew() -> None:
+    bench = Bench()
+    alike = Alike(bench.arbiter._wire)
+    alike.count = 7
+    assert not alike.another(hcp2.Read(1).open(1, hcp2.PROFILE.timings), 0.0, 1.0)
+    assert alike.count == 0

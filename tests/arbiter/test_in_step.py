@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.health import SILENT, NodeRecord
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.transaction import Priority, Transaction
@@ -151,6 +152,17 @@ def test_r15_an_ack_and_the_replies_behind_it_pay_what_is_owed(behind: list[int]
     assert payer is not None
     assert payer.node is node
     assert in_step.debts == []
+
+
+def test_r15_what_is_unlike_the_last_answers_was_not_said_twice() -> None:
+    in_step = InStep()
+    in_step.last = (bytes.fromhex(reply_of(1, 5)),)
+    assert in_step.heard(bytes.fromhex(reply_of(2, 7)), 1.0) is None
+    assert len(in_step.debts) == 1, "more of it may come"
+
+
+def test_r15_a_line_is_not_strict_unless_it_is_to_be() -> None:
+    assert not Arbiter(TAU)._in_step.alert
 
 
 @pytest.mark.parametrize("behind", ["", "FF"])
