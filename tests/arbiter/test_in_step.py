@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.health import SILENT, NodeRecord
 from busmaster.arbiter.in_step import InStep
 from busmaster.arbiter.transaction import Priority, Transaction
@@ -152,28 +151,6 @@ def test_r15_an_ack_and_the_replies_behind_it_pay_what_is_owed(behind: list[int]
     assert payer is not None
     assert payer.node is node
     assert in_step.debts == []
-
-
-def test_r15_what_is_unlike_the_last_answers_was_not_said_twice() -> None:
-    in_step = InStep()
-    in_step.last = (bytes.fromhex(reply_of(1, 5)),)
-    assert in_step.heard(bytes.fromhex(reply_of(2, 7)), 1.0) is None
-    assert len(in_step.debts) == 1, "more of it may come"
-
-
-def test_r15_a_line_is_not_strict_unless_it_is_to_be() -> None:
-    assert not Arbiter(TAU)._in_step.alert
-
-
-@pytest.mark.parametrize("behind", ["", "FF"])
-def test_r15_of_several_who_pay_at_once_the_first_is_told(behind: str) -> None:
-    in_step, bench = InStep(), Bench()
-    first, second = up(bench, 1), up(bench, 2)
-    in_step.owe((bytes.fromhex(ACK),), first, 0.0, 0.15)
-    in_step.owe((bytes.fromhex(reply_of(2, 5)),), second, 0.0, 0.15)
-    payer = in_step.heard(bytes.fromhex(ACK + reply_of(2, 5) + behind), 1.0)
-    assert payer is not None
-    assert payer.node is first
 
 
 @pytest.mark.parametrize("bytewise", [False, True])

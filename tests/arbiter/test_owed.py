@@ -6,13 +6,14 @@ from math import inf
 
 import pytest
 
+from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.health import SILENT, NodeRecord
 from busmaster.arbiter.in_step import ANY_BYTE, LAPSE, Awaited, InStep
 from busmaster.contract.profile import Profile
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import BAD_CHECKSUM, FIVE
+from tests.arbiter.bench import ACK, BAD_CHECKSUM, FIVE, TAU, Bench, reply_of, up
 
 ONE, TWO = b"\x0201", b"\x0202"
 """What replies of elements 1 and 2 begin with."""
@@ -108,3 +109,25 @@ def test_r15_a_forgiven_reply_that_comes_after_all_was_not_said_twice_and_is_dou
     assert in_step.heard(b"\x06", 2.0) is None
     assert (in_step.doubts(2.0), in_step.debts) == (False, [])
     assert not in_step.is_doubtful((b"\x06",), 2.0)
+
+
+def test_r15_what_is_unlike_the_last_answers_was_not_said_twice() -> None:
+    in_step = InStep()
+    in_step.last = (bytes.fromhex(reply_of(1, 5)),)
+    assert in_step.heard(bytes.fromhex(reply_of(2, 7)), 1.0) is None
+    assert len(in_step.debts) == 1, "more of it may come"
+
+
+def test_r15_a_line_is_not_strict_unless_it_is_to_be() -> None:
+    assert not Arbiter(TAU)._in_step.alert
+
+
+@pytest.mark.parametrize("behind", ["", "FF"])
+def test_r15_of_several_who_pay_at_once_the_first_is_told(behind: str) -> None:
+    in_step, bench = InStep(), Bench()
+    first, second = up(bench, 1), up(bench, 2)
+    in_step.owe((bytes.fromhex(ACK),), first, 0.0, 0.15)
+    in_step.owe((bytes.fromhex(reply_of(2, 5)),), second, 0.0, 0.15)
+    payer = in_step.heard(bytes.fromhex(ACK + reply_of(2, 5) + behind), 1.0)
+    assert payer is not None
+    assert payer.node is first

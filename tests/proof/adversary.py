@@ -136,15 +136,7 @@ def _instants(times: list[Time]) -> list[Instant]:
 
 def act(world: World, action: Action, now: Instant, later: Instant, script: tuple[int, ...]) -> None:
     """Let it happen now; `later` is any time from now on. Raises Violation, or Outside."""
-    Decided.by_answer[0] = AnyTime.chosen[0] = False
-    Asker.ask[0] = world.ask_one
-    Asker.saturated[0] = world.is_saturated
-    Ranks.of = world.ranks
-    AnyTime.at[0] = cast("float", later)
-    world.now = now
-    world.said = b""
-    world.ended = []
-    SCRIPT.begin(script)
+    _begin(world, now, later, script)
     arbiter, what = world.arbiter, action[0]
     settles_until: Time = arbiter._silent_at if arbiter.state is SETTLING else None
     if what == "timer":
@@ -197,6 +189,18 @@ def act(world: World, action: Action, now: Instant, later: Instant, script: tupl
         world.pump()
     settles_on = arbiter.state is SETTLING and arbiter._silent_at is settles_until
     Looked.only[0] = settles_on or arbiter.state is READY
+
+
+def _begin(world: World, now: Instant, later: Instant, script: tuple[int, ...]) -> None:
+    Decided.by_answer[0] = AnyTime.chosen[0] = False
+    Asker.ask[0] = world.ask_one
+    Asker.saturated[0] = world.is_saturated
+    Ranks.of = world.ranks
+    AnyTime.at[0] = cast("float", later)
+    world.now = now
+    world.said = b""
+    world.ended = []
+    SCRIPT.begin(script)
 
 
 def _byte(world: World, place: int, what: object) -> None:
