@@ -22,6 +22,7 @@ FURTHER = (
     "tests/config",
     "tests/emulator",
     "tests/planning",
+    "tests/service",
     "tests/campaigns",
     "tests/proof",
 )
