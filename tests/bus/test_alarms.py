@@ -142,3 +142,35 @@ def test_a_node_that_is_away_keeps_its_alarm_until_it_says_otherwise() -> None:
         assert bus.alarms[speed] is began
 
     on_a_bus(story, device)
+
+
+def test_an_alarm_goes_on_while_other_points_of_its_group_come_and_go() -> None:
+    async def story(bus: Bus) -> None:
+        drive = Hcp2Controller(bus, 1)
+        speed, other = replace(drive.point("10"), meaning=LIMITS), drive.point("11")
+        await drive.write(10, 30)
+        group = bus.poll_group("axes", period=0.1, points=[speed])
+        await cycles(group, 1)
+        began, events = bus.alarms[speed], bus.events()
+        assert began is not None
+        group.add(other)
+        assert bus.alarms[speed] is began
+        await cycles(group, 2)
+        group.remove(other)
+        await cycles(group, 2)
+        assert bus.alarms[speed] is began
+        events.close()
+        assert [event async for event in events if isinstance(event, AlarmChanged)] == []
+
+    on_a_bus(story)
+
+
+def test_each_of_several_overheard_values_may_begin_an_alarm() -> None:
+    async def story(bus: Bus) -> None:
+        drive = Hcp2Controller(bus, 1)
+        speeds = [replace(drive.point(item), meaning=LIMITS) for item in ("10", "11", "12")]
+        [sample] = samples(30.0).values()
+        bus.overheard(dict.fromkeys((*speeds, drive.point("13")), sample))
+        assert {point for point, alarm in bus.alarms.items() if alarm is not None} == set(speeds)
+
+    on_a_bus(story)

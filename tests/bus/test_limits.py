@@ -221,6 +221,58 @@ async def test_a_step_counts_from_what_is_read_where_the_write_before_may_have_b
 
 
 @in_virtual_time
+async def test_a_step_counts_from_what_is_read_where_the_writer_before_was_cancelled() -> None:
+    async with controller() as drive:
+        drive.element(10).limit(max_step=20)
+        await drive.write(10, 20)
+        writing = asyncio.ensure_future(drive.write(10, 40))
+        await asyncio.sleep(0.001)  # it is on the wire
+        writing.cancel()
+        await asyncio.gather(writing, return_exceptions=True)
+        await drive.write(10, 60)
+        assert await drive.read(10) == 60
+
+
+@in_virtual_time
+async def test_a_step_counts_from_what_is_read_after_a_stop() -> None:
+    async with bus_of(MicroFlexDrive, make_device("microflex", 7)) as bus:
+        drive = MicroFlexDrive(bus, 7)
+        drive.command_word.limit(max_step=5)
+        await drive.write("command_word", 3)
+        await drive.disable()
+        with pytest.raises(InvalidCommand, match="8 is too far from 0"):
+            await drive.write("command_word", 8)
+
+
+@in_virtual_time
+async def test_a_limit_that_is_set_while_a_write_waits_for_its_step_holds_it() -> None:
+    async with controller() as drive:
+        drive.element(10).limit(max_step=20)
+        waiting = asyncio.ensure_future(drive.write(10, 20))
+        await asyncio.sleep(0)  # it reads the value before it
+        drive.element(10).limit(maximum=10)
+        with pytest.raises(InvalidCommand, match="maximum of 10"):
+            await waiting
+        assert await drive.read(10) == 0
+
+
+@in_virtual_time
+async def test_a_limit_that_is_lifted_and_held_again_reads_the_value_it_steps_from() -> None:
+    device = make_device("hcp2", 5)
+    async with bus_of(Hcp2Controller, device) as bus:
+        drive = Hcp2Controller(bus, 5)
+        drive.element(10).limit(max_step=20)
+        await drive.write(10, 20)
+        [limit] = Node.of(drive).limits
+        Node.of(drive).lift(limit)
+        assert Node.of(drive).limits == ()
+        await drive.write(10, 100)
+        Node.of(drive).limit(limit)
+        with pytest.raises(InvalidCommand, match="30 is too far from 100"):
+            await drive.write(10, 30)
+
+
+@in_virtual_time
 async def test_a_step_counts_from_what_is_read_where_the_node_was_away() -> None:
     device = make_device("hcp2", 5)
     async with bus_of(Hcp2Controller, device) as bus:

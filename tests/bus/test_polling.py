@@ -93,6 +93,37 @@ def test_a_pause_and_a_demand() -> None:
     on_a_bus(story)
 
 
+def test_a_demand_is_sent_at_once_and_not_with_what_the_line_does_next() -> None:
+    async def story(bus: Bus) -> None:
+        group = bus.poll_group("g", period=1000.0, points=[Hcp2Controller(bus, 1).point("7")])
+        await cycles(group, 1)
+        await asyncio.sleep(1.0)
+        asked = bus.now()
+        group.demand()
+        snapshot = (await cycles(group, 1))[0]
+        assert (snapshot.due, snapshot.started) == (asked, asked)
+
+    on_a_bus(story)
+
+
+def test_a_group_says_whether_it_is_paused_and_a_sample_how_old_it_is() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        group = bus.poll_group("g", period=0.1, points=[point])
+        sample = (await cycles(group, 1))[0][point]
+        assert sample.started is not None
+        assert sample.started < sample.finished
+        assert sample.age(sample.finished) == sample.finished - sample.started
+        assert sample._replace(started=None).age(sample.finished + 1.0) == pytest.approx(1.0)
+        states = [group.paused]
+        for change in (group.pause, group.resume):
+            change()
+            states.append(group.paused)
+        assert states == [False, True, False]
+
+    on_a_bus(story)
+
+
 def test_statistics_say_what_was_asked_and_what_was_had() -> None:
     async def story(bus: Bus) -> None:
         points = [Hcp2Controller(bus, address).point("7") for address in (1, 2)]
@@ -283,6 +314,23 @@ def mscs(values: int = 40, **options: Any) -> tuple[EmulatedMsc, LineSettings]:
     device = EmulatedMsc(3, delay=Delay(0.005), packet_delay=Delay(0.005), **options)
     device.set_value(2000, *range(100, 100 + values))
     return device, LineSettings(9600)
+
+
+def test_of_two_groups_with_a_point_the_younger_sample_serves() -> None:
+    async def story(bus: Bus) -> None:
+        point = Hcp2Controller(bus, 1).point("7")
+        slow = bus.poll_group("slow", period=100.0, points=[point])
+        await cycles(slow, 1)
+        quick = bus.poll_group("quick", period=0.1, points=[point])
+        await asyncio.sleep(1.0)
+        youngest = (await cycles(quick, 1))[0][point]
+        assert Node.of(point).latest(point) == youngest
+        quick.close()
+        slow.demand()
+        youngest = (await cycles(slow, 1))[0][point]
+        assert Node.of(point).latest(point) == youngest
+
+    on_a_bus(story)
 
 
 def test_neighbouring_values_come_in_one_exchange_and_points_stay_what_they_are() -> None:

@@ -212,3 +212,9 @@ def test_a_place_without_a_folder_or_without_learning_is_refused(text: str) -> N
         opened(text.replace("learned.json", "nowhere/learned.json"))
     with pytest.raises(InvalidCommand, match='say timing = "learned" too'):
         opened(text.replace('timing = "learned"\n', ""))
+
+
+def test_it_is_enough_that_one_node_learns(text: str, kept: Path) -> None:
+    one = text.replace('timing = "learned"\n', "").replace("address = 2", 'address = 2\ntiming = "learned"')
+    assert run_for(one, LONG) == {"drive"}
+    assert set(json.loads(kept.read_text())["nodes"]) == {"drive"}

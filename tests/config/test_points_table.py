@@ -76,6 +76,16 @@ other = { item = "11" }
     assert [str(change) for change in more.changes] == ['w/newer is new: { item = "10" }']
 
 
+def test_a_point_of_a_range_of_nodes_is_one_row_of_its_section() -> None:
+    many = HEAD.replace("nodes.w", "nodes.w5-8").replace("address = 5  # of winder 5", 'address = "5-8"')
+    held = read(
+        Source("line.toml", many + '[nodes.w5-8.points]\na = { item = "10", maximum = 1 }\nb = { item = "10" }\n')
+    )
+    assert len(held.nodes) == 4
+    assert [(row.node, row.point, row.limited_by) for row in rows(held)] == [("w5-8", "a", ()), ("w5-8", "b", ("a",))]
+    assert taken(held, "points.csv", points_csv(held)).changes == ()
+
+
 def take(held: LineFile, *lines: str) -> Taking:
     return taken(held, "points.csv", "\n".join(lines).encode())
 

@@ -163,6 +163,8 @@ def test_tokens_that_others_may_read_or_change_are_refused(tmp_path: Path, mode:
 def test_a_token_of_which_the_section_speaks_has_to_be_in_the_file(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"service\.tokens\.hmy: there is no token 'hmy' in "):
         tokens(tmp_path, HMI, roles='tokens.hmy.role = "write"')
+    with pytest.raises(FileError, match=r"service\.tokens\.logger: there is no token 'logger' in "):
+        tokens(tmp_path, HMI, roles='tokens.hmi.role = "write"\ntokens.logger.role = "read"')
     with pytest.raises(FileError, match="cannot be read: No such file"):
         parse(f'{TEXT}[service]\nlisten = "[::1]:7420"\ntoken_file = "{tmp_path}/none"\n').service.secrets()
     with pytest.raises(FileError, match="is no file"):

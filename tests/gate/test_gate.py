@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+import getpass
+import logging
+import os
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from dataclasses import replace
 
 import pytest
 
 from busmaster.bus.bus import Bus
+from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import (
@@ -25,7 +31,7 @@ from busmaster.errors import (
     VerifyFailed,
     WriteUnconfirmed,
 )
-from busmaster.gate.gate import MOST_AT_ONCE, Gate, Wish, outcome_of
+from busmaster.gate.gate import FRESH, MOST_AT_ONCE, Gate, Wish, outcome_of
 from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.modbus.handle import ModbusUnit
@@ -178,3 +184,124 @@ def test_nothing_that_may_have_been_carried_out_is_called_not_started(
     assert outcome_of(error)[0] is outcome
     if isinstance(error, BusError | InvalidCommand):
         assert "x" in outcome_of(error)[1] or isinstance(error, Refused)
+
+
+ABSENT = 9
+LONG = Timings.uniform(ReplyTiming(5.0, 5.0, 5.0, 0.02))
+"""Of a node that is not there: a request to it keeps the line busy for five seconds."""
+
+
+@asynccontextmanager
+async def busy(gate: Gate) -> AsyncIterator[None]:
+    """Keep the line busy for longer than a command is fresh."""
+    holding = asyncio.ensure_future(Hcp2Controller(gate.bus, ABSENT, timings=LONG).read(1, retries=0))
+    await asyncio.sleep(0)
+    yield
+    with pytest.raises(NoReply):
+        await holding
+
+
+def test_writes_that_fail_give_their_places_back() -> None:
+    async def story(gate: Gate, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        absent = Hcp2Controller(gate.bus, ABSENT)
+        for _ in range(MOST_AT_ONCE):
+            await gate.write(wish(absent, 1))
+        refused = Hcp2Controller(gate.bus, 5).point("1")
+        refused.limit(maximum=0)
+        for _ in range(MOST_AT_ONCE):
+            await gate.write(wish(controller, 1))
+        assert not any(record.ok for record in records)
+        assert (await gate.write(wish(controller, 2))).ok
+
+    at_a_gate(story)
+
+
+def test_writes_whose_writers_are_cancelled_give_their_places_back() -> None:
+    async def story(gate: Gate, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        writing = [asyncio.ensure_future(gate.write(wish(controller, 1))) for _ in range(MOST_AT_ONCE)]
+        await asyncio.sleep(0)
+        for one in writing:
+            one.cancel()
+        await asyncio.gather(*writing, return_exceptions=True)
+        assert (await gate.write(wish(controller, 2))).ok
+
+    at_a_gate(story)
+
+
+def test_a_line_that_is_left_or_read_only_lets_no_write_through() -> None:
+    async def story(gate: Gate, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        gate.leaving = True
+        assert (await gate.write(wish(controller, 1))).error == "the line is being left: nothing was sent"
+        gate.leaving, gate.read_only = False, True
+        assert (await gate.write(wish(controller, 1))).error == "this line is read-only"
+        gate.read_only = False
+        assert (await gate.write(wish(controller, 1))).ok
+        outcomes = [record.outcome for record in records]
+        assert outcomes == [Outcome.REFUSED, Outcome.REFUSED, Outcome.WRITTEN]
+
+    at_a_gate(story)
+
+
+def test_a_command_waits_for_the_line_as_long_as_it_is_fresh_and_its_age_counts() -> None:
+    async def story(gate: Gate, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        async with busy(gate):
+            began = gate.bus.now()
+            new, old = (gate.write(replace(wish(controller, 1), arrived=began - age)) for age in (0.0, FRESH / 2))
+            ended = asyncio.ensure_future(old)
+            assert (await new).outcome is Outcome.NOT_STARTED
+            assert gate.bus.now() - began == pytest.approx(FRESH, abs=0.001)
+            assert ended.result().took == pytest.approx(FRESH / 2, abs=0.001)
+            assert ended.result().outcome is Outcome.NOT_STARTED
+        too_old = await gate.write(replace(wish(controller, 1), arrived=gate.bus.now() - FRESH))
+        assert (too_old.outcome, too_old.error) == (Outcome.REFUSED, "it is too old: nothing was sent")
+        assert (await gate.write(replace(wish(controller, 1), arrived=gate.bus.now()))).ok
+
+    at_a_gate(story)
+
+
+def test_a_command_that_says_until_when_it_is_meant_is_held_to_that_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    today = 1_800_000_000.0
+    monkeypatch.setattr(time, "time", lambda: today)
+
+    async def story(gate: Gate, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        old = replace(wish(controller, 1), arrived=gate.bus.now() - 10 * FRESH)
+        assert (await gate.write(replace(old, expires=today + FRESH))).ok
+        assert (await gate.write(replace(old, expires=today))).error == "it is too old: nothing was sent"
+        async with busy(gate):
+            [record] = await asyncio.gather(gate.write(replace(old, expires=today + 2 * FRESH)))
+            assert record.outcome is Outcome.NOT_STARTED
+            assert record.took == pytest.approx(2 * FRESH, abs=0.001)
+
+    at_a_gate(story)
+
+
+def test_the_log_says_how_a_write_ended_and_warns_of_one_that_is_unconfirmed(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "busmaster.audit")
+
+    async def story(gate: Gate, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        began = gate.bus.now()
+        await gate.write(replace(wish(Hcp2Controller(gate.bus, ABSENT), 1), id="a1"))
+        assert records[0].took == gate.bus.now() - began > 0
+        await gate.write(wish(controller, 1))
+        gate.refuse(wish(controller, 1), "no")
+        audit = [record for record in caplog.records if record.name == "busmaster.audit"]
+        assert [record.levelno for record in audit] == [logging.WARNING, logging.INFO, logging.INFO]
+        assert f"unconfirmed in {records[0].took:.3f} s by mqtt a test [a1], " in audit[0].message
+
+    at_a_gate(story)
+
+
+def test_a_user_without_a_name_is_on_record_by_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nameless() -> str:
+        raise KeyError("getpwuid(): uid not found: 12345")
+
+    monkeypatch.setattr(getpass, "getuser", nameless)
+    monkeypatch.setattr(os, "getuid", lambda: 12345)
+
+    async def story(gate: Gate, controller: Hcp2Controller, records: list[WriteRecord]) -> None:
+        await gate.write(wish(controller, 1))
+        assert (records[0].user, records[0].process) == ("12345", os.getpid())
+
+    at_a_gate(story)
