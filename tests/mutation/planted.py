@@ -88,7 +88,7 @@ def section(file: Path) -> str:
         lines.append(f"Chosen {chosen}: {len(those)}, of which {missed} were missed at first.\n")
         lines.append("| bug | file | at first | noticed by |\n|---|---|---|---|")
         for bug in those:
-            tests = "<br>".join(f"`{test.removeprefix('tests/')}`" for test in bug.tests)
+            tests = "<br>".join(f"`{test}`" for test in bug.tests)
             lines.append(f"| {bug.bug} | `{bug.file.removeprefix('busmaster/')}` | {bug.first} | {tests} |")
         lines.append("")
     return "\n".join(lines)
