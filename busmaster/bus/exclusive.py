@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, TypeVar, Unpack
 
@@ -65,6 +65,9 @@ class HeldNode(ABC):
 
     def merge_reads(self, merge: Merge, /) -> None:
         self._node.merge_reads(merge)
+
+    def use_sync_reads(self, probe: Command[Any] | None, sync_reads: Sequence[Command[Any]], /) -> None:
+        self._node.use_sync_reads(probe, sync_reads)
 
     def limit(self, limit: Limit, /) -> None:
         self._node.limit(limit)

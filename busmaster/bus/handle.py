@@ -56,6 +56,18 @@ class Handle(ABC):
     async def write(self, item: Any, value: Any, /, **options: Unpack[WriteOptions]) -> None:
         """Write a value to an item. `RequestOptions` says what the options are."""
 
+    def use_sync_reads(self, *, probe: str | None = None, sync_reads: Sequence[str] = ()) -> None:
+        """Set the probe and the sync reads of the node, by items, where the usual ones do not fit this device.
+
+        The probe is the read that is sent to a node that may be dead. Sync reads are sent where the line must prove
+        that replies match requests: name several cheap items that the device has, whose replies begin differently.
+        What is left out stays as it is. All handles of the node are concerned. Raises InvalidCommand for an item that
+        does not exist, and if another handle has set other ones. On the line of another program it changes nothing.
+        """
+        self.node.use_sync_reads(
+            None if probe is None else self.point(probe).command, [self.point(item).command for item in sync_reads]
+        )
+
     @asynccontextmanager
     async def exclusive(self, *, max_hold: float = 0.5) -> AsyncIterator[Self]:
         """Return, for `async with`, this handle for a sequence of requests: nothing but what is urgent comes between.

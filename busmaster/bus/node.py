@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterable
+from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from math import inf
@@ -79,6 +79,8 @@ class Node:
         self.returning = asyncio.Lock()
         """Held while its hook runs."""
         self._on_return: Callable[[Node], Awaitable[None]] | None = None
+        self._sync_reads: tuple[Command[Any] | None, tuple[Command[Any], ...]] = (None, ())
+        """The probe and the sync reads that handles have set."""
 
     @classmethod
     def of(cls, owner: HasNode) -> Node:
@@ -196,6 +198,27 @@ class Node:
     def merge_reads(self, merge: Merge, /) -> None:
         """Have poll groups propose `merge` for this node's reads from now on, in place of what its profile had."""
         self.shared.arbiter.change_profile(self.record, replace(self.record.profile, merge=merge))
+
+    def use_sync_reads(self, probe: Command[Any] | None, sync_reads: Sequence[Command[Any]], /) -> None:
+        """Use these reads in place of its profile's; None or an empty sequence leaves what the profile has.
+
+        The probe is sent to a node that may be dead; a sync read is sent where the line must prove that replies match
+        requests. Raises InvalidCommand for a write, and if another handle of the node has set other ones.
+        """
+        before = self._sync_reads
+        wanted = (probe or before[0], tuple(sync_reads) or before[1])
+        for command in (probe, *sync_reads):
+            if command is not None and getattr(command, "writes", False):
+                raise InvalidCommand(f"{self.label}: a probe or sync read must read, and {command} writes")
+        if any(said and said != now for said, now in zip(before, wanted, strict=True)):
+            raise InvalidCommand(
+                f"{self.label} is in use already, and now asked for with another probe or other sync reads: "
+                "give all handles of an address the same options, or leave them out in all but the first"
+            )
+        self._sync_reads = wanted
+        own = self.record.profile
+        changed = replace(own, probe=wanted[0] or own.probe, checks=wanted[1] or own.checks)
+        self.shared.arbiter.change_profile(self.record, changed)
 
     def limit(self, limit: Limit, /) -> None:
         """Refuse, from now on, every write beyond a limit, whatever names it; writes to all nodes too."""

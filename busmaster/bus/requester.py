@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol, TypedDict, TypeVar, Unpack, cast
@@ -157,6 +157,10 @@ class Requester(Protocol):
 
     def merge_reads(self, merge: Merge, /) -> None:
         """Have poll groups propose `merge` for this node's reads from now on, in place of what its profile had."""
+        ...
+
+    def use_sync_reads(self, probe: Command[Any] | None, sync_reads: Sequence[Command[Any]], /) -> None:
+        """Use these reads in place of its profile's; None or an empty sequence leaves what the profile has."""
         ...
 
     def limit(self, limit: Limit, /) -> None:

@@ -100,7 +100,7 @@ async def ask_once(node: Requester) -> tuple[object, str] | GarbledReply | None:
     except (NoReply, NodeDown):
         return None
     except Refused:
-        return None, f"{probe}: refused"
+        return None, f"replies; refuses to {probe}"
     except GarbledReply as error:
         return error
     return value, f"{probe}: {value_text(value)}"

@@ -224,6 +224,7 @@ class ConfiguredLine:
         with node.table.at():
             handle = handle_of(node, self.bus, timings=node.timings, retries=node.retries)
             own = Node.of(handle)
+            _use_sync_reads(node, handle)
             if node.reply_time is not None:
                 own.reply_time = node.reply_time  # until it is measured
             if not is_decimal(node.name):
@@ -371,7 +372,17 @@ def _address(node: NodeSection) -> tuple[str, int]:
 
 def _settings(node: NodeSection) -> tuple[object, ...]:
     decimals = decimals_of(node) if node.kind.takes_decimals else None
-    return node.name, node.protocol, node.address, node.timings, node.retries, node.options, decimals
+    return (
+        node.name,
+        node.protocol,
+        node.address,
+        node.timings,
+        node.retries,
+        node.probe,
+        node.sync_reads,
+        node.options,
+        decimals,
+    )
 
 
 def _section(file: LineFile, name: str) -> PointSection | None:
@@ -414,6 +425,17 @@ def _known(handle: Handle, item: str, points: Iterable[str]) -> Point[Any]:
         if near := guess(item, points):
             raise InvalidCommand(f"no such item {item!r}{near}") from None
         raise
+
+
+def _use_sync_reads(node: NodeSection, handle: Handle) -> None:
+    """Set the probe and the sync reads that the file has for a node. Items may be named as its points are."""
+    items = {name: point.item for name, point in node.points.items()}
+    if node.probe is not None:
+        with node.table.at(*(["probe"] if "probe" in node.table else [])):
+            handle.use_sync_reads(probe=items.get(node.probe, node.probe))
+    if node.sync_reads:
+        with node.table.at(*(["sync_reads"] if "sync_reads" in node.table else [])):
+            handle.use_sync_reads(sync_reads=[items.get(item, item) for item in node.sync_reads])
 
 
 def handle_of(node: NodeSection, bus: NodeSource, **options: Any) -> Handle:

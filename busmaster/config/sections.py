@@ -69,6 +69,13 @@ SHARED_KEYS = (
         most=MOST_RETRIES,
     ),
     Key("reply_time", "seconds", "From a request to its reply, where it is known, for `plan`.", unit="s", least=0),
+    Key("probe", "text", "The item that is read to find out whether a node replies. The protocol's by default."),
+    Key(
+        "sync_reads",
+        "texts",
+        "Items that are read where the line must prove that replies match requests: cheap ones that the device has, "
+        "at least two. The protocol's by default.",
+    ),
 )
 """Of nodes, and of all nodes of one protocol."""
 NODE_KEYS = (
@@ -105,6 +112,8 @@ class NodeSection:
     timings: Timings | Learned | None
     retries: int | None
     reply_time: float | None
+    probe: str | None
+    sync_reads: tuple[str, ...]
     options: Mapping[str, Any]
     points: Mapping[str, PointSection]
     table: Table = field(compare=False, repr=False)
@@ -245,6 +254,10 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
     timings = Learned(document) if is_learned else None if document == profile.timings else document
     retries = table.whole("retries", default.whole("retries", None, most=MOST_RETRIES), most=MOST_RETRIES)
     reply_time = table.seconds("reply_time", default.seconds("reply_time", None))
+    probe = table.text("probe", default.text("probe", None))
+    sync_reads = (table if "sync_reads" in table else default).texts("sync_reads", ())
+    if len(sync_reads) == 1:
+        raise table.error("one sync read cannot be told from itself: name at least two items", "sync_reads")
     options = {**read_options(default, own), **read_options(table, own)}
     points = read_points(table, find(protocol))
     for name, address in zip(names, addresses, strict=True):
@@ -257,6 +270,8 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
             timings=timings,
             retries=retries,
             reply_time=reply_time,
+            probe=probe,
+            sync_reads=sync_reads,
             options=options,
             points=points,
             table=table,

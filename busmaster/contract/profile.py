@@ -78,8 +78,9 @@ class Profile:
     """In rising order."""
     line: LineSettings
     timings: Timings
-    probe: Command[Any]
-    checks: Sequence[Command[Any]] = ()
+    probe: Command[Any] = field(compare=False)
+    checks: Sequence[Command[Any]] = field(default=(), compare=False)
+    # Both compared apart: two kinds of device that speak one protocol may share a node (Node.check_shared).
     broadcast: int | None = None
     addressed: bool = True
     retries: int = 2

@@ -274,7 +274,8 @@ class _Hearing:
             error = None if self.driver.ending is None else self.driver.ending.error
             hint = error.hint if isinstance(error, FrameError) else None
             return Probe(Outcome.GARBLED, self.start, result, self._raw + rest, hint=hint)
-        text = value_text(result) if verdict is Verdict.OK else result
+        # a refusal is a reply: a device without this item is as healthy as any
+        text = value_text(result) if verdict is Verdict.OK else f"{result}; the device does not have this item"
         left_over = b"" if self.driver.ending is None else self.driver.ending.rest
         told = f"{self._command}: {text}"
         raw = self._raw + rest

@@ -138,8 +138,8 @@ class NodeKind:
 
     @property
     def profile(self) -> Profile:
-        """Return the profile of the protocol that has this kind of node."""
-        return self.protocol.profile
+        """Return the profile of this kind of node: the protocol's, with the probe and the sync reads of its handle."""
+        return self.handle.profile
 
     def decimals(self, item: str) -> int:
         """Return how many of an item's last digits on the line are decimals, as the document has it; else 0."""

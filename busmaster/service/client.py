@@ -36,7 +36,7 @@ from busmaster.service.overview import said_details
 from busmaster.service.peers import Peer
 from busmaster.service.requests import Requests
 from busmaster.service.streams import Broadcast, GroupBroadcast
-from busmaster.service.telling import point_of, protocol_of, said_statistics
+from busmaster.service.telling import point_of, profile_of, protocol_of, said_statistics
 
 NodeKey = tuple[str, int]
 
@@ -233,14 +233,22 @@ class Client:
         key = params["protocol"], params["address"]
         self._refused.pop(key, None)
         try:
-            node = self.node(*key, params.get("timings"), params.get("retries"))
+            sync_reads = params.get("probe"), params.get("sync_reads")
+            node = self.node(*key, params.get("timings"), params.get("retries"), sync_reads)
         except InvalidCommand as error:
             if len(self._refused) < MOST_NODES:
                 self._refused[key] = str(error)
             raise
         return {"label": node.label, "health": node.health.value}
 
-    def node(self, name: str, address: int, timings: Any = None, retries: int | None = None) -> Node:
+    def node(
+        self,
+        name: str,
+        address: int,
+        timings: Any = None,
+        retries: int | None = None,
+        sync_reads: tuple[Any, Any] = (None, None),
+    ) -> Node:
         """Return a node, which this client has until it leaves. Raises InvalidCommand as `Bus.node` does."""
         if refused := self._refused.get((name, address)):
             raise InvalidCommand(refused)
@@ -251,7 +259,8 @@ class Client:
         if known is None and len(self._nodes) >= MOST_NODES:
             raise InvalidCommand(f"one program names {MOST_NODES} nodes at most")
         bus = self._line.bus
-        node = bus.lend_node(protocol.profile, address, timings=timings_of(timings), retries=retries)
+        profile = profile_of(protocol, *sync_reads)
+        node = bus.lend_node(profile, address, timings=timings_of(timings), retries=retries)
         if known is not None:
             bus.give_back(node)  # it was asked for its complaint alone
         self._nodes[name, address] = node

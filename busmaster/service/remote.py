@@ -34,6 +34,7 @@ from busmaster.service.telling import (
     event_of,
     protocol_of,
     said_points,
+    said_sync_reads,
     statistics_of,
 )
 
@@ -196,6 +197,7 @@ class RemoteBus:
             params["timings"] = said_timings(timings)
         if retries is not None:
             params["retries"] = retries
+        params |= said_sync_reads(node.profile)
         asked = self.link.ask("node", params, node=node)
 
         def named(future: asyncio.Future[Any]) -> None:

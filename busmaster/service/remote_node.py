@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Coroutine, Iterable, Mapping
+from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
 from typing import Any, Protocol, TypeVar, Unpack
@@ -98,6 +98,9 @@ class RemoteNode:
     def merge_reads(self, merge: Merge, /) -> None:
         """Have the profile propose `merge`. What is merged on the line is its owner's affair."""
         self._profile = replace(self._profile, merge=merge)
+
+    def use_sync_reads(self, probe: Command[Any] | None, sync_reads: Sequence[Command[Any]], /) -> None:
+        """Change nothing: the line's owner sends the probes and the sync reads."""
 
     def limit(self, limit: Limit, /) -> None:
         """Raise InvalidCommand: limits are held by the program that owns the line, for all programs."""

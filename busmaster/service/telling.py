@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any, Protocol, cast
 
@@ -23,11 +24,15 @@ from busmaster.bus.points import Point
 from busmaster.bus.requester import Requester
 from busmaster.bus.samples import Quality, Sample
 from busmaster.bus.snapshots import Snapshot
+from busmaster.contract.profile import Profile
 from busmaster.errors import GarbledReply, InvalidCommand
 from busmaster.registry import Protocol as BusProtocol
 from busmaster.registry import protocols
 from busmaster.service.failures import bus_error_of, error_data
 from busmaster.service.messages import value_of
+
+MOST_SYNC_READS = 64
+"""More than any kind of node needs."""
 
 
 class FindNode(Protocol):
@@ -43,6 +48,34 @@ def protocol_of(name: str) -> BusProtocol:
         if protocol.name == name:
             return protocol
     raise InvalidCommand(f"no such protocol {name!r}; there are {', '.join(one.name for one in protocols())}")
+
+
+def said_sync_reads(profile: Profile) -> dict[str, Any]:
+    """Return the probe and the sync reads of a kind of node, as they are sent, where they are not its protocol's."""
+    protocol = protocol_of(profile.name)
+    usual = protocol.profile
+    if (profile.probe, tuple(profile.checks)) == (usual.probe, tuple(usual.checks)):
+        return {}
+    return {
+        "probe": protocol.write_down(profile.probe),
+        "sync_reads": [protocol.write_down(command) for command in profile.checks],
+    }
+
+
+def profile_of(protocol: BusProtocol, probe: Any, sync_reads: Any) -> Profile:
+    """Return the profile with the probe and the sync reads that a client has sent; None: the protocol's.
+
+    Raises InvalidCommand for what is no read of the protocol.
+    """
+    if probe is None and sync_reads is None:
+        return protocol.profile
+    if not isinstance(probe, dict) or not isinstance(sync_reads, list) or not 0 < len(sync_reads) <= MOST_SYNC_READS:
+        raise InvalidCommand(f"{protocol.name}: a client sends one probe, and 1 to {MOST_SYNC_READS} sync reads")
+    first, *others = [protocol.read_back(dict(said)) for said in (probe, *sync_reads)]
+    for command in (first, *others):
+        if command.writes:
+            raise InvalidCommand(f"{protocol.name}: a probe or sync read must read, and {command} writes")
+    return replace(protocol.profile, probe=first, checks=tuple(others))
 
 
 # snapshots

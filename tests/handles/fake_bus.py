@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from typing import Any, Unpack
@@ -44,6 +44,9 @@ class FakeNode:
 
     def merge_reads(self, merge: Merge) -> None:
         self.profile = replace(self.profile, merge=merge)
+
+    def use_sync_reads(self, probe: Command[Any] | None, sync_reads: Sequence[Command[Any]], /) -> None:
+        """Nothing is probed."""
 
     def limit(self, limit: Limit) -> None:
         """Nothing is limited."""

@@ -37,7 +37,8 @@ every_protocol = pytest.mark.parametrize("protocol", protocols(), ids=lambda pro
 
 @every_kind
 def test_a_kind_of_node_has_a_handle_and_a_device_that_speak_its_protocol(kind: NodeKind) -> None:
-    assert kind.handle.profile is kind.profile is kind.protocol.profile
+    assert kind.handle.profile is kind.profile
+    assert kind.profile == kind.protocol.profile
     assert kind in kind.protocol.kinds
     address = kind.profile.addresses[-1]
     device = make_device(kind.name, address, delay=Delay(0.01))

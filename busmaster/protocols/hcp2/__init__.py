@@ -28,7 +28,7 @@ PROTOCOL = Protocol(
             MicroFlexDrive,
             device_of("busmaster.protocols.hcp2.microflex_device"),
             items=f"an element, or its name: {' '.join(MicroFlexDrive.elements)}",
-            probe_item="1",
+            probe_item="status_word",
             documented=microflex.ITEMS,
             emulated=(
                 Option(
@@ -65,7 +65,13 @@ PROTOCOL = Protocol(
                 Option(
                     "refuse_unmapped",
                     "flag",
-                    about="It refuses to read elements that its map has not; else they read 0.",
+                    about="It refuses to read elements that its map does not have, true by default; false: they read "
+                    "0.",
+                ),
+                Option(
+                    "ignore_unmapped",
+                    "flag",
+                    about="It does not reply to a read of an element that its map does not have.",
                 ),
             ),
             capture_id=3,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import IntFlag
 
 from busmaster.contract.items import bits_of
 from busmaster.protocols._comms.elements import Element, bits, by_name, whole
+from busmaster.protocols.hcp2 import codec as hcp2
 
 FIRST_FIRMWARE = 5221
 """The firmware build that brought this map."""
@@ -104,3 +106,22 @@ TEMPERATURE = Element("temperature", 242, float, "temperature of the drive", "°
 ELEMENTS = by_name(value for value in list(globals().values()) if isinstance(value, Element))
 """Every name of the map, in the order of the numbers."""
 ITEMS = tuple(element.item for element in ELEMENTS.values())
+
+PROFILE = replace(
+    hcp2.PROFILE,
+    probe=hcp2.Read(STATUS_WORD.number),
+    checks=tuple(
+        hcp2.Read(element.number)
+        for element in (
+            FIRMWARE,
+            TEMPERATURE,
+            BUS_VOLTAGE,
+            POSITION,
+            AXIS_ERROR,
+            FOLLOWING_ERROR,
+            DRIVE_ERROR,
+            DEMAND_POSITION,
+        )
+    ),
+)
+"""HCP2 with the probe and the sync reads of this map: it has no Mint program, and so none of the elements 1 to 99."""

@@ -57,7 +57,8 @@ class EmulatedMicroFlex(HostCommsDevice):
 
     `current_control` False: speed control. `host_reference`: the references come from the host. Otherwise writes to
     the reference that does not apply are refused. `ripple` is by how much of itself, 0 to 1, the measured speed swings
-    with every turn. Unmapped elements read 0 and refuse writes; `refuse_unmapped` refuses reads too.
+    with every turn. Writes to unmapped elements are refused. Reads of them are refused too; without `refuse_unmapped`
+    they return 0, and with `ignore_unmapped` they have no reply: the document does not say which of these a drive does.
     """
 
     def __init__(
@@ -69,7 +70,8 @@ class EmulatedMicroFlex(HostCommsDevice):
         ripple: float = 0.0,
         delay: Delay | None = None,
         traceable: TraceableMemory | None = None,
-        refuse_unmapped: bool = False,
+        refuse_unmapped: bool = True,
+        ignore_unmapped: bool = False,
         firmware: int = 5221,
         acceleration: float = 50.0,
     ) -> None:
@@ -78,6 +80,7 @@ class EmulatedMicroFlex(HostCommsDevice):
         self.host_reference = host_reference
         self.ripple = ripple
         self.refuse_unmapped = refuse_unmapped
+        self.ignore_unmapped = ignore_unmapped
         self.firmware = firmware
         self.hardware_enable = True
         self.stop_input = False
@@ -177,8 +180,16 @@ class EmulatedMicroFlex(HostCommsDevice):
 
     def read_element(self, element: int, now: float) -> float | None:
         self._update(now)
-        value = self._read_axis(element) if element < 220 else self._read_io(element)
+        value = self._read_mapped(element)
         return 0 if value is None and not self.refuse_unmapped else value
+
+    def _answer_read(self, element: int, now: float) -> None:
+        if self.ignore_unmapped and self.traceable is None and self._read_mapped(element) is None:
+            return
+        super()._answer_read(element, now)
+
+    def _read_mapped(self, element: int) -> float | None:
+        return self._read_axis(element) if element < 220 else self._read_io(element)
 
     def write_element(self, element: int, value: float, now: float) -> bool:
         if not self.writable(element):
@@ -253,6 +264,8 @@ class EmulatedMicroFlex(HostCommsDevice):
                 return self._current * math.sqrt(2) * math.sin(self._angle - math.tau / 3)
             case 130:
                 return (0b001, 0b011, 0b010, 0b110, 0b100, 0b101)[int(self._angle / math.tau * 6) % 6]
+            case 132:
+                return 0
         return None
 
     def _read_io(self, element: int) -> float | None:

@@ -36,7 +36,7 @@ class MicroFlexDrive(CommsHandle):
     No loss of communication stops the drive: assume that it keeps its last reference when the master dies.
     """
 
-    profile: ClassVar[Profile] = hcp2.PROFILE
+    profile: ClassVar[Profile] = microflex.PROFILE
     read_command = hcp2.Read
     write_command = hcp2.Write
     elements = microflex.ELEMENTS
