@@ -195,6 +195,34 @@ def test_a_node_that_answers_after_the_window_is_found_under_its_own_address() -
     assert discovery.found[0].starts[0] == pytest.approx(0.13, abs=0.01)
 
 
+class Fading(Device):
+    """Answers node 3's probe so many times, and then nothing: so does noise that looks like an answer."""
+
+    def __init__(self, answers: int) -> None:
+        super().__init__(3)
+        self.attentive = True
+        self._left = answers
+        self._heard = b""
+        profile = find("hcp2").profile
+        self._request = profile.probe.open(3, profile.timings).request
+        line = line_of(profile.line, make_device("hcp2", 3))
+        line.send(self._request, 0.0)
+        self._answer = line.receive(1.0)
+
+    def hear_byte(self, byte: int, now: float) -> None:
+        self._heard += bytes((byte,))
+        if self._left and self._heard.endswith(self._request):
+            self._left -= 1
+            self.reply(self._answer, now, 0.002)
+
+
+@pytest.mark.parametrize(("answers", "found"), [(1, []), (2, []), (3, [3])])
+def test_a_node_must_answer_twice_more_to_be_taken_for_one(answers: int, found: list[int]) -> None:
+    line = line_of(LineSettings(57600), Fading(answers))
+    discovery = looked(line, steps([find("hcp2").protocol], (3,), LineSettings(57600)))
+    assert [node.address for node in discovery.found] == found
+
+
 def test_two_protocols_that_may_share_a_line_are_both_found() -> None:
     line = line_of(LineSettings(57600), make_device("hcp", 1), make_device("hcp2", 2))
     discovery = looked(line, steps(protocols(), None, None))

@@ -7,13 +7,15 @@ import grp
 import os
 import subprocess
 import sys
+import termios
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from busmaster.doctor.adapters import Finding, inspect, latency_timer, low_latency, made_rate, rs485_mode
-from busmaster.doctor.examination import rate
+from busmaster.doctor.examination import driver, rate
 from busmaster.transport import identity
 from busmaster.transport.holders import Holder, holders, lock_owner, owning_group
 from tests.transport.fakes import PtyMaster, plugged
@@ -74,6 +76,17 @@ def test_a_quick_adapter_is_in_order(pty_master: PtyMaster, sysfs: Path) -> None
     assert topics(inspect(pty_master.path))["latency"]
     timer.unlink()
     assert latency_timer(pty_master.path) is None
+
+
+def test_an_adapter_that_is_named_by_a_link_is_examined_as_what_it_points_to(tmp_path: Path, sysfs: Path) -> None:
+    """As one is of /dev/serial/by-id."""
+    [entry] = os.listdir(sysfs / "class/tty")
+    link = tmp_path / "usb-FTDI_A5069RR4-if00-port0"
+    link.symlink_to(f"/dev/pts/{entry}")
+    found = inspect(str(link))
+    assert not topics(found)["latency"]
+    assert "ftdi_sio" in "\n".join(finding.what for finding in found)
+    assert latency_timer(str(link)) == 16
 
 
 def test_what_is_no_port_is_said_first_and_alone(tmp_path: Path) -> None:
@@ -158,6 +171,26 @@ def test_a_pty_has_no_low_latency_flag_and_a_driver_tells_its_own(
     for flag in (0, 1 << 13):
         monkeypatch.setattr(fcntl, "ioctl", lambda _, __, settings, flag=flag: settings.__setitem__(4, flag))
         assert low_latency(pty_master.fd) is bool(flag)
+
+
+def test_the_low_latency_flag_is_told_with_how_to_set_it(
+    monkeypatch: pytest.MonkeyPatch, pty_master: PtyMaster
+) -> None:
+    def told(flags: int | None) -> tuple[str, str]:
+        def ioctl(_descriptor: int, request: int, settings: Any) -> int:
+            if flags is None or request != termios.TIOCGSERIAL:
+                raise OSError("no such flag")
+            settings[4] = flags
+            return 0
+
+        monkeypatch.setattr(fcntl, "ioctl", ioctl)
+        [finding] = [finding for finding in driver(pty_master.fd) if finding.topic == "driver"]
+        assert finding.ok
+        return finding.what, finding.advice
+
+    assert told(1 << 13) == ("its low-latency flag is set", "")
+    assert told(0) == ("its low-latency flag is not set", "?low_latency=1 may bring replies sooner")
+    assert told(None) == ("it has no low-latency flag", "")
 
 
 def test_a_rate_that_a_uart_cannot_make_is_told_where_its_driver_tells_what_it_divides(

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from busmaster.bus.meaning import Meaning
 from busmaster.bus.snapshots import Snapshot
 from busmaster.errors import NoReply
 from busmaster.gate.record import Outcome, WriteRecord
@@ -101,6 +102,32 @@ def test_what_another_program_locks_out_is_written_when_the_lock_is_gone(
         output._retry = 0.01
     assert [value for (value,) in query(path, "select value from samples order by rowid")] == [1.0, 2.0, 3.0]
     assert output.statistics().dropped == 0
+
+
+def test_a_point_that_came_first_in_a_batch_that_failed_is_there_with_the_next_try(tmp_path: Path) -> None:
+    """Its number was that of a transaction which was undone, and may be another point's by now."""
+    path = tmp_path / "x.db"
+    on = Meaning(labels={2: "on"})
+    with recording(path) as output:
+        output.offer(cycle(1, 1.0))
+        until(lambda: settled(output))
+        with closing(sqlite3.connect(path, isolation_level=None)) as other:
+            other.execute("create trigger full before insert on samples begin select raise(abort, 'full'); end")
+            found = cycle(2, 1.5, 2)
+            samples = {
+                replace(point, meaning=on): sample._replace(value=on.named(sample.value))
+                if sample.value == 2
+                else sample
+                for point, sample in found.samples.items()
+            }
+            output.offer(replace(found, samples=samples))
+            until(lambda: output.statistics().error == "full")
+            other.execute("begin immediate")
+            other.execute("insert into points (node, item, unit) values ('another', 'program', '')")
+            other.execute("drop trigger full")
+            other.execute("commit")
+    found_rows = query(path, "select node, item, value, label from history order by time, item")
+    assert found_rows == [("5", "1", 1.0, None), ("5", "1", 1.5, None), ("5", "2", 2, "on")]
 
 
 def test_what_is_too_old_is_deleted_from_the_oldest_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -317,6 +317,30 @@ def test_output_that_never_leaves_takes_the_line_down_and_is_discarded() -> None
     run_in_virtual_time(main())
 
 
+def test_output_is_held_anew_where_the_port_was_lost_meanwhile() -> None:
+    """Twice 3 s on two connections are not 5 s on one."""
+
+    async def main() -> None:
+        async with Bus(MemoryPort(line())) as bus:
+            axis = Hcp2Controller(bus, 1)
+            await axis.write(1, 5)
+            events = bus.events()
+            transport_of(bus).hold()
+            reading = asyncio.ensure_future(axis.read(1))
+            await asyncio.sleep(3.0)
+            transport_of(bus).lose(None)
+            changes = [await anext(events) for _ in range(2)]
+            assert [change.change for change in changes if isinstance(change, LineChanged)][-1] is LineChange.UP
+            await asyncio.gather(reading, return_exceptions=True)
+            transport_of(bus).hold()
+            reading = asyncio.ensure_future(axis.read(1))
+            await asyncio.sleep(3.0)
+            transport_of(bus).release()
+            assert await reading == 5
+
+    run_in_virtual_time(main())
+
+
 def test_closing_does_not_wait_for_output_that_is_held() -> None:
     async def main() -> None:
         async with Bus(MemoryPort(line())) as bus:
