@@ -160,6 +160,19 @@ async def test_the_selection_stays_on_its_row_through_every_change() -> None:
 
 
 @pytest.mark.asyncio
+async def test_a_click_selects_the_row_under_it_wherever_the_table_is_scrolled_to() -> None:
+    async with drawn(tell(Picture(), *(row(number) for number in range(1, 41))), (60, 20)) as (screen, _, pilot):
+        for keys in ((), ("end",), ("home",)):
+            await pilot.press(*keys)
+            await pilot.pause()
+            second = table(screen)[1]
+            await pilot.click(screen.table, offset=(0, 1))
+            await pilot.pause()
+            assert screen.table.selected is not None
+            assert screen.table.selected.name.split() == second[:3]
+
+
+@pytest.mark.asyncio
 async def test_rows_are_filtered_by_words_and_ordered_by_trouble() -> None:
     nodes = (node(1), node(2), node(9, "down"))
     async with drawn(tell(Picture(), *three_drives(), nodes=nodes)) as (screen, _, pilot):
@@ -215,11 +228,13 @@ async def test_keys_pause_poll_and_suspend_what_is_selected_or_all() -> None:
     nodes = (node(5), node(6, "suspended"))
     rows = (row(5), row(6, "inputs", group="slow"))
     async with drawn(tell(Picture(), *rows, nodes=nodes, groups=groups)) as (_, line, pilot):
-        await pilot.press("p", "d", "P", "s", "n", "s", "y", "down", "p", "s", "y")
+        await pilot.press("p", "d", "D", "P", "s", "n", "s", "y", "down", "p", "s", "y")
         await pilot.pause()
     assert line.said == [
         ("pause", "axes", True),
         ("demand", "axes"),
+        ("demand", "axes"),
+        ("demand", "slow"),
         ("pause", "axes", True),
         ("pause", "slow", True),
         ("suspend", "hcp2", 5, 60.0),

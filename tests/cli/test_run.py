@@ -190,6 +190,21 @@ def test_plan_says_that_a_schedule_fits(busmaster: Command, line: Path) -> None:
     assert 'with timing = "learned" (a window of 39.5 ms) for ' in outcome.lines[-1]
 
 
+@pytest.mark.parametrize(
+    ("nodes", "named"), [(8, "d1, d2, d3, d4, d5, d6, d7, d8:"), (11, "d1, d2, d3, d4, d5, d6, d7, d8 and 3 more:")]
+)
+def test_plan_names_some_nodes_without_a_reply_time_and_counts_the_others(
+    nodes: int, named: str, busmaster: Command, tmp_path: Path
+) -> None:
+    path = tmp_path / "line.toml"
+    path.write_text(
+        f'port = "/dev/ttyUSB0"\n[nodes.d1-{nodes}]\nprotocol = "hcp2"\naddress = "1-{nodes}"\n'
+        '[groups.g]\nperiod = 5\npoints = ["d1/1"]\n'
+    )
+    outcome = busmaster("plan", str(path))
+    assert outcome.lines[-2].startswith(f"reply times are assumed, half of the nominal one, for {named} ")
+
+
 def test_plan_says_what_would_fit_where_it_does_not_and_ends_with_1(busmaster: Command, line: Path) -> None:
     outcome = busmaster("plan", str(line))
     assert (outcome.status, outcome.err) == (1, "")

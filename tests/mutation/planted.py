@@ -137,11 +137,19 @@ def planted(folder: Path, bug: Bug) -> Iterator[None]:
 
 
 def planted_text(text: str, bug: Bug) -> str:
-    """Return a file's text with the bug in it. Raises SystemExit unless the old text occurs exactly once."""
+    """Return a file's text with the bug in it.
+
+    Raises SystemExit unless the old text occurs exactly once and the new text is Python, whose absence any test notices.
+    """
     count = text.count(bug.old)
     if count != 1 or bug.old == bug.new:
         raise SystemExit(f"{bug.file}: {bug.bug}: the old text must occur once, and occurs {count} times: {bug.old!r}")
-    return text.replace(bug.old, bug.new)
+    changed = text.replace(bug.old, bug.new)
+    try:
+        compile(changed, bug.file, "exec", dont_inherit=True)
+    except SyntaxError as error:
+        raise SystemExit(f"{bug.file}: {bug.bug}: it is no Python then: {error}") from None
+    return changed
 
 
 def run_tests(folder: Path, tests: Sequence[str]) -> tuple[int, str]:

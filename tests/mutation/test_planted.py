@@ -38,6 +38,11 @@ def test_a_text_that_is_not_there_just_once_is_an_error(old: str, new: str) -> N
         planted_text(CODE, bug(old, new))
 
 
+def test_a_new_text_that_is_not_python_is_an_error() -> None:
+    with pytest.raises(SystemExit, match="it is no Python then"):
+        planted_text(CODE, bug("    return", "return"))
+
+
 @pytest.mark.slow
 def test_tests_that_fail_without_a_bug_are_an_error(tree: Path) -> None:
     (tree / "test_it.py").write_text(TEST.replace("== 2", "== 1"))
