@@ -139,7 +139,7 @@ def planted(folder: Path, bug: Bug) -> Iterator[None]:
 def planted_text(text: str, bug: Bug) -> str:
     """Return a file's text with the bug in it.
 
-    Raises SystemExit unless the old text occurs exactly once and the new text is Python, whose absence any test notices.
+    Raises SystemExit unless the old text occurs exactly once, and the new text is Python: any test notices the rest.
     """
     count = text.count(bug.old)
     if count != 1 or bug.old == bug.new:
