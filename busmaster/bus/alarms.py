@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
@@ -54,6 +55,12 @@ class Alarms:
         self.states: Mapping[Point[Any], AlarmChanged | None] = {}
         """The alarm of each point that was looked at, None for none. Replaced whole, so that any thread may look."""
         self._tell = tell
+        self._groups: Counter[Point[Any]] = Counter()
+        """In how many poll groups each point is watched."""
+
+    def watch(self, points: Iterable[Point[Any]]) -> None:
+        """Note that one more poll group watches these points, until it calls `forget`."""
+        self._groups.update(points)
 
     def look(self, points: Iterable[Point[Any]], samples: Mapping[Point[Any], Sample[Any]]) -> None:
         """Tell what the samples of these points begin and end."""
@@ -76,8 +83,11 @@ class Alarms:
         self._become({**self.states, **changed} if changed else self.states, told)
 
     def forget(self, points: Iterable[Point[Any]]) -> None:
-        """End the alarms of points that are polled no more."""
-        gone = {point: self.states[point] for point in points if point in self.states}
+        """Note that a poll group no longer watches these points, and end the alarms of those that no other does."""
+        points = tuple(points)
+        self._groups.subtract(points)
+        self._groups = +self._groups
+        gone = {point: self.states[point] for point in points if point in self.states and point not in self._groups}
         if gone:
             ended = [replace(alarm, value=None, active=False) for alarm in gone.values() if alarm is not None]
             self._become({point: alarm for point, alarm in self.states.items() if point not in gone}, ended)

@@ -155,7 +155,7 @@ class PollGroup(Cycles):
         self._line.check_loop()
         if self._poll.active:
             self._on_close(self)
-            self._line.alarms.forget(self._watched)
+            self._watch(())
             self._line.latest_of.pop(self.name, None)
             self._line.answers_of.pop(self.name, None)
             self._line.remove_poll(self._poll)
@@ -272,9 +272,15 @@ class PollGroup(Cycles):
     # which exchanges bring the values
 
     def _points_changed(self) -> None:
-        self._line.alarms.forget(point for point in self._watched if point not in self._points)
-        self._watched = tuple(point for point in self._points if point.meaning.watched)
+        self._watch(tuple(point for point in self._points if point.meaning.watched))
         self._choose()
+
+    def _watch(self, points: tuple[Point[Any], ...]) -> None:
+        """Look for alarms of these points from now on, and of no others."""
+        before, self._watched = self._watched, points
+        # in this order: an alarm of a point that stays goes on
+        self._line.alarms.watch(points)
+        self._line.alarms.forget(before)
 
     def _choose(self) -> None:
         """Choose the exchanges anew: a piece at a time, so that the line goes on (see Schedule.prepare)."""

@@ -165,6 +165,28 @@ def test_an_alarm_goes_on_while_other_points_of_its_group_come_and_go() -> None:
     on_a_bus(story)
 
 
+def test_an_alarm_goes_on_while_another_group_still_polls_its_point() -> None:
+    async def story(bus: Bus) -> None:
+        drive = Hcp2Controller(bus, 1)
+        speed = replace(drive.point("10"), meaning=LIMITS)
+        await drive.write(10, 30)
+        groups = [bus.poll_group(name, period=0.1, points=[speed]) for name in ("a", "b", "c")]
+        await cycles(groups[2], 2)
+        began, events = bus.alarms[speed], bus.events()
+        assert began is not None
+        groups[0].remove(speed)
+        groups[1].close()
+        await cycles(groups[2], 2)
+        assert bus.alarms[speed] is began
+        groups[2].close()
+        assert not bus.alarms
+        events.close()
+        changes = [event async for event in events if isinstance(event, AlarmChanged)]
+        assert [(change.active, change.value) for change in changes] == [(False, None)]
+
+    on_a_bus(story)
+
+
 def test_each_of_several_overheard_values_may_begin_an_alarm() -> None:
     async def story(bus: Bus) -> None:
         drive = Hcp2Controller(bus, 1)
