@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from busmaster import Hcp2Controller, NoReply, RemoteBus
+from busmaster import Hcp2Controller, NoReply, Priority, RemoteBus
+from busmaster.errors import BacklogFull
 from busmaster.gate.gate import FRESH
 from busmaster.service.messages import BUS_ERROR, INVALID_PARAMS
 from tests.patience import PATIENCE
@@ -129,5 +130,19 @@ def test_a_group_of_the_owner_has_all_its_points_there_too(tmp_path: Path) -> No
             if len(snapshot.samples) == 3:
                 break
         assert [point.key for point in theirs.points] == ["5/1", "6/1", "6/2"]
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_of_urgent_requests_too_only_so_many_may_be_unanswered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("busmaster.service.requests.MOST_REQUESTS", 3)
+    monkeypatch.setattr("busmaster.service.requests.MOST_URGENT", 2)
+
+    async def story(line: Served, remote: RemoteBus) -> None:
+        async with busy(line):
+            reads = (Hcp2Controller(remote, 5).read(1, priority=Priority.URGENT) for _ in range(7))
+            ended = await asyncio.gather(*reads, return_exceptions=True)
+        assert [type(end) for end in ended if isinstance(end, Exception)] == [BacklogFull] * 2
+        assert ended.count(0) == 5
 
     on_a_served_line(tmp_path, story)
