@@ -64,8 +64,14 @@ class Arbiter(LineMachine):
         timings: Timings | Learned | None = None,
         retries: int | None = None,
     ) -> NodeRecord:
-        """Add a node and return its record. Raises InvalidCommand for an address that the protocol does not have."""
+        """Add a node and return its record.
+
+        Raises InvalidCommand for an address that the protocol does not have, and for learned windows where they cannot
+        be learned (HCP).
+        """
         profile.check_address(address)
+        if isinstance(timings, Learned):
+            profile.check_learnable()
         node = NodeRecord(
             profile,
             address,
@@ -83,10 +89,12 @@ class Arbiter(LineMachine):
         return node
 
     def remove_node(self, node: NodeRecord) -> None:
-        """Probe a node no more, nor ask it anything else by the line's own wish: nobody names it any longer.
+        """Remove a node: the line sends it no probe and no sync read any more.
 
-        What it may still have on the wire runs out, and what it owes stays owed.
+        An exchange with it that is on the wire runs out. Its overdue replies stay overdue (R15): another node's reply
+        clears them, as it does for a node that is silent.
         """
+        node.removed = True
         self.dispatcher.nodes.remove(node)
         self.dispatcher.writes.forget_empty()
         self.dispatcher.probes.plan()

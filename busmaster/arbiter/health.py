@@ -81,6 +81,7 @@ class NodeRecord:
         "probe_delay",
         "probed_at",
         "profile",
+        "removed",
         "replies",
         "retries",
         "slowest",
@@ -117,6 +118,8 @@ class NodeRecord:
         self.probed_at = -inf
         self.suspended_until = -inf
         self.has_hook = False
+        self.removed = False
+        """It is no longer a node of the line, which sends it nothing of its own accord."""
         self.holds = 0
         """Returns whose on_return hook has not ended: its polls wait."""
         self.stops = 0

@@ -48,7 +48,12 @@ KEYS = (
         "Whether an answer that could be another request's is held until it is certain (R15).",
         "false",
     ),
-    Key("timing", "text", "The windows of all nodes are learned from their replies.", choices=(LEARNED_WORD,)),
+    Key(
+        "timing",
+        "text",
+        "The windows of all nodes are learned from their replies, except those of HCP, which cannot be learned.",
+        choices=(LEARNED_WORD,),
+    ),
     Key("learned", "text", "The file in which learned windows are kept from one run to the next."),
     Key("protocols", "table", "A table for each protocol, of what holds for its nodes: `[protocols.NAME]`."),
     Key("nodes", "table", "A table for each node: `[nodes.NAME]`.", REQUIRED),
@@ -250,7 +255,10 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
     default = defaults.get(protocol, Table(table.source, ("protocols", protocol), {}))
     base = read_timings(default, profile.timings)
     document = read_timings(table, base)
-    is_learned = reads_learned(table, reads_learned(default, learned))
+    is_learned = reads_learned(table, reads_learned(default, learned and profile.checked_requests))
+    if is_learned:
+        with (table if "timing" in table else default).at("timing"):
+            profile.check_learnable()
     timings = Learned(document) if is_learned else None if document == profile.timings else document
     retries = table.whole("retries", default.whole("retries", None, most=MOST_RETRIES), most=MOST_RETRIES)
     reply_time = table.seconds("reply_time", default.seconds("reply_time", None))

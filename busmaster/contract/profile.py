@@ -70,6 +70,8 @@ class Profile:
     exchanges are `Abandonable`. `shares_line_with` are the other protocols whose nodes may be on the same line.
     `fixed_rate`: its devices have the baud rate of `line` and no other. `other_lines`: further settings that its
     devices are met with, the likeliest first, for whoever looks for one on an unknown line.
+    `checked_requests`: a node notices a flipped bit in any request. Without that a damaged read is answered with
+    another item, which is taken for that item if the line goes on meanwhile: reply windows cannot be learned.
     """
 
     name: str
@@ -89,6 +91,7 @@ class Profile:
     fixed_rate: bool = False
     other_lines: Sequence[LineSettings] = ()
     exchange_limit: float | None = None
+    checked_requests: bool = True
     listen: Callable[[], Listener] | None = field(default=None, compare=False)
     # Compared apart: a second handle that leaves it open asks for the same node (Node.check_shared).
     merge: Callable[[Sequence[Command[Any]]], Sequence[Batch]] | None = field(default=None, compare=False)
@@ -106,6 +109,14 @@ class Profile:
         if not self.fixed_rate or baudrate == self.line.baudrate:
             return ""
         return f"{self.title} nodes speak at {self.line.baudrate} baud alone, not at {baudrate}"
+
+    def check_learnable(self) -> None:
+        """Raise InvalidCommand where reply windows cannot be learned."""
+        if not self.checked_requests:
+            raise InvalidCommand(
+                f"{self.name}: reply windows cannot be learned, because a read request carries no checksum: a damaged "
+                "one is answered with another element; use the documented windows"
+            )
 
     def check_address(self, address: int) -> None:
         """Raise InvalidCommand unless `address` is a node's, or the broadcast, address."""

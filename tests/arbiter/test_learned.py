@@ -19,7 +19,8 @@ from busmaster.arbiter.learned import (
 )
 from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.contract.learning import LEARNED, Learned
-from busmaster.errors import NoReply, WriteUnconfirmed
+from busmaster.errors import InvalidCommand, NoReply, WriteUnconfirmed
+from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import ACK, FIVE, LATENESS, TAU, Bench, reply_of, request_of, up
@@ -470,3 +471,10 @@ def test_r3_a_straggler_near_its_lateness_raises_it_though_the_line_had_gone_on(
     bench.until_ready()
     raised = [event for event in bench.events if isinstance(event, LatenessRaised)]
     assert [event.node for event in raised] == [node]
+
+
+def test_windows_are_not_learned_where_a_damaged_request_is_answered_with_another_element() -> None:
+    """One flipped bit in HCP's read request, which has no checksum, and a late reply: another element's value."""
+    bench = Bench()
+    with pytest.raises(InvalidCommand, match="hcp: reply windows cannot be learned, because a read request"):
+        bench.arbiter.add_node(hcp.PROFILE, 1, bench.now, LEARNED)

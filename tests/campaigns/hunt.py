@@ -89,7 +89,7 @@ class Hunt:
         self.judge = Judge(self.kind, self.mix, ledger, self.line, self.world.arbiter)
         self.ledger = ledger
         self.sharing = Sharing(self.name, self.world.arbiter, self.judge.problem) if self.mix.shared else None
-        timings = LEARNED if learned else None
+        timings = LEARNED if learned and self.kind.profile.checked_requests else None
         if learned:
             be_hasty()
         self.nodes = [self.world.node(self.kind.profile, address, timings=timings) for address in addresses]

@@ -335,6 +335,20 @@ def test_a_command_may_only_be_allowed_for_what_can_be_written() -> None:
         ConfiguredLine(parse(text))
 
 
+def test_a_line_whose_windows_are_learned_keeps_the_documents_for_hcp() -> None:
+    text = 'port = "/dev/ttyS0"\ntiming = "learned"\n'
+    nodes = '[nodes.a]\nprotocol = "hcp"\naddress = 1\n[nodes.b]\nprotocol = "hcp2"\naddress = 2\n'
+    file = parse(text + nodes)
+    assert file.nodes["a"].timings is None
+    assert isinstance(file.nodes["b"].timings, Learned)
+
+
+def test_windows_of_a_node_of_hcp_cannot_be_learned_and_the_file_says_where() -> None:
+    text = 'port = "/dev/ttyS0"\n[nodes.a]\nprotocol = "hcp"\naddress = 1\ntiming = "learned"\n'
+    with pytest.raises(FileError, match=r"line\.toml:5: nodes\.a\.timing: hcp: reply windows cannot be learned"):
+        parse(text)
+
+
 @pytest.mark.parametrize(
     ("line", "protocol", "node", "learned"),
     [

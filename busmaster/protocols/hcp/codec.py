@@ -58,5 +58,6 @@ PROFILE = Profile(
     probe=Read(1),
     checks=tuple(Read(element) for element in CHECKED),
     other_lines=OTHER_LINES,
+    checked_requests=False,
     shares_line_with=frozenset({"hcp2"}),  # a telegram of the one means nothing to the other
 )
