@@ -87,6 +87,8 @@ class Choice:
         # Only its first attempt: a late answer to that one is not the retry's, which needs proof as any other does.
         if transaction.priority is URGENT and transaction.writes and not transaction.attempts:
             pass
+        elif transaction.writes and now < in_step.lone_bytes_until and any(len(key) == 1 for key in answers):
+            chosen = self._before_first_write(first, now)
         elif _is_decisive(first) and now < in_step.awaited_until(self._last_byte):
             chosen = self._while_awaited(first, now) or in_step.awaited_until(self._last_byte)
         elif transaction.probe and in_step.clashes(answers, now, transaction.node):
@@ -156,6 +158,26 @@ class Choice:
             return first
         self._gone_before += 1
         return other
+
+    def _before_first_write(self, first: Chosen, now: float) -> Chosen | float:
+        """Return what goes before the first write on a line that came up: a read, which ends what a node holds of an
+        earlier master's frame; then the time until which that node may reply. A write that is refused by such a node's
+        NAK would be sent again, and be carried out twice."""
+        in_step, transaction = self._in_step, first[0]
+        node = transaction.node
+
+        def clashes(answers: Sequence[bytes], node: NodeRecord) -> bool:
+            return in_step.clashes(answers, now, node)
+
+        other = self._another(first, now, clashes)
+        if other is not None:
+            return other
+        if in_step.lone_bytes_until < inf:
+            return in_step.lone_bytes_until
+        alive, silent = self._whom_to_ask(now)
+        own = [] if node.address == node.profile.broadcast else [node]
+        # Without a read to send, the write goes: its refusal is then not believed.
+        return self._ask_check(dict.fromkeys([*own, *alive, *silent]), now, clashes) or first
 
     def _while_awaited(self, first: Chosen, now: float, answers: Sequence[bytes] | None = None) -> Chosen | None:
         """Return what goes while an owed answer (that could look so) may still be on time, though the line went on: a

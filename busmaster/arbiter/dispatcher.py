@@ -222,7 +222,7 @@ class Dispatcher:
         else:
             node.counters.garbled += 1
         worth = doubted or self._watch.is_worth_a_retry(transaction)
-        if transaction.retried < transaction.retries and worth and self._wanted(transaction):
+        if transaction.retried < transaction.retries and worth and self.is_wanted(transaction):
             transaction.retried += 1
             node.counters.retries += 1
             self._requeue(transaction, now)
@@ -253,7 +253,7 @@ class Dispatcher:
             node.note_refused(transaction.command)
         transaction.unsure = transaction.unsure or not certain
         again = refusal.confirm if certain else not transaction.writes or transaction.idempotent
-        if again and not transaction.refusals and not transaction.probe and self._wanted(transaction):
+        if again and not transaction.refusals and not transaction.probe and self.is_wanted(transaction):
             transaction.refusals += 1
             self._requeue(transaction, now)
             return
@@ -438,7 +438,8 @@ class Dispatcher:
 
     # the ways of one transaction
 
-    def _wanted(self, transaction: Transaction) -> bool:
+    def is_wanted(self, transaction: Transaction) -> bool:
+        """Return whether a transaction may be sent again: its caller waits for it, and nothing has overtaken it."""
         client = transaction.client
         over = client is not None and client.over
         return transaction.wanted and not (transaction.superseded or over) and self.fault is None

@@ -16,6 +16,14 @@ A debt is paid
   doubted for three times its lateness;
 - by LAPSE seconds.
 
+Where every unlike request is owed an answer too, a debt is *forgiven*: the request goes although its answer could be
+the overdue one. That answer is held until the maximum reply delay is over: if a second one comes, neither is believed.
+
+A master that stopped in the middle of a frame leaves a node waiting for the rest. Such a node takes the first bytes of
+the next frame, to whichever node, for that rest, and replies with a NAK (or an ACK) of its own, up to its maximum reply
+delay later. So after the line came up, no NAK is trusted, and every ACK is held, until that time has passed behind the
+first frame.
+
 What nobody owed and yet came, though it looks like a reply, was said twice. Then answers like those heard lately are
 doubted for a while, and neighbours that could be confused are not asked one after the other where there is a choice.
 """
@@ -86,7 +94,17 @@ class Debt:
 class InStep:
     """What is owed on one line, and how far its answers can be trusted. Times are in seconds, on the caller's clock."""
 
-    __slots__ = ("_doubt_until", "_doubted", "_said", "alert", "before", "debts", "last")
+    __slots__ = (
+        "_doubt_until",
+        "_doubted",
+        "_forgiven",
+        "_said",
+        "alert",
+        "before",
+        "debts",
+        "last",
+        "lone_bytes_until",
+    )
 
     def __init__(self, strict: bool = False) -> None:
         """Begin with nothing owed. If `strict`, it is always as if something had been said twice a moment ago."""
@@ -98,6 +116,10 @@ class InStep:
         self.before: Sequence[bytes] = ()
         """What would answer the one before that."""
         self._doubted: list[tuple[bytes, float]] = []
+        self._forgiven: list[tuple[bytes, float]] = []
+        self.lone_bytes_until = -inf
+        """Until then a lone byte may be a node's reply to a frame that an earlier master left unfinished; inf until the
+        first frame was sent."""
         self._said: deque[tuple[Sequence[bytes], float]] = deque(maxlen=256)
         self._doubt_until = inf if strict else -inf
 
@@ -120,7 +142,9 @@ class InStep:
         """Forget what has been owed for too long, and stop being careful where nothing is left to be careful of."""
         self.debts = [debt for debt in self.debts if now - debt.asked <= LAPSE]
         self._doubted = [entry for entry in self._doubted if entry[1] > now]
-        self.alert = bool(self.debts or self._doubted or self._doubt_until > now)
+        self._forgiven = [entry for entry in self._forgiven if entry[1] > now]
+        unsure = self.debts or self._doubted or self._forgiven
+        self.alert = bool(unsure or self._doubt_until > now or self.lone_bytes_until > now)
 
     def clashes(
         self, answers: Sequence[bytes], now: float, node: NodeRecord | None = None, but: float | None = None
@@ -144,9 +168,15 @@ class InStep:
         return until
 
     def owing(self, answers: Sequence[bytes] | None, now: float) -> Iterator[NodeRecord]:
-        """Yield the nodes that owe what could look so (None: anything), and answer, as far as is known."""
+        """Yield the nodes that owe what could look so (None: anything), and answer, as far as is known. A removed node
+        is never asked."""
         for debt in self.debts:
-            if debt.node is None or now >= debt.until or not (answers is None or _could_be(debt, answers)):
+            if (
+                debt.node is None
+                or debt.node.removed
+                or now >= debt.until
+                or not (answers is None or _could_be(debt, answers))
+            ):
                 continue
             if not _is_silent(debt) or (
                 debt.awaited is not None and now < debt.over and debt.node.unheard <= MOST_UNHEARD
@@ -159,8 +189,7 @@ class InStep:
 
     def forgive(self, answers: Sequence[bytes]) -> None:
         """Forgive what is owed and could look so: nothing unlike can be asked, R3's assumption must do, and doubt."""
-        forgiven = [debt for debt in self.debts if _could_be(debt, answers)]
-        self._doubted += [(debt.key, debt.asked + LAPSE) for debt in forgiven]
+        self._forgiven += [(debt.key, debt.asked + LAPSE) for debt in self.debts if _could_be(debt, answers)]
         self.debts = [debt for debt in self.debts if not _could_be(debt, answers)]
 
     def answered(self, node: NodeRecord, asked: float, now: float, patience: float) -> None:
@@ -197,8 +226,9 @@ class InStep:
                 rest = rest[:place] + rest[place + len(debt.key) :]
         if payers and not rest:
             return payers[0]
-        if not payers and any(until > now and _is(run, key) for key, until in self._doubted):
+        if not payers and any(until > now and _is(run, key) for key, until in (*self._doubted, *self._forgiven)):
             self._doubted = [entry for entry in self._doubted if not _is(run, entry[0])]
+            self._forgiven = [entry for entry in self._forgiven if not _is(run, entry[0])]
         elif not payers and any(_is(run, key) for key in (*self.last, *self.before)):
             self.said_twice(now)
         else:
@@ -257,6 +287,32 @@ class InStep:
         """Return whether something was said twice lately."""
         return now < self._doubt_until
 
+    def is_to_be_held(self, answers: Sequence[bytes], now: float) -> bool:
+        """Return whether a reply like this may be an overdue one that was forgiven, or the reply to a frame that an
+        earlier master left unfinished."""
+        lone = any(len(key) == 1 for key in answers)
+        if lone and now < self.lone_bytes_until:
+            return True
+        return any(until > now and (key in answers if key else lone) for key, until in self._forgiven)
+
+    def stood_alone(self, answers: Sequence[bytes]) -> None:
+        """Note that no second reply came behind one that was held: what was forgiven and is like it is not to come."""
+        self._forgiven = [entry for entry in self._forgiven if entry[0] and entry[0] not in answers]
+
+    def is_overdue(self, now: float) -> bool:
+        """Return whether a reply to an earlier request may still come."""
+        return bool(self.debts) or any(until > now for _, until in self._forgiven)
+
+    def doubts_refusals(self, now: float) -> bool:
+        """Return whether a NAK may be the reply to another request than the one on the wire: every request can be
+        answered with it, whatever its good replies begin with."""
+        return now < self.lone_bytes_until or self.is_overdue(now)
+
+    def came_up(self) -> None:
+        """Note that the line came up: a node may hold the beginning of an earlier master's frame."""
+        self.lone_bytes_until = inf
+        self.alert = True
+
     def is_doubtful(self, answers: Sequence[bytes], now: float) -> bool:
         """Return whether an answer like this may be one that was overtaken, or one that is said twice."""
         if any(until > now and key in answers for key, until in self._doubted):
@@ -289,8 +345,9 @@ def _could_be(debt: Debt, answers: Sequence[bytes]) -> bool:
 
 def _is_silent(debt: Debt) -> bool:
     """Return whether the debt's node does not answer, as far as is known: another's answer must do. A node that does
-    answer is asked itself."""
-    return debt.node is None or debt.node.silent or debt.node.last_reply == -inf
+    answer is asked itself, unless it was removed."""
+    node = debt.node
+    return node is None or node.removed or node.silent or node.last_reply == -inf
 
 
 def _is(run: bytes, key: bytes) -> bool:

@@ -79,7 +79,10 @@ class LineMachine:
         # the exchange on the wire
         self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency, byte_time)
         self._in_step = InStep(strict)
-        self._wire = OnWire(self._leg, self._echo, self._deadlines, self._in_step, self.dispatcher.urgent_waits)
+        dispatcher = self.dispatcher
+        self._wire = OnWire(
+            self._leg, self._echo, self._deadlines, self._in_step, dispatcher.urgent_waits, dispatcher.is_wanted
+        )
         self._choice = Choice(self.dispatcher, self._in_step, self._wire)
         self._trust = Trust(self._in_step)
         # the line
@@ -99,6 +102,7 @@ class LineMachine:
         lateness = max((node.lateness for node in self.dispatcher.nodes), default=UNKNOWN_LATENESS)
         self._up_at = now
         self._quarantine = now + lateness + self._leg.latency + self._leg.byte_time
+        self._in_step.came_up()
         self._settle(now)
 
     def line_down(self, cause: str, now: float) -> None:
@@ -281,6 +285,8 @@ class LineMachine:
         assert transaction is not None
         assert exchange is not None
         answered, rest = wire.answered, step.rest
+        if self._in_step.lone_bytes_until == inf:
+            self._first_frame_ended()
         if answered:
             if self._in_step.alert or rest:
                 verdict = self._trust.weigh(wire, step, now)
@@ -336,7 +342,9 @@ class LineMachine:
         elif error.heard:
             unasked.blame(now)
             unasked.run[:] = error.heard
-        spared = error.whole and not self._in_step.debts  # its reply has begun: the silence alone is waited for (R3)
+        spared = error.whole and not self._in_step.is_overdue(
+            now
+        )  # its reply has begun: the silence alone is waited for (R3)
         both = error.what is TWO_ANSWERS
         if both:
             self._in_step.said_twice(now)
@@ -357,7 +365,7 @@ class LineMachine:
         """
         transaction = self._wire.transaction
         assert transaction is not None
-        certain = not self._in_step.debts
+        certain = not self._in_step.doubts_refusals(now)
         if not certain:
             self._trust.owe(self._wire, heard=False)
         confirmed = transaction.refusals > 0
@@ -370,8 +378,15 @@ class LineMachine:
         else:
             self._settle(now, begun=confirmed and certain)
 
+    def _first_frame_ended(self) -> None:
+        """Tell R15 when no node can reply to the first frame any more, whether or not it was sent to that node."""
+        lateness = max((node.lateness for node in self.dispatcher.nodes), default=UNKNOWN_LATENESS)
+        self._in_step.lone_bytes_until = self._leg.out + lateness + self._leg.latency + self._leg.byte_time
+
     def _end_exchange(self) -> None:
         wire = self._wire
+        if self._in_step.lone_bytes_until == inf:
+            self._first_frame_ended()
         if wire.exchange is not None:
             self._leg.give_up(wire.exchange.later)
             self._leg.came_unasked(self._unasked.last_byte)  # what came in place of the reply may have been it, damaged

@@ -23,6 +23,7 @@ class OnWire:
         "_deadlines",
         "_echo",
         "_in_step",
+        "_is_wanted",
         "_urgent_waits",
         "answered",
         "came_unasked",
@@ -33,7 +34,13 @@ class OnWire:
     )
 
     def __init__(
-        self, leg: Leg, echo: Echo, deadlines: Deadlines, in_step: InStep, urgent_waits: Callable[[], bool]
+        self,
+        leg: Leg,
+        echo: Echo,
+        deadlines: Deadlines,
+        in_step: InStep,
+        urgent_waits: Callable[[], bool],
+        is_wanted: Callable[[Transaction], bool],
     ) -> None:
         self.transaction: Transaction | None = None
         self.exchange: Exchange[Any] | None = None
@@ -47,6 +54,7 @@ class OnWire:
         self._deadlines = deadlines
         self._in_step = in_step
         self._urgent_waits = urgent_waits
+        self._is_wanted = is_wanted
 
     def begin(self, transaction: Transaction, exchange: Exchange[Any], now: float) -> None:
         """Say its request, and set the deadline of its first leg."""
@@ -117,22 +125,28 @@ class OnWire:
 
     def _next_leg(self, step: Expect, now: float) -> None:
         """Begin the next leg. Raises FrameError or Refused instead, where a repeat would hold the line past its limit
-        or an urgent command (R9), or do twice what may have been done (R7)."""
+        or an urgent command (R9), or where the request may not be sent again."""
         transaction = self.transaction
         assert transaction is not None
         limit = transaction.node.profile.exchange_limit
         self.learn(now)  # before the next leg begins, which takes the place of this one's times
         if step.send and limit is not None:
             too_long = now - transaction.started > limit or self._urgent_waits()
-            if too_long or (transaction.writes and not transaction.idempotent and self._may_be_anothers(now)):
+            if too_long or not self._may_send_again(step, transaction, now):
                 raise cast("Abandonable", self.exchange).abandon()
         self._deadlines.line = self.leg.begin(step.timing, len(step.send), step.sizes.longest, now)
         if step.send:
             self.output.add(step.send, now)
 
-    def _may_be_anothers(self, now: float) -> bool:
-        """Return whether what was said to this exchange could be one that is owed (R15): a NAK, too."""
-        transaction, exchange, in_step = self.transaction, self.exchange, self._in_step
-        assert transaction is not None
-        assert exchange is not None
-        return in_step.alert and in_step.clashes(exchange.answers, now, transaction.node)
+    def _may_send_again(self, step: Expect, transaction: Transaction, now: float) -> bool:
+        """Return whether the exchange may send this, as far as it is its request: a NAK came.
+
+        While a reply is overdue, the NAK may be that one (R15). Then this request has a reply under way, a second
+        request would cause a second reply, and only one is accounted for: the other would confirm the next write, to
+        whichever node. That holds for an idempotent write and for a read too. And a request is not repeated for a
+        caller that has gone (R6): its write was reported as unconfirmed, or was overtaken by another one.
+        """
+        assert self.exchange is not None
+        if step.send != self.exchange.request:
+            return True
+        return self._is_wanted(transaction) and not self._in_step.doubts_refusals(now)

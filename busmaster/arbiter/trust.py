@@ -52,15 +52,20 @@ class Trust:
         if in_step.clashes(answers, now, transaction.node):
             # It pays nothing: it may be this request's, and what was owed before is still to come.
             return "its answer may be an earlier request's, whose own never came"
-        if in_step.is_doubtful(answers, now) and not held:
+        to_be_held = in_step.is_to_be_held(answers, now)
+        if not held and (to_be_held or in_step.is_doubtful(answers, now)):
             latest = leg.end + transaction.node.latest(leg.timing.window) + leg.latency
             if step.rest or leg.begun_at > latest:
                 return "its answer may be another's, said late or twice"
-            if in_step.doubts(now):
+            if to_be_held:  # its own reply may take as long as the document allows, not only as long as usual
+                latest = max(latest, leg.past())
+            if to_be_held or in_step.doubts(now):
                 if step.send:  # at once: MSC says its packet again until that is acknowledged
                     wire.say(step.send, now)
                 self.held = Done(step.value)
                 return max(now, latest) + 2 * leg.byte_time
+        if to_be_held:
+            in_step.stood_alone(answers)
         in_step.answered(transaction.node, transaction.started, now, leg.timing.nominal)
         in_step.said(answers, now)
         return None
@@ -106,7 +111,12 @@ class Trust:
         # Where the reader would have said something in between, this is not all that comes.
         if ending is None or not ending.delivered or ending.rest or read.said or any(len(key) == 1 for key in answers):
             return False
-        return not (self._in_step.clashes(answers, now, node, but=asked) or self._in_step.is_doubtful(answers, now))
+        in_step = self._in_step
+        return not (
+            in_step.clashes(answers, now, node, but=asked)
+            or in_step.is_doubtful(answers, now)
+            or in_step.is_to_be_held(answers, now)
+        )
 
     def hear(
         self, wire: OnWire, run: bytes, unasked: UnaskedBytes, now: float, ours: bool = False

@@ -66,7 +66,9 @@ class Bench:
         capacity: int = 1000,
         strict: bool = False,
         tapped: bool = False,
+        fresh: bool = False,
     ) -> None:
+        """If `fresh`, no frame was sent yet since the line came up: a node may hold a part of an earlier one."""
         self.arbiter = Arbiter(TAU, echo=echo, receive_latency=latency, capacity=capacity, strict=strict)
         if tapped:
             self.arbiter.set_tapped(True)
@@ -81,6 +83,8 @@ class Bench:
         self.checks = 0
         self._out = b""
         self.arbiter.line_up(0.0, paced=paced)
+        if not fresh:
+            self.arbiter._in_step.lone_bytes_until = -inf
         self.to(1.0)
         self.events.clear()
 

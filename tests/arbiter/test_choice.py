@@ -10,7 +10,7 @@ import pytest
 from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.health import KNOWN_TO_REFUSE, SILENT, Health
 from busmaster.arbiter.transaction import Priority
-from busmaster.errors import WriteUnconfirmed
+from busmaster.errors import GarbledReply, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import ACK, FIVE, NAK, TAU, WRITE_5, Bench, lost, reply_of, request_of, up
 
@@ -211,7 +211,34 @@ def test_r15_where_nothing_can_be_asked_that_is_unlike_the_line_settles_and_goes
         bench.until_sent()
     assert bench.sent() == request_of(1)
     bench.answer(7)
+    assert not bench.ended(read), "it may be the reply that never came: its own would follow"
+    bench.wait(0.150)
     assert read.value == 7.0
+
+
+def test_r15_of_two_replies_where_the_overdue_one_was_forgiven_neither_is_believed() -> None:
+    bench = Bench()
+    node = bench.node(profile=replace(hcp2.PROFILE, checks=()))
+    lost(bench, node)
+    read = bench.ask(node, retries=0)
+    bench.until_sent()
+    bench.hear(reply_of(1, 55), after=REQUEST + 0.004)
+    bench.hear(reply_of(1, 7), after=0.090)
+    assert (bench.ended(read), read.value) == (1, None)
+    assert isinstance(read.error, GarbledReply)
+
+
+def test_r15_one_reply_that_stood_alone_is_enough_for_those_that_follow() -> None:
+    bench = Bench()
+    node = bench.node(profile=replace(hcp2.PROFILE, checks=()))
+    lost(bench, node)
+    bench.ask(node)
+    bench.until_sent()
+    bench.answer()
+    bench.wait(0.150)
+    following = bench.ask(node)
+    bench.answer(8)
+    assert following.value == 8.0
 
 
 def test_r15_probes_that_can_only_ask_one_thing_find_a_node_that_is_back() -> None:
@@ -224,6 +251,7 @@ def test_r15_probes_that_can_only_ask_one_thing_find_a_node_that_is_back() -> No
         bench.wait(0.2)
     bench.until_sent()
     bench.answer()
+    bench.wait(0.150)
     assert node.health is Health.UP
 
 

@@ -92,23 +92,23 @@ def test_r15_another_nodes_answer_pays_only_for_a_node_that_is_silent_and_late()
         assert (in_step.ends((ONE,), 1.0) < inf) is paid
 
 
-def test_r15_only_what_is_like_a_forgiven_reply_is_doubted_and_only_until_it_would_have_lapsed() -> None:
+def test_r15_only_what_is_like_a_forgiven_reply_is_held_and_only_until_it_would_have_lapsed() -> None:
     in_step = InStep()
     in_step.owe((ONE,), living(), asked=1.0, over=1.150)
     in_step.forgive((ONE,))
-    assert in_step.is_doubtful((ONE,), 10.9)
-    assert not in_step.is_doubtful((TWO,), 10.9)
-    assert not in_step.is_doubtful((ONE,), 1.0 + LAPSE)
+    assert in_step.is_to_be_held((ONE,), 10.9)
+    assert not in_step.is_to_be_held((TWO,), 10.9)
+    assert not in_step.is_to_be_held((ONE,), 1.0 + LAPSE)
 
 
-def test_r15_a_forgiven_reply_that_comes_after_all_was_not_said_twice_and_is_doubted_no_more() -> None:
+def test_r15_a_forgiven_reply_that_comes_after_all_was_not_said_twice_and_is_held_no_more() -> None:
     in_step = InStep()
     in_step.owe((b"\x06",), living(), asked=1.0, over=1.150)
     in_step.forgive((b"\x06",))
     in_step.last = (b"\x06",)
     assert in_step.heard(b"\x06", 2.0) is None
     assert (in_step.doubts(2.0), in_step.debts) == (False, [])
-    assert not in_step.is_doubtful((b"\x06",), 2.0)
+    assert not in_step.is_to_be_held((b"\x06",), 2.0)
 
 
 def test_r15_what_is_unlike_the_last_answers_was_not_said_twice() -> None:

@@ -30,7 +30,7 @@ from busmaster.protocols.modbus.codec import WriteRegisters
 from busmaster.protocols.modbus.handle import ModbusUnit
 from busmaster.protocols.msc.handle import MscController
 from busmaster.registry import make_device
-from tests.stories import in_virtual_time
+from tests.stories import in_use, in_virtual_time
 
 Way: TypeAlias = Callable[[Any, float], Awaitable[None]]
 
@@ -43,6 +43,7 @@ def bus_of(handle: type[Handle], *devices: Device) -> Bus:
 async def controller() -> AsyncIterator[Hcp2Controller]:
     bus = bus_of(Hcp2Controller, make_device("hcp2", 5))
     async with bus:
+        in_use(bus)
         yield Hcp2Controller(bus, 5)
 
 
@@ -292,6 +293,7 @@ async def test_a_step_counts_from_what_is_read_where_the_node_was_away() -> None
 async def test_the_time_of_a_write_counts_from_before_the_value_is_read_from_which_it_steps() -> None:
     slow = 0.03
     async with bus_of(Hcp2Controller, make_device("hcp2", 5, delay=Delay(slow, slow))) as bus:
+        in_use(bus)
         drive = Hcp2Controller(bus, 5)
         await drive.read(10)
         drive.element(10).limit(max_step=20)

@@ -23,6 +23,7 @@ from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.hcp2.microflex_handle import MicroFlexDrive
 from busmaster.registry import find, make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
+from tests.stories import in_use
 
 
 async def record(path: Path, echo: bool) -> list[Packet]:
@@ -30,6 +31,7 @@ async def record(path: Path, echo: bool) -> list[Packet]:
     line = Line(LineSettings(57600), devices, echo=Echo() if echo else None)
     with Recorder(path, echo=echo) as tap:
         async with Bus(MemoryPort(line), tap=tap) as bus:
+            in_use(bus)
             old, new, drive = HcpController(bus, 1), Hcp2Controller(bus, 2), MicroFlexDrive(bus, 7)
             await old.write(10, 1.5, -2)
             assert await old.read(11) == -2

@@ -31,6 +31,7 @@ from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.protocols.msc.status import ProgramStatus
 from busmaster.registry import find, make_device
+from tests.stories import in_use
 
 BLOCK = tuple(range(-16, 16))
 Step = tuple[Command[Any], Any]
@@ -44,6 +45,7 @@ class Master:
         self.line = Line(profile.line, devices, chance=Random(1), **options)
         self.transcript: list[str] = []
         self.world = World(self.line, record=self.transcript.append)
+        in_use(self.world)
         self.nodes = {device.address: self.world.node(profile, device.address) for device in devices}
 
     def knows(self, profile: Profile, address: int) -> None:

@@ -17,6 +17,7 @@ from busmaster.errors import LineDown, NoReply
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.emulator.lines import SETTINGS, TAU
+from tests.stories import in_use
 
 SETTLED = 0.2
 
@@ -25,6 +26,7 @@ def world_of(*devices: EmulatedMint, seed: int = 1, **options: object) -> World:
     line = Line(SETTINGS, devices, chance=Random(seed), **options)  # type: ignore[arg-type]  # options of Line
     world = World(line)
     world.run(SETTLED)
+    in_use(world)
     return world
 
 
@@ -57,6 +59,7 @@ def test_an_action_happens_at_its_time_and_events_reach_their_listener() -> None
     events: list[tuple[float, Event]] = []
     line = Line(SETTINGS, [EmulatedMint(2)])
     world = World(line, on_event=lambda event: events.append((world.now, event)))
+    in_use(world)
     node = world.node(hcp2.PROFILE, 2)
     world.at(0.5, lambda: world.request(node, hcp2.Write(1, (5.0,))))
     world.run(1.0)

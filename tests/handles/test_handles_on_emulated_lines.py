@@ -35,7 +35,7 @@ from busmaster.protocols.msc import codec as msc_commands
 from busmaster.protocols.msc import device as msc
 from busmaster.protocols.msc.status import ProgramStatus
 from busmaster.testing.virtual_time import run_in_virtual_time
-from tests.stories import in_virtual_time
+from tests.stories import in_use, in_virtual_time
 
 
 async def cycles(group: PollGroup, count: int) -> list[Snapshot]:
@@ -52,6 +52,7 @@ async def cycles(group: PollGroup, count: int) -> list[Snapshot]:
 async def line_of(handle: type[Handle], *devices: Device) -> AsyncIterator[Bus]:
     """A bus on a line as that handle's protocol has it, once it has settled."""
     async with Bus(MemoryPort(Line(handle.profile.line, devices, chance=random.Random(1)))) as bus:
+        in_use(bus)
         yield bus
 
 

@@ -16,6 +16,7 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.service.exchanges import HEARD_AT_ONCE, MOST_BYTES, MOST_KEPT, Listener, said_passage
 from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, until
 from tests.service.schema import check
+from tests.stories import in_use
 
 
 def attempt() -> Attempt:
@@ -65,6 +66,7 @@ def test_each_exchange_is_told_with_what_was_said_and_what_came_of_it(tmp_path: 
         heard = Heard()
         await remote.exchanges(heard)
         await until(lambda: tapped(line))
+        in_use(line.bus)
         before = line.bus.now()
         controller = Hcp2Controller(remote, 5)
         await controller.write(1, 2.5)
