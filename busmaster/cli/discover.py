@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,13 +19,13 @@ from busmaster.cli.output import emit_all, note
 from busmaster.cli.parsing import parsed
 from busmaster.contract.profile import LineSettings
 from busmaster.discovery.search import Discovery, Search
-from busmaster.discovery.steps import LISTENING, Step, seconds, steps, untuned_steps
+from busmaster.discovery.steps import LISTENING, Step, ranges, seconds, steps, untuned_steps, usual_kinds
 from busmaster.discovery.writing import lasting, line_text, summary
 from busmaster.doctor.diagnosis import speed
 from busmaster.doctor.probing import opened
 from busmaster.errors import InvalidCommand
 from busmaster.files import open_file
-from busmaster.registry import Protocol, find, kinds, protocols
+from busmaster.registry import NodeKind, find, kinds
 from busmaster.transport.endpoints import endpoint, is_served
 from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
@@ -62,8 +63,9 @@ def command(
     """Find out at which rate, in which framing and which protocols the nodes on PORT speak; write a LINE.toml for them.
 
     It says what it will try and how long that takes, and asks before it does. It listens first, and sends nothing where
-    somebody else talks. Nothing but reads is sent. Nodes 1 to 8 are asked unless --nodes names others; a baud rate in
-    PORT (`?baudrate=9600`) is the only one that is tried, and with a framing (`&bytesize=7&parity=E`) that too.
+    somebody else talks. Nothing but reads is sent. Nodes 1 to 8 are asked unless --nodes names others. If one answers,
+    all other addresses of its protocol are asked too, and what was not asked is printed. A baud rate in PORT
+    (`?baudrate=9600`) is the only one that is tried, and with a framing (`&bytesize=7&parity=E`) that too.
     """
     errand = Errand(*parsed(lambda text: what_to_try(text, names, nodes), port))
     if output is not None and Path(output).exists():
@@ -95,7 +97,7 @@ def what_to_try(
     """Return the port, and what is tried there. Raises InvalidCommand."""
     if is_served(port):
         raise InvalidCommand(f"{port} is a line that a program owns and knows: discover needs the port itself")
-    wanted: Sequence[Protocol] = list(dict.fromkeys(find(name).protocol for name in names)) or protocols()
+    wanted: Sequence[NodeKind] = list(dict.fromkeys(find(name) for name in names)) or usual_kinds()
     where = endpoint(port, defaults=USUAL)
     if isinstance(where, TcpPort):
         return where, untuned_steps(wanted, nodes)
@@ -109,7 +111,7 @@ def tell_plan(errand: Errand) -> None:
     """Say what will be tried, and for how long."""
     tried = errand.tried
     settings = list(dict.fromkeys(step.settings for step in tried))
-    titles = dict.fromkeys(step.protocol.profile.title for step in tried)
+    titles = dict.fromkeys(step.kind.profile.title for step in tried)
     requests = sum(len(step.addresses) for step in tried)
     match settings:
         case [None]:
@@ -121,19 +123,52 @@ def tell_plan(errand: Errand) -> None:
     reads = "1 read" if requests == 1 else f"{requests} reads"
     note(f"{errand.port.name}: listen for {LISTENING:g} s; then {reads}, {at}, in {', '.join(titles)}")
     note(f"that takes {seconds(tried):.0f} s at most where nobody answers; nothing is written to any node")
+    if any(step.rest for step in tried):
+        note("if a node answers, the other addresses of its protocol are asked too")
 
 
 async def discover(errand: Errand, tap: Tap | None) -> Discovery | None:
     """Listen, and look. Returns None where nothing was found or nothing was sent, having said why."""
     from busmaster.cli.progress import Bar  # it takes a fifth of the time of --help
 
-    async with opened(errand.port, tap) as wire:
-        search = Search(wire, errand.port, note, Bar)
+    async with opened(errand.port, tap) as wire, EnterStops() as stop:
+        search = Search(wire, errand.port, note, Bar, stop.offered)
         if talk := await search.listen(errand.tried):
             note(f"{talk}; nothing was sent. `busmaster monitor` shows it; end the other master to look for nodes")
             return None
         discovery = await search.look(errand.tried)
     if not discovery.found:
         note("nobody answered: check power, wires A and B (swap them), termination; name nodes beyond 1-8 with --nodes")
-        return None
-    return discovery
+    for name, addresses in discovery.not_asked.items():
+        note(f"not asked: {name} {ranges(addresses)}")
+    return discovery if discovery.found else None
+
+
+class EnterStops:
+    """Lets the user stop a search with the Enter key, if standard input is a terminal."""
+
+    def __init__(self) -> None:
+        self._pressed = False
+        self._watched: int | None = None
+
+    async def __aenter__(self) -> EnterStops:
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        if self._watched is not None:
+            asyncio.get_running_loop().remove_reader(self._watched)
+
+    def offered(self) -> Callable[[], bool]:
+        """Tell the user how to stop, where that is possible, and return what says whether the user has."""
+        if sys.stdin.isatty() and self._watched is None:
+            try:
+                asyncio.get_running_loop().add_reader(sys.stdin.fileno(), self._press)
+            except NotImplementedError:  # Windows: its event loop does not watch a console
+                return lambda: False
+            self._watched = sys.stdin.fileno()
+            note("press Enter to stop and keep what was found")
+        return lambda: self._pressed
+
+    def _press(self) -> None:
+        os.read(sys.stdin.fileno(), 1024)  # else the shell would get the line
+        self._pressed = True

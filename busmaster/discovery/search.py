@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 from busmaster.arbiter.unasked import QUIET
 from busmaster.contract.profile import LineSettings
-from busmaster.discovery.steps import LISTENING, Step
+from busmaster.discovery.steps import LISTENING, Step, ranges
 from busmaster.doctor.diagnosis import garbage, speed, spoken
 from busmaster.doctor.examination import OPENING, Course, unseen
 from busmaster.doctor.probing import Outcome, Probe, Prober, Wire
 from busmaster.errors import LineDown
-from busmaster.registry import Protocol
+from busmaster.registry import NodeKind, Protocol
 from busmaster.transport.endpoints import Endpoint
 
 RECOGNISING = 1.0
@@ -21,6 +21,8 @@ RECOGNISED = 2
 """Whole frames by which a protocol is known."""
 CONFIRMED = 2
 """How often a node must answer again to be taken for one: at wrong settings, noise may look like an answer."""
+SLOW = 10.0
+"""Seconds that the other addresses may take before the user is offered to stop."""
 MEASURED = 10
 """How often a node is asked for its reply time."""
 
@@ -31,7 +33,7 @@ Tell = Callable[[str], None]
 class Found:
     """A node that answers. `starts`: seconds until its replies began, in order; `text`: what it said."""
 
-    protocol: Protocol
+    kind: NodeKind
     address: int
     starts: tuple[float, ...]
     text: str
@@ -39,8 +41,12 @@ class Found:
     """It answers, and refuses what was asked: it lives, but has no such item."""
 
     @property
+    def protocol(self) -> Protocol:
+        return self.kind.protocol
+
+    @property
     def label(self) -> str:
-        return self.protocol.profile.label(self.address)
+        return self.kind.profile.label(self.address)
 
 
 @dataclass(slots=True)
@@ -52,17 +58,31 @@ class Discovery:
     found: list[Found] = field(default_factory=list)
     talk: str = ""
     """Who talks there already, in words; then nothing was sent."""
+    not_asked: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    """The addresses that were not asked, by kinds of nodes that were tried and may be on this line."""
 
 
 class Search:
-    """Looks for nodes on an open port. `tell` is called with what is noticed on the way, in words."""
+    """Looks for nodes on an open port. `tell` is called with what is noticed on the way, in words.
 
-    def __init__(self, wire: Wire, endpoint: Endpoint, tell: Tell, progress: Course = unseen) -> None:
+    `stop_offered` is called before many addresses are asked on a slow line. It tells the user how to stop, and returns
+    what says whether the user has done so.
+    """
+
+    def __init__(
+        self,
+        wire: Wire,
+        endpoint: Endpoint,
+        tell: Tell,
+        progress: Course = unseen,
+        stop_offered: Callable[[], Callable[[], bool]] = lambda: lambda: False,
+    ) -> None:
         self._wire = wire
         self._endpoint = endpoint
         self._tell = tell
         self._progress = progress
         self._echo = endpoint.echo
+        self._stop_offered = stop_offered
         self._silent: set[tuple[LineSettings | None, bytes]] = set()
         """Requests that nobody answered, and how the line was set: some protocols have the same ones."""
 
@@ -81,34 +101,64 @@ class Search:
                 if one is None or await self._tuned(one):
                     heard = await wire.hear_all(RECOGNISING, quiet=RECOGNISING) or heard
                     for step in tried:
-                        known = spoken(heard, step.protocol.kinds[0].name) if step.settings == one else []
+                        known = spoken(heard, step.kind.protocol.kinds[0].name) if step.settings == one else []
                         if len(known) >= RECOGNISED:
-                            return f"somebody talks {step.protocol.profile.title} already{_at(one)}: {known[0]}"
+                            return f"somebody talks {step.kind.profile.title} already{_at(one)}: {known[0]}"
                 bar.advance()
         return f"somebody talks already, in a way that is not known here: {garbage(heard)}"
 
     async def look(self, tried: Sequence[Step]) -> Discovery:
         """Try one step after the other; where nodes are found, only what may share a line with them is tried on.
 
-        Raises LineDown.
+        Then the other addresses of their protocols are asked too. Raises LineDown.
         """
         discovery = Discovery()
-        left = list(tried)
+        found: dict[tuple[str, int], Found] = {}
+        left, asked = list(tried), list[Step]()
         with self._progress("asking", sum(len(step.addresses) for step in tried)) as bar:
             while left:
                 step = left.pop(0)
-                found = []
-                if step.settings is None or await self._tuned(step.settings):
-                    found = await self._ask_all(step, bar.advance)
-                if found:
-                    discovery.settings, discovery.found = step.settings, discovery.found + found
+                if step.settings is not None and not await self._tuned(step.settings):
+                    continue
+                others = [other for other in tried if other.settings == step.settings]
+                asked.append(step)
+                before = len(found)
+                await self._ask_all(step, step.addresses, others, found, bar.advance)
+                if len(found) > before:
+                    discovery.settings = step.settings
                     left = [other for other in left if self._goes_with(other, step)]
+                    asked = [other for other in asked if self._goes_with(other, step)]
+        if found:
+            await self._finish(asked, found, discovery)
+        else:
+            discovery.not_asked = {step.kind.name: step.rest for step in tried if step.rest}
+        discovery.found = list(found.values())
         discovery.echo = self._echo
         return discovery
 
+    async def _finish(self, asked: Sequence[Step], found: dict[tuple[str, int], Found], discovery: Discovery) -> None:
+        """Ask the other addresses of the protocols of which nodes have replied, and note which were not asked."""
+        spoken = {node.protocol.name for node in found.values()}
+        due = [step for step in asked if step.kind.protocol.name in spoken and step.rest]
+        discovery.not_asked = {step.kind.name: step.rest for step in asked if step.rest and step not in due}
+        total, stopped = sum(step.seconds_for(step.rest) for step in due), lambda: False
+        if due:
+            names = "; ".join(f"{step.kind.name} {ranges(step.rest)}" for step in due)
+            self._tell(f"nodes have replied, so the other addresses are asked too ({names}): up to {total:.0f} s")
+        if total > SLOW:
+            stopped = self._stop_offered()
+        with self._progress("asking the others", sum(len(step.rest) for step in due)) as bar:
+            for step in due:
+                if step.settings is not None and not await self._tuned(step.settings):
+                    discovery.not_asked[step.kind.name] = step.rest
+                    continue
+                count = await self._ask_all(step, step.rest, asked, found, bar.advance, stopped)
+                if count < len(step.rest):
+                    discovery.not_asked[step.kind.name] = step.rest[count:]
+
     @staticmethod
     def _goes_with(other: Step, found: Step) -> bool:
-        return other.settings == found.settings and other.protocol.profile.may_share_with(found.protocol.profile)
+        return other.settings == found.settings and other.kind.profile.may_share_with(found.kind.profile)
 
     async def _tuned(self, settings: LineSettings) -> bool:
         """Set the port so, and return whether it takes that. What was on its way before is heard and forgotten."""
@@ -123,32 +173,61 @@ class Search:
         return True
 
     def _prober(self, step: Step) -> Prober:
-        profile = step.protocol.profile
+        profile = step.kind.profile
         return Prober(self._wire, profile, profile.timings, (step.settings or profile.line).byte_time, echo=self._echo)
 
-    async def _ask_all(self, step: Step, advance: Callable[[], None]) -> list[Found]:
-        found: dict[int, Found] = {}
+    async def _ask_all(
+        self,
+        step: Step,
+        some: Sequence[int],
+        others: Sequence[Step],
+        found: dict[tuple[str, int], Found],
+        advance: Callable[[], None],
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> int:
+        """Ask addresses, and add the nodes that reply to `found`. Returns how many were asked before it was stopped."""
         before: int | None = None
-        for address in step.addresses:
-            request = step.protocol.profile.probe.open(address, step.protocol.profile.timings).request
-            if (step.settings, request) not in self._silent:
+        name, profile = step.kind.protocol.name, step.kind.profile
+        for number, address in enumerate(some):
+            if stopped():
+                return number
+            request = profile.probe.open(address, profile.timings).request
+            if (name, address) not in found and (step.settings, request) not in self._silent:
                 probe = await self._ask(step, address, request)
                 if probe.outcome is Outcome.SILENT:
                     self._silent.add((step.settings, request))
                 else:
                     # A late answer is heard behind the next request: it may be that of the node before.
                     for one in (before, address):
-                        if one is not None and one not in found and (node := await self._confirmed(step, one)):
-                            found[one] = node
+                        if (
+                            one is not None
+                            and (name, one) not in found
+                            and (node := await self._known(step, one, others))
+                        ):
+                            found[name, one] = node
                     if not found and probe.outcome is Outcome.GARBLED:
                         self._tell(f"{self._place(step, address)}: {probe.text}: {garbage(probe.raw)}")
             before = address
             advance()
-        return list(found.values())
+        return len(some)
+
+    async def _known(self, step: Step, address: int, others: Sequence[Step]) -> Found | None:
+        """Return the node that replies at an address, as the kind of node that does not refuse the kind's probe.
+
+        A MicroFlex drive refuses what a controller has, and replies all the same.
+        """
+        found = await self._confirmed(step, address)
+        if found is not None and found.refuses:
+            for other in others:
+                if other.kind.protocol is step.kind.protocol and other.kind is not step.kind:
+                    better = await self._confirmed(other, address)
+                    if better is not None and not better.refuses:
+                        return better
+        return found
 
     async def _ask(self, step: Step, address: int, request: bytes) -> Probe:
         """Ask a node once. An adapter that echoes is found out by the first request that comes back."""
-        profile = step.protocol.profile
+        profile = step.kind.profile
         probe = await self._prober(step).ask(address, patience=profile.timings.read.window)
         # an echo may look like an answer: that of a Mentor II begins with EOT
         if not self._echo and probe.raw.startswith(request):
@@ -160,17 +239,17 @@ class Search:
     async def _confirmed(self, step: Step, address: int) -> Found | None:
         """Ask a node again and again; None unless it answers each time, with nobody else to answer for it."""
         prober = self._prober(step)
-        await self._wire.hear_all(step.protocol.profile.timings.read.lateness)  # an answer of before is over then
+        await self._wire.hear_all(step.kind.profile.timings.read.lateness)  # an answer of before is over then
         probes = [await prober.ask(address, alone=True) for _ in range(CONFIRMED)]
         if any(probe.outcome is not Outcome.ANSWERED for probe in probes):
             return None
         probes += [await prober.ask(address, alone=number == MEASURED - 1) for number in range(MEASURED)]
         starts = sorted(max(0.0, probe.start) for probe in probes if probe.start is not None)
         refuses = all(probe.refused for probe in probes)
-        return Found(step.protocol, address, tuple(starts), probes[0].text, refuses)
+        return Found(step.kind, address, tuple(starts), probes[0].text, refuses)
 
     def _place(self, step: Step, address: int) -> str:
-        return f"{step.protocol.profile.title}, {step.protocol.profile.label(address)}{_at(step.settings)}"
+        return f"{step.kind.profile.title}, {step.kind.profile.label(address)}{_at(step.settings)}"
 
 
 def _at(settings: LineSettings | None) -> str:

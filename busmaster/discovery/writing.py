@@ -41,7 +41,7 @@ def line_text(port: SerialPort | TcpPort, discovery: Discovery) -> str:
     for node in found:
         lines += ["", *_node(names[node], node)]
     if polled:
-        points = [f"{names[node]}/{node.protocol.kinds[0].probe_item}" for node in polled]
+        points = [f"{names[node]}/{node.kind.probe_item}" for node in polled]
         lines += [
             "",
             "[groups.all]",
@@ -77,7 +77,7 @@ def _name(node: Found, found: Sequence[Found]) -> str:
     if not node.protocol.profile.addressed:
         return "drive"
     alone = len({other.protocol.name for other in found}) == 1
-    return f"node{node.address}" if alone else f"{node.protocol.kinds[0].name}_{node.address}"
+    return f"node{node.address}" if alone else f"{node.kind.name}_{node.address}"
 
 
 def _port(port: SerialPort | TcpPort, discovery: Discovery) -> Iterator[str]:
@@ -96,8 +96,8 @@ def _port(port: SerialPort | TcpPort, discovery: Discovery) -> Iterator[str]:
 
 
 def _node(name: str, node: Found) -> Iterator[str]:
-    kind = node.protocol.kinds[0]
-    others = [other.name for other in node.protocol.kinds[1:]]
+    kind = node.kind
+    others = [other.name for other in node.protocol.kinds if other is not kind]
     times = " / ".join(map(milliseconds, (node.starts[0], median(node.starts), percentile(node.starts))))
     yield f"[nodes.{name}]"
     yield f"# it said: {' '.join(node.text.split())}; replies began after {times} ms (least / median / p99)"

@@ -12,7 +12,7 @@ from busmaster.config import load
 from busmaster.contract.profile import LineSettings
 from busmaster.emulator.line import Line
 from busmaster.emulator.serve import PtyServer, serve_pty, serve_tcp
-from busmaster.registry import make_device
+from busmaster.registry import find, make_device
 from tests.cli.conftest import Command, ended_once
 
 HCP2 = ("--protocol", "hcp2", "--nodes", "1-3")
@@ -36,6 +36,24 @@ def test_what_it_finds_is_a_file_that_runs(busmaster: Command, unknown: PtyServe
     assert {name: node.address for name, node in file.nodes.items()} == {"node1": 1, "node3": 3}
     run = ended_once(lambda lines: '"node1/1": {"value": 0' in lines[-1], "run", str(path), "--json")
     assert run.status == 130, run.err
+
+
+@pytest.mark.parametrize(
+    ("name", "nodes"), [("microflex", tuple(range(1, 11))), ("ct-ansi", (12, 23)), ("modbus", (5, 17, 18))]
+)
+def test_every_node_of_the_protocol_is_found(
+    busmaster: Command, tmp_path: Path, name: str, nodes: tuple[int, ...]
+) -> None:
+    path, settings = tmp_path / "line.toml", find(name).profile.line
+    line = Line(settings, [make_device(name, node) for node in nodes], chance=random.Random(1), paced=False)
+    with serve_pty(line) as server:
+        port = f"{server.path}?baudrate={settings.baudrate}&bytesize={settings.bytesize}&parity={settings.parity}"
+        done = busmaster("discover", port, "--protocol", name, "--yes", "-o", str(path))
+    assert done.status == 0, done.err
+    found = {node.address: node.protocol for node in load(path).nodes.values()}
+    assert found == dict.fromkeys(nodes, name)
+    assert "the other addresses are asked too" in done.err
+    assert "not asked" not in done.err
 
 
 def test_without_a_file_it_is_printed(busmaster: Command, unknown: PtyServer) -> None:
@@ -69,6 +87,14 @@ def test_where_nobody_answers_the_status_is_1(busmaster: Command) -> None:
     assert (done.status, done.out) == (1, "")
     assert "then 1 read, at the server's own rate, in DC104-SER" in done.err
     assert "nobody answered" in done.err
+    assert "not asked" not in done.err, "it has no addresses"
+
+
+def test_what_was_not_asked_is_printed(busmaster: Command) -> None:
+    with serve_tcp(Line(LineSettings(9600), [], paced=False)) as server:
+        done = busmaster("discover", server.path, "--protocol", "msc", "--yes")
+    assert done.status == 1
+    assert "not asked: msc 9-15" in done.err
 
 
 def test_a_device_server_is_searched_at_the_rate_that_it_has(busmaster: Command) -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import count
 
 import pytest
 
 from busmaster.contract.profile import LineSettings
 from busmaster.discovery.search import Discovery, Search
-from busmaster.discovery.steps import LISTENING, Step, addresses, seconds, steps
+from busmaster.discovery.steps import LISTENING, Step, addresses, ranges, seconds, steps, usual_kinds
 from busmaster.doctor.probing import opened
 from busmaster.emulator.device import Delay, Device
 from busmaster.emulator.line import Echo, Line
@@ -18,7 +18,7 @@ from busmaster.emulator.memory import MemoryPort
 from busmaster.emulator.misheard import misheard
 from busmaster.emulator.traceable import TraceableMemory
 from busmaster.errors import InvalidCommand
-from busmaster.registry import NodeKind, find, kinds, make_device, protocols
+from busmaster.registry import NodeKind, find, kinds, make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
 
 MODULI = {"hcp": 10**12, "hcp2": 10**12, "microflex": 10**12, "msc": 2**31, "mentor": 10**4, "ct-ansi": 10**4}
@@ -72,7 +72,7 @@ def test_each_protocol_is_found_at_three_settings(kind: NodeKind, settings: Line
     known = settings in (kind.profile.line, *kind.profile.other_lines)
     nodes = addresses(kind.profile, None)[:3]
     line = line_of(settings, *(device_of(kind, node) for node in nodes))
-    discovery = looked(line, steps(protocols(), None, None if known else settings.baudrate))
+    discovery = looked(line, steps(usual_kinds(), None, None if known else settings.baudrate))
     assert discovery.settings == settings
     assert {(node.protocol.name, node.address) for node in discovery.found} == {
         (kind.protocol.name, node) for node in nodes
@@ -80,17 +80,17 @@ def test_each_protocol_is_found_at_three_settings(kind: NodeKind, settings: Line
 
 
 def test_all_that_is_tried_takes_less_than_a_minute() -> None:
-    assert LISTENING < seconds(steps(protocols(), None, None)) < 60
+    assert LISTENING < seconds(steps(usual_kinds(), None, None)) < 60
 
 
 def every_probe() -> dict[bytes, str]:
     """Each request that a search may send, with who would."""
     return {
-        step.protocol.profile.probe.open(node, step.protocol.profile.timings).request: f"{step.protocol.name} {node}"
-        for step in steps(protocols(), None, None)
+        step.kind.profile.probe.open(node, step.kind.profile.timings).request: f"{step.kind.name} {node}"
+        for step in steps(usual_kinds(), None, None)
         for node in {
             *step.addresses,
-            *step.protocol.profile.addresses[:: max(1, len(step.protocol.profile.addresses) // 16)],
+            *step.kind.profile.addresses[:: max(1, len(step.kind.profile.addresses) // 16)],
         }
     }
 
@@ -102,7 +102,7 @@ def test_no_probe_changes_a_value_however_the_ends_are_set(kind: NodeKind) -> No
     Bytes with a wrong parity or stop bit are passed over, as devices do, and taken for good, as they should not be.
     """
     own = dict.fromkeys((kind.profile.line, *kind.profile.other_lines))
-    tried = dict.fromkeys(step.settings for step in steps(protocols(), None, None))
+    tried = dict.fromkeys(step.settings for step in steps(usual_kinds(), None, None))
     heard: dict[bytes, str] = {}
     for request, who in every_probe().items():
         for said in tried:
@@ -153,7 +153,7 @@ def test_where_somebody_talks_nothing_is_sent_and_it_is_said_what_is_spoken() ->
 
     talkers = Talkers()
     talkers.attentive = True
-    discovery = looked(line_of(settings, talkers), steps(protocols(), None, None))
+    discovery = looked(line_of(settings, talkers), steps(usual_kinds(), None, None))
     assert not discovery.found
     assert discovery.talk.startswith("somebody talks Modbus RTU already at 9600 8N1: ")
     assert talkers.heard == b""
@@ -174,23 +174,23 @@ def test_talk_that_nobody_knows_is_left_alone_too() -> None:
 
     babbler = Babbler()
     babbler.attentive = True
-    discovery = looked(line_of(LineSettings(9600), babbler), steps(protocols(), None, None))
+    discovery = looked(line_of(LineSettings(9600), babbler), steps(usual_kinds(), None, None))
     assert "in a way that is not known here" in discovery.talk
 
 
 def test_an_adapter_that_echoes_is_noticed() -> None:
     told: list[str] = []
     line = line_of(LineSettings(9600), make_device("hcp2", 3), echo=Echo())
-    discovery = looked(line, steps(protocols(), None, None), told)
+    discovery = looked(line, steps(usual_kinds(), None, None), told)
     assert discovery.echo
-    assert told == ["the adapter hears what it sends"]
+    assert told[0] == "the adapter hears what it sends"
     assert [node.address for node in discovery.found] == [3]
 
 
 def test_a_node_that_answers_after_the_window_is_found_under_its_own_address() -> None:
     """Its answer is heard behind the next node's request."""
     line = line_of(LineSettings(57600), make_device("hcp2", 2, delay=Delay(0.13)), make_device("hcp2", 5))
-    discovery = looked(line, steps(protocols(), None, None))
+    discovery = looked(line, steps(usual_kinds(), None, None))
     assert [node.address for node in discovery.found] == [2, 5]
     assert discovery.found[0].starts[0] == pytest.approx(0.13, abs=0.01)
 
@@ -219,37 +219,38 @@ class Fading(Device):
 @pytest.mark.parametrize(("answers", "found"), [(1, []), (2, []), (3, [3])])
 def test_a_node_must_answer_twice_more_to_be_taken_for_one(answers: int, found: list[int]) -> None:
     line = line_of(LineSettings(57600), Fading(answers))
-    discovery = looked(line, steps([find("hcp2").protocol], (3,), LineSettings(57600)))
+    discovery = looked(line, steps([find("hcp2")], (3,), LineSettings(57600)))
     assert [node.address for node in discovery.found] == found
 
 
 def test_two_protocols_that_may_share_a_line_are_both_found() -> None:
     line = line_of(LineSettings(57600), make_device("hcp", 1), make_device("hcp2", 2))
-    discovery = looked(line, steps(protocols(), None, None))
+    discovery = looked(line, steps(usual_kinds(), None, None))
     assert {(node.protocol.name, node.address) for node in discovery.found} == {("hcp", 1), ("hcp2", 2)}
 
 
 def test_where_nodes_are_found_nothing_is_tried_that_cannot_share_their_line() -> None:
     line = line_of(LineSettings(57600), make_device("hcp2", 2))
-    looked(line, steps(protocols(), None, None))
+    looked(line, steps(usual_kinds(), None, None))
     assert line.host is None, "the port is as the nodes have it"
 
 
 def test_a_unit_that_refuses_is_found_too() -> None:
     line = line_of(LineSettings(19200, 8, "E"), make_device("modbus", 4, size=0))
-    [node] = looked(line, steps(protocols(), None, None)).found
+    [node] = looked(line, steps(usual_kinds(), None, None)).found
     assert (node.address, node.refuses) == (4, True)
 
 
 def test_on_an_empty_line_nothing_is_found() -> None:
-    assert looked(line_of(LineSettings(57600)), steps(protocols(), None, None)).found == []
+    assert looked(line_of(LineSettings(57600)), steps(usual_kinds(), None, None)).found == []
 
 
 def test_the_nodes_that_are_named_are_asked_where_they_exist() -> None:
-    tried = steps(protocols(), (0, 12), None)
-    assert {step.protocol.name: step.addresses for step in tried} == {
+    tried = steps(usual_kinds(), (0, 12), None)
+    assert {step.kind.name: step.addresses for step in tried} == {
         "hcp": (0, 12),
         "hcp2": (0, 12),
+        "microflex": (0, 12),
         "msc": (12,),
         "mentor": (12,),
         "ct-ansi": (12,),
@@ -257,10 +258,84 @@ def test_the_nodes_that_are_named_are_asked_where_they_exist() -> None:
         "dc104": (0,),
     }
     with pytest.raises(InvalidCommand, match="nothing is left to try"):
-        steps([find("msc").protocol], (99,), None)
+        steps([find("msc")], (99,), None)
 
 
 def test_a_rate_or_settings_that_are_said_are_the_only_ones() -> None:
-    assert {step.settings and step.settings.baudrate for step in steps(protocols(), None, 4800)} == {4800}
+    assert {step.settings and step.settings.baudrate for step in steps(usual_kinds(), None, 4800)} == {4800}
     wanted = LineSettings(9600, 7, "E")
-    assert {step.settings for step in steps(protocols(), None, wanted)} == {wanted}
+    assert {step.settings for step in steps(usual_kinds(), None, wanted)} == {wanted}
+
+
+def found_on(line: Line, *names: str, told: list[str] | None = None) -> Discovery:
+    return looked(line, steps([find(name) for name in names] or usual_kinds(), None, None), told)
+
+
+AWKWARD = {
+    "microflex": tuple(range(1, 11)),
+    "ct-ansi": (12, 23),
+    "modbus": (5, 17, 18),
+    "hcp2": (8, 255),
+    "hcp": (0, 1, 15),
+    "msc": (1, 15),
+    "mentor": (3, 99),
+}
+
+
+@pytest.mark.parametrize(("name", "nodes"), AWKWARD.items())
+def test_if_a_node_replies_the_other_addresses_of_its_protocol_are_asked(name: str, nodes: tuple[int, ...]) -> None:
+    told: list[str] = []
+    line = line_of(find(name).profile.line, *(make_device(name, node) for node in nodes))
+    discovery = found_on(line, name, told=told)
+    assert sorted(node.address for node in discovery.found) == list(nodes)
+    assert discovery.not_asked == {}
+    assert "so the other addresses are asked too" in told[-1]
+
+
+@pytest.mark.parametrize("ignores", [False, True])
+def test_a_microflex_is_found_as_one_whether_it_refuses_or_ignores_the_reads_of_a_controller(ignores: bool) -> None:
+    drives = [make_device("microflex", node, ignore_unmapped=ignores) for node in (2, 9)]
+    line = line_of(find("microflex").profile.line, *drives, make_device("hcp2", 4), make_device("hcp2", 11))
+    found = {node.address: (node.kind.name, node.refuses) for node in found_on(line).found}
+    assert found == {2: ("microflex", False), 9: ("microflex", False), 4: ("hcp2", False), 11: ("hcp2", False)}
+
+
+def test_what_was_not_asked_is_reported() -> None:
+    line = line_of(find("hcp2").profile.line, make_device("hcp2", 3))
+    discovery = found_on(line, "hcp", "hcp2")
+    assert discovery.not_asked == {"hcp": (0, *range(9, 16))}, "no HCP node has replied"
+    nothing = found_on(line_of(LineSettings(9600)), "msc")
+    assert nothing.not_asked == {"msc": tuple(range(9, 16))}
+
+
+def test_the_nodes_that_are_named_are_all_that_are_asked() -> None:
+    line = line_of(find("hcp2").profile.line, *(make_device("hcp2", node) for node in (3, 20)))
+    discovery = looked(line, steps([find("hcp2")], (3,), None))
+    assert [node.address for node in discovery.found] == [3]
+
+
+def test_the_user_is_offered_to_stop_on_a_slow_line_and_what_was_found_is_kept() -> None:
+    line = line_of(find("modbus").profile.line, *(make_device("modbus", node) for node in (5, 12, 200)))
+    offers: list[bool] = []
+
+    def offered() -> Callable[[], bool]:
+        offers.append(True)
+        left = count(30, -1)
+        return lambda: next(left) == 0
+
+    async def look() -> Discovery:
+        port = Undeclared(line)
+        async with opened(port) as wire:
+            return await Search(wire, port, lambda _: None, stop_offered=offered).look(
+                steps([find("modbus")], None, None)
+            )
+
+    discovery = run_in_virtual_time(look())
+    assert offers == [True]
+    assert [node.address for node in discovery.found] == [5, 12]
+    assert discovery.not_asked == {"modbus": tuple(range(39, 248))}
+
+
+def test_addresses_are_written_as_ranges() -> None:
+    assert ranges((0, 9, 10, 11, 255, 13)) == "0, 9-11, 13, 255"
+    assert ranges(()) == ""

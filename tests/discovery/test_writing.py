@@ -20,7 +20,7 @@ SETTINGS = LineSettings(19200)
 
 
 def node_of(protocol: Protocol, starts: tuple[float, ...] = (0.002, 0.003, 0.004)) -> Found:
-    return Found(protocol, protocol.profile.addresses[-1], starts, 'it: says\n"this"', refuses=False)
+    return Found(protocol.kinds[0], protocol.profile.addresses[-1], starts, 'it: says\n"this"', refuses=False)
 
 
 def line_of(discovery: Discovery, port: SerialPort | TcpPort, folder: Path) -> ConfiguredLine:
