@@ -47,15 +47,19 @@ SLOWEST_DECAY = 0.002
 
 
 class Health(enum.Enum):
-    """UNKNOWN was never heard; SUSPECT failed lately; DOWN is probed, and its polls are parked."""
+    """UNKNOWN was never heard; SUSPECT failed lately; DOWN is probed, and its polls are parked.
+
+    OFFLINE is every node while its line is lost. A record never has it: `Node.health` combines record and line.
+    """
 
     UNKNOWN = "unknown"
     UP = "up"
     SUSPECT = "suspect"
     DOWN = "down"
+    OFFLINE = "offline"
 
 
-UNKNOWN, UP, SUSPECT, DOWN = Health
+UNKNOWN, UP, SUSPECT, DOWN, OFFLINE = Health
 
 
 class NodeRecord:

@@ -14,13 +14,14 @@ import anyio._backends._asyncio  # now, not when a line runs: it takes 30 ms
 
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.counters import LineStatistics
-from busmaster.arbiter.events import CameUnasked, NodeChanged, PortFailed
+from busmaster.arbiter.events import CameUnasked, LineChange, LineChanged, NodeChanged, PortFailed
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.schedule import SLICE
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.tap import Tap
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.alarms import AlarmChanged, Alarms, BusEvent
+from busmaster.bus.condition import LineCondition
 from busmaster.bus.node import Node
 from busmaster.bus.outlook import Outlook
 from busmaster.bus.points import Point
@@ -339,6 +340,21 @@ class Bus:
         """Return what the line does: OFFLINE, READY, in an EXCHANGE, in the HOLDOFF between two, or SETTLING."""
         return self._arbiter.state
 
+    @property
+    def condition(self) -> LineCondition:
+        """Return whether the line is lost while the bus is open, since when, and why."""
+        return self._line.condition
+
+    @property
+    def lost_seconds(self) -> float:
+        """Return for how long the line was lost since the bus was opened, in all."""
+        return self._line.losses.seconds(self.now())
+
+    def as_of_now(self, point: Point[T], sample: Sample[T]) -> Sample[T]:
+        """Return a sample of a poll group with the quality that it has now: bad while the line is lost, stale after a
+        write to what the point reads. `PollGroup.latest` has it as it was when its cycle ended."""
+        return self._line.as_of_now(point, sample)
+
     def statistics(self) -> LineStatistics:
         """Return an immutable snapshot of the line's counts since it was opened or reset."""
         self.check_loop()
@@ -420,6 +436,11 @@ class Bus:
             del self._groups[group.name]
 
     def _on_event(self, event: BusEvent) -> None:
+        match event:
+            case LineChanged(LineChange.DOWN, cause) | PortFailed(cause):
+                self._line.losses.lost(self.now(), cause)
+            case LineChanged(LineChange.UP):
+                self._line.losses.found(self.now())
         if isinstance(event, NodeChanged):
             node = self._nodes.get((event.node.profile.name, event.node.address))
             if node is None or node.record is not event.node:

@@ -153,8 +153,8 @@ class Node:
 
     @property
     def health(self) -> Health:
-        """Return what is known of the node: up, suspect, down or unknown."""
-        return self.record.health
+        """Return what is known of the node: up, suspect, down or unknown; offline while the line is lost."""
+        return Health.OFFLINE if self.shared.condition.is_lost else self.record.health
 
     def __repr__(self) -> str:
         return f"<Node {self.profile.name} {self.address} {self.health.value}>"

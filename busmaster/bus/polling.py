@@ -8,6 +8,7 @@ from functools import partial
 from math import inf
 from typing import Any, NamedTuple
 
+from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.schedule import line_time, set_members
 from busmaster.arbiter.transaction import Poll, Priority, Transaction
@@ -79,6 +80,8 @@ class PollGroup(Cycles):
         self._points: dict[Point[Any], Node] = {}
         self._watched: tuple[Point[Any], ...] = ()
         self._tally = Tally(self._poll)
+        self._good_at: dict[Point[Any], float] = {}
+        """When each point that cannot be read was last read, in seconds since 1970."""
         # the cycle that runs
         self._cycle = 0
         self._samples: dict[Point[Any], Sample[Any]] = {}
@@ -92,6 +95,10 @@ class PollGroup(Cycles):
     def points(self) -> tuple[Point[Any], ...]:
         """Return the points that a cycle reads, in their order."""
         return tuple(self._points)
+
+    def points_of(self, record: NodeRecord) -> list[Point[Any]]:
+        """Return those of its points that are of this node."""
+        return [point for point, node in self._points.items() if node.record is record]
 
     @property
     def period(self) -> float:
@@ -134,6 +141,7 @@ class PollGroup(Cycles):
         self._line.check_loop()
         for point in points:
             self._points.pop(point, None)
+            self._good_at.pop(point, None)
         self._points_changed()
 
     def pause(self) -> None:
@@ -209,6 +217,8 @@ class PollGroup(Cycles):
             self._refusals.append(read)
         for point, place in read.points:
             sample = self._sample(point, place, transaction)
+            if sample.error is not None:
+                self._note_good(point)
             self._samples[point] = sample
             self._qualities[sample.quality] += 1
 
@@ -253,6 +263,22 @@ class PollGroup(Cycles):
         finished = transaction.ended_at
         wall = finished + self._wall_offset
         return Sample(value, error, self._poll.due, timeline.started, finished, quality, timeline, wall)
+
+    def _note_good(self, point: Point[Any]) -> None:
+        """Keep when a point was last read, as its sample of the cycle before is about to be replaced by an error."""
+        before = None if self.latest is None else self.latest.samples.get(point)
+        if before is not None and before.error is None:
+            self._good_at[point] = before.wall
+
+    def good_at(self, point: Point[Any]) -> float | None:
+        """Return when a point was last read without an error, in seconds since 1970; None if it never was.
+
+        May be called in any thread.
+        """
+        sample = None if self.latest is None else self.latest.samples.get(point)
+        if sample is None or sample.error is not None:
+            return self._good_at.get(point)
+        return sample.wall
 
     def _age(self) -> None:
         """Mark the samples that were read before a write to their point that ended meanwhile."""

@@ -12,14 +12,16 @@ from typing import Any
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.health import NodeRecord
+from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Phase, Poll, Priority, Transaction
 from busmaster.bus.alarms import Alarms
 from busmaster.bus.answers import Answer, composed
+from busmaster.bus.condition import PRESENT, LineCondition, LossLog
 from busmaster.bus.limiter import Limiter
 from busmaster.bus.logbook import Logbook
 from busmaster.bus.points import Point
 from busmaster.bus.requester import Requester
-from busmaster.bus.samples import Sample
+from busmaster.bus.samples import Quality, Sample
 from busmaster.bus.snapshots import Snapshot
 from busmaster.contract.places import Changing, Placed
 from busmaster.errors import BusClosed, GarbledReply, InvalidCommand
@@ -39,6 +41,7 @@ class SharedLine:
         self.pump: Pump
         self.alarms: Alarms
         self.logbook = Logbook(name)
+        self.losses = LossLog()
         self.limiter: Limiter | None = None
         """None while nothing is limited."""
         self.clients = 0
@@ -77,11 +80,40 @@ class SharedLine:
         """Note that the bus is open from now on, and used from this thread, by this loop."""
         self.loop_runs = loop.is_running
         self.pump.bind(loop)
+        self.losses.lost(self.now(), "its port is not open yet")
         self.thread = get_ident()
 
     def unbind(self) -> None:
         """Note that the bus is open no longer."""
         self.thread = 0
+
+    # what holds now
+
+    @property
+    def condition(self) -> LineCondition:
+        """Return whether the line is lost while the bus is open, since when, and why. May be called in any thread."""
+        lost = self.running and self.arbiter.state is LineState.OFFLINE
+        return self.losses.condition if lost else PRESENT
+
+    def as_of_now(self, point: Point[Any], sample: Sample[Any]) -> Sample[Any]:
+        """Return a sample with the quality that it has now, perhaps long after it was read.
+
+        While the line is lost it is bad, and its error says why. After a write to what the point reads it is stale.
+        Every consumer that shows a value later than its cycle takes it from here. May be called in any thread.
+        """
+        if sample.error is not None:
+            return sample
+        condition = self.condition
+        if condition.is_lost:
+            return sample._replace(value=None, error=condition.error, quality=Quality.BAD)
+        fine = sample.quality in (Quality.GOOD, Quality.LATE)
+        if fine and sample.started is not None and self.is_stale(point, sample.started):
+            return sample._replace(quality=Quality.STALE)
+        return sample
+
+    def is_outdated(self, point: Point[Any], asked: float) -> bool:
+        """Return whether a good value that was asked for then has been stale or bad at any time since."""
+        return self.losses.condition.since > asked or self.is_stale(point, asked)
 
     # time
 
@@ -118,7 +150,10 @@ class SharedLine:
         self.pump.turn()
 
     def latest(self, point: Point[Any]) -> Sample[Any] | None:
-        """Return the youngest good sample of this point in any group, unless a write has made it stale."""
+        """Return the youngest good sample of this point in any group; None where a write has made it stale, or the line
+        is lost."""
+        if self.condition.is_lost:
+            return None
         youngest = None
         for snapshot in self.latest_of.values():
             sample = snapshot.samples.get(point)
