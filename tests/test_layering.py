@@ -83,7 +83,7 @@ OPEN: dict[str, set[str]] = {
     "registry": {""},
     "service": {
         *("folder", "messages", "picture", "remote", "remote_exchanges", "remote_group", "remote_overview", "service"),
-        "tcp",
+        *("tcp", "touches"),
     },
     "transport": {
         *("clock", "endpoints", "holders", "identity", "kernel", "pump", "reconnect", "serial_port", "tcp"),

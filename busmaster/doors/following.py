@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from busmaster.errors import BusError, InvalidCommand, LineDown, NotStarted
@@ -37,6 +37,8 @@ class Lost:
     """The line's owner is not there: why, and what to try."""
 
     why: str
+    since: float = field(default_factory=time.time, compare=False)
+    """In seconds since 1970."""
 
 
 class Following:
@@ -66,6 +68,7 @@ class Following:
         self._read_only = read_only
         self._listeners: list[Hear] = []
         self._watchers: list[Callable[[], None]] = []
+        self._touch_listeners: list[Callable[[Mapping[str, Any]], None]] = []
         self._remote: RemoteBus | None = None
         self._overview: RemoteOverview | None = None
 
@@ -84,6 +87,14 @@ class Following:
         """Have `watch` called when `state` has changed; return what ends that. It must not block, nor raise."""
         self._watchers.append(watch)
         return lambda: self._watchers.remove(watch)
+
+    def on_touched(self, hear: Callable[[Mapping[str, Any]], None]) -> Callable[[], None]:
+        """Have `hear` told which values a write has made stale, after `picture` has taken it; return what ends that.
+
+        It is told before the write is confirmed. `Touches` takes the message. It must not block, nor raise.
+        """
+        self._touch_listeners.append(hear)
+        return lambda: self._touch_listeners.remove(hear)
 
     @property
     def is_connected(self) -> bool:
@@ -179,6 +190,7 @@ class Following:
             self._remote = remote
             self._change(Connected(remote.about))
             remote.on_access.append(lambda: self._change(Connected(remote.about)))
+            remote.on_touched.append(self._hear_touched)
             self._overview = await remote.overview(self._hear)
             await self._overview.over()
         finally:
@@ -189,7 +201,16 @@ class Following:
         for hear in list(self._listeners):
             hear(method, said)
 
+    def _hear_touched(self, said: Mapping[str, Any]) -> None:
+        self.picture.hear("touched", said)
+        for hear in list(self._touch_listeners):
+            hear(said)
+
     def _change(self, state: Connected | Lost) -> None:
+        if isinstance(state, Lost):
+            if isinstance(self.state, Lost):  # one loss, though another reason is known now
+                state = replace(state, since=self.state.since)
+            self.picture.lose(state.why)
         if state != self.state:
             self.state = state
             for watch in list(self._watchers):

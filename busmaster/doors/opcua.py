@@ -22,11 +22,12 @@ from busmaster.doors.following import Following
 from busmaster.doors.opcua_access import Rules, guard
 from busmaster.doors.opcua_health import Health
 from busmaster.doors.opcua_space import Space, Variable
-from busmaster.doors.opcua_terms import CODES, GOOD, range_of, status_of_sample, status_of_write, type_of
+from busmaster.doors.opcua_terms import CODES, DOUBTFUL, GOOD, range_of, status_of_sample, status_of_write, type_of
 from busmaster.errors import BusError, InvalidCommand, LineDown
 from busmaster.gate.record import cut
 from busmaster.service.picture import Row
 from busmaster.service.remote import RemoteBus
+from busmaster.service.touches import Touches
 
 OLD_AFTER = 3
 """Periods after which a value that none has followed is uncertain; not before `LEAST_AGE`."""
@@ -56,6 +57,8 @@ class Shown:
     variable: Variable
     writable: bool = False
     read: float = -inf
+    asked: float = -inf
+    """When it was asked for."""
 
 
 class LineServer:
@@ -78,14 +81,18 @@ class LineServer:
         self._groups: dict[str, asyncio.Task[None]] = {}
         self._heard: dict[str, float] = {}
         """When the last cycle of each group ended, by the clock of the line."""
+        self._touches = Touches()
         self._changed = asyncio.Event()
         self._new_rows = True
+        self._is_touched = False
+        """Whether a write was reported whose values are not doubted yet."""
 
     async def run(self) -> None:
         """Show the line until cancelled."""
         await self._space.begin()
         end_picture = self._line.on_picture(self._hear)
         end_state = self._line.on_state(self._changed.set)
+        end_touched = self._line.on_touched(self._hear_touched)
         try:
             while True:
                 await self._show()
@@ -96,6 +103,7 @@ class LineServer:
         finally:
             end_picture()
             end_state()
+            end_touched()
             await self._leave_groups(set())
 
     def _hear(self, method: str, said: Mapping[str, Any]) -> None:
@@ -103,6 +111,11 @@ class LineServer:
             self._new_rows = True
         if method == "frame":
             self._changed.set()
+
+    def _hear_touched(self, said: Mapping[str, Any]) -> None:
+        self._touches.note(said)
+        self._is_touched = True
+        self._changed.set()
 
     # what is shown
 
@@ -114,6 +127,7 @@ class LineServer:
                 remote = self._line.remote
         if remote is not self._remote:  # what was known is of the connection before
             self._remote = remote
+            self._touches = Touches()
             self._new_rows = True
             await self._leave_groups(set())
             await self._put_bad(CODES.BadOutOfService)
@@ -134,6 +148,7 @@ class LineServer:
             await self._take_rows(remote, rows)
         if frame is not None and frame.state == "offline":
             await self._put_bad(CODES.BadNoCommunication, frame.now)
+        await self._doubt_touched()
         await self._doubt_old(remote.now())
 
     async def _take_rows(self, remote: RemoteBus, rows: list[Row]) -> None:
@@ -197,8 +212,12 @@ class LineServer:
                 continue
             taken.add(identity)
             shown.read = sample.finished
+            shown.asked = sample.finished if sample.started is None else sample.started
+            status = status_of_sample(sample)
+            if status == GOOD and self._touches.is_stale(*identity, shown.asked):
+                status = DOUBTFUL  # it was read before a write that was reported first
             try:
-                await shown.variable.put(sample.value, status_of_sample(sample), sample.wall)
+                await shown.variable.put(sample.value, status, sample.wall)
             except (TypeError, OverflowError):
                 await shown.variable.put(None, CODES.BadDataEncodingUnsupported, sample.wall)
             if count % AT_ONCE == 0:
@@ -209,6 +228,15 @@ class LineServer:
         for shown in list(self._points.values()):
             if shown.read <= since and shown.variable.status not in (status, CODES.BadConfigurationError):
                 await shown.variable.put(None, status, time.time())
+
+    async def _doubt_touched(self) -> None:
+        """Have values doubted that were read before a write to what they read."""
+        if not self._is_touched:
+            return
+        self._is_touched = False
+        for identity, shown in list(self._points.items()):
+            if self._touches.is_stale(*identity, shown.asked):
+                await shown.variable.doubt()
 
     async def _doubt_old(self, now: float) -> None:
         """Have values doubted that no cycle has followed: their group rests, or the line's program stands still."""
@@ -259,7 +287,9 @@ class LineServer:
             await self._line.write(row.group, row.key, value)
         except (BusError, InvalidCommand) as error:
             self._tell(f"{who}: {row.key} = {said}: {cut(str(error))}")
+            await self._doubt_touched()
             return status_of_write(error)
+        await self._doubt_touched()  # before the client is told, so that it never reads the old value as good
         self._tell(f"{who}: {row.key} = {said}: written")
         return status_of_write(None)
 

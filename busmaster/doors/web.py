@@ -73,15 +73,22 @@ class Api:
         """Answer what the line does."""
         state, frame = self._line.state, self._line.picture.frame
         lost = isinstance(state, Lost)
+        why, since = "", None
+        if isinstance(state, Lost):
+            why, since = state.why, state.since
+        elif frame is not None and frame.since is not None:
+            why, since = frame.why, self._wall(frame.since)
         said: dict[str, Any] = {
             "connected": not lost,
-            "why": state.why if isinstance(state, Lost) else "",
+            "why": why,
+            "since": since,
             "read_only": not self._may_be_written(),
             "wants_token": self._guard.wants_token,
             "frame": None,
         }
         if frame is not None:
-            said["frame"] = {name: value for name, value in asdict(frame).items() if name != "events"}
+            left_out = ("events", "why", "since")
+            said["frame"] = {name: value for name, value in asdict(frame).items() if name not in left_out}
         return _json(said)
 
     async def nodes(self, _: Request) -> Response:

@@ -111,12 +111,14 @@ class Client:
             params = {"protocol": key[0], "address": key[1], "stops": node.stops - self._stops[key]}
             self.outbox.put_latest(("stops", key), written({"method": "stops", "params": params}))
 
-    def tell_touched(self, node: NodeRecord, when: float) -> None:
-        """Say that a write to a node has ended, if this client has samples of its own poll groups."""
-        if self._groups:
-            key = (node.profile.name, node.address)
-            params = {"protocol": key[0], "address": key[1], "when": when}
-            self.outbox.put_latest(("touched", key), written({"method": "touched", "params": params}))
+    @property
+    def has_values(self) -> bool:
+        """Return whether it follows anything of the line, and so may hold values that a write makes stale."""
+        return bool(self._streams)
+
+    def tell_touched(self, params: Mapping[str, Any], key: Hashable) -> None:
+        """Say which values a write has made stale; `key` stands for these same values."""
+        self.outbox.put_latest(("touched", key), written({"method": "touched", "params": params}))
 
     # what it says
 
@@ -196,7 +198,7 @@ class Client:
             case "exchanges":
                 return self._follow(params, self._line.exchanges())
             case "details":
-                return said_details(*self._line.point(params["group"], params["key"]))
+                return said_details(self._line.bus, *self._line.point(params["group"], params["key"]))
             case "pause" | "demand" | "suspend":
                 return self._steer(method, params)
         raise Malformed(f"no method {method[:40]!r}", NO_METHOD)

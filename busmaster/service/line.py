@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Hashable
 from functools import partial
+from math import inf, nextafter
 from typing import Any
 
+from busmaster.arbiter.health import NodeRecord
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
@@ -17,6 +19,9 @@ from busmaster.service.exchanges import ExchangesBroadcast
 from busmaster.service.overview import Journal, Overview
 from busmaster.service.safe import SafeWishes
 from busmaster.service.streams import Broadcast, EventBroadcast, GroupBroadcast
+
+MOST_NAMED = 50
+"""Points that one message names as stale."""
 
 
 class ServedLine:
@@ -97,6 +102,16 @@ class ServedLine:
                 if isinstance(point.command, Placed)
             }
         return self._points.get((node, frozenset(places)))
+
+    def stale_items(self, record: NodeRecord, when: float) -> list[str] | None:
+        """Return the polled points of a node that the write that ended just now has made stale.
+
+        None stands for all of the node, also where they are too many to be named: to doubt a good value is safe.
+        """
+        before = nextafter(when, -inf)
+        points = {point.item: point for group in self.bus.groups for point in group.points_of(record)}
+        stale = [item for item, point in points.items() if self.bus.shared.is_stale(point, before)]
+        return stale if len(stale) <= MOST_NAMED else None
 
     def _forget_group(self, group: PollGroup) -> None:
         self._groups.pop(group, None)

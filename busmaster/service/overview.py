@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from operator import is_
 from typing import Any
 
+from busmaster.arbiter.health import Health
 from busmaster.arbiter.state import LineState
 from busmaster.bus.alarms import AlarmChanged
 from busmaster.bus.bus import Bus
@@ -20,7 +21,6 @@ from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
 from busmaster.bus.samples import Sample
-from busmaster.bus.snapshots import Snapshot
 from busmaster.contract.places import Placed
 from busmaster.gate.gate import Gate
 from busmaster.outputs.values import event_text, value_text
@@ -82,7 +82,8 @@ class Part:
         self.group = group
         self.first = first
         self._points = points
-        self._seen: Snapshot | None = None
+        self._seen: object = None
+        """What its values were worked out of: the cycle, the last write, and whether the line was there."""
         self.rows = ""
         self.values = ""
 
@@ -92,15 +93,20 @@ class Part:
         self.rows = encoded({"set": number, "first": self.first, "rows": rows})
         self.values = encoded({"set": number, "first": self.first, "values": []})
 
-    def say_values(self, number: int, alarms: Mapping[Point[Any], AlarmChanged | None]) -> bool:
-        """Work out what these points hold, and return whether there is a cycle since they were last looked at."""
-        snapshot = self.group.latest
-        if snapshot is None or snapshot is self._seen:
+    def say_values(self, number: int, bus: Bus) -> bool:
+        """Work out what these points hold now, and return whether that is something else than before."""
+        snapshot, line = self.group.latest, bus.shared
+        if snapshot is None:
             return False
-        self._seen = snapshot
-        values = [_said_value(point, snapshot.samples.get(point), alarms.get(point)) for point in self._points]
-        self.values = encoded({"set": number, "first": self.first, "values": values})
-        return True
+        touched = line.last_touched if line.last_touched > snapshot.due else None  # an older write changes nothing here
+        seen = (id(snapshot), snapshot.cycle, touched, line.condition)
+        if seen == self._seen:
+            return False
+        self._seen = seen
+        alarms = bus.alarms
+        values = [_said_value(bus, point, snapshot.samples.get(point), alarms.get(point)) for point in self._points]
+        before, self.values = self.values, encoded({"set": number, "first": self.first, "values": values})
+        return self.values != before
 
 
 class Overview(Broadcast):
@@ -151,7 +157,7 @@ class Overview(Broadcast):
             if new:
                 part.say_rows(self._set)
             await self._say("rows", number, part.rows, tuple(self.readers) if new else fresh)
-            changed = part.say_values(self._set, self._bus.alarms)
+            changed = part.say_values(self._set, self._bus)
             await self._say("values", number, part.values, tuple(self.readers) if changed else fresh)
             if new or changed:
                 await asyncio.sleep(0)
@@ -202,6 +208,7 @@ class Overview(Broadcast):
 
     def _frame(self) -> dict[str, Any]:
         now, statistics = self._bus.now(), self._bus.statistics()
+        condition = self._bus.condition
         settings = self._bus.endpoint.settings
         return {
             "set": self._set,
@@ -212,6 +219,8 @@ class Overview(Broadcast):
             "now": now,
             "elapsed": statistics.elapsed,
             "state": state_text(self._bus),
+            "why": condition.reason,
+            "since": condition.since if condition.is_lost else None,
             "utilisation": self._utilisation(now, statistics.busy + statistics.settling),
             "backlog": statistics.backlog,
             "losses": statistics.losses,
@@ -237,6 +246,12 @@ def state_text(bus: Bus) -> str:
     return STATES.get(bus.state, "ready")
 
 
+def health_text(node: Node) -> str:
+    """Return how a node does: its health, or that it is suspended; a node of a lost line is offline in any case."""
+    health = node.health
+    return "suspended" if node.suspended and health is not Health.OFFLINE else health.value
+
+
 def _same(one: tuple[PollGroup, tuple[Point[Any], ...]], other: tuple[PollGroup, tuple[Point[Any], ...]]) -> bool:
     """Return whether these are the same points: equal ones may mean something else."""
     return one[0] is other[0] and len(one[1]) == len(other[1]) and all(map(is_, one[1], other[1]))
@@ -256,13 +271,16 @@ def _said_point(group: PollGroup, point: Point[Any]) -> dict[str, Any]:
     }
 
 
-def _said_value(point: Point[Any], sample: Sample[Any] | None, alarm: AlarmChanged | None = None) -> list[Any] | None:
+def _said_value(
+    bus: Bus, point: Point[Any], sample: Sample[Any] | None, alarm: AlarmChanged | None = None
+) -> list[Any] | None:
     """Return value, quality, when it was asked for, what went wrong, and the limit that it has left ("" for none).
 
-    None where the cycle did not have the point.
+    All is as it is now, not as it was when it was read. None where the cycle did not have the point.
     """
     if sample is None:
         return None
+    sample = bus.as_of_now(point, sample)
     asked = sample.finished if sample.started is None else sample.started
     error = "" if sample.error is None else sample.error.what
     return [shown(point, sample.value), sample.quality.value, asked, error, "" if alarm is None else alarm.limit]
@@ -273,14 +291,16 @@ def shown(point: Point[Any], value: Any) -> Any:
     return value if type(value) in (int, float) or value is None else value_text(value, point.meaning.precision)
 
 
-def said_details(group: PollGroup, point: Point[Any]) -> dict[str, Any]:
+def said_details(bus: Bus, group: PollGroup, point: Point[Any]) -> dict[str, Any]:
     """Return what there is to know of one point of a group: its last exchange, its limits, and what its value means."""
     sample = None if group.latest is None else group.latest.samples.get(point)
+    if sample is not None:
+        sample = bus.as_of_now(point, sample)
     meaning = point.meaning
     node = point.node if isinstance(point.node, Node) else None
     return {
         "command": str(point.command),
-        "sample": _said_value(point, sample),
+        "sample": _said_value(bus, point, sample),
         "hint": "" if sample is None or sample.error is None else sample.error.hint or "",
         "timeline": None if sample is None else sample.timeline._asdict(),
         "due": None if sample is None else sample.due,
@@ -314,7 +334,7 @@ def _said_node(node: Node) -> dict[str, Any]:
         "label": node.label,
         "protocol": node.profile.name,
         "address": node.address,
-        "health": "suspended" if node.suspended else node.health.value,
+        "health": health_text(node),
         "requests": counts.attempts,
         "failed": counts.fruitless,
         "late": counts.late,

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
+from busmaster.arbiter.health import Health
+from busmaster.bus.samples import Quality
 from busmaster.service.messages import value_of
+from busmaster.service.touches import Touches
 
 KEPT_VALUES = 120
 """Of each point, for its trend."""
@@ -19,7 +22,10 @@ Identity: TypeAlias = tuple[str, str, int]
 
 @dataclass(slots=True)
 class Row:
-    """One point of one poll group. `value` is the last good one: a number, or a text; `asked` when it was asked for."""
+    """One point of one poll group. `value` is the last good one: a number, or a text; `asked` when it was asked for.
+
+    `quality` is of now: "bad" beside an `error`, "stale" after a write to what it reads, else as it was read.
+    """
 
     group: str
     key: str
@@ -52,13 +58,22 @@ class Row:
         return f"{self.node} {self.item}"
 
     def take(self, value: Any, quality: str, asked: float, error: str, alarm: str, *_: Any) -> None:
-        """Take the outcome of a cycle, once."""
-        if self.past and self.past[-1][0] == asked:
-            return
-        self.error, self.alarm = error, alarm
-        self.past.append((asked, value if isinstance(value, int | float) and not error else None))
+        """Take the outcome of a cycle, or what has become of it since: a write, or a loss of the line."""
+        self.error, self.alarm, self.quality = error, alarm, quality
         if not error:
-            self.value, self.quality, self.asked = value, quality, asked
+            self.value, self.asked = value, asked
+        if not (self.past and self.past[-1][0] == asked):
+            self.past.append((asked, value if isinstance(value, int | float) and not error else None))
+
+    def lose(self, why: str) -> None:
+        """Note that nothing is known of it any more: its last value stays, and is not good."""
+        self.error, self.quality = why, Quality.BAD.value
+
+    def doubt(self, touches: Touches) -> None:
+        """Make a good value stale that was asked for before a write to what it reads had ended."""
+        fine = self.quality in (Quality.GOOD.value, Quality.LATE.value)
+        if fine and self.asked is not None and touches.is_stale(self.protocol, self.address, self.item, self.asked):
+            self.quality = Quality.STALE.value
 
     def go_on(self, before: Row) -> None:
         """Go on from what was known of the same point."""
@@ -114,6 +129,10 @@ class Frame:
     points: int
     left_out: int
     events: tuple[tuple[float, str], ...]
+    why: str = ""
+    """Why the line is lost."""
+    since: float | None = None
+    """Since when it is, by the bus's clock."""
 
 
 class Picture:
@@ -131,6 +150,7 @@ class Picture:
         self._known: dict[Identity, Row] = {}
         self._groups: dict[int, list[Group]] = {}
         self._nodes: dict[int, list[Node]] = {}
+        self._touches = Touches()
 
     def hear(self, method: str, said: Mapping[str, Any]) -> None:
         """Take one thing that the line's owner says. What a later version says besides is passed over."""
@@ -149,10 +169,23 @@ class Picture:
                 if body["set"] == self._set:
                     self._values[body["first"]] = body["values"]
                     self._take_values(body["first"])
+            case "touched":
+                self._touches.note(body)
+                for row in self.rows:
+                    row.doubt(self._touches)
             case "groups":
                 self._groups[body["first"]] = [_made(Group, said) for said in body["groups"]]
             case "nodes":
                 self._nodes[body["first"]] = [_made(Node, said) for said in body["nodes"]]
+
+    def lose(self, why: str) -> None:
+        """Note that the program that owns the line is gone: no node is up, and no value is good."""
+        for row in self.rows:
+            row.lose(why)
+        for nodes in self._nodes.values():
+            nodes[:] = [replace(node, health=Health.OFFLINE.value) for node in nodes]
+        if self.frame is not None:
+            self.frame = replace(self.frame, state="offline", why=why, since=None)
 
     def _begin(self, number: int) -> None:
         """Begin a new set of points, if this is one: its parts may come in any order."""
@@ -177,6 +210,7 @@ class Picture:
         for row, value in zip(self._rows.get(first, ()), self._values.get(first, ()), strict=False):
             if value is not None:
                 row.take(*value)
+                row.doubt(self._touches)  # it may have been read before a write that was reported before it
 
     @property
     def rows(self) -> list[Row]:

@@ -78,6 +78,8 @@ class RemoteBus:
         """What the owner says of the line: its name, settings and process, and whether this program may only read."""
         self.on_access: list[Callable[[], None]] = []
         """Called when `about` says otherwise what this program may do. They must not block, nor raise."""
+        self.on_touched: list[Callable[[Mapping[str, Any]], None]] = []
+        """Told, before a write is confirmed, which values it has made stale: what `touched` says in docs/service.md."""
         self._link: Link | None = None
         self._ahead = 0.0
         """Seconds by which the clock of the owner's machine is ahead of this one, less what it took to hear that."""
@@ -327,6 +329,8 @@ class RemoteBus:
                 tell()
         elif method == "touched":
             self._touched[params["protocol"], params["address"]] = params["when"]
+            for told in self.on_touched:
+                told(params)
         elif method == "event":
             event = event_of(params["body"], self.find)
             for stream in self._events:

@@ -189,8 +189,15 @@ class Service:
             client.tell_stops(record)
 
     def _tell_touched(self, record: NodeRecord, when: float) -> None:
-        for client in self._clients:
-            client.tell_touched(record, when)
+        clients = [client for client in self._clients if client.has_values]
+        if not clients:
+            return
+        params: dict[str, Any] = {"protocol": record.profile.name, "address": record.address, "when": when}
+        params["all"] = record.address == record.profile.broadcast
+        items = params["items"] = None if params["all"] else self.line.stale_items(record, when)
+        key = (record.profile.name, record.address, None if items is None else tuple(items))
+        for client in clients:
+            client.tell_touched(params, key)
 
     # those who come
 

@@ -113,6 +113,20 @@ async def opened(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Open
             await asyncio.to_thread(entered.__exit__, None, None, None)
 
 
+async def test_none_of_60_reads_after_60_writes_is_the_old_value_as_good(opened: Opened) -> None:
+    async with opened.owned() as line:
+        controller = Hcp2Controller(line.bus, 5)
+        group = line.bus.poll_group("axes", period=1000, points=[controller.point("10"), controller.point("11")])
+        await opened.is_("5/10", "Good")
+        for number in range(1, 61):
+            assert await opened.write("5/10", float(number)) == "Good"
+            told = await asyncio.to_thread(opened.client.read, "5/10")
+            assert (told.value, told.status) == (0.0, "UncertainLastUsableValue")
+        assert (await asyncio.to_thread(opened.client.read, "5/11")).status == "Good"  # another register
+        group.demand()
+        assert (await opened.is_("5/10", "Good")).value == 60.0
+
+
 async def test_a_point_has_its_unit_range_status_and_time(opened: Opened) -> None:
     async with opened.owned() as line:
         began = time.time()

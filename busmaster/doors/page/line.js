@@ -76,11 +76,12 @@ export class Line {
       const row = rows[number];
       if (!held || !row) return;
       const [value, quality, asked, error, alarm] = held;
-      if (row.past.length && row.past.at(-1)[0] >= asked) return;
-      Object.assign(row, { error, alarm });
-      row.past.push([asked, error ? null : number_of(value)]);
-      if (row.past.length > KEPT) row.past.shift();
-      if (!error) Object.assign(row, { value: plain(value), quality, asked });
+      Object.assign(row, { error, alarm, quality }); // also of a value that was shown before: a write may have made it stale
+      if (!(row.past.length && row.past.at(-1)[0] >= asked)) {
+        row.past.push([asked, error ? null : number_of(value)]);
+        if (row.past.length > KEPT) row.past.shift();
+      }
+      if (!error) Object.assign(row, { value: plain(value), asked });
     });
   }
 

@@ -63,7 +63,7 @@ function allowed() {
 function trouble() {
   if (!connected) return "This page's program does not answer: what is shown is old. It is tried again.";
   if (!line.state.connected) return `The line's program is away: what is shown is old. ${line.state.why}`;
-  if (line.frame?.state === "offline") return "The line is lost: nothing is read or written until its port is back.";
+  if (line.frame?.state === "offline") return `The line is lost: nothing is read or written until its port is back. ${line.frame.why ?? ""}`;
   return "";
 }
 
@@ -81,20 +81,26 @@ function draw_head(wrong) {
   document.title = `${state === "ready" ? "" : "✕ "}${frame.title}`;
   by("port").textContent = `${frame.line} ${frame.settings}`;
   const down = line.all_nodes.filter((node) => node.health === "down").length;
-  by("health").textContent = down ? `✕ ${down} of ${line.all_nodes.length} nodes down` : `${line.all_nodes.length} nodes, none down`;
-  by("health").className = down ? "bad" : "";
+  const lost = is_lost();
+  by("health").textContent = lost ? `✕ ${line.all_nodes.length} nodes offline` : down ? `✕ ${down} of ${line.all_nodes.length} nodes down` : `${line.all_nodes.length} nodes, none down`;
+  by("health").className = lost || down ? "bad" : "";
   by("load").value = frame.utilisation;
   by("load-text").textContent = `${(frame.utilisation * 100).toFixed(0)} %`;
   by("waiting").textContent = `${frame.backlog} waiting, lost ${frame.losses} ${frame.losses === 1 ? "time" : "times"}${wire.left_out ? `, ${wire.left_out} exchanges not shown` : ""}`;
 }
 
-const HEALTH = { up: "✓ up", suspect: "? suspect", down: "✕ down", suspended: "‖ suspended", unknown: "… not asked yet" };
+function is_lost() {
+  return !connected || !line.state.connected || line.frame?.state === "offline";
+}
+
+const HEALTH = { offline: "✕ offline", up: "✓ up", suspect: "? suspect", down: "✕ down", suspended: "‖ suspended", unknown: "… not asked yet" };
 
 function draw_nodes() {
   replace(by("node-list"), line.all_nodes, (item, node) => {
-    item.className = node.health;
+    const health = is_lost() ? "offline" : node.health;
+    item.className = health;
     const late = node.late ? `, ${node.late} late` : "";
-    item.replaceChildren(element("b", `${node.label}: ${HEALTH[node.health] ?? node.health}`),
+    item.replaceChildren(element("b", `${node.label}: ${HEALTH[health] ?? health}`),
       element("small", `${node.requests} asked, ${node.failed} failed${late}, p50 ${milliseconds(node.p50)}`));
   }, "li");
 }
