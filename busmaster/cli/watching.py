@@ -142,9 +142,13 @@ class Watch:
         counts = self.bus.statistics()
         if self.bus.state is LineState.SETTLING and not (counts.exchanges or counts.unasked_bytes):
             note("nothing was asked: a new line rests until replies to an earlier master are past; let it run longer")
+        if text := loss_text(self.bus):
+            note(text, Level.WARNING)
         for group in self.groups:
             seen, periods = group.statistics(), group.recent_periods
             text = f"{group.name}: {seen.cycles} cycles, {seen.missed} missed"
+            if seen.bad:
+                text += f", {seen.bad} of {seen.good + seen.late + seen.stale + seen.bad} values not read"
             if periods:
                 text += f", period {seen.achieved * 1000:.2f} ms mean, {p99_of(periods) * 1000:.2f} ms p99"
             note(f"{text}, line {counts.utilisation:.1%} busy")
@@ -159,6 +163,15 @@ class Watch:
                 note(f"{bus_node.label}: {text}")
         if text := uart.damage_text(uart.damage(counts.damaged, counts.breaks, counts.driver)):
             note(f"uart: {text}; `busmaster doctor` says what to look for")
+
+
+def loss_text(bus: Bus) -> str:
+    """Return how often and for how long the line was lost, and why it is if it still is; "" where it never was."""
+    losses, lost = bus.statistics().losses, bus.condition
+    if not (losses or lost.is_lost):
+        return ""
+    times = f"lost {losses} time{'s' * (losses != 1)}, " if losses else "never connected, "
+    return f"line: {times}for {bus.lost_seconds:.1f} s" + (f"; still lost: {lost.reason}" if lost.is_lost else "")
 
 
 def learned_text(learned: Iterable[LearnedTimes]) -> str:

@@ -170,7 +170,7 @@ class Distributor:
 
     async def _feed(self, cycles: Stream[Snapshot], group: Source) -> None:
         lost = 0
-        news = self._news[group] = News()
+        news = self._news[group] = News(self._bus.shared.is_outdated)
         async for snapshot in cycles:
             told = news.of(snapshot)
             for output in self._outputs:

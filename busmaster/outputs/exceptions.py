@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -15,12 +16,13 @@ ROUNDING = 1e-6
 
 
 class Told(NamedTuple):
-    """What was told last of a point, and when it was due."""
+    """What was told last of a point, when it was due, and when it was asked for."""
 
     value: Any
     quality: Quality
     error: type[BusError] | None
     due: float
+    asked: float
 
 
 class News:
@@ -28,10 +30,12 @@ class News:
 
     A value is news where it is further than the deadband from what was told last, where its quality is another one,
     as when it could not be read and when it can be again, and where the heartbeat is over. A point whose meaning has
-    neither deadband nor heartbeat always is.
+    neither deadband nor heartbeat always is. `outdated` says whether what was asked for at that time has become stale
+    or bad since, which an output may have told: what is read then is news, though it be the same value.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, outdated: Callable[[Point[Any], float], bool] = lambda *_: False) -> None:
+        self._outdated = outdated
         self._told: dict[Point[Any], Told] = {}
 
     def of(self, snapshot: Snapshot) -> Snapshot:
@@ -58,9 +62,11 @@ class News:
             and (told.quality, told.error) == (sample.quality, error)
             and (heartbeat is None or due - told.due < heartbeat - ROUNDING)
             and not differs(told.value, sample.value, point.meaning.deadband or 0)
+            and not self._outdated(point, told.asked)
         ):
             return False
-        self._told[point] = Told(sample.value, sample.quality, error, due)
+        asked = sample.finished if sample.started is None else sample.started
+        self._told[point] = Told(sample.value, sample.quality, error, due, asked)
         return True
 
 

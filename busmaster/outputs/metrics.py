@@ -19,6 +19,7 @@ from busmaster.arbiter.health import Health
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
+from busmaster.bus.samples import Quality
 from busmaster.outputs.base import Output, OutputStatistics, check_extra
 from busmaster.outputs.scrapes import listening, page, serve
 from busmaster.outputs.settings import MetricsSettings
@@ -141,6 +142,11 @@ class MetricsOutput(Output):
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         line = self._ask(self._bus.statistics)
+        lost = self._ask(lambda: self._bus.condition.is_lost)
+        yield GaugeMetricFamily("busmaster_line_up", "1 while the port is there, 0 while it is lost", value=not lost)
+        yield CounterMetricFamily(
+            "busmaster_line_lost_seconds", "Time for which the port was lost", value=self._ask(self._lost_seconds)
+        )
         yield GaugeMetricFamily(
             "busmaster_line_utilisation_ratio", "Share of the time in which the line was busy", value=line.utilisation
         )
@@ -158,6 +164,9 @@ class MetricsOutput(Output):
             waits.add_metric([priority.name.lower()], line.waits[priority].p99)
         yield waits
 
+    def _lost_seconds(self) -> float:
+        return self._bus.lost_seconds
+
     def _of_nodes(self) -> Iterator[Metric]:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 
@@ -167,7 +176,9 @@ class MetricsOutput(Output):
         outcomes = CounterMetricFamily(
             "busmaster_node_exchanges", "Exchanges by their outcome", labels=["node", "outcome"]
         )
-        health = GaugeMetricFamily("busmaster_node_up", "1 while the node answers, 0 while it is down", labels=["node"])
+        health = GaugeMetricFamily(
+            "busmaster_node_up", "1 while the node answers, 0 while it is down or its line is lost", labels=["node"]
+        )
         latency = HistogramMetricFamily(
             "busmaster_node_latency_seconds", "From the start of a request to the end of its reply", labels=["node"]
         )
@@ -177,7 +188,7 @@ class MetricsOutput(Output):
                 family.add_metric([node.label], getattr(counts, name))
             for outcome in OUTCOMES:
                 outcomes.add_metric([node.label, outcome], getattr(counts, outcome))
-            health.add_metric([node.label], float(node.health is not Health.DOWN))
+            health.add_metric([node.label], float(node.health not in (Health.DOWN, Health.OFFLINE)))
             add_histogram(latency, node.label, buckets, total)
         yield from (*counters.values(), outcomes, health, latency)
 
@@ -197,27 +208,41 @@ class MetricsOutput(Output):
         yield from (cycles, missed, wanted, achieved)
 
     def _of_points(self) -> Iterator[Metric]:
-        """Yield the last values of the groups that are to be told. What is no number, or was not read, is left out."""
+        """Yield the last values of the groups that are to be told. What is no number is left out.
+
+        A point that cannot be read has no value, but the time of the last one: an alert on its age goes on.
+        """
         from prometheus_client.core import GaugeMetricFamily
 
         labels = ["group", "node", "item", "unit"]
         values = GaugeMetricFamily("busmaster_value", "The value that was read last", labels=labels)
-        times = GaugeMetricFamily("busmaster_value_time_seconds", "When it was read, since 1970", labels=labels)
+        times = GaugeMetricFamily(
+            "busmaster_value_time_seconds", "When it was last read without an error, since 1970", labels=labels
+        )
+        good = GaugeMetricFamily(
+            "busmaster_value_good", "1 while the value is good, 0 while it is stale or cannot be read", labels=labels
+        )
         for group in self._bus.groups:
             latest = group.latest if group.name in self.groups else None
             for point, sample in latest.samples.items() if latest is not None else ():
-                number = number_of(sample.value)
-                if sample.error is None and number is not None:
-                    node, _, item = point.key.partition("/")
-                    values.add_metric([group.name, node, item, point.unit], number)
-                    times.add_metric([group.name, node, item, point.unit], micros(sample.wall))
+                now = self._bus.as_of_now(point, sample)
+                number, read_at = number_of(now.value), group.good_at(point)
+                if now.error is None and number is None:
+                    continue
+                node, _, item = point.key.partition("/")
+                place = [group.name, node, item, point.unit]
+                if number is not None:
+                    values.add_metric(place, number)
+                if read_at is not None:
+                    times.add_metric(place, micros(read_at))
+                good.add_metric(place, float(now.quality in (Quality.GOOD, Quality.LATE)))
         alarms = GaugeMetricFamily(
             "busmaster_alarm", "1 while a value is above its high, -1 below its low, else 0", labels=["node", "item"]
         )
         for point, alarm in self._bus.alarms.items():
             node, _, item = point.key.partition("/")
             alarms.add_metric([node, item], 0.0 if alarm is None else 1.0 if alarm.limit == "high" else -1.0)
-        yield from (values, times, alarms)
+        yield from (values, times, good, alarms)
 
     def _of_outputs(self) -> Iterator[Metric]:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily

@@ -1,9 +1,10 @@
 """MQTT: values and health out, and, where the file allows it, commands in.
 
-    PREFIX/values/NODE/ITEM   {"time": ..., "value": 12.5, "unit": "mm", "error": null, "late": false}
+    PREFIX/values/NODE/ITEM   {"time": ..., "value": 12.5, "unit": "mm", "quality": "good", "error": null,
+                              "late": false}, and again, with "stale" or "bad", after a write, or when the line is lost
     PREFIX/cycles/GROUP       a whole cycle, as `busmaster run --json` prints it (messages = "cycle")
     PREFIX/health/NODE        {"time": ..., "health": "up"}, retained
-    PREFIX/line               {"time": ..., "line": "ready"}, retained; "offline" while the port is gone
+    PREFIX/line               {"time": ..., "line": "ready", "reason": null}, retained; "offline" while the port is gone
     PREFIX/alarms/NODE/ITEM   {"time": ..., "alarm": "high"}, "low" or null, of points with limits; retained
     PREFIX/events             {"time": ..., "node": "winder", "text": "winder is down, was suspect"}
     PREFIX/status             online, or offline, which is also the last will; retained
@@ -41,7 +42,7 @@ from anyio.abc import TaskStatus
 from busmaster.arbiter.state import LineState
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
-from busmaster.bus.polling import Snapshot
+from busmaster.bus.polling import Sample, Snapshot
 from busmaster.gate.gate import Gate, Wish
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import PAUSE, TICK, Item, check_extra, size_of
@@ -123,6 +124,8 @@ class MqttOutput(SpillingOutput):
         self._owner: asyncio.AbstractEventLoop | None = None
         self._held: list[Item] = []
         self._published: dict[str, str | None] = {}
+        self._seen: object = None
+        """The last write, and whether the line was there, when values were last looked at."""
         self._alarms: object = None
         """Those that were told last."""
         self._quiet = logging.getLogger("busmaster.mqtt")
@@ -197,7 +200,9 @@ class MqttOutput(SpillingOutput):
                 while not self.spilled and self.hold(AT_ONCE):
                     await self._send(client, (message for item in self._held for message in self._messages(item)))
                     self.written += self.let_go()
+                await self._send(client, list(self._outdated()))  # after the cycles that these values are of
                 await anyio.sleep(0 if stopped else TICK)
+            await self._send(client, list(self._farewell()))
             await self._send(client, self._status("offline"))
             tasks.cancel_scope.cancel()
 
@@ -300,20 +305,55 @@ class MqttOutput(SpillingOutput):
             payload = json_line(**cycle_fields(item, item.wall_at))
             yield Outgoing(self._topic("cycles", item.group), payload, settings.retain)
         else:
+            # Not of an older cycle, such as one that waited for the broker: that is history.
+            current = any(
+                group.latest is not None and (group.name, group.latest.cycle) == (item.group, item.cycle)
+                for group in self._bus.groups
+            )
             for point, sample in item.samples.items():
-                payload = json_line(time=micros(sample.wall), unit=point.unit, **sample_fields(sample))
-                yield Outgoing(self._topic("values", topic_part(point.key)), payload, settings.retain)
+                yield self._value(point, self._bus.as_of_now(point, sample) if current else sample)
+
+    def _value(self, point: Point[Any], sample: Sample[Any]) -> Outgoing:
+        said = {"unit": point.unit, "quality": sample.quality.value, **sample_fields(sample)}
+        payload = json_line(time=micros(sample.wall), **said)
+        return Outgoing(self._topic("values", topic_part(point.key)), payload, self._settings.retain)
+
+    def _outdated(self) -> Iterator[Outgoing]:
+        """Yield the values that a write or a loss of the line has made something else than they were when read."""
+        line = self._bus.shared
+        seen = (line.last_touched, line.condition)
+        if self._settings.messages == "cycle" or seen == self._seen:
+            return
+        self._seen = seen
+        for group in self._bus.groups:
+            latest = group.latest
+            if latest is None or (self.groups and group.name not in self.groups):
+                continue
+            for point, sample in tuple(latest.samples.items()):
+                now = line.as_of_now(point, sample)
+                if now is not sample:
+                    yield self._value(point, now)
 
     def _status(self, state: str) -> list[Outgoing]:
         return [Outgoing(self._topic("status"), state, True)] if self._in_charge else []
+
+    def _farewell(self) -> Iterator[Outgoing]:
+        """Yield that no line and no node is known to be up any more: what is retained would say so for ever."""
+        for topic in self._published if self._in_charge else ():
+            name = topic.partition("/")[0]
+            if name in ("line", "health"):
+                payload = json_line(**{"time": round(time.time(), 3), name: "offline"})
+                yield Outgoing(self._topic(topic), payload, True)
 
     def _changes(self) -> Iterator[Outgoing]:
         """Yield what is not as it was when it was told last. Only attributes that are replaced whole are looked at."""
         if not self._in_charge:
             return
         now: dict[str, tuple[str, str | None]] = {}
+        more: dict[str, dict[str, Any]] = {}
         if self._asks:
             now["line"] = ("line", "offline" if self._bus.state is LineState.OFFLINE else "ready")
+            more["line"] = {"reason": self._bus.condition.reason or None}
         for node in self._bus.nodes if self._asks else ():
             now[f"health/{topic_part(node.label.removeprefix('node '))}"] = ("health", node.health.value)
         alarms = self._bus.alarms
@@ -325,7 +365,7 @@ class MqttOutput(SpillingOutput):
         for topic, (name, state) in now.items():
             if self._published.get(topic, "") != state:
                 self._published[topic] = state
-                payload = json_line(**{"time": round(time.time(), 3), name: state})
+                payload = json_line(**{"time": round(time.time(), 3), name: state, **more.get(topic, {})})
                 yield Outgoing(self._topic(topic), payload, True)
 
     def _topic(self, *parts: str) -> str:

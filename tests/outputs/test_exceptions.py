@@ -56,6 +56,17 @@ def test_the_heartbeat_tells_what_did_not_change_on_the_grid() -> None:
     assert news(5, 5, 5, 6, 6, 6, 6, period=1, deadband=0, heartbeat=3) == [5, 6, 6]
 
 
+def test_the_same_value_is_news_where_it_was_stale_or_bad_in_between() -> None:
+    outdated: list[float] = []
+    known = News(lambda _, asked: asked in outdated)
+    first = meant(cycle(0, 5.0, at=0.0), Meaning(deadband=1))
+    assert len(known.of(first)) == 1
+    assert len(known.of(first)) == 0
+    [sample] = first.samples.values()
+    outdated.append(sample.finished if sample.started is None else sample.started)
+    assert len(known.of(first)) == 1
+
+
 def test_a_change_of_quality_is_always_news() -> None:
     gone = NoReply("no reply within 100 ms")
     assert news(1.0, gone, NoReply("no reply within 101 ms"), 1.0, 1.0, deadband=10) == [1.0, "error", 1.0]

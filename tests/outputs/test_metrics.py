@@ -20,8 +20,8 @@ from busmaster.arbiter.counters import DriverErrors
 from busmaster.arbiter.health import Health
 from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
-from busmaster.emulator.memory import MemoryPort
-from busmaster.errors import NoReply
+from busmaster.emulator.memory import MemoryPort, MemoryTransport
+from busmaster.errors import LineDown, NoReply
 from busmaster.outputs import metrics as metrics_module
 from busmaster.outputs import scrapes
 from busmaster.outputs.base import OutputStatistics
@@ -170,6 +170,43 @@ async def test_values_are_gauges_where_their_group_is_named() -> None:
     async with served() as output:
         metrics = await asyncio.to_thread(scraped, output.port)
     assert not any(name.startswith("busmaster_value") for name, _ in metrics)
+
+
+@pytest.mark.asyncio
+async def test_a_stale_value_is_told_as_such_and_a_lost_one_keeps_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
+    output = MetricsOutput("metrics", MetricsSettings(port=0, groups=("axes",)), bus)
+    labels = {"group": "axes", "node": "5", "item": "10", "unit": ""}
+    async with bus:
+        point = Hcp2Controller(bus, 5).point("10")
+        group = bus.poll_group("axes", period=1000.0, points=[point])
+        async for _ in group:
+            break
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        assert (of(metrics, "line_up"), of(metrics, "node_up", node="node 5")) == (1, 1)
+        assert of(metrics, "value_good", **labels) == 1
+        read_at = of(metrics, "value_time_seconds", **labels)
+        await point.write(7.0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        assert (of(metrics, "value", **labels), of(metrics, "value_good", **labels)) == (0, 0)
+        monkeypatch.setattr(MemoryPort, "open", never_opens)
+        transport = bus.pump._transport
+        assert isinstance(transport, MemoryTransport)
+        transport.lose(OSError("unplugged"))
+        while not bus.condition.is_lost:  # noqa: ASYNC110  nobody tells it
+            await asyncio.sleep(0)
+        metrics = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    assert (of(metrics, "line_up"), of(metrics, "node_up", node="node 5")) == (0, 0)
+    assert of(metrics, "value_good", **labels) == 0
+    assert of(metrics, "value_time_seconds", **labels) == read_at
+    assert ("busmaster_value", frozenset(labels.items())) not in metrics
+
+
+async def never_opens(*_: object, **__: object) -> None:
+    raise LineDown("unplugged")
 
 
 @pytest.mark.parametrize(("value", "number"), [(3, 3.0), (2.5, 2.5), (Health.UP, None), ((1, 2), None), ("on", None)])
