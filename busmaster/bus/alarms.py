@@ -19,7 +19,7 @@ class AlarmChanged:
     """A polled value is above `high` or below `low` of its point (`active`), or no longer.
 
     `limit` is the one that it crossed, `bound` that limit. `value` is None where it ended as the point is watched no
-    more.
+    more. Of a bit whose 1 is an alarm, `limit` is "high" and `bound` False; of one whose 0 is an alarm, "low" and True.
     """
 
     point: Point[Any]
@@ -31,11 +31,20 @@ class AlarmChanged:
     @property
     def text(self) -> str:
         """Say in a sentence what began or ended, with the value and its unit."""
+        if isinstance(self.bound, bool):
+            return self._text_of_bit()
         crossed = f"{'above' if self.limit == 'high' else 'below'} its {self.limit} of {self._text(self.bound)}"
         if self.active:
             return f"{self.point.key} = {self._text(self.value)} is {crossed}"
         how = "is watched no more" if self.value is None else f"is back at {self._text(self.value)}"
         return f"{self.point.key} {how}, was {crossed}"
+
+    def _text_of_bit(self) -> str:
+        alarming, calm = ("set", "clear") if self.limit == "high" else ("clear", "set")
+        if self.active:
+            return f"{self.point.key} is {alarming}"
+        how = "is watched no more" if self.value is None else f"is {calm} again"
+        return f"{self.point.key} {how}, was {alarming}"
 
     def _text(self, value: float | None) -> str:
         return f"{value:.10g} {self.point.unit}".rstrip()
@@ -101,6 +110,8 @@ class Alarms:
 def _begun(point: Point[Any], value: float) -> AlarmChanged | None:
     """Return the alarm that a value begins, None if it begins none."""
     low, high = point.meaning.low, point.meaning.high
+    if isinstance(value, bool):  # a bit, of which a bound says "above false" or "below true"
+        low, high = None if low is None else bool(low), None if high is None else bool(high)
     if high is not None and value > high:
         return AlarmChanged(point, "high", high, value, active=True)
     if low is not None and value < low:

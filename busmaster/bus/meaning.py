@@ -63,6 +63,7 @@ class Meaning:
     last, 0 for every change; with `heartbeat` at the latest after so many seconds. A value above `high` or below
     `low` begins an alarm, which ends when it is back by `hysteresis`; that is a hundredth of what is between the
     two, or of the one that is given, where it is left out. All but seconds is in the unit of the value.
+    `alarm_if_set` and `alarm_if_clear` name bits of `bits` that begin an alarm while they are 1, or 0.
     """
 
     precision: int | None = None
@@ -73,6 +74,8 @@ class Meaning:
     low: float | None = None
     high: float | None = None
     hysteresis: float | None = None
+    alarm_if_set: tuple[str, ...] = ()
+    alarm_if_clear: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name, fault in self.faults():
@@ -109,6 +112,12 @@ class Meaning:
                 yield "bits", f"{name} must be the number of a bit, 0 for the lowest, not {bit!r}"
             elif holders.setdefault(bit, name) != name:
                 yield "bits", f"{name} and {holders[bit]} are the same bit, {bit}"
+        for field_name, other in (("alarm_if_set", ()), ("alarm_if_clear", self.alarm_if_set)):
+            for name in getattr(self, field_name):
+                if name not in self.bits:
+                    yield field_name, f"{name!r} is not the name of a bit: name it in bits too"
+                elif name in other:
+                    yield field_name, f"{name} is in alarm_if_set too, and would always be an alarm"
         for number, label in self.labels.items():
             if type(number) is not int:
                 yield "labels", f"are of whole numbers, not of {number!r}"
@@ -141,6 +150,16 @@ class Meaning:
         if self.low is not None and self.high is not None:
             return SHARE * (self.high - self.low)
         return SHARE * abs(self.low or self.high or 0.0)
+
+    def of_bit(self, name: str) -> Meaning:
+        """Return the meaning of one of its bits: an alarm is a flag above false, or below true."""
+        return Meaning(
+            deadband=self.deadband,
+            heartbeat=self.heartbeat,
+            high=0 if name in self.alarm_if_set else None,
+            low=1 if name in self.alarm_if_clear else None,
+            hysteresis=0 if name in (*self.alarm_if_set, *self.alarm_if_clear) else None,
+        )
 
     @property
     def by_exception(self) -> bool:

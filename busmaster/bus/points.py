@@ -83,7 +83,7 @@ class Point(Generic[T]):
         def decode(raw: Any) -> bool:
             return bit_of(raw if of_word is None else of_word(raw), number)
 
-        told = Meaning(deadband=self.meaning.deadband, heartbeat=self.meaning.heartbeat)
+        told = self.meaning.of_bit(name)
         word: Any = self
         bit: Point[bool] = replace(word, item=f"{self.item}.{name}", unit="", decode=decode, encode=None, meaning=told)
         return bit

@@ -62,6 +62,8 @@ POINT = {
     "high": "A value above it begins an alarm.",
     "hysteresis": "How far a value must be back for its alarm to end. By default a hundredth of what is between `low` "
     "and `high`, or of the one that there is.",
+    "alarm_if_set": 'Bits that begin an alarm while they are 1, by their names in `bits`: `alarm_if_set = ["FAULT"]`.',
+    "alarm_if_clear": "Bits that begin an alarm while they are 0, likewise.",
 }
 OUTPUTS = {
     "enabled": "Whether it is used. What is said of one that is not must be right, too.",

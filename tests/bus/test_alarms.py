@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from busmaster.bus.alarms import AlarmChanged, Alarms
 from busmaster.bus.bus import Bus
-from busmaster.bus.meaning import Meaning
+from busmaster.bus.meaning import Meaning, MeansNothing
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.samples import Sample
@@ -196,3 +196,55 @@ def test_each_of_several_overheard_values_may_begin_an_alarm() -> None:
         assert {point for point, alarm in bus.alarms.items() if alarm is not None} == set(speeds)
 
     on_a_bus(story)
+
+
+def word(**alarms: Any) -> Point[Any]:
+    return replace(point("1"), meaning=Meaning(bits={"RUNS": 0, "FAULT": 3}, **alarms))
+
+
+def told_of_bits(of: Point[Any], *values: int) -> list[str]:
+    """What is told of the bits of a word, one cycle each."""
+    texts: list[str] = []
+    alarms = Alarms(lambda alarm: texts.append(alarm.text))
+    bits = [bit for bit in of.bits if bit.meaning.watched]
+    alarms.watch(bits)
+    for value in values:
+        alarms.look(bits, {bit: samples(bit.value_of(value))[point("1")] for bit in bits})
+    alarms.forget(bits)
+    return texts
+
+
+def test_a_bit_begins_an_alarm_while_it_is_set() -> None:
+    assert told_of_bits(word(alarm_if_set=("FAULT",)), 0, 1, 8, 9, 1, 8) == [
+        "5/1.FAULT is set",
+        "5/1.FAULT is clear again, was set",
+        "5/1.FAULT is set",
+        "5/1.FAULT is watched no more, was set",
+    ]
+
+
+def test_a_bit_begins_an_alarm_while_it_is_clear() -> None:
+    assert told_of_bits(word(alarm_if_clear=("RUNS",)), 1, 9, 8, 0, 1, 0) == [
+        "5/1.RUNS is clear",
+        "5/1.RUNS is set again, was clear",
+        "5/1.RUNS is clear",
+        "5/1.RUNS is watched no more, was clear",
+    ]
+
+
+def test_only_the_bits_that_are_named_begin_alarms() -> None:
+    assert told_of_bits(word(), 0, 9, 0) == []
+    assert [bit.item for bit in word(alarm_if_set=("FAULT",)).bits if bit.meaning.watched] == ["1.FAULT"]
+
+
+@pytest.mark.parametrize(
+    ("alarms", "complaint"),
+    [
+        ({"alarm_if_set": ("FALT",)}, "'FALT' is not the name of a bit"),
+        ({"alarm_if_clear": ("FALT",)}, "'FALT' is not the name of a bit"),
+        ({"alarm_if_set": ("FAULT",), "alarm_if_clear": ("FAULT",)}, "FAULT is in alarm_if_set too"),
+    ],
+)
+def test_an_alarm_of_a_bit_names_a_bit_once(alarms: Any, complaint: str) -> None:
+    with pytest.raises(MeansNothing, match=complaint):
+        word(**alarms)

@@ -301,3 +301,49 @@ async def test_a_value_that_was_read_is_the_same_whatever_digits_are_shown() -> 
     async with emulated(file("hcp2", 'a = { item = "10", precision = 0 }' + GROUP)) as line:
         await line.point("w/a").write(1.2345)
         assert await line.point("w/a").read(max_age=inf) == 1.2345
+
+
+def templated(kind: str, own: str, word: str, emulator: str) -> ConfiguredLine:
+    """Return an emulated line with one node of a shipped template, whose word is polled."""
+    rate = 9600 if kind == "msc" else 57600
+    text = (
+        f'port = "/dev/ttyUSB0?baudrate={rate}"\n[nodes.w]\nprotocol = "{kind}"\naddress = 3\ntemplate = "{kind}"\n'
+        f'{own}[groups.axes]\nperiod = 0.2\npoints = "w/{word}"\n[emulator.nodes.w]\n{emulator}'
+    )
+    return emulated(read(Source("line.toml", text)))
+
+
+@in_virtual_time
+async def test_the_template_of_a_microflex_reports_a_trip() -> None:
+    async with templated("microflex", "", "status_word", "axis_error = 2\ntrips_after = 1.5\n") as line:
+        alarms = (event async for event in line.bus.events() if isinstance(event, AlarmChanged))
+        assert (await anext(alarms)).text == "w/status_word.ASYNCHRONOUS_ERROR is set"
+        assert {point.key: alarm and alarm.limit for point, alarm in line.bus.alarms.items()} == {
+            "w/status_word.ASYNCHRONOUS_ERROR": "high"
+        }
+        await line.nodes["w"].write("command_word", 64)
+        assert (await anext(alarms)).text == "w/status_word.ASYNCHRONOUS_ERROR is clear again, was set"
+
+
+@in_virtual_time
+async def test_the_template_of_an_msc_reports_a_program_that_does_not_run() -> None:
+    async with templated("msc", "", "status", "[emulator.nodes.w.values]\nstatus = 64\n") as line:
+        alarms = (event async for event in line.bus.events() if isinstance(event, AlarmChanged))
+        assert (await anext(alarms)).text == "w/status.PROGRAM_RUNNING is clear"
+        assert [point.key for point, alarm in line.bus.alarms.items() if alarm is not None] == [
+            "w/status.PROGRAM_RUNNING"
+        ]
+
+
+def test_an_alarm_of_a_template_is_switched_off_in_the_node() -> None:
+    own = "[nodes.w.points]\nstatus = { alarm_if_clear = [] }\n"
+    line = templated("msc", own, "status", "")
+    watched = {bit.item for bit in line.point("w/status").bits if bit.meaning.watched}
+    assert "status.PROGRAM_RUNNING" not in watched
+    assert "status.BATTERY_LOW" in watched
+
+
+def test_an_alarm_of_a_bit_that_there_is_not_is_an_error_at_its_key() -> None:
+    point = 'a = { item = "10", bits = { FAULT = 3 }, alarm_if_set = ["FALT"] }'
+    with pytest.raises(FileError, match=r"line.toml:6: nodes.w.points.a.alarm_if_set: 'FALT' is not the name of a bit"):
+        parse("hcp2", point)
