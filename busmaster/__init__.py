@@ -6,7 +6,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from busmaster.arbiter.counters import DriverErrors, LineStatistics, NodeStatistics, Quantiles
-from busmaster.arbiter.events import LatenessLowered, LatenessRaised, LineChange, LineChanged, NodeChanged, PortFailed
+from busmaster.arbiter.events import (
+    LatenessLowered,
+    LatenessRaised,
+    LineChange,
+    LineChanged,
+    NodeChanged,
+    PortFailed,
+    RepliesLate,
+)
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.learned import LearnedTimes
 from busmaster.arbiter.state import LineState
@@ -117,6 +125,7 @@ __all__ = [
     "Quantiles",
     "Refused",
     "RemoteBus",
+    "RepliesLate",
     "ReplyTiming",
     "RequestOptions",
     "Requester",

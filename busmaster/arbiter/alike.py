@@ -52,7 +52,8 @@ class Alike:
         `last_byte` is when the last byte of the last answer came, in seconds.
         """
         leg = self._wire.leg
-        if now - last_byte - leg.latency > exchange.timing.window:  # in this pause an answer too many would have come
+        # in a pause that is longer than its reply can be awaited an answer too many would have come
+        if now - last_byte - leg.latency > exchange.timing.awaited:
             self.count = 0
             return False
         self.count += 1

@@ -48,6 +48,9 @@ class NodeStatistics:
     """From the start of the request to the end of its reply, of attempts that succeeded."""
     learned: tuple[LearnedTimes, ...] = ()
     """Of each kind of command that it was asked, where its reply times are learned."""
+    overdue: int = 0
+    """Of those that were `late`, the replies that began after the reply window even: their values count all the same,
+    and say that the window is too short for this node."""
 
     @property
     def fruitless(self) -> int:
@@ -114,6 +117,7 @@ class NodeCounters:
         "late",
         "latency",
         "no_reply",
+        "overdue",
         "probes",
         "refused",
         "retries",
@@ -125,7 +129,7 @@ class NodeCounters:
 
     def reset(self) -> None:
         """Begin all counts anew."""
-        self.late = self.no_reply = self.garbled = self.refused = self.cut_off = 0
+        self.late = self.overdue = self.no_reply = self.garbled = self.refused = self.cut_off = 0
         self.retries = self.unheard = self.failed = self.probes = 0
         self.latency = Histogram()
 
@@ -154,6 +158,7 @@ class NodeCounters:
             self.probes,
             lateness,
             Quantiles.of(self.latency),
+            overdue=self.overdue,
         )
 
 

@@ -176,7 +176,7 @@ class Dispatcher:
         transaction.phase = ON_WIRE
         transaction.attempts += 1
         transaction.started = now
-        transaction.late = False  # an earlier attempt may have been; this one's value is not late for that
+        transaction.late = transaction.overdue = False  # an earlier attempt may have been: its value is not this one's
 
     # what came of an attempt
 
@@ -201,6 +201,7 @@ class Dispatcher:
         counters.latency.record(now - transaction.started)
         if transaction.late:
             counters.late += 1
+            counters.overdue += transaction.overdue
         node.last_reply = now
         if node.health is not UP:
             self._watch.heard(node, now)

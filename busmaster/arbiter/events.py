@@ -68,6 +68,18 @@ class LatenessLowered:
     lateness: float
 
 
+@dataclass(frozen=True, slots=True)
+class RepliesLate:
+    """A reply of this node began `age` seconds after its request, later than its reply `window`, and was delivered.
+
+    Told for the first such reply, and for one that is a quarter later than any told before. A longer window fits.
+    """
+
+    node: NodeRecord
+    age: float
+    window: float
+
+
 class LineChange(enum.Enum):
     """What became of the line: its port UP or DOWN, the line NOISY (nothing is sent) or QUIET again."""
 
@@ -114,6 +126,7 @@ Event: TypeAlias = (
     | NodeChanged
     | LatenessRaised
     | LatenessLowered
+    | RepliesLate
     | LineChanged
     | PortFailed
     | CameUnasked

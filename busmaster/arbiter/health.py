@@ -92,6 +92,7 @@ class NodeRecord:
         "stops",
         "suspended_until",
         "timings",
+        "told_late",
         "unheard",
         "up_since",
         "usual",
@@ -141,6 +142,8 @@ class NodeRecord:
         self.lateness_until = inf
         """When a lateness that was raised comes down again, if all replies are prompt until then."""
         self._before_raised: Timings | None = None
+        self.told_late = 0.0
+        """Seconds to the first byte of the latest of its replies that was told as a late one."""
 
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
         """Note that the node has answered this command rightly, after `took` seconds."""

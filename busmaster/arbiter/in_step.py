@@ -146,12 +146,9 @@ class InStep:
         unsure = self.debts or self._doubted or self._forgiven
         self.alert = bool(unsure or self._doubt_until > now or self.lone_bytes_until > now)
 
-    def clashes(
-        self, answers: Sequence[bytes], now: float, node: NodeRecord | None = None, but: float | None = None
-    ) -> bool:
-        """Return whether an answer beginning with one of these keys, of this node if given, could be one owed; `but` to
-        the request that was out then."""
-        return any(debt.of(node, now) and debt.asked != but and _could_be(debt, answers) for debt in self.debts)
+    def clashes(self, answers: Sequence[bytes], now: float, node: NodeRecord | None = None) -> bool:
+        """Return whether an answer beginning with one of these keys, of this node if given, could be one owed."""
+        return any(debt.of(node, now) and _could_be(debt, answers) for debt in self.debts)
 
     def over(self, answers: Sequence[bytes]) -> float:
         """Return when all that is owed and could look so is later than its node's lateness allows."""

@@ -10,8 +10,6 @@ a request, one leg               a silence of `quiet()` that ends at or after `e
 a request whose ACK was heard    likewise from the end of that ACK, with the packet's lateness (MSC)
 a request whose ACK was not      likewise; the packet's lateness counts from the request's end, and anew from
 heard (MSC: it may be lost)      each unasked byte, and what came for it: either may be the ACK, damaged
-likewise, and then its whole     a silence of `quiet()`: nothing of it is still to come
-reply, late (MSC)
 a request on an echoing port     likewise, `end` being the last byte of its echo
 a closing ACK                    when it is out; nothing answers it
 a broadcast                      when it is out, and `turnaround` later
@@ -56,7 +54,6 @@ class Leg:
         "out",
         "paced",
         "pause",
-        "reply_came",
         "taint_until",
         "timing",
         "went_on_at",
@@ -81,8 +78,6 @@ class Leg:
         self.byte_time = byte_time
         self._follows: ReplyTiming | None = None
         self._follows_until = -inf
-        self.reply_came = False
-        """Though it was given up, all of its reply came."""
         self.longest = 0
         """Bytes that its reply can have."""
         self.paced = False
@@ -111,7 +106,10 @@ class Leg:
         """Return when the reply, of which a byte came now, must go on; a trickle cannot hold the line."""
         timing, latency, byte_time = self.timing, self.latency, self.byte_time
         due = now + timing.byte_gap + latency + byte_time
-        limit = self.end + timing.window + latency + self.longest * byte_time + timing.byte_gap
+        latest = self.end + timing.window + latency
+        if self.begun_at > latest:  # it began late
+            latest = self.begun_at
+        limit = latest + self.longest * byte_time + timing.byte_gap
         return due if due < limit else limit
 
     def note_pause(self, now: float) -> None:
@@ -142,7 +140,6 @@ class Leg:
         """Stop waiting for the reply. It may still come; then its node goes on by itself with those of the `later` legs
         that need no word from the host (MSC: the packet after its ACK)."""
         self._follows = later[0].timing if later and not later[0].sent else None
-        self.reply_came = False
         if self._follows is not None:
             self._follows_until = self._past(self.end, self._follows)
 
@@ -150,11 +147,6 @@ class Leg:
         """Note that what was answered has left, whatever the baud rate says: not every port keeps to it."""
         if self.end > self.begun_at:
             self.end = self.out = self.begun_at
-
-    @property
-    def goes_on(self) -> bool:
-        """The reply was given up, and its node may go on by itself with a later leg."""
-        return self._follows is not None
 
     def came_unasked(self, now: float) -> float:
         """Note that something came: perhaps the reply that was given up, and its next leg begins here. Or it was noise,
@@ -167,13 +159,14 @@ class Leg:
     def settled(self) -> None:
         """Note that nothing of the leg can come any more."""
         self._follows = None
-        self.reply_came = False
+
+    def last_begin(self) -> float:
+        """Return from when on a reply that has not begun never comes: a later leg may follow it all the same."""
+        return self._past(self.end, self.timing)
 
     def past(self) -> float:
         """Return from when on no byte of a reply to it can be the first one that is received (R3)."""
-        if self.reply_came:
-            return -inf
-        past = self._past(self.end, self.timing)
+        past = self.last_begin()
         return past if self._follows is None else max(past, self._follows_until)
 
     def _past(self, end: float, timing: ReplyTiming) -> float:

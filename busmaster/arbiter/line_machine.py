@@ -14,9 +14,11 @@ state      data received          its deadline             line_up / line_down  
 OFFLINE    counted, dropped       never                    up: SETTLING                fails with LineDown
 READY      unasked: SETTLING      never                    down: OFFLINE               EXCHANGE
 HOLDOFF    unasked: SETTLING      READY                    down: OFFLINE, all fail     waits
-EXCHANGE   read: stays, or ends   window or gap is over:   down: OFFLINE, all fail     waits
-           in READY, HOLDOFF      failed (SETTLING), next
-           or SETTLING            leg, or done (broadcast)
+EXCHANGE   read: stays, or ends   window is over: stays    down: OFFLINE, all fail     waits
+           in READY, HOLDOFF      until the lateness is;
+           or SETTLING            then, or gap is over:
+                                  failed (SETTLING), next
+                                  leg, or done (broadcast)
 SETTLING   unasked: silence       READY                    down: OFFLINE, all fail     waits (NOISY: fails)
            again; 1 s of it:
            NOISY, all fail
@@ -192,10 +194,10 @@ class LineMachine:
                 self.dispatcher.probe(now, self.state is READY)
         if now >= deadlines.line and not unread:
             if self.state is EXCHANGE:
-                if self._trust.held is None:
-                    self._take(None, now)
-                else:
+                if self._trust.held is not None:
                     self._complete(self._trust.held, now)
+                elif not self._awaits_late_reply(now):
+                    self._take(None, now)
             elif self.state is SETTLING and now < self._silent_at:
                 deadlines.line = self._unasked.look_before(self._silent_at, now)
             else:
@@ -254,6 +256,8 @@ class LineMachine:
             transaction.first_byte = now
         if now > leg.end + leg.timing.nominal + leg.latency:
             transaction.late = True
+            if now > leg.end + leg.timing.window + leg.latency:
+                transaction.overdue = True
         self._unasked.last_byte = now
         self._take(data, now)
 
@@ -265,6 +269,7 @@ class LineMachine:
             assert exchange is not None
             step = exchange.expired(self._leg.begun) if data is None else exchange.feed(data)
             if type(step) is Expect:
+                self._watch_max_reply_delay()  # now: the next leg takes the place of this one's times
                 step = self._wire.follow(step, now)
         except FrameError as error:
             self._attempt_failed(error, now, no_reply=no_reply)
@@ -277,6 +282,33 @@ class LineMachine:
                 self._complete(step, now)
             elif self._leg.begun:
                 self._deadlines.line = self._wire.gap_over(now)
+
+    def _awaits_late_reply(self, now: float) -> bool:
+        """Wait on for a reply that has not begun in its window, and return whether it may still begin.
+
+        The line would settle until then anyway (R3), so a late reply that is right is worth waiting for, and costs
+        nothing. A learned window ends the wait: the line goes on, and the reply is overdue (R15).
+        """
+        wire, leg, unasked = self._wire, self._leg, self._unasked
+        if leg.begun or not wire.answered or leg.timing.silence is not None:
+            return False
+        if self._closed or self._echo.owed:  # who leaves waits for a window (R8); an echo that is lost hides the reply
+            return False
+        until = leg.last_begin()
+        if now >= until:
+            return False
+        assert wire.transaction is not None
+        unasked.unanswered(wire.transaction.node, leg.end, leg.timing.lateness)
+        self._deadlines.line = unasked.look_before(until, now)
+        return True
+
+    def _watch_max_reply_delay(self) -> None:
+        """Tell of a node whose reply to this leg began after its window; raise its lateness if that was near (R3)."""
+        leg, transaction = self._leg, self._wire.transaction
+        assert transaction is not None
+        # an earlier leg may have been the late one
+        if transaction.overdue and leg.begun and leg.begun_at > leg.end + leg.timing.window + leg.latency:
+            self._unasked.note_late(transaction.node, leg.timing, leg.end, leg.begun_at)
 
     def _complete(self, step: Done[Any], now: float) -> None:
         """Deliver a value: the line is free when the closing ACK has left and the node has let go of the line."""
@@ -297,6 +329,8 @@ class LineMachine:
                     self._deadlines.line = verdict
                     return
             begun_at = leg.begun_at
+            if transaction.overdue:  # asked here, too: this is done for every reply
+                self._watch_max_reply_delay()
             if leg.end > begun_at:  # an unpaced port: what was answered has left, whatever the baud rate says
                 leg.end = leg.out = begun_at
             transaction.node.note_reply(exchange.answers, transaction.command, begun_at - leg.end)
@@ -336,12 +370,19 @@ class LineMachine:
         if no_reply:
             unasked.unanswered(transaction.node, leg.end, leg.timing.lateness)
             if error.what == NO_REPLY:
-                error.what = f"no reply within {leg.timing.window * 1000:g} ms"
+                timing = leg.timing
+                early = timing.silence is not None or self._closed or self._echo.owed  # see _awaits_late_reply
+                awaited = timing.window if early else timing.lateness
+                error.what = f"no reply within {awaited * 1000:g} ms"
             if self._echo.owed:
                 error.what += ", and no echo of the request: if the adapter has none, leave echo out"
-        elif error.heard:
-            unasked.blame(now)
-            unasked.run[:] = error.heard
+        else:
+            if transaction.overdue:
+                unasked.answered()  # what came late and is wrong may be noise: it makes no node slower
+            elif error.heard:
+                unasked.blame(now)
+            if error.heard:
+                unasked.run[:] = error.heard
         spared = error.whole and not self._in_step.is_overdue(
             now
         )  # its reply has begun: the silence alone is waited for (R3)
@@ -368,6 +409,8 @@ class LineMachine:
         certain = not self._in_step.doubts_refusals(now)
         if not certain:
             self._trust.owe(self._wire, heard=False)
+        elif transaction.writes:
+            self._watch_max_reply_delay()
         confirmed = transaction.refusals > 0
         transaction.last_byte = now
         self._end_exchange()
@@ -423,7 +466,6 @@ class LineMachine:
         """End a holdoff or a settle."""
         if self.state is SETTLING:
             self._leg.settled()
-            self._trust.settled()
             self._hear_out(self._unasked.silent(), now)
             if self._answer_unasked(self._unasked.reply_to_silence(), now):
                 return
@@ -442,7 +484,6 @@ class LineMachine:
         self._leg.came_unasked(now)
         if self.state is OFFLINE:
             return
-        self._leg.reply_came = self._leg.goes_on and self._trust.is_late_reply(bytes(unasked.run), now)
         self._settle(now)
         self._answer_unasked(unasked.reply_to(data, self.noisy), now)
         if unasked.babbling(now) and not self.noisy:

@@ -93,11 +93,14 @@ class OnWire:
         begun = max(0.0, heard - (len(leg.first_bytes) - 1) * leg.byte_time)
         pause = leg.pause if leg.went_on_at < leg.begun_at else max(leg.pause, now - leg.went_on_at)
         packet = leg.timing is not exchange.timing
-        learning.note(transaction.command, packet, begun, heard, max(0.0, pause - leg.latency), leg.byte_time)
         # Only a learned window that is nearly missed says that the node has become slower; the document's says nothing,
         # not even where what was learned comes to as much: the node is as slow as it has always been.
         document = transaction.node.timings
         longest = (document.packet if packet else document.write if transaction.writes else document.read).window
+        # A reply later than that teaches nothing: no learned window exceeds the document's. So a node that is always as
+        # late is never trusted, has the document's times for good, and its late replies are delivered.
+        if heard <= longest:
+            learning.note(transaction.command, packet, begun, heard, max(0.0, pause - leg.latency), leg.byte_time)
         if leg.timing.silence is not None and LATE_SHARE * leg.timing.window < heard and leg.timing.window < longest:
             learning.was_late()
 

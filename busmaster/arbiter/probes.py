@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf
 
 from busmaster.arbiter.deadlines import Deadlines
-from busmaster.arbiter.health import DOWN, LONGEST_BUDGET_WAIT, NodeRecord, ProbeBudget
+from busmaster.arbiter.health import DOWN, NodeRecord, ProbeBudget
 from busmaster.arbiter.transaction import BACKGROUND, Transaction
 
 IDLE_PROBE_EVERY = 0.8
@@ -28,11 +28,11 @@ class Probes:
         if self._running is not None:
             self._deadlines.health = inf
             return
-        down = [node for node in self.nodes if node.health is DOWN]
+        down = self._down()
         # A probe of a dead node is expected to fail, and a failed attempt costs the lateness: that, not the window, is
         # what it takes of the line.
         self.budget.probe = max((node.lateness for node in down), default=0.0)
-        due = min((max(node.probe_at, node.suspended_until) for node in down), default=inf)
+        due = min(map(_due, down), default=inf)
         free = min((max(self._free_at, node.suspended_until) for node in down), default=inf)
         self._deadlines.health = min(due, free)
 
@@ -52,7 +52,8 @@ class Probes:
             self._put_off(now)
             return None
         elif not self.budget.take(cost, now):
-            self._deadlines.health = now + self.budget.wait_for(cost, now)
+            due = now + self.budget.wait_for(cost, now)
+            self._deadlines.health = min(due, self._free_at) if self._free_at > now else due
             return None
         return self._probe(node, cost, now)
 
@@ -96,4 +97,13 @@ class Probes:
         self.plan()
         # Never a time that is past: the owner would call again at once, and find the same.
         if self._deadlines.health <= now:
-            self._deadlines.health = now + LONGEST_BUDGET_WAIT
+            due = min((due for due in map(_due, self._down()) if due > now), default=inf)
+            self._deadlines.health = min(due, now + IDLE_PROBE_EVERY)
+
+    def _down(self) -> list[NodeRecord]:
+        return [node for node in self.nodes if node.health is DOWN]
+
+
+def _due(node: NodeRecord) -> float:
+    """Return when this dead node's probe is due, if it must be paid for."""
+    return max(node.probe_at, node.suspended_until)

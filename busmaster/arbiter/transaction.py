@@ -83,6 +83,7 @@ class Transaction:
         "last_byte",
         "late",
         "node",
+        "overdue",
         "phase",
         "poll",
         "priority",
@@ -113,6 +114,8 @@ class Transaction:
     settling_ahead: float
     late: bool
     """The reply to its last attempt began after the nominal time."""
+    overdue: bool
+    """It began after its window even."""
     # Those above are set when it is queued, or sent, and not before; and a string behind a statement of a function is
     # an instruction that does nothing. Each costs, and this is done for every request.
     finish_by: float

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import inf
 from typing import Any
 
 from busmaster.arbiter.health import NodeRecord
@@ -11,8 +10,7 @@ from busmaster.arbiter.learned import LATE_SHARE
 from busmaster.arbiter.mark import Mark
 from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.unasked import QUIET, UnaskedBytes
-from busmaster.contract.driver import Driver
-from busmaster.contract.exchange import Command, Done
+from busmaster.contract.exchange import Done
 
 TWO_ANSWERS = "two answers came where one was due"
 TOO_EARLY = "bytes came before the request was out"
@@ -31,12 +29,10 @@ SPOILING = frozenset((TOO_EARLY, COLLIDED, *map(damaged, Mark)))
 class Trust:
     """Of one line. While things are said twice on it, a doubtful answer is held until another could have come."""
 
-    __slots__ = ("_in_step", "_unheard", "held")
+    __slots__ = ("_in_step", "held")
 
     def __init__(self, in_step: InStep) -> None:
         self._in_step = in_step
-        self._unheard: tuple[Command[Any], NodeRecord, float] | None = None
-        """What was asked last, of whom, and when it was out, if nothing at all was heard of it in time."""
         self.held: Done[Any] | None = None
         """An answer that is delivered only if no other comes meanwhile."""
 
@@ -89,34 +85,6 @@ class Trust:
         if exchange.answered:
             transaction.node.unheard += not heard
             self._in_step.owe(keys, transaction.node, leg.end, over, awaited)
-        unheard = not heard and transaction.first_byte == -inf
-        self._unheard = (transaction.command, transaction.node, leg.end) if unheard else None
-
-    def settled(self) -> None:
-        """Note that nothing of what was asked last can come any more."""
-        self._unheard = None
-
-    def is_late_reply(self, run: bytes, now: float) -> bool:
-        """Return whether these bytes are all of the late reply to what was asked last, and nothing else.
-
-        Then nothing more of it can come, since a request causes one reply (R3). What proves that is what ends an
-        exchange for certain within its window: the reader takes it, nothing is behind it, and nothing that is owed or
-        doubted could be it. A lone byte may be noise, and proves nothing.
-        """
-        if self._unheard is None:
-            return False
-        command, node, asked = self._unheard
-        read = Driver(command.open(node.address, node.timings)).feed(run)
-        ending, answers = read.ending, read.exchange.answers
-        # Where the reader would have said something in between, this is not all that comes.
-        if ending is None or not ending.delivered or ending.rest or read.said or any(len(key) == 1 for key in answers):
-            return False
-        in_step = self._in_step
-        return not (
-            in_step.clashes(answers, now, node, but=asked)
-            or in_step.is_doubtful(answers, now)
-            or in_step.is_to_be_held(answers, now)
-        )
 
     def hear(
         self, wire: OnWire, run: bytes, unasked: UnaskedBytes, now: float, ours: bool = False

@@ -6,9 +6,10 @@ from collections import deque
 from math import inf
 
 from busmaster.arbiter.counters import LineCounters
-from busmaster.arbiter.events import CameUnasked, Event, LatenessRaised
+from busmaster.arbiter.events import CameUnasked, Event, LatenessRaised, RepliesLate
 from busmaster.arbiter.health import NodeRecord
 from busmaster.contract.exchange import Done, FrameError, Listener, Need
+from busmaster.contract.timing import ReplyTiming
 
 QUIET = 0.020
 """The least silence, in seconds, that ends a settle."""
@@ -19,6 +20,8 @@ STRAGGLER_MARGIN = 1.6
 LONGEST_LATENESS = 0.5
 STRAGGLER_MEMORY = 1.0
 """Seconds after which an unasked byte is no longer blamed on the last unanswered request."""
+TOLD_AGAIN = 1.25
+"""How many times as late as the latest reply that was told one must be to be told, too."""
 LOOKS = 10
 """In so many parts of a lateness the line is looked at while a straggler may come."""
 LOOK_SLACK = 0.005
@@ -34,8 +37,7 @@ class UnaskedBytes:
         self.last_byte = -inf
         self.run = bytearray()
         """What came since the line was last silent, or in place of a reply."""
-        self._looked = -inf
-        self._look_at = inf
+        self._looked = self._look_at = -inf
         self.listener: Listener | None = None
         self._events = events
         self._counters = counters
@@ -96,10 +98,19 @@ class UnaskedBytes:
             self.looked(now, due)
         return due
 
-    def blame(self, first_byte: float) -> None:
-        """Raise the lateness of a node whose reply came long after its request: it is slower than was believed."""
+    def note_late(self, node: NodeRecord, timing: ReplyTiming, asked: float, first_byte: float) -> None:
+        """Note that a reply was right, and began after its window: that is told once, and again where it is slower."""
+        self.unanswered(node, asked, timing.lateness)
+        age = self.blame(first_byte)
+        if age > timing.window and age > TOLD_AGAIN * node.told_late:
+            node.told_late = age
+            self._events.append(RepliesLate(node, age, timing.window))
+
+    def blame(self, first_byte: float) -> float:
+        """Raise the lateness of a node whose reply came long after its request: it is slower than was believed. Returns
+        how long after it, in seconds, as far as is known: 0 if it is not."""
         if self.unanswered_one is None:
-            return
+            return 0.0
         node, asked, lateness = self.unanswered_one
         self.unanswered_one = None
         stalled = first_byte > self._look_at + LOOK_SLACK  # it may have lain unread for as long
@@ -110,6 +121,7 @@ class UnaskedBytes:
         if STRAGGLER_SHARE * lateness < age <= STRAGGLER_MEMORY and raised > lateness:
             node.raise_lateness(raised, first_byte)
             self._events.append(LatenessRaised(node, age, raised))
+        return age
 
     def blame_for(self, node: NodeRecord, asked: float, first_byte: float) -> None:
         """Blame the node whose reply to an earlier request came, though the line had gone on."""

@@ -13,6 +13,7 @@ from busmaster.arbiter.events import (
     LineChanged,
     NodeChanged,
     PortFailed,
+    RepliesLate,
 )
 from busmaster.arbiter.health import Health
 from busmaster.bus.alarms import AlarmChanged, BusEvent
@@ -51,6 +52,12 @@ class Logbook:
                 f"{event.node.label} has been prompt for an hour: its lateness is {event.lateness * 1000:.0f} ms again"
             )
             self._write((event.node, LatenessLowered), logging.INFO, text, now)
+        elif isinstance(event, RepliesLate):
+            text = (
+                f"{event.node.label} answers after {event.age * 1000:.0f} ms, later than its reply window of "
+                f"{event.window * 1000:g} ms: its values are late"
+            )
+            self._write((event.node, RepliesLate), logging.WARNING, text, now)
         elif isinstance(event, PortFailed):
             text = f"cannot connect: {event.cause}" + (f"; {event.hint}" if event.hint else "")
             self._write((PortFailed, event.cause), logging.WARNING, text, now, event.bug)

@@ -1,16 +1,17 @@
-"""Nodes that answer, but only after their window: a command that hears them says so, as the doctor would."""
+"""Nodes that answer after their reply window: the commands say so, and which window would fit."""
 
 from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import anyio
 
-from busmaster.arbiter.events import LatenessRaised
+from busmaster.arbiter.events import LatenessRaised, RepliesLate
 from busmaster.bus.bus import Bus
+from busmaster.cli.output import Level, note
 from busmaster.errors import NoReply
 from busmaster.service.remote import RemoteBus
 
@@ -23,40 +24,46 @@ ROOM = 1.5
 class LateNodes:
     """The nodes of a bus that have answered late, and after how many seconds."""
 
-    def __init__(self) -> None:
-        self._ages: dict[int, float] = {}
+    def __init__(self, *, in_file: bool = False) -> None:
+        self._in_file = in_file
+        self._ages: dict[int, tuple[str, float]] = {}
 
     async def listen(self, bus: Bus | RemoteBus) -> None:
         """Note late answers, until cancelled."""
         async for event in bus.events():
-            if isinstance(event, LatenessRaised):
-                self._ages[event.node.address] = event.age
+            if isinstance(event, LatenessRaised | RepliesLate):
+                self._ages[event.node.address] = (event.node.label, event.age)
 
     async def explain(self, error: NoReply, lateness: float) -> None:
         """Say in an error what to try where its node is only late. Waits as long as the answer may still come."""
         await anyio.sleep(lateness)
-        if error.address in self._ages:
-            error.hint = advice(self._ages[error.address])
+        if error.address is not None and error.address in self._ages:
+            _, age = self._ages.pop(error.address)
+            error.hint = advice(age)
 
-    def advice(self) -> Iterator[tuple[int, str]]:
-        """Yield each late node's address, and what to try."""
-        for address, age in self._ages.items():
-            yield address, advice(age)
+    def tell(self) -> None:
+        """Print on standard error, once for each late node, what to try."""
+        for label, age in self._ages.values():
+            note(f"{label}: {advice(age, in_file=self._in_file)}", Level.WARNING)
+        self._ages.clear()
 
 
-def advice(age: float) -> str:
-    """Return what to try for a node that has answered after so many seconds."""
+def advice(age: float, *, in_file: bool = False) -> str:
+    """Return what to try for a node that has answered after so many seconds: an option, or what to write `in_file`."""
     window = math.ceil(ROOM * age / STEP) * STEP
-    return f"it answers late, after {age * 1000:.0f} ms: try --timeout {window * 1000:.0f}"
+    what = f"set timing = {{ window = {window:g} }} in its section" if in_file else f"try --timeout {window * 1000:.0f}"
+    return f"it answers late, after {age * 1000:.0f} ms: {what}"
 
 
 @asynccontextmanager
-async def late_nodes(bus: Bus | RemoteBus) -> AsyncIterator[LateNodes]:
-    """Listen for late answers on an open bus until the end of the block."""
-    late = LateNodes()
+async def late_nodes(bus: Bus | RemoteBus, *, in_file: bool = False) -> AsyncIterator[LateNodes]:
+    """Listen for late answers on an open bus until the end of the block, where those not told yet are told."""
+    late = LateNodes(in_file=in_file)
     listening = asyncio.create_task(late.listen(bus))
     await asyncio.sleep(0)  # it hears from now on
     try:
         yield late
     finally:
+        await asyncio.sleep(0)  # it hears what came last
         listening.cancel()
+        late.tell()

@@ -17,6 +17,7 @@ from busmaster.bus.snapshots import Snapshot
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import Connection, View, connected, nodes_option, viewed
 from busmaster.cli.ending import until_ended
+from busmaster.cli.late import late_nodes
 from busmaster.cli.output import Level, emit_all, note
 from busmaster.cli.parsing import option_type, parse_items, parse_seconds
 from busmaster.cli.protocols import ItemCommand
@@ -114,7 +115,7 @@ async def poll_served(remote: RemoteBus, points: Sequence[Point[Any]], period: f
         note("the live view of a line that another program owns is busmaster top; plain lines instead")
     cycles = Cycles(remote, view)
     try:
-        async with remote:
+        async with remote, late_nodes(remote):
             with anyio.move_on_after(view.seconds):
                 await cycles.show(await remote.poll_group("poll", period=period, points=points))
                 await remote.groups()  # it ended without us: this says why

@@ -97,7 +97,7 @@ class Running:
         self._view = view
         self._hangups = hangups
         self._ending = ending
-        self.watch = Watch(line.bus, line.file.title, view, gate=line.gate, steady=True)
+        self.watch = Watch(line.bus, line.file.title, view, gate=line.gate, steady=True, of_file=True)
         self._manager = ServiceManager()
 
     async def run(self) -> int:

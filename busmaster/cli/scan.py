@@ -61,8 +61,7 @@ async def scan(connection: Connection, addresses: tuple[int, ...], as_json: bool
                 bar.advance()
         if silent:
             await anyio.sleep(connection.lateness)  # so long the last one's answer may still take
-        for address, advice in late.advice():
-            note(f"{connection.profile.label(address)}: {advice}")
+        late.tell()
         for line in [line async for line in in_other_protocols(bus, connection.profile, silent)]:
             note(line)
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import anyio
 from anyio.abc import TaskGroup
 
-from busmaster.arbiter.events import LineChange, LineChanged, NodeChanged, PortFailed
+from busmaster.arbiter.events import LineChange, LineChanged, NodeChanged, PortFailed, RepliesLate
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.learned import LearnedTimes
 from busmaster.arbiter.state import LineState
@@ -22,6 +22,7 @@ from busmaster.bus.polling import PollGroup, Snapshot
 from busmaster.cli.app import FAILED, OK
 from busmaster.cli.arguments import View
 from busmaster.cli.drawing import draw, served_here
+from busmaster.cli.late import advice
 from busmaster.cli.output import Level, SteadyOutput, emit_all, json_line, note, value_text
 from busmaster.cli.top import what_is_missing
 from busmaster.doctor import uart
@@ -38,11 +39,22 @@ class Watch:
     """What is told of a bus while its groups are polled. Times are in seconds since it was made.
 
     `view` says how it is shown, `gate` is what the writes of the screen pass. `steady`: that nobody can print any more
-    does not end it. It hears what happens to the bus from the start on, before that is entered too.
+    does not end it. `of_file`: a LINE.toml says what is polled. It hears what happens to the bus from the start on,
+    before that is entered too.
     """
 
-    def __init__(self, bus: Bus, title: str, view: View, *, gate: Gate | None = None, steady: bool = False) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        title: str,
+        view: View,
+        *,
+        gate: Gate | None = None,
+        steady: bool = False,
+        of_file: bool = False,
+    ) -> None:
         self.bus = bus
+        self._of_file = of_file
         self.output = SteadyOutput(note) if steady else None
         self.title = title
         self.view = view
@@ -90,6 +102,8 @@ class Watch:
         async for event in self._heard:
             level = self._level(event)
             if (text := event_text(event)) and level is not None and self.may_print():
+                if isinstance(event, RepliesLate):
+                    text = f"{event.node.label}: {advice(event.age, in_file=self._of_file)}"
                 note(text, level)
 
     def _level(self, event: BusEvent) -> Level | None:
@@ -103,6 +117,8 @@ class Watch:
                 return Level.ERROR
             case AlarmChanged():
                 return Level.WARNING if event.active else Level.NOTICE
+            case RepliesLate():
+                return Level.WARNING
             case LineChanged():
                 lost = event.change in (LineChange.DOWN, LineChange.NOISY)
                 return self._turn(LINE, Level.ERROR if lost else None)

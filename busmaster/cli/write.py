@@ -15,6 +15,7 @@ from busmaster.bus.points import Point
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
 from busmaster.cli.capturing import capturing
 from busmaster.cli.ending import until_ended
+from busmaster.cli.late import late_nodes
 from busmaster.cli.lines import is_line_file, keep, load
 from busmaster.cli.output import emit, json_line, note
 from busmaster.cli.parsing import Whole, parse_assignment, parsed
@@ -89,7 +90,7 @@ async def write(
         with_decimals = {**connection.options, "decimals": dict.fromkeys(items, decimals)}
         handle = replace(connection, options=with_decimals).open_handle(bus, address)
     prepared = [(item, handle.prepare_write(item, values, verify=verify)) for item, values in pairs]
-    async with bus:
+    async with bus, late_nodes(bus):
         for item, sends in prepared:
             for send in sends:
                 await send()
@@ -103,7 +104,7 @@ async def write_points(line: ConfiguredLine, pairs: Pairs, verify: bool, as_json
     line.gate.record = records.append
     try:
         prepared = [prepare(line, name, values, verify) for name, values in pairs]
-        async with line.bus:
+        async with line.bus, late_nodes(line.bus, in_file=True):
             for wish, send in prepared:
                 await pass_on(line, wish, send)
                 tell(wish.name, as_json, point=wish.name)
@@ -115,7 +116,7 @@ async def write_points_through(line: ConfiguredLine, address: str, pairs: Pairs,
     """Write the pairs to points of a line that another program owns, which holds its limits and keeps the record."""
     remote = connect(address)
     prepared = [(name, line.prepare_write(name, values, bus=remote, verify=verify)) for name, values in pairs]
-    async with remote:
+    async with remote, late_nodes(remote, in_file=True):
         for name, send in prepared:
             await send()
             tell(name, as_json, point=name)

@@ -24,7 +24,7 @@ def _time(name: str, about: str) -> Key:
 
 TIME_KEYS = (
     _time("nominal", "A reply that begins by then is on time; a later one is counted late."),
-    _time("window", "A reply that begins by then is awaited: how long one attempt waits."),
+    _time("window", "A reply that begins by then is as expected; a later one, until `lateness`, is delivered late."),
     _time("lateness", "What has not begun by then never comes: on this it rests that no value is another's (R3)."),
     _time("byte_gap", "The longest pause between two bytes of one reply."),
     _time("turnaround", "How long the node's driver holds the line after its reply."),

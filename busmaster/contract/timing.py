@@ -23,7 +23,8 @@ class ReplyTiming:
     window: float
     """A reply begun by then is accepted, and counted late after `nominal`."""
     lateness: float
-    """What has not begun by then never comes: the promise R3 rests on it."""
+    """What has not begun by then never comes: the promise R3 rests on it. A reply begun between `window` and then is
+    accepted and counted late, too, unless the window is learned."""
     byte_gap: float
     """The longest pause between two bytes of one frame."""
     turnaround: float = 0.0
@@ -41,6 +42,11 @@ class ReplyTiming:
             )
         if not self.byte_gap:
             raise InvalidCommand("a reply's byte_gap is above 0 s")
+
+    @property
+    def awaited(self) -> float:
+        """Until when a reply that has not begun is awaited: the lateness, or the window where that is learned."""
+        return self.lateness if self.silence is None else self.window
 
     def with_window(self, window: float) -> ReplyTiming:
         """Return the same with another reply window; nominal and lateness move only as far as they must."""

@@ -208,7 +208,8 @@ def windows(starts: Sequence[float], timing: ReplyTiming) -> Finding:
     if slow > timing.window:
         lateness = max(timing.lateness, rounded_up(1.5 * window))
         wanted = " / ".join(milliseconds(value) for value in (rounded_up(1.5 * slow), window, lateness))
-        return Finding("windows", False, what, f"too short: use {wanted} ms, or --timeout {milliseconds(window)}")
+        advice = f"their values come, late: use {wanted} ms, or --timeout {milliseconds(window)}"
+        return Finding("windows", False, what, advice)
     if slow > timing.nominal:
         nominal = milliseconds(rounded_up(1.5 * slow))
         return Finding("windows", True, what, f"they are counted late: a nominal time of {nominal} ms would fit")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import anyio
 
-from busmaster.arbiter.events import LatenessRaised, NodeChanged
+from busmaster.arbiter.events import LatenessRaised, NodeChanged, RepliesLate
 from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
@@ -234,7 +234,7 @@ async def close_all(outputs: Collection[Output]) -> None:
 def label_of(event: BusEvent) -> str:
     """Return the label of the node that an event is of, "" for one of the line."""
     match event:
-        case NodeChanged() | LatenessRaised():
+        case NodeChanged() | LatenessRaised() | RepliesLate():
             return event.node.label
         case AlarmChanged():
             return event.point.node.label

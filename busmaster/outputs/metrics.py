@@ -38,6 +38,7 @@ OUTCOMES = ("ok", "no_reply", "garbled", "refused")
 COUNTS = {
     "attempts": "Exchanges with this node that have ended",
     "late": "Replies after the nominal time, accepted all the same",
+    "overdue": "Replies after the reply window, accepted all the same",
     "retries": "Reads that were tried again",
     "unheard": "Replies to callers that had gone",
     "failed": "Requests that ended with an error, retries and all",

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from decimal import Decimal
 from typing import Any
 
-from busmaster.arbiter.events import LatenessRaised, LineChanged, NodeChanged, PortFailed
+from busmaster.arbiter.events import LatenessRaised, LineChanged, NodeChanged, PortFailed, RepliesLate
 from busmaster.arbiter.health import Health
 from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.meaning import Named
@@ -186,6 +186,11 @@ def event_text(event: BusEvent) -> str:
             return (
                 f"{event.node.label} answered after {event.age * 1000:.0f} ms: "
                 f"its lateness is now {event.lateness * 1000:.0f} ms"
+            )
+        case RepliesLate():
+            return (
+                f"{event.node.label} answers after {event.age * 1000:.0f} ms, later than its reply window of "
+                f"{event.window * 1000:g} ms: its values are late"
             )
         case LineChanged():
             return f"the line is {event.change.value}" + (f": {event.cause}" if event.cause else "")

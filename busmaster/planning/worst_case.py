@@ -63,19 +63,21 @@ def shape(exchange: Exchange[Any]) -> tuple[object, ...]:
 def longest_hold(exchange: Exchange[Any], byte_time: float, receive_latency: float = 0.0) -> float:
     """Return for how many seconds one attempt can keep the line from others, if nothing is repeated in it.
 
-    Its settle is included. It is the H of R9: each leg's request, its window (or lateness) and its longest reply; then
-    the silence after the last byte, which a reply that trickles in puts off.
+    Its settle is included. It is the H of R9: each leg's request, its lateness and its longest reply; then the silence
+    after the last byte, which a reply that trickles in puts off.
     """
     before = worst = 0.0
     legs = [(len(exchange.request), exchange.timing, exchange.sizes)]
     legs += ((leg.sent, leg.timing, leg.sizes) for leg in exchange.later)
     for sent, timing, sizes in legs:
         said = before + sent * byte_time + receive_latency
-        whole = timing.window + timing.byte_gap + sizes.longest * byte_time
+        begins = timing.lateness + byte_time
+        whole = begins + sizes.longest * byte_time + timing.byte_gap  # then the leg is over, whatever still trickles in
         quiet = max(QUIET, timing.byte_gap) + receive_latency + byte_time
-        # A line that is not silent for longer is NOISY: nobody waits longer, but fails with LineNoisy.
-        trickle = min(sizes.longest * quiet, NOISY_AFTER + quiet)
-        worst = max(worst, said + max(whole, timing.lateness + byte_time) + trickle + quiet)
+        # Each byte puts the silence off; but a line that is not silent for longer is NOISY: nobody waits longer, but
+        # fails with LineNoisy.
+        trickles = min(begins + sizes.longest * quiet, whole + NOISY_AFTER + quiet)
+        worst = max(worst, said + trickles + quiet)
         before = said + whole
     return worst + exchange.closing * byte_time + exchange.timing.turnaround
 

@@ -16,6 +16,7 @@ from busmaster.arbiter.events import (
     LineChanged,
     NodeChanged,
     PortFailed,
+    RepliesLate,
 )
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import Timeline
@@ -174,6 +175,8 @@ def said_event(event: BusEvent) -> dict[str, Any] | None:
             said |= {"age": event.age, "lateness": event.lateness}
         case LatenessLowered():
             said |= {"lateness": event.lateness}
+        case RepliesLate():
+            said |= {"age": event.age, "window": event.window}
         case LineChanged():
             return said | {"change": event.change.value, "cause": event.cause}
         case PortFailed():
@@ -199,7 +202,7 @@ def event_of(said: Mapping[str, Any], find: FindNode) -> BusEvent | None:
     if name == "AlarmChanged":
         point = owners_point_of(said["point"], find)
         return AlarmChanged(point, said["limit"], said["bound"], said["value"], said["active"])
-    if name not in ("NodeChanged", "LatenessRaised", "LatenessLowered"):
+    if name not in ("NodeChanged", "LatenessRaised", "LatenessLowered", "RepliesLate"):
         return None
     # It has all that an event's reader asks of a node: label, address, profile, line.
     node = cast("NodeRecord", find(said["protocol"], said["address"]))
@@ -207,6 +210,8 @@ def event_of(said: Mapping[str, Any], find: FindNode) -> BusEvent | None:
         return NodeChanged(node, Health(said["before"]), Health(said["after"]), said["returning"])
     if name == "LatenessRaised":
         return LatenessRaised(node, said["age"], said["lateness"])
+    if name == "RepliesLate":
+        return RepliesLate(node, said["age"], said["window"])
     return LatenessLowered(node, said["lateness"])
 
 

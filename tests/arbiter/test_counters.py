@@ -39,6 +39,12 @@ def is_late(bench: Bench, node: NodeRecord) -> None:
     bench.hear(FIVE, after=REQUEST + 0.060)
 
 
+def is_overdue(bench: Bench, node: NodeRecord) -> None:
+    bench.ask(node)
+    bench.sent()
+    bench.hear(FIVE, after=REQUEST + 0.101)
+
+
 def is_refused_twice(bench: Bench, node: NodeRecord) -> None:
     bench.ask(node)
     for _ in range(2):
@@ -51,7 +57,7 @@ def is_silent(bench: Bench, node: NodeRecord) -> None:
     node.health = Health.UP
     bench.ask(node, retries=1)
     bench.sent()
-    bench.wait(0.120)
+    bench.wait(0.152)
 
 
 def answers_something_else(heard: str, after: float) -> Story:
@@ -94,8 +100,9 @@ FAILED = ONE | {"failed": 1}
     ("story", "line", "counts"),
     [
         (is_late, {}, ONE | {"ok": 1, "late": 1}),
+        (is_overdue, {}, ONE | {"ok": 1, "late": 1, "overdue": 1}),
         (is_refused_twice, {}, FAILED | {"attempts": 2, "exchanges": 2, "refused": 2, "settles": 2}),
-        (is_silent, {}, {"attempts": 1, "exchanges": 1, "no_reply": 1, "retries": 1, "settles": 1}),
+        (is_silent, {}, {"attempts": 1, "exchanges": 1, "no_reply": 1, "retries": 1, "settles": 1, "checks": 1}),
         (answers_something_else(BAD_CHECKSUM, 0.004), {}, FAILED | {"garbled": 1, "settles": 1}),
         (answers_something_else(FIVE, 0.0001), {"paced": True}, FAILED | {"garbled": 1, "tainted": 1, "settles": 1}),
         (answers_something_else(SEVEN, 0.001), {"echo": True}, FAILED | {"garbled": 1, "collisions": 1, "settles": 1}),

@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import pytest
 
+from busmaster.arbiter.events import RepliesLate
+from busmaster.arbiter.health import Health
 from busmaster.arbiter.state import LineState
 from busmaster.contract.exchange import Exchange
 from busmaster.contract.timing import Timings
-from busmaster.errors import GarbledReply, NoReply, WriteUnconfirmed
+from busmaster.errors import GarbledReply, NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from tests.arbiter.bench import (
+    ACK,
     ANOTHER_ELEMENT,
     BAD_CHECKSUM,
     FIVE,
+    LATENESS,
+    NAK,
     QUIET,
     READ_1_OF_NODE_1,
     SEVEN,
     TAU,
     WRITE_5,
     Bench,
+    reply_of,
 )
 
 REQUEST = 8 * TAU
@@ -48,14 +54,16 @@ def test_r1_the_next_request_leaves_only_when_the_reply_is_complete() -> None:
 def test_r2_the_window_runs_from_the_end_of_the_request_on_the_wire() -> None:
     bench = Bench()
     read = bench.ask(bench.node(), retries=0)
-    bench.wait(REQUEST + 0.0999)
+    bench.wait(REQUEST + LATENESS - 0.0001)
     assert not bench.ended(read)
     bench.wait(0.0002)
     assert isinstance(read.error, NoReply)
-    assert str(read.error).startswith("node 1: no reply within 100 ms, 1 attempt")
+    assert str(read.error).startswith("node 1: no reply within 150 ms, 1 attempt")
 
 
-@pytest.mark.parametrize(("delay", "late"), [(0.049, False), (0.051, True), (0.099, True)])
+@pytest.mark.parametrize(
+    ("delay", "late"), [(0.049, False), (0.051, True), (0.099, True), (0.101, True), (0.149, True)]
+)
 def test_r2_a_reply_after_nominal_is_accepted_and_counted_late(delay: float, late: bool) -> None:
     bench = Bench()
     node = bench.node()
@@ -94,6 +102,71 @@ def test_r2_a_trickle_of_bytes_cannot_hold_the_line() -> None:
         bench.hear("31", after=0.001)
         assert bench.now - start < 1.0
     assert bench.now <= 1.0 + REQUEST + 0.100 + longest * TAU + 0.020 + TAU + 0.001
+
+
+def test_r2_the_trickle_of_a_reply_that_began_late_cannot_hold_the_line_either() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node(), retries=0)
+    began = bench.now + REQUEST + 0.149
+    bench.hear("02", after=REQUEST + 0.149)
+    bench.hear("30")
+    bench.hear("31")
+    longest = hcp2.Read(1).open(1, hcp2.PROFILE.timings).sizes.longest
+    while read.error is None:
+        bench.hear("31", after=0.001)
+        assert bench.now - began < 1.0
+    assert bench.now <= began + longest * TAU + 0.020 + TAU + 0.001
+
+
+def test_r2_a_late_reply_may_last_as_long_as_any_other() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node(), retries=0)
+    bench.wait(REQUEST + 0.1495)
+    bench.hear_bytewise(reply_of(1, 123456789))
+    assert read.value == 123456789.0
+
+
+def test_r2_a_write_is_confirmed_by_a_late_ack() -> None:
+    bench = Bench()
+    write = bench.ask(bench.node(), hcp2.Write(1, (5,)))
+    request = len(bytes.fromhex(bench.sent())) * TAU
+    bench.hear(ACK, after=request + 0.130)
+    assert (bench.ended(write), write.attempts, write.error) == (1, 1, None)
+
+
+def test_r7_a_late_refusal_of_a_write_is_one_and_is_confirmed_at_once() -> None:
+    bench = Bench()
+    node = bench.node()
+    write = bench.ask(node, hcp2.Write(1, (5,)))
+    for _ in range(2):
+        request = len(bytes.fromhex(bench.sent())) * TAU
+        assert request
+        bench.hear(NAK, after=request + 0.130)
+    assert isinstance(write.error, Refused)
+    assert node.lateness == pytest.approx(1.6 * 0.130)
+
+
+def test_r2_where_the_bus_is_closed_no_late_reply_is_awaited() -> None:
+    bench = Bench()
+    read = bench.ask(bench.node(), retries=0)
+    bench.sent()
+    bench.arbiter.close(bench.now)
+    bench.wait(REQUEST + 0.1001)
+    assert str(read.error).startswith("node 1: no reply within 100 ms")
+    assert bench.arbiter.state is LineState.OFFLINE
+
+
+def test_r2_a_node_that_answers_late_is_told_once_and_again_where_it_is_much_slower() -> None:
+    bench = Bench()
+    node = bench.node()
+    for delay in (0.090, 0.105, 0.106, 0.120, 0.140, 0.141, 0.140):
+        bench.ask(node)
+        bench.until_sent()
+        bench.answer(after=REQUEST + delay)
+    told = [event for event in bench.events if isinstance(event, RepliesLate)]
+    assert [(event.node, event.window) for event in told] == [(node, 0.100)] * 2
+    assert [event.age for event in told] == pytest.approx([0.105, 0.140])
+    assert (node.counters.late, node.counters.overdue, node.health) == (7, 6, Health.UP)
 
 
 def test_r4_on_a_paced_line_bytes_before_the_request_is_out_taint_the_attempt() -> None:

@@ -183,10 +183,11 @@ def test_what_the_port_holds_back_may_leave_yet_and_is_unconfirmed() -> None:
 @pytest.mark.parametrize(("command", "kind"), [(hcp2.Read(1), NoReply), (REPEATED, WriteUnconfirmed)])
 def test_a_retry_that_cannot_finish_is_not_sent(command: hcp2.Read | hcp2.Write, kind: type[BusError]) -> None:
     bench = Bench()
-    asked = bench.ask(heard(bench), command, finish_by=bench.now + 0.120)
+    asked = bench.ask(heard(bench), command, finish_by=bench.now + 0.165)
     assert bench.sent()
-    bench.wait(0.119)
+    bench.hear("FF", after=0.150)
     assert asked.phase is Phase.QUEUED  # failed once, while the line settles
+    bench.wait(0.014)
     bench.wait(0.002)
     assert (bench.ended(asked), type(asked.error), asked.attempts) == (1, kind, 1)
     bench.wait(1.0)
@@ -211,7 +212,7 @@ def test_a_retry_whose_time_is_over_does_not_go_before_another_either() -> None:
     bench = Bench()
     asked = bench.ask(heard(bench), finish_by=bench.now + 0.5)
     bench.sent()
-    bench.wait(0.12)
+    bench.hear("FF", after=0.12)
     assert (asked.phase, asked.attempts) == (Phase.QUEUED, 1)
     asked.node.health = Health.UP
     may_go = bench.arbiter.dispatcher.may_go
@@ -222,7 +223,7 @@ def test_a_retry_may_go_before_another_though_the_time_to_start_is_over() -> Non
     bench = Bench()
     asked = bench.ask(heard(bench), start_by=bench.now + 0.1)
     bench.sent()
-    bench.wait(0.12)
+    bench.hear("FF", after=0.12)
     assert (asked.phase, asked.attempts) == (Phase.QUEUED, 1)
     asked.node.health = Health.UP
     assert bench.arbiter.dispatcher.may_go(asked, bench.now)

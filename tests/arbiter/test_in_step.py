@@ -12,7 +12,7 @@ from busmaster.arbiter.transaction import Priority, Transaction
 from busmaster.errors import GarbledReply, NoReply, Refused, WriteUnconfirmed
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.msc import codec as msc
-from tests.arbiter.bench import ACK, NAK, TAU, WRITE_5, Bench, lost, reply_of, request_of, right_answer, up
+from tests.arbiter.bench import ACK, LATENESS, NAK, TAU, WRITE_5, Bench, lost, reply_of, request_of, right_answer, up
 
 REQUEST = 8 * TAU
 URGENT, COMMAND, POLL, BACKGROUND = Priority
@@ -454,7 +454,8 @@ def test_r15_an_unanswered_check_costs_the_first_one_no_more_than_its_lateness()
     while not bench.ended(read):
         bench.until_sent()
         asked.append(bench.sent())
-        bench.wait(0.101 + REQUEST)
+        bench.wait(LATENESS + REQUEST - 0.0001)
+        bench.to(bench.arbiter.poll_timeout())
     assert asked == [request_of(1), request_of(2), request_of(1)]
     assert isinstance(read.error, NoReply)
     assert bench.now - start < 3 * (REQUEST + 0.150 + TAU) + 0.01

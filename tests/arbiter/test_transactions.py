@@ -317,6 +317,7 @@ def test_a_timeline_says_what_a_request_waited_for() -> None:
     second = bench.ask(node)
     bench.sent()
     start = bench.now
+    bench.hear("FF", after=8 * TAU + 0.100)
     bench.checked()
     bench.hear(FIVE, after=0.004)
     timeline = second.timeline()
@@ -386,6 +387,7 @@ def test_a_timeline_that_spans_a_reset_of_the_statistics_counts_on() -> None:
     waiting = bench.ask(node)
     bench.sent()
     bench.arbiter.reset_statistics(bench.now)
+    bench.hear("FF", after=8 * TAU + 0.100)
     bench.checked()
     timeline = waiting.timeline()
     assert timeline.exchanges_ahead == 2, "the one that failed, and the check behind it"

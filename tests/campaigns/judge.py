@@ -111,7 +111,6 @@ class Judge:
         self._demanded: set[Poll] = set()
         self._timing = kind.profile.timings
         self._since_doubled = 0
-        self._window = max(self._timing.read.window, self._timing.write.window)
         ledger.problem = self.problem
         line.on_request = self.request_leaves
 
@@ -212,13 +211,15 @@ class Judge:
         return int(value) in STATES
 
     def _check_times(self, transaction: Transaction) -> None:
-        """R2: a value's first byte came within the window, all of it within the bound of a leg."""
+        """R2: a value's first byte came within the lateness, which a straggler may have raised."""
         if self.line.repeats or self.line.echo is not None or self.mix.stands is not None:
             return
         spoken = next(self.line.during(transaction.started, transaction.last_byte))
-        due = spoken.asked_until + self._window + self.line.latency + self.line.settings.byte_time + ROUNDING
+        due = (
+            spoken.asked_until + transaction.node.lateness + self.line.latency + self.line.settings.byte_time + ROUNDING
+        )
         if transaction.first_byte > due:
-            self.problem(f"R2: {transaction.command} accepted {transaction.first_byte - due:.6f} s after its window")
+            self.problem(f"R2: {transaction.command} accepted {transaction.first_byte - due:.6f} s after its lateness")
 
     def _check_write(self, transaction: Transaction, asked: Asked) -> None:
         written, error = asked.written, transaction.error

@@ -61,7 +61,7 @@ async def test_every_exchange_of_a_bus_is_recorded_with_its_outcome(tmp_path: Pa
         (2, "write element 100 = 3", Outcome.REFUSED),
     ]
     silent = [packet.comment for packet in packets if packet.outcome is Outcome.NO_REPLY]
-    assert silent[-1].startswith("read element 1: no reply within 100 ms")
+    assert silent[-1].startswith("read element 1: no reply within 150 ms")
     assert "read element 11: -2.0" in [packet.comment for packet in packets]
     assert exchanges[-1].command in ("read element 100", "read element 115")
 
@@ -133,7 +133,7 @@ def test_polls_retries_refusals_cancellations_and_probes_each_have_their_verdict
     ] == [
         ("", 1, Outcome.OK, "read element 1: 0.0", ()),
         ("poll axes", 2, Outcome.OK, "read element 100: 0.0", ()),
-        ("", 2, Outcome.NO_REPLY, "read element 2: no reply within 100 ms", ()),
+        ("", 2, Outcome.NO_REPLY, "read element 2: no reply within 150 ms", ()),
         ("check", 2, Outcome.OK, "read element 100: 0.0", ()),
         ("attempt 2", 2, Outcome.OK, "read element 2: 0.0", ()),
         ("", 2, Outcome.REFUSED, "write element 100 = 3: refused", ()),

@@ -55,7 +55,7 @@ def test_a_write_can_be_verified_and_says_so_in_json(busmaster: Command, control
 def test_a_node_that_is_not_there_is_one_clear_line_and_status_1(busmaster: Command, controllers: TcpServer) -> None:
     read = busmaster("read", controllers.path, *HCP2, "--node", "77", "1")
     assert (read.status, read.out) == (1, "")
-    assert read.err.startswith("busmaster: node 77: no reply within 100 ms, 3 attempts; ")
+    assert read.err.startswith("busmaster: node 77: no reply within 150 ms, 3 attempts; ")
     assert read.err.count("\n") == 1
 
 

@@ -123,7 +123,6 @@ def past_legs(view: View) -> None:
         elif view.past(leg._follows_until) and arbiter.state is SETTLING:
             pass  # a stray would start it anew
     else:
-        leg.reply_came = False  # it is not while something is asked
         if not leg.begun and arbiter._trust.held is None:
             leg.begun_at = -inf  # with its first byte
         leg._follows = None  # by `begin`
@@ -180,17 +179,13 @@ def past_silences(view: View) -> None:
 def past_stragglers(view: View) -> None:
     """Who was not answered is blamed within STRAGGLER_MEMORY; where nobody's lateness is raised, never."""
     strays = view.world.arbiter._unasked
-    trust, leg = view.world.arbiter._trust, view.world.arbiter._leg
-    if not leg.goes_on:
-        trust._unheard = None  # what comes is not asked whether it is that reply
-    if not view.world.setup.in_step and trust._unheard is None:
-        strays.run.clear()  # else `InStep.heard` alone reads it
+    if not view.world.setup.in_step:
+        strays.run.clear()  # `InStep.heard` alone reads it
     one = strays.unanswered_one
     if one is not None and not (view.world.setup.may(setups.RAISED) and not view.past(one[1], STRAGGLER_MEMORY, True)):
         strays.unanswered_one = None
     if strays.unanswered_one is None:
-        strays._looked = -inf
-        strays._look_at = inf
+        strays._looked = strays._look_at = -inf
 
 
 def past_requests(view: View) -> None:
@@ -205,6 +200,8 @@ def past_requests(view: View) -> None:
     for transaction in transactions(world):
         transaction.queued = ranks.get(transaction, 0.0)
         _past_request(transaction)
+        if not (world.setup.may(setups.RAISED) and transaction is world.arbiter._wire.transaction):
+            transaction.overdue = False  # it makes a node slower, and `started` sets it
         if not (limited and transaction is world.arbiter._wire.transaction) and not world.frozen:
             transaction.started = -inf
 

@@ -321,9 +321,10 @@ def _as_learned(right: Callable[[NodeRecord, float], float], setup: Setup) -> Ca
     return latest
 
 
-def _may_raise(strays: UnaskedBytes, first_byte: float) -> None:
+def _may_raise(strays: UnaskedBytes, first_byte: float) -> float:
+    """That it was late is told to nobody."""
     if strays.unanswered_one is None:
-        return
+        return 0.0
     node, asked, lateness = strays.unanswered_one
     strays.unanswered_one = None
     stalled = first_byte > strays._look_at + 0.005
@@ -332,6 +333,7 @@ def _may_raise(strays: UnaskedBytes, first_byte: float) -> None:
         higher = [raised for raised in RAISED_TO if raised > lateness]
         if higher:
             node.raise_lateness(higher[choose(len(higher))], first_byte)
+    return 0.0
 
 
 def _may_be_noisy(strays: UnaskedBytes, now: float) -> bool:
@@ -346,8 +348,8 @@ def _blames_nobody(strays: UnaskedBytes, node: NodeRecord, asked: float, latenes
     """The line is not looked at while it settles, either: a look changes nothing else."""
 
 
-def _raises_nothing(strays: UnaskedBytes, first_byte: float) -> None:
-    pass
+def _raises_nothing(strays: UnaskedBytes, first_byte: float) -> float:
+    return 0.0
 
 
 def _fails_nothing(node: NodeRecord, now: float, jitter: Callable[[], float]) -> None:

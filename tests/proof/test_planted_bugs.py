@@ -18,12 +18,8 @@ from busmaster.arbiter.on_wire import OnWire
 from busmaster.arbiter.output import Output
 from busmaster.arbiter.shared_backlog import SharedBacklog
 from busmaster.arbiter.transaction import Transaction
-from busmaster.arbiter.trust import Trust
-from busmaster.arbiter.unasked import UnaskedBytes
 from busmaster.contract.exchange import FrameError
-from busmaster.protocols.msc.exchange import is_sound
 from busmaster.wire import readers
-from busmaster.wire.readers import ACK, STX
 from tests.planted import (
     with_a_cancellation_that_clears_the_exchange,
     without_lateness,
@@ -34,7 +30,7 @@ from tests.planted import (
 from tests.proof.explore import Explorer
 from tests.proof.history import as_test, retell, told
 from tests.proof.instants import seconds, set_unit
-from tests.proof.kinds import KINDS, READ, READ_THERE, WRITE, WRITE_THERE
+from tests.proof.kinds import KINDS, READ, WRITE, WRITE_THERE
 from tests.proof.setups import (
     CANCELS,
     FLIPS,
@@ -43,7 +39,6 @@ from tests.proof.setups import (
     LOSS,
     LOST,
     NAKS,
-    NOISE,
     STALLS,
     STRAYS,
     URGENT,
@@ -155,23 +150,25 @@ def with_a_nak_that_gives_nothing_up(patch: Any) -> None:
     patch.setattr(LineMachine, "_refused", refused)
 
 
-def with_packets_in_noise_that_nobody_answers(patch: Any) -> None:
-    """As it was: a packet that came on a noisy line was said again into the next exchange."""
-    right = UnaskedBytes.reply_to
-
-    def reply_to(unasked: UnaskedBytes, data: bytes, noisy: bool) -> bytes:
-        return b"" if noisy else right(unasked, data, noisy)
-
-    patch.setattr(UnaskedBytes, "reply_to", reply_to)
+def without_late_replies(patch: Any) -> None:
+    """As it was: what had not begun in its window was given up, though the line waited on."""
+    patch.setattr(LineMachine, "_awaits_late_reply", lambda line, now: False)
 
 
-def with_any_late_packet_for_the_reply(patch: Any) -> None:
-    """Whatever packet ends what came: also one before the ACK."""
-    patch.setattr(Trust, "is_late_reply", lambda trust, run, now: is_sound(run[run.find(STX) :]))
+def with_late_replies_awaited_a_tick_less(patch: Any) -> None:
+    right, short = Leg.last_begin, tick()
+    past = Leg.past
 
+    def shorter(leg: Leg) -> float:
+        return right(leg) - short
 
-def with_a_late_ack_for_the_reply(patch: Any) -> None:
-    patch.setattr(Trust, "is_late_reply", lambda trust, run, now: run == ACK)
+    def settles_as_ever(leg: Leg) -> float:
+        with patch.context() as within:
+            within.setattr(Leg, "last_begin", right)
+            return past(leg)
+
+    patch.setattr(Leg, "last_begin", shorter)
+    patch.setattr(Leg, "past", settles_as_ever)
 
 
 def with_an_end_that_any_answer_moves(patch: Any) -> None:
@@ -315,9 +312,9 @@ def with_a_last_attempt_that_is_not_waited_for(patch: Any) -> None:
 @pytest.mark.parametrize(
     ("plant", "setup", "rule"),
     [
-        (without_lateness, LINE, "R1"),
-        (with_lateness_a_tick_short, LINE, "R1"),
-        (without_the_byte_time, LINE, "R1"),
+        (without_lateness, LINE, "R2"),
+        (with_lateness_a_tick_short, LINE, "R2"),
+        (without_the_byte_time, LINE, "R2"),
         (without_the_adapter_in_the_lateness, LATE, "R1"),
         (without_the_adapter_in_the_silence, replace(LATE, adversary=(FLIPS,), kind="dc104", lapse=1.5), "R1"),
         (with_a_silence_a_tick_short, LINE, "R1"),
@@ -327,15 +324,15 @@ def with_a_last_attempt_that_is_not_waited_for(patch: Any) -> None:
         (with_a_cancellation_that_clears_the_exchange, replace(LINE, adversary=(CANCELS,)), "R1"),
         (with_a_whole_frame_that_releases, replace(LINE, adversary=(STRAYS,)), "R1"),
         (with_a_stray_that_uses_up_the_packet, replace(MSC, adversary=(STRAYS,)), "R1"),
-        (without_the_packet_behind_an_ack, MSC, "R1"),
+        (without_the_packet_behind_an_ack, replace(MSC, adversary=(FLIPS,)), "R1"),
         (with_a_damaged_ack_that_is_none, replace(MSC, adversary=(FLIPS,)), "R1"),
         (with_a_nak_that_gives_nothing_up, replace(MSC, adversary=(STRAYS, URGENT)), "R1"),
-        (with_packets_in_noise_that_nobody_answers, replace(MSC, adversary=(STRAYS, NOISE)), "R3"),
-        (with_any_late_packet_for_the_reply, replace(MSC, commands=(READ, READ_THERE), lost_acknowledgements=1), "R1"),
-        (with_a_late_ack_for_the_reply, MSC, "R1"),
+        (without_late_replies, LINE, "R2"),
+        (without_late_replies, MSC, "R2"),
+        (with_late_replies_awaited_a_tick_less, LINE, "R2"),
         (with_an_end_that_any_answer_moves, replace(LINE, adversary=(STRAYS,)), "R1"),
         (without_the_turnaround, TURNS, "R1"),
-        (without_the_time_of_the_write, replace(LINE, adversary=(FROZEN,)), "R1"),
+        (without_the_time_of_the_write, replace(LINE, adversary=(FROZEN,)), "R2"),
         (without_what_is_unsent, replace(LINE, adversary=(HELD,)), "R1"),
         (without_what_is_unread, replace(LINE, adversary=(STALLS,)), "R1"),
         (without_unconfirmed_writes, replace(LINE, adversary=(LOSS,)), "R7"),

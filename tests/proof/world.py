@@ -15,7 +15,7 @@ from busmaster.arbiter.state import EXCHANGE, OFFLINE
 from busmaster.arbiter.transaction import PARKED, URGENT, Transaction
 from busmaster.arbiter.unasked import QUIET
 from busmaster.contract.timing import ReplyTiming, Timings
-from busmaster.errors import LineDown, WriteUnconfirmed
+from busmaster.errors import LineDown, NoReply, WriteUnconfirmed
 from tests.proof import setups
 from tests.proof.instants import Instant
 from tests.proof.kinds import KINDS, READ, WRITE, Kind
@@ -217,13 +217,13 @@ class World:
         return False
 
     def _longest_deadline(self) -> float:
-        """No deadline of the line is further away: a lateness, or a window with its bytes, behind all that is being
-        said; or what R15 waits for."""
+        """No deadline of the line is further away: a lateness with its bytes, behind all that is being said; or what
+        R15 waits for."""
         setup, byte_time = self.setup, self.byte_time
         longest = 0.0
         for node in self.nodes:
             for timing in (node.timings.read, node.timings.write, node.timings.packet):
-                whole = timing.window + timing.byte_gap + LONGEST_FRAME * byte_time
+                whole = timing.lateness + timing.byte_gap + LONGEST_FRAME * byte_time
                 longest = max(longest, whole, timing.lateness + timing.turnaround)
         later = 2 * setup.receive_latency + QUIET + LONGEST_FRAME * byte_time
         return longest + later + setup.lapse
@@ -246,6 +246,8 @@ class World:
                 raise Violation(f"R7: a write that may have been carried out ends as {type(error).__name__}")
             if isinstance(error, LineDown) and self.arbiter.state is not OFFLINE:
                 raise Violation("R13: LineDown on a line that is up")
+            if isinstance(error, NoReply):
+                self._judge_silence(ticket)
             return
         if by is None:
             raise Violation("R5: a success though nothing was heard")
@@ -259,6 +261,15 @@ class World:
             raise Outside
         if not right:
             raise Violation("R5: a wrong value")
+
+    def _judge_silence(self, ticket: Ticket) -> None:
+        """R2, as a caller is told that no reply came: none can come in time any more. A learned window ends sooner, and
+        so does an exchange whose echo is lost."""
+        if self.setup.learned is not None or self.setup.echo:
+            return
+        for reply in self.owed:
+            if reply.own and reply.ticket is ticket and not reply.begun and reply.hi > self.now:
+                raise Violation("R2: a request ends as NoReply while its reply may still come in time")
 
     def _judge_request(self, old: list[Owed]) -> None:
         """R1 and R3, as a request leaves: nothing of an earlier exchange can come any more."""
