@@ -6,7 +6,9 @@ byte time later, and later still behind an adapter that holds bytes back: most m
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Sequence
+from math import inf
 from random import Random
 from typing import Any
 
@@ -83,13 +85,17 @@ def crowd(kind: Kind, device: Device, edges: Edges, usual: Delay) -> None:
 
 
 class EdgeLine(WatchedLine):
-    """A line on which frames of devices are struck as `edges` says; and by `double_once`."""
+    """A line on which frames are struck as `edges` says, and by `double_once`, `second` and `twice`."""
 
     def __init__(
         self, ledger: Ledger, *args: Any, edges: Edges | None, kind: Kind, own: Random, **options: Any
     ) -> None:
         super().__init__(ledger, *args, **options)
         self.edges = edges
+        self.kind = kind
+        self.second = self.twice = 0.0
+        """Shares of replies that come a second time, and of requests that are received a second time."""
+        self._received_again: list[tuple[float, bytes]] = []
         self.on_doubled: Callable[[], None] = lambda: None
         self._own = own
         self._byte_gap = kind.profile.timings.packet.byte_gap
@@ -100,9 +106,28 @@ class EdgeLine(WatchedLine):
         """The next reply of a device comes a second time."""
         self._double = True
 
+    def send(self, data: bytes, now: float) -> None:
+        super().send(data, now)
+        if self.twice and len(data) > 1 and self._own.random() < self.twice:
+            heapq.heappush(self._received_again, (self._sent_by + self._own.uniform(0.0, self.kind.lateness), data))
+
+    def receive(self, now: float) -> bytes:
+        while self._received_again and self._received_again[0][0] <= now:
+            when, data = heapq.heappop(self._received_again)
+            self._attached.request(data, when - len(data) * self.tau, when)
+        return super().receive(now)
+
+    def next_event(self) -> float:
+        again = self._received_again[0][0] if self._received_again else inf
+        return min(super().next_event(), again)
+
     def _say(self, talker: Device | None, start: float, data: bytes) -> None:
         if talker is None:
             super()._say(talker, start, data)
+        elif self.second and self._own.random() < self.second:
+            super()._say(talker, start, data)
+            end = start + len(data) * self.tau
+            super()._say(talker, end + self._own.uniform(0.0, self.kind.lateness), data)
         elif self._double:
             self._double = False
             super()._say(talker, start, data)

@@ -194,6 +194,8 @@ class Hunt:
                 crowd(self.kind, device, mix.edges, slow)
             device.faults = mix.faults(mix.device, lateness)
         self.line.faults = mix.faults(mix.line, lateness)
+        self.line.second, self.line.twice = mix.second, mix.twice
+        self.line.repeats = self.line.repeats or mix.twice > 0  # they reply to what was received a second time, too
         for _ in range(self.random.randrange(1, 4)):
             self._add_poll()
         for client in range(self.random.randrange(1, 6)):
@@ -218,6 +220,7 @@ class Hunt:
         self._healed = True
         self.line.faults = Faults()
         self.line.edges = None
+        self.line.second = self.line.twice = 0.0
         if isinstance(world, StandingWorld):
             world.heal()
         self.line.restore(world.now)

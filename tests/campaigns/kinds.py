@@ -1,4 +1,4 @@
-"""The five protocols as a campaign sees them: what devices there are, what to ask them, and what an answer shows."""
+"""The seven protocols as a campaign sees them: what devices there are, what to ask them, and what an answer shows."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from typing import Any
 from busmaster.contract.exchange import Command
 from busmaster.contract.profile import Profile
 from busmaster.emulator.device import Delay, Device
+from busmaster.protocols.ct_ansi import codec as ct_ansi
 from busmaster.protocols.dc104 import codec as dc104
 from busmaster.protocols.dc104.device import EmulatedDc104
 from busmaster.protocols.hcp import codec as hcp
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
+from busmaster.protocols.modbus import codec as modbus
+from busmaster.protocols.modbus.device import SIZE
 from busmaster.protocols.msc import codec as msc
 from busmaster.protocols.msc.device import EmulatedMsc
 from busmaster.registry import make_device
@@ -22,6 +25,7 @@ from busmaster.wire.checks import sum8, sum16, xor
 from tests.campaigns.ledger import Ledger, LedgerMemory
 
 SEVEN_BITS = bytes(byte & 0x7F for byte in range(256))
+ETX, ENQ = 0x03, 0x05
 MSC_STEP = 4
 EEPROM = 1.9
 """How much longer than a slow read a slow write of DC104 takes, whose lateness is three times as long."""
@@ -71,8 +75,12 @@ def elements_of(command: Command[Any]) -> tuple[int, ...]:
             return (element,)
         case hcp.Write(element, values) | hcp2.Write(element, values):
             return tuple(range(element, element + len(values)))
-        case mentor.Read(menu, number) | mentor.Write(menu, number):
+        case mentor.Read(menu, number) | mentor.Write(menu, number) | ct_ansi.Write(menu, number):
             return (menu * 100 + number,)
+        case modbus.ReadRegisters(first, count):
+            return tuple(range(first, first + count))
+        case modbus.WriteRegisters(first, values):
+            return tuple(range(first, first + len(values)))
         case mentor.ReadRun(menu, number, count, step):
             return tuple(menu * 100 + number + step * place for place in range(count))
         case msc.DataRead(address) | msc.DataWrite(address):
@@ -95,6 +103,8 @@ def echoed(command: Command[Any], address: int, heard: bytes) -> bool:
             return b"\x02%02d%02d" % (menu, number) in heard.translate(SEVEN_BITS)
         case dc104.Read(parameter):
             return bytes((0x02, parameter)) in heard
+        case modbus.ReadRegisters(_, count):
+            return bytes((address, modbus.READS["holding"], 2 * count)) in heard
         case _:
             name = _NAMES.get(type(command))
             return name is None or (bytes((0x02, address)) in heard and name in heard)
@@ -109,6 +119,26 @@ _NAMES: dict[type, bytes] = {
 }
 
 
+def refused(kind: Kind, request: bytes) -> bytes:
+    """Return a request so damaged that its device refuses it.
+
+    One bit of the checksum is wrong. Reads of HCP, Mentor II and CT-ANSI have no checksum: there one bit of a digit is,
+    which makes it an element or a parameter that no device has. A Modbus unit does not reply to a wrong CRC, but
+    refuses a register beyond its table.
+    """
+    if kind.name == "modbus":
+        return modbus.with_crc(request[:2] + SIZE.to_bytes(2, "big") + request[4:-2])
+    place, mask = -1, 0x01
+    reads = request[-1] == ENQ and request[-2] != ETX
+    if reads and kind.name == "hcp":
+        place, mask = 5, 0x40
+    elif reads and kind.name in ("mentor", "ct-ansi"):
+        place, mask = 6, 0x08
+    damaged = bytearray(request)
+    damaged[place] ^= mask
+    return bytes(damaged)
+
+
 def _comms(write: type[hcp.Write] | type[hcp2.Write]) -> Callable[[Random, int, bool], Command[Any]]:
     def make(chance: Random, number: int, repeat: bool) -> Command[Any]:
         return write(chance.randrange(1, 6), (number,) * chance.choice((1, 1, 1, 3)), idempotent=repeat)
@@ -120,6 +150,14 @@ def _mentor_write(chance: Random, number: int, repeat: bool) -> Command[Any]:
     if chance.random() < 0.2:
         return mentor.Write(15, 60, number, wide=True, idempotent=repeat)
     return mentor.Write(1, chance.randrange(17, 21), number, idempotent=repeat)
+
+
+def _ct_ansi_write(chance: Random, number: int, repeat: bool) -> Command[Any]:
+    return ct_ansi.Write(1, chance.randrange(17, 21), number, idempotent=repeat)
+
+
+def _modbus_write(chance: Random, number: int, repeat: bool) -> Command[Any]:
+    return modbus.WriteRegisters(chance.randrange(0, 5), (number,) * chance.choice((1, 1, 1, 3)), idempotent=repeat)
 
 
 def _msc_write(chance: Random, number: int, repeat: bool) -> Command[Any]:
@@ -142,6 +180,10 @@ def _hcp2_checksum(node: int, element: int, number: int) -> int:
 
 def _msc_checksum(node: int, element: int, number: int) -> int:
     return sum16(bytes((node, 10)) + b"DREAD," + number.to_bytes(4, "big")) & 0xFF
+
+
+def _modbus_checksum(node: int, element: int, number: int) -> int:
+    return modbus.with_crc(bytes((node, modbus.READS["holding"], 2)) + number.to_bytes(2, "big"))[-1]
 
 
 def _dc104_checksum(node: int, element: int, number: int) -> int:
@@ -192,6 +234,27 @@ KINDS = {
             [*(mentor.Read(1, number) for number in range(17, 22)), mentor.Read(15, 60)],
             _mentor_write,
             [mentor.ReadRun(1, 17, 4), mentor.ReadRun(1, 20, 3, -1), mentor.ReadRun(1, 17, 2, 0)],
+        ),
+        Kind(
+            "ct-ansi",
+            ct_ansi.PROFILE,
+            ct_ansi.PROFILE.addresses,
+            10**4,
+            3_719,
+            [*(ct_ansi.Read(1, number) for number in range(17, 22)), ct_ansi.Read(15, 60)],
+            _ct_ansi_write,
+            [ct_ansi.ReadRun(1, 17, 4), ct_ansi.ReadRun(1, 20, 3, -1), ct_ansi.ReadRun(1, 17, 2, 0)],
+        ),
+        Kind(
+            "modbus",
+            modbus.PROFILE,
+            range(1, 248),
+            2**16,
+            25_717,
+            # equal lengths, which only R15 tells apart, and others
+            [*(modbus.ReadRegisters(first) for first in range(5)), modbus.ReadRegisters(0, 2)],
+            _modbus_write,
+            checksum=_modbus_checksum,
         ),
         Kind(
             "dc104",

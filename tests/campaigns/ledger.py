@@ -157,7 +157,9 @@ class Ledger:
             return
         written.taken += 1
         written.taken_at = now
-        if written.node is not None:
+        if (
+            written.node is not None and written.taken == 1
+        ):  # a request that is received twice is not the master's order
             if written.order < self._orders.get((node, written.by), 0):
                 self.problem(f"R7: device {node} took the write of {number} after a later one")
             self._orders[node, written.by] = written.order

@@ -23,7 +23,9 @@ class Standstill:
 
     `requests` and `replies`: the network on either way, as a share of the frames. `process`: the process, between what
     the arbiter says and the bytes leaving, and as often at any other moment. `held`: the driver keeps its output, and
-    can tell that it has not left. `within`: the share of these that begin inside of a frame.
+    can tell that it has not left. `within`: the share of these that begin inside of a frame. `damaged`: the share of
+    requests that their device refuses for it. `apart`: no standstill begins in another on the same way, so that
+    `longest` bounds each.
     """
 
     requests: float = 0.0
@@ -31,8 +33,10 @@ class Standstill:
     process: float = 0.0
     held: float = 0.0
     within: float = 0.0
+    damaged: float = 0.0
     shortest: float = 0.005
     longest: float = 2.0
+    apart: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,9 @@ class Mix:
     channel keeps order, so that R15 still allows no wrong value. `equal`: all reads are of one element, so that every
     answer can be taken for a neighbour's. `writes`: the share of requests that write. `doubled`: mean seconds between
     single replies that are said twice; each may bring AT_MOST wrong values. `shared`: several programs share the line,
-    one asks far more than the others, and they hold it for sequences.
+    one asks far more than the others, and they hold it for sequences. `second`: the share of replies that come a second
+    time, with a delay of their own, up to the lateness. `twice`: the share of requests that their device receives a
+    second time, as much later, and replies to as well.
     """
 
     name: str
@@ -83,6 +89,8 @@ class Mix:
     equal: bool = False
     writes: float = 0.25
     doubled: float = 0.0
+    second: float = 0.0
+    twice: float = 0.0
     stands: Standstill | None = None
     edges: Edges | None = None
     shared: bool = False
@@ -94,7 +102,7 @@ class Mix:
 
     @property
     def refuses(self) -> bool:
-        return "nak" in {*self.device, *self.line}
+        return "nak" in {*self.device, *self.line} or (self.stands is not None and self.stands.damaged > 0)
 
     @property
     def gaps(self) -> bool:
@@ -284,18 +292,51 @@ IN_STEP = (
         reconnects=20.0,
     ),
 )
+LONG = Standstill(replies=0.02, damaged=0.05, shortest=0.01, longest=6.0, apart=True)
+BOTH_LONG = Standstill(requests=0.01, replies=0.01, damaged=0.05, shortest=0.01, longest=4.5, apart=True)
+"""Together shorter than what is remembered of a reply (LAPSE)."""
+STANDING_LONG = (
+    Mix("long", "the way back stands still for up to 6 s, requests are damaged", stands=LONG, in_step=True, writes=0.4),
+    Mix("long, equal", "likewise, equal reads", stands=LONG, in_step=True, equal=True, writes=0.1),
+    Mix("long, either way", "likewise, either way for up to 4.5 s", stands=BOTH_LONG, in_step=True, writes=0.4),
+    Mix(
+        "long, lost",
+        "likewise, requests and replies are lost",
+        {"lost": 0.02, "deaf": 0.02},
+        stands=BOTH_LONG,
+        in_step=True,
+        equal=True,
+        writes=0.3,
+    ),
+    Mix(
+        "long, all",
+        "likewise, devices die, the port is lost and found",
+        {"lost": 0.02, "deaf": 0.02},
+        stands=BOTH_LONG,
+        in_step=True,
+        writes=0.4,
+        deaths=10.0,
+        reconnects=20.0,
+    ),
+)
+BEYOND_LAPSE = Standstill(requests=0.005, replies=0.005, damaged=0.05, shortest=8.0, longest=30.0)
 BEYOND = (
     *IN_STEP,
+    *STANDING_LONG,
+    Mix("beyond", "the network stands still for 8 to 30 s", stands=BEYOND_LAPSE, overdue=True, writes=0.4),
     Mix("doubled once", "one reply is said twice, on a line of equal reads", doubled=10.0, equal=True, writes=0.0),
-    Mix("repeated", "a second reply, up to 300 ms after the first", {"repeated": 0.05}),
-    Mix("repeated rarely", "likewise, one in 3000", {"repeated": 0.00033}),
+    Mix("repeated", "a second reply, up to the lateness after the first", second=0.05, overdue=True),
+    Mix("repeated, 2 %", "the same, one reply in 50", second=0.02, overdue=True),
+    Mix("repeated rarely", "the same, one reply in 3,000", second=0.00033, overdue=True),
     Mix("overdue", "replies begin after up to three times the lateness", slow=0.05, span=(1.0, 3.0), overdue=True),
     Mix("forged", "an unasked ACK, NAK or EOT before a reply", {"forged": 0.05}),
     Mix("duplicate", "two devices answer to one address", {"duplicate": 0.05}),
     Mix("double flips", "the same bit flipped in two bytes of a reply", {"unseen": 0.05}),
     Mix("double flips both ways", "or of a request", line={"unseen": 0.05}),
-    Mix("heard twice", "a request is heard twice, and answered twice", line={"doubled": 0.05}, overdue=True),
-    Mix("heard twice rarely", "likewise, one in 3000", line={"doubled": 0.00033}, overdue=True),
+    Mix("heard twice", "a request is received twice, up to the lateness apart", twice=0.05, overdue=True),
+    Mix("heard twice, 2 %", "the same, one request in 50", twice=0.02, overdue=True),
+    Mix("heard twice rarely", "the same, one request in 3,000", twice=0.00033, overdue=True),
+    Mix("heard twice at once", "a request is received twice, back to back", line={"doubled": 0.05}, overdue=True),
     Mix("glued, delayed", "doubled replies that lie in an adapter", {"doubled": 0.1}, latency=0.004, overdue=True),
     Mix("cut", "requests are cut", line={"truncated": 0.05}, overdue=True),
     Mix("runs", "short commands, damaged requests", line={"flip": 0.05, "lost": 0.05}, runs=True, overdue=True),

@@ -13,6 +13,7 @@ from typing import Any
 
 from busmaster.emulator.world import World
 from tests.campaigns.edges import EdgeLine
+from tests.campaigns.kinds import refused
 from tests.campaigns.mixes import Standstill
 
 
@@ -35,7 +36,8 @@ class Channel:
         self._own = own
 
     def put(self, data: bytes, now: float) -> None:
-        if self._rate and self._own.random() < self._rate:
+        may_begin = self._rate and not (self._stands.apart and now < self.still_until)
+        if may_begin and self._own.random() < self._rate:
             if self._own.random() < self._stands.within and len(data) > 1:
                 cut = self._own.randrange(1, len(data))
                 self.waiting.append((max(now, self.still_until), data[:cut]))
@@ -67,13 +69,17 @@ class StandingLine(EdgeLine):
         self.driver = Channel(stands.held, stands, own)
         self.there = Channel(stands.requests, stands, own)
         self.back = Channel(stands.replies, stands, own)
+        self._damaged = stands.damaged
 
     def heal(self) -> None:
         """What is on its way still comes when it was to come."""
         for channel in (self.driver, self.there, self.back):
             channel._rate = 0.0
+        self._damaged = 0.0
 
     def send(self, data: bytes, now: float) -> None:
+        if self._damaged and len(data) > 1 and self._own.random() < self._damaged:
+            data = refused(self.kind, data)
         self.driver.put(data, now)
         self._pass_on(now)
 

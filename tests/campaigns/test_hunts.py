@@ -16,10 +16,12 @@ from tests.campaigns.__main__ import main
 from tests.campaigns.hunt import Hunt
 from tests.campaigns.judge import Totals
 from tests.campaigns.kinds import KINDS
-from tests.campaigns.mixes import BEYOND, IN_STEP, WITHIN
+from tests.campaigns.mixes import BEYOND, IN_STEP, STANDING_LONG, WITHIN
 
 EACH = 700
 """Transactions of one hunt."""
+LONG = 150
+"""Likewise, of one with standstills of seconds."""
 EVERY_PROTOCOL = pytest.mark.parametrize("protocol", list(KINDS))
 
 
@@ -76,6 +78,21 @@ def test_r15_whatever_stands_still_nothing_is_wrong_or_lost_and_everything_heals
     check(totals, hunt)
     assert totals.wrong == totals.lost == 0
     assert totals.transactions >= EACH
+
+
+@EVERY_PROTOCOL
+@pytest.mark.parametrize("learned", [False, True])
+@pytest.mark.parametrize("mix", [mix.name for mix in STANDING_LONG])
+def test_r15_a_network_that_stands_still_for_6_s_confirms_no_write_and_delivers_no_other_value(
+    protocol: str, mix: str, learned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("TRUSTED_AFTER", "TRUSTED_AGAIN_AFTER", "EPOCH"):  # which learned hunts set
+        monkeypatch.setattr(learning, name, getattr(learning, name))
+    hunt = Hunt(protocol, mix, 1, learned=learned)
+    totals = hunt.run(LONG)
+    check(totals, hunt)
+    assert totals.wrong == totals.lost == 0
+    assert totals.transactions >= LONG
 
 
 @pytest.mark.parametrize("mix", [mix.name for mix in BEYOND])
