@@ -82,7 +82,8 @@ def test_a_cancellation_that_clears_the_exchange_is_caught(protocol: str, monkey
     assert "WRONG" in caught(protocol, "cancelled").problems[0]
 
 
-@EVERY_PROTOCOL
+# `excusing` does not reach the reader of Modbus, whose replies name no register
+@pytest.mark.parametrize("protocol", [protocol for protocol in KINDS if protocol != "modbus"])
 def test_an_echo_that_is_not_looked_at_is_caught(protocol: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The element check removed; for an MSC, that of unit and name."""
     right, read = readers.find_field, dc104.Reading.feed
