@@ -98,3 +98,15 @@ def test_the_log_is_as_before_when_it_has_ended() -> None:
     with AuditLog(lambda: True) as handler:
         assert handler in log.handlers
     assert (log.level, log.handlers) == before
+
+
+def test_the_log_is_left_as_it_was_found(printed: Printed) -> None:
+    log = logging.getLogger(NAME)
+    before = log.level, list(log.handlers)
+    log.setLevel(logging.ERROR)
+    try:
+        with AuditLog(lambda: True):
+            assert log.level == logging.INFO
+        assert (log.level, log.handlers) == (logging.ERROR, before[1])
+    finally:
+        log.setLevel(before[0])

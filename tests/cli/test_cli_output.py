@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import enum
 import json
+import os
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -92,3 +95,14 @@ def test_letters_of_any_language_and_spaces_of_any_width_are_printed_as_they_are
 ) -> None:
     emit("Wickler №\u202f2  Ø 12\u00a0mm")
     assert capsys.readouterr().out == "Wickler №\u202f2  Ø 12\u00a0mm\n"
+
+
+def test_a_standard_error_that_nobody_reads_any_more_ends_nothing() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    code = "from busmaster.cli.output import note; note('lost'); print('it goes on')"
+    try:
+        run = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=writer, text=True, check=True)
+    finally:
+        os.close(writer)
+    assert run.stdout == "it goes on\n"

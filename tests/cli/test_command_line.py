@@ -158,3 +158,9 @@ def test_each_exit_status_is_the_promised_one(busmaster: Command, controllers: T
         assert bool(done.out) == (status == 0)
         assert done.err.count("\n") == (status > 0)
         assert status == 0 or done.err.startswith("busmaster: ")
+
+
+@pytest.mark.parametrize("command", ["discover", "doctor", "scan"])
+def test_a_port_that_is_none_is_wrong_usage(command: str, busmaster: Command) -> None:
+    outcome = busmaster(command, "/dev/ttyUSB0?baudrate=fast", "--yes" if command == "discover" else "--json")
+    assert (outcome.status, outcome.out) == (2, "")

@@ -15,7 +15,7 @@ from busmaster.errors import BacklogFull
 from busmaster.gate.gate import FRESH
 from busmaster.service.messages import BUS_ERROR, INVALID_PARAMS
 from tests.patience import PATIENCE
-from tests.service.lines import ABSENT, PATIENT, Served, on_a_line, on_a_served_line, raw
+from tests.service.lines import ABSENT, PATIENT, Raw, Served, on_a_line, on_a_served_line, raw
 
 READ: dict[str, Any] = {"protocol": "hcp2", "address": 5, "command": {"command": "read", "element": 1}}
 
@@ -146,3 +146,53 @@ def test_of_urgent_requests_too_only_so_many_may_be_unanswered(tmp_path: Path, m
         assert ended.count(0) == 5
 
     on_a_served_line(tmp_path, story)
+
+
+async def asked(client: Raw, number: int, method: str, **params: Any) -> dict[str, Any]:
+    """Return the answer to a question, whatever news come before it."""
+    await client.say(method=method, params=params, id=number)
+    while (said := await client.hear()).get("id") != number:
+        pass
+    return said
+
+
+def polled(stream: int, **more: Any) -> dict[str, Any]:
+    point = {"protocol": "hcp2", "address": 5, "item": "1", "command": {"command": "read", "element": 1}}
+    return {"name": "mine", "period": 60.0, "stream": stream, "points": [point], **more}
+
+
+def test_a_poll_group_that_cannot_be_followed_is_not_polled(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        async with raw(line) as client:
+            assert (await asked(client, 1, "poll", **polled(7)))["result"] == {"period": 60.0}
+            said = await asked(client, 2, "poll", **{**polled(7), "name": "another"})
+            assert "each with a number of its own" in said["error"]["message"]
+            assert len(line.bus.groups) == 1
+
+    on_a_line(tmp_path, story)
+
+
+def test_a_program_polls_at_the_priority_of_a_poll_at_most(tmp_path: Path) -> None:
+    async def story(line: Served, remote: RemoteBus) -> None:
+        controller = Hcp2Controller(remote, 5)
+        for asked in Priority:
+            name = asked.name.lower()
+            await remote.poll_group(name, period=60.0, points=[controller.point("1")], priority=asked)
+        found = [group.planned().priority for group in line.bus.groups]
+        assert found == [Priority.POLL, Priority.POLL, Priority.POLL, Priority.BACKGROUND]
+
+    on_a_served_line(tmp_path, story)
+
+
+def test_a_node_that_was_named_wrongly_is_asked_once_it_is_named_rightly(tmp_path: Path) -> None:
+    async def story(line: Served) -> None:
+        Hcp2Controller(line.bus, 5)
+        node = {"protocol": "hcp2", "address": 5}
+        async with raw(line) as client:
+            wrong = await client.ask("node", **node, retries=7)
+            assert "other retries" in wrong["error"]["message"]
+            assert "other retries" in (await client.ask("request", **READ))["error"]["message"]
+            assert (await client.ask("node", **node))["result"]["label"] == "node 5"
+            assert (await client.ask("request", **READ))["result"] == 0
+
+    on_a_line(tmp_path, story)
