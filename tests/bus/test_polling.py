@@ -102,6 +102,7 @@ def test_a_demand_is_sent_at_once_and_not_with_what_the_line_does_next() -> None
         group.demand()
         snapshot = (await cycles(group, 1))[0]
         assert (snapshot.due, snapshot.started) == (asked, asked)
+        assert bus.now() - asked < 0.1  # in virtual time: one exchange
 
     on_a_bus(story)
 
