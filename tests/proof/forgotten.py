@@ -265,6 +265,9 @@ def past_debts(view: View) -> None:
                 asked, over = past(0, 0), past(0, ticks(apart))
                 debt.asked, debt.over = asked, over
     book._doubted = [entry for entry in book._doubted if not view.past(entry[1])]
+    book._forgiven = [entry for entry in book._forgiven if not view.past(entry[1])]
+    if book.lone_bytes_until != inf and view.past(book.lone_bytes_until):
+        book.lone_bytes_until = -inf
     if view.past(book._doubt_until):
         book._doubt_until = -inf
     while book._said and view.past(book._said[0][1], in_step.SAID_MEMORY, strictly=True):

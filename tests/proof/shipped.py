@@ -110,6 +110,7 @@ class AnyStep:
     last: Sequence[bytes] = ()
     before: Sequence[bytes] = ()
     alert = True
+    lone_bytes_until = -inf
 
     def __setattr__(self, name: str, value: Any) -> None:
         pass
@@ -124,15 +125,17 @@ class AnyStep:
     def nothing(self, *arguments: Any) -> None:
         pass
 
-    owe = lapse = forgive = answered = said = said_twice = heard = nothing
+    owe = lapse = forgive = answered = said = said_twice = heard = came_up = stood_alone = nothing
 
     def perhaps(self, *arguments: Any, **named: Any) -> bool:
         return bool(choose(2))
 
-    clashes = doubts = perhaps
+    clashes = doubts = is_overdue = doubts_refusals = perhaps
 
     def is_doubtful(self, *arguments: Any) -> bool:
         return self.holds[0] and bool(choose(2))
+
+    is_to_be_held = is_doubtful
 
     def awaited_until(self, *arguments: Any) -> float:
         """Nothing is: no window of these worlds is learned."""

@@ -68,6 +68,7 @@ class World:
         arbiter.dispatcher.probes.budget = BUDGET  # type: ignore[assignment]  # one that may or may not
         if not setup.in_step:
             arbiter._in_step = arbiter._choice._in_step = arbiter._trust._in_step = ANY_STEP  # type: ignore[assignment]  # any R15
+            arbiter._wire._in_step = ANY_STEP  # type: ignore[assignment]  # likewise
         several = 1 + max(self.kind.commands[place][0] for place in setup.commands)
         for place in range(several):
             timings = Timings.uniform(SECOND_TIMING) if setup.second_timing and place else None
@@ -106,6 +107,8 @@ class World:
         self.said_by: Time = -inf
         """Until then the host speaks."""
         arbiter.line_up(now, paced=setup.paced)
+        if setup.in_step:  # a line in use: no node holds a part of an earlier master's frame
+            arbiter._in_step.lone_bytes_until = -inf
 
     def own_actions(self) -> list[Action]:
         """What may happen in a world of this kind alone."""
