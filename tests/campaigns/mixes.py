@@ -342,8 +342,4 @@ BEYOND = (
     Mix("runs", "short commands, damaged requests", line={"flip": 0.05, "lost": 0.05}, runs=True, overdue=True),
     Mix("runs, deaths", "short commands, drives that hear nothing for a while", deaths=3.0, runs=True, overdue=True),
 )
-SWEPT = Mix(
-    "one standstill", "the way back stands still once", cancel=0.1, writes=0.5, in_step=True, stands=Standstill()
-)
-"""For `sweep.py`, which makes it stand still."""
-MIXES = {mix.name: mix for mix in (*WITHIN, *BEYOND, SWEPT)}
+MIXES = {mix.name: mix for mix in (*WITHIN, *BEYOND)}

@@ -27,9 +27,6 @@ class Channel:
 
     def __init__(self, rate: float, stands: Standstill, own: Random) -> None:
         self.still_until = -inf
-        self.byte_time = 0.0
-        """Seconds for each byte that was held up: a serial server passes them on at the baud rate. 0: all at once."""
-        self._busy_until = -inf
         self.waiting: deque[tuple[float, bytes]] = deque()
         self._rate = rate
         self._stands = stands
@@ -46,15 +43,10 @@ class Channel:
         self.waiting.append((max(now, self.still_until), data))
 
     def due(self) -> float:
-        return max(self.waiting[0][0], self._busy_until) if self.waiting else inf
+        return self.waiting[0][0] if self.waiting else inf
 
     def take(self, now: float) -> bytes | None:
-        if self.due() > now:
-            return None
-        data = self.waiting.popleft()[1]
-        if self.waiting and self.byte_time:
-            self._busy_until = now + len(self.waiting[0][1]) * self.byte_time
-        return data
+        return self.waiting.popleft()[1] if self.waiting and self.waiting[0][0] <= now else None
 
     def clear(self) -> None:
         self.waiting.clear()

@@ -251,6 +251,8 @@ class EmulatedModbus(Device):
 
     def disguise(self, reply: bytes, chance: Chance) -> bytes:
         """Return the reply as if another unit had said it."""
+        if len(reply) < SHORTEST:
+            return reply  # a lone byte names no unit
         other = chance.randrange(ALL.start, ALL.stop - 1)
         body = bytes((other + (other >= reply[0]),)) + reply[1:-2]
         if self.traceable is not None and reply[1] in (READ_HOLDING, READ_INPUTS):
