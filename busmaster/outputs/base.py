@@ -113,6 +113,7 @@ class Output(ABC):
     ) -> None:
         self.kind = kind
         self.groups = settings.groups
+        self._destination = settings.destination
         self.error = ""
         self.offered = self.dropped = self.written = 0
         self.suppressed = 0
@@ -219,6 +220,8 @@ class Output(ABC):
     def down(self, error: BaseException) -> None:
         """Note why the output does not work, and say so where that is new."""
         text = reason(error)
+        if self._destination not in text:  # most errors of a library name neither a file nor a host
+            text = f"{self._destination}: {text}"
         if text != self.error:
             self.error = text
             self._say(f"{self.kind} is down: {text}")

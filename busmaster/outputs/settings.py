@@ -31,6 +31,11 @@ class Settings:
         if self.buffer < 1:
             raise InvalidCommand(f"a buffer holds at least one value, not {self.buffer}")
 
+    @property
+    def destination(self) -> str:
+        """Return where values go, as messages name it: a file, or host and port; "" for what has no name."""
+        return ""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpillingSettings(Settings):
@@ -55,6 +60,11 @@ class FileSettings(SpillingSettings):
     path: str
     sync_every: Annotated[float, Between(0)] = 10.0
 
+    @property
+    def destination(self) -> str:
+        """Return the file."""
+        return self.path
+
     def __post_init__(self) -> None:
         Settings.__post_init__(self)  # super() does not work in a class with slots
         for field in DATE_FIELD.findall(self.path):
@@ -71,6 +81,11 @@ class SqliteSettings(SpillingSettings):
     path: str
     keep_days: float | None = None
     keep_mb: float | None = None
+
+    @property
+    def destination(self) -> str:
+        """Return the file."""
+        return self.path
 
     def __post_init__(self) -> None:
         for name in ("keep_days", "keep_mb"):
@@ -98,6 +113,11 @@ class MqttSettings(SpillingSettings):
     ca_file: str | None = None
     allow_commands: tuple[str, ...] = ()
 
+    @property
+    def destination(self) -> str:
+        """Return the broker."""
+        return f"{self.host}:{self.port}"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MetricsSettings(Settings):
@@ -105,3 +125,8 @@ class MetricsSettings(Settings):
 
     host: str = "127.0.0.1"
     port: Annotated[int, Between(0, 65535)] = 9464
+
+    @property
+    def destination(self) -> str:
+        """Return the address that is served."""
+        return f"{self.host}:{self.port}"

@@ -134,7 +134,7 @@ async def test_a_port_that_is_taken_is_told_and_tried_again() -> None:
     await asyncio.to_thread(scraped, port)
     await asyncio.to_thread(output.close, PATIENCE)
     down, up = said
-    assert down.startswith("metrics is down: Address already in use")
+    assert down.startswith(f"metrics is down: 127.0.0.1:{port}: Address already in use")
     assert up == "metrics is up again"
 
 

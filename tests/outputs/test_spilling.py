@@ -152,7 +152,7 @@ def test_a_database_that_another_program_locks_loses_nothing(tmp_path: Path, mon
     until(lambda: settled(output))
     output.close(PATIENCE)
     assert numbers(tmp_path / "x") == list(range(1, 501))
-    assert said == ["sqlite is down: database is locked", "sqlite is up again"]
+    assert said == [f"sqlite is down: {tmp_path}/x: database is locked", "sqlite is up again"]
 
 
 def test_a_spool_that_cannot_be_made_is_told_and_the_output_works_without(tmp_path: Path) -> None:
