@@ -17,7 +17,7 @@ from pathlib import Path
 
 from busmaster.errors import LineDown
 from busmaster.transport import identity
-from busmaster.transport.holders import PROC, holders, owning_group, serves
+from busmaster.transport.holders import PROC, holders, how_to_open, owning_group, serves
 
 SLOW_LATENCY_TIMER = 2
 """Milliseconds; above that, an FTDI adapter's batching shows in every reply."""
@@ -127,13 +127,8 @@ def _name(name: str, path: str) -> Iterator[Finding]:
 def _permission(path: str) -> Finding:
     if os.access(path, os.R_OK | os.W_OK):
         return Finding("permission", True, "it may be opened")
-    group = owning_group(path)
-    return Finding(
-        "permission",
-        False,
-        f"you may not open it: it belongs to the group {group}",
-        f"run `sudo usermod -aG {group} $USER`, then log in again",
-    )
+    what = f"you may not open it: it belongs to the group {owning_group(path)}"
+    return Finding("permission", False, what, how_to_open(path))
 
 
 def _holders(path: str, proc: Path) -> Finding:

@@ -6,10 +6,12 @@ import contextlib
 import grp
 import os
 import re
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 
 PROC = Path("/proc")
+GROUP_OPENS = stat.S_IRGRP | stat.S_IWGRP
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +54,20 @@ def owning_group(path: str) -> str:
         return grp.getgrgid(gid).gr_name
     except KeyError:
         return str(gid)
+
+
+def how_to_open(path: str) -> str:
+    """Return what a user can do who has no permission to open it.
+
+    To join the group root would give far more than a port, and to join a group without rights opens nothing.
+    """
+    status = os.stat(path)
+    if status.st_gid != 0 and status.st_mode & GROUP_OPENS == GROUP_OPENS:
+        return f"join its group: `sudo usermod -aG {owning_group(path)} $USER`, then log in again"
+    return (
+        f"its group {owning_group(path)} is not one to join: have a udev rule give it to a group, such as "
+        'SUBSYSTEM=="tty", GROUP="dialout", MODE="0660"'
+    )
 
 
 def _pids(proc: Path) -> list[int]:

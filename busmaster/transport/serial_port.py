@@ -385,8 +385,7 @@ def _refusal(port: SerialPort, error: Exception) -> LineDown:
         target = f": it points to {os.readlink(path)}, which is gone" if os.path.islink(path) else ""
         return LineDown(f"{path} does not exist{target}", hint="plug it in, or see `python -m serial.tools.list_ports`")
     if code in (errno.EACCES, errno.EPERM):
-        group = holders.owning_group(path)
-        return LineDown(f"no permission to open {path}", hint=f"join its group: `sudo usermod -aG {group} $USER`")
+        return LineDown(f"no permission to open {path}", hint=holders.how_to_open(path))
     if isinstance(error, ValueError):
         return LineDown(f"{path} does not take {port.baudrate} baud, {port.settings.framing}", hint="use another rate")
     if code in (errno.EIO, errno.ENXIO, errno.ENODEV):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import grp
 import os
+import stat
 import subprocess
 import sys
 import termios
@@ -17,7 +18,7 @@ import pytest
 from busmaster.doctor.adapters import Finding, inspect, latency_timer, low_latency, made_rate, rs485_mode
 from busmaster.doctor.examination import driver, rate
 from busmaster.transport import identity
-from busmaster.transport.holders import Holder, holders, lock_owner, owning_group
+from busmaster.transport.holders import Holder, holders, how_to_open, lock_owner, owning_group
 from tests.transport.fakes import PtyMaster, plugged
 from tests.transport.usb import UsbTree
 
@@ -108,7 +109,21 @@ def test_a_port_that_may_not_be_opened_names_its_group(pty_master: PtyMaster, mo
     monkeypatch.setattr(os, "access", lambda *_: False)
     permission = inspect(pty_master.path)[1]
     assert not permission.ok
-    assert f"usermod -aG {owning_group(pty_master.path)} $USER" in permission.advice
+    assert f"it belongs to the group {owning_group(pty_master.path)}" in permission.what
+    assert permission.advice == how_to_open(pty_master.path)
+
+
+@pytest.mark.parametrize(
+    ("group", "mode", "joins"), [(20, 0o660, True), (20, 0o640, False), (20, 0o600, False), (0, 0o660, False)]
+)
+def test_only_a_group_that_opens_the_port_and_is_not_roots_is_to_be_joined(
+    group: int, mode: int, joins: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = os.stat_result((stat.S_IFCHR | mode, 0, 0, 1, 0, group, 0, 0, 0, 0))
+    monkeypatch.setattr(os, "stat", lambda *_: said)
+    advice = how_to_open("/dev/ttyS0")
+    assert ("sudo usermod -aG" in advice) is joins
+    assert ('MODE="0660"' in advice) is not joins
 
 
 def test_a_group_without_a_name_goes_by_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -288,7 +288,7 @@ async def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("error", "says"),
     [
-        (serial.SerialException(errno.EACCES, "denied"), r"no permission to open .*; join its group"),
+        (serial.SerialException(errno.EACCES, "denied"), r"no permission to open .*; (join|its) "),
         (serial.SerialException(errno.EBUSY, "busy"), "is in use by another program"),
         (serial.SerialException(errno.ENXIO, "nothing"), "there is no hardware behind"),
         (termios.error(errno.EIO, "Input/output error"), "there is no hardware behind"),
