@@ -145,6 +145,9 @@ class NodeRecord:
         self.told_late = 0.0
         """Seconds to the first byte of the latest of its replies that was told as a late one."""
 
+    def __repr__(self) -> str:
+        return f"<{self.profile.name} {self.label}, {self.health.value}>"
+
     def note_reply(self, answers: Sequence[bytes], command: Command[Any], took: float) -> None:
         """Note that the node has answered this command rightly, after `took` seconds."""
         self.unheard = 0

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import click
@@ -27,7 +29,8 @@ from busmaster.config.points_taking import BadRows, taken, write_beside
     help="Take them from this CSV into LINE.toml; - is standard input.",
 )
 def command(path: str, as_csv: bool, table: str | None) -> int:
-    """Show the points of LINE.toml, one a line: what the file says of each, and the template or table it comes from.
+    """Show the points of LINE.toml, one a line: what the file says of each, and the template or table it comes from. A
+    terminal that is narrower than this table shows them one below the other.
 
     Limits hold for the quantity, by whatever name: the column limited_by has the points whose limits hold for this one
     too. It is told, not taken, as the column origin is.
@@ -62,7 +65,23 @@ def page(file: LineFile) -> Iterator[str]:
         yield "no points: describe them in [nodes.NAME.points]"
         return
     used = [column for column in COLUMNS if any(text.get(column) for text in texts)]
-    yield from columns([[column.upper() for column in used], *([text.get(key, "") for key in used] for text in texts)])
+    table = list(
+        columns([[column.upper() for column in used], *([text.get(key, "") for key in used] for text in texts)])
+    )
+    width = shutil.get_terminal_size().columns
+    if sys.stdout.isatty() and max(map(len, table)) > width:
+        yield from paragraphs(texts, used, width)
+    else:
+        yield from table
+
+
+def paragraphs(texts: Sequence[Mapping[str, str]], used: Sequence[str], width: int) -> Iterator[str]:
+    """Yield the points one below the other, for a terminal that is narrower than the table."""
+    for text in texts:
+        item = "" if text[ITEM] == text[POINT] else f" ({text[ITEM]})"
+        yield f"{text[NODE]}/{text[POINT]}{item}"
+        said = ", ".join(f"{key} {text[key]}" for key in used if key not in (NODE, POINT, ITEM) and text.get(key))
+        yield from textwrap.wrap(said, width, initial_indent="    ", subsequent_indent="    ")
 
 
 def print_csv(data: bytes) -> None:

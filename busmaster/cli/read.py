@@ -1,22 +1,29 @@
-"""`busmaster read`: values of one node, now."""
+"""`busmaster read`: values of one node, or points of a file, now."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import click
 
+from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle
+from busmaster.bus.node import Node
 from busmaster.cli.arguments import Connection, connected, json_option, node_option
+from busmaster.cli.capturing import capturing
 from busmaster.cli.ending import until_ended
 from busmaster.cli.late import late_nodes
+from busmaster.cli.lines import is_line_file, load
 from busmaster.cli.output import emit, emit_all, json_line, json_value, name_fields, value_text
 from busmaster.cli.protocols import ItemCommand, Offer, read_options, take_options
-from busmaster.cli.reaching import reach
+from busmaster.cli.reaching import owner_of, reach, tell_owner
+from busmaster.config import ConfiguredLine
 from busmaster.errors import NoReply
 from busmaster.outputs.values import utc
+from busmaster.service.remote import RemoteBus, connect
 
 
 class ItemsReadCommand(ItemCommand):
@@ -26,13 +33,20 @@ class ItemsReadCommand(ItemCommand):
         return [*super().offers(), *read_options()]
 
 
-@click.command(short_help="Read values of one node.", cls=ItemsReadCommand)
-@connected
+@click.command(short_help="Read values of one node, or of a file's points.", cls=ItemsReadCommand)
+@partial(connected, or_file=True)
 @node_option
 @click.argument("items", nargs=-1, required=True, metavar="ITEM...")
 @json_option
 def command(connection: Connection, node: int | None, items: tuple[str, ...], as_json: bool, **options: Any) -> None:
-    """Read each ITEM of one node on PORT and print `ITEM VALUE` on a line; of a run of values each on its own."""
+    """Read each ITEM of one node on PORT and print `ITEM VALUE` on a line; of a run of values each on its own.
+
+    With a LINE.toml, ITEM is a point of it, as NODE/ITEM, and its value is in the point's unit; the values of a run are
+    on one line, with commas. Where another busmaster owns the line, the read goes through it.
+    """
+    if is_line_file(connection.port):
+        read_of_file(connection, items, as_json)
+        return
     how = take_options(read_options(), connection.protocol, options)
     until_ended(read, connection, connection.one_address(node), items, how, as_json)
 
@@ -56,6 +70,41 @@ async def read(
                 emit(json_line(node=connection.node_number(address), item=item, **fields))
             else:
                 emit_all(plain_lines(handle, item, value, point.meaning.precision))
+
+
+def read_of_file(connection: Connection, names: tuple[str, ...], as_json: bool) -> None:
+    """Read points of a LINE.toml, through the program that owns its line if there is one."""
+    file = load(connection.port)
+    owner = owner_of(file.port)
+    if owner is not None:
+        if connection.capture is not None:
+            raise click.UsageError(f"{owner.port} is a line of another program: record it there, not by --capture")
+        tell_owner(owner)
+        until_ended(read_points, ConfiguredLine(file, outputs=False), connect(owner.address), names, as_json)
+        return
+    with capturing(connection.capture, port=file.port.name, echo=file.port.echo) as recorder:
+        line = ConfiguredLine(file, outputs=False, tap=recorder)
+        until_ended(read_points, line, line.bus, names, as_json)
+
+
+async def read_points(line: ConfiguredLine, bus: Bus | RemoteBus, names: tuple[str, ...], as_json: bool) -> None:
+    """Read points of a line over `bus` and print each; all are checked before the first is asked for."""
+    points = [line.point(name) for name in names]
+    other = None if bus is line.bus else bus
+    handles = {point.where: line.handle(point.where, other) for point in points}
+    async with bus, late_nodes(bus) as late:
+        for name, point in zip(names, points, strict=True):
+            try:
+                value = point.value_of(await handles[point.where].node.request(point.command))
+            except NoReply as error:
+                await late.explain(error, Node.of(point).timings.read.lateness)
+                raise
+            if as_json:
+                fields = {"value": json_value(value), **name_fields(value), "unit": point.unit}
+                emit(json_line(point=name, **fields, time=utc(time.time())))
+            else:
+                several = value if isinstance(value, tuple) else (value,)
+                emit(f"{name} {','.join(value_text(one, point.meaning.precision) for one in several)}")
 
 
 def plain_lines(handle: Handle, item: str, value: Any, precision: int | None) -> Iterator[str]:

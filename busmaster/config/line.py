@@ -144,6 +144,10 @@ class ConfiguredLine:
         """Yield the points that `drive4-8/speed,current` names. Raises InvalidCommand for what is none of the line."""
         return (self._point(*name) for name in self._names(text))
 
+    def handle(self, node: str, bus: NodeSource | None = None) -> Handle:
+        """Return the handle of a node, over `bus` where that is another than the line's own."""
+        return self.nodes[node] if bus is None else handle_of(self.file.nodes[node], bus)
+
     def prepare_write(
         self, name: str, values: Sequence[float], *, bus: NodeSource | None = None, **options: Unpack[WriteOptions]
     ) -> Send:
@@ -160,8 +164,7 @@ class ConfiguredLine:
                 point.encode(tuple(values))
             except (ArithmeticError, TypeError, ValueError) as error:
                 raise InvalidCommand(f"{name} does not take {len(values)} values: {error}") from None
-        where = name.partition("/")[0]
-        handle = self.nodes[where] if bus is None else handle_of(self.file.nodes[where], bus)
+        handle = self.handle(point.where, bus)
         # one call, whatever it takes on the line: half of it must not be taken for nothing, or for the whole
         [send] = handle.prepare_write(point.source.item, list(map(point.unscaled, values)), **options)
         return send

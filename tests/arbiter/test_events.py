@@ -8,6 +8,9 @@ from typing import Any
 import pytest
 
 from busmaster.arbiter import events, learned
+from busmaster.arbiter.events import NodeChanged
+from busmaster.arbiter.health import Health
+from tests.arbiter.bench import Bench
 
 TOLD_ONCE = {events.Overdue, events.Sampled, events.Polled}
 """Made for each request or cycle and read once: where freezing them would cost each something."""
@@ -25,3 +28,11 @@ def test_what_is_told_never_changes(kind: Any) -> None:
     for each in fields(kind):
         with pytest.raises(FrozenInstanceError):
             setattr(told, each.name, None)
+
+
+def test_an_event_prints_its_node_by_name_and_health() -> None:
+    bench = Bench()
+    node = bench.node(5)
+    assert repr(NodeChanged(node, Health.UNKNOWN, Health.UP, False)).startswith(
+        "NodeChanged(node=<hcp2 node 5, unknown>, before=<Health.UNKNOWN: 'unknown'>"
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import pty
 import subprocess
 import sys
 from pathlib import Path
@@ -55,6 +57,18 @@ def test_people_see_a_table_with_the_columns_in_which_something_is_said(busmaste
     temperature = next(line for line in shown.lines if "temperature" in line)
     assert temperature.split() == ["d6-7", "temperature", "temperature", "°C", "microflex"]
     assert len({line.index("temperature") for line in shown.lines[1:] if "temperature" in line}) == 1
+
+
+def test_a_terminal_narrower_than_the_table_shows_the_points_one_below_the_other(path: Path) -> None:
+    shown, terminal = pty.openpty()
+    with os.fdopen(shown, "rb", buffering=0) as reader:
+        environment = ENVIRONMENT | {"COLUMNS": "50"}
+        arguments = [sys.executable, "-m", "busmaster", "points", str(path)]
+        subprocess.run(arguments, stdout=terminal, env=environment, timeout=PATIENCE, check=True)
+        lines = reader.read(65536).decode().splitlines()
+        os.close(terminal)
+    assert lines[:3] == ["w/position (axis0.position)", "    unit °C, factor 0.001", "w/status (11)"]
+    assert max(map(len, lines)) <= 50
 
 
 def test_a_file_without_points_says_so(busmaster: Command, path: Path) -> None:

@@ -68,6 +68,24 @@ def test_three_programs_use_one_line_at_once(busmaster: Command, file: Path, thr
     ]
 
 
+def test_points_of_a_file_are_read_by_name_and_in_their_unit_with_and_without_an_owner(
+    busmaster: Command, file: Path, three_controllers: TcpServer
+) -> None:
+    ran = busmaster("write", str(file), "winder/force=3")
+    assert ran.status == 0
+    ran = busmaster("read", str(file), "winder/force", "winder/10")
+    assert (ran.status, ran.lines) == (0, ["winder/force 3", "winder/10 30"])
+    with owner("serve", str(file)) as (process, _):
+        ran = busmaster("read", str(file), "winder/force", "--json")
+        assert ran.status == 0
+        assert f"is owned by process {process.pid}" in ran.err
+        read = json.loads(ran.out)
+        assert (read["point"], read["value"]) == ("winder/force", 3.0)
+        ran = busmaster("read", str(file), "winder/force", "nowhere/1")
+        assert (ran.status, ran.out) == (2, ""), "all are checked before the first is read"
+        assert "no such point 'nowhere/1'" in ran.err
+
+
 def test_options_that_differ_from_the_owners_are_wrong_usage(
     busmaster: Command, file: Path, three_controllers: TcpServer
 ) -> None:
