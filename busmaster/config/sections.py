@@ -51,7 +51,7 @@ KEYS = (
     Key(
         "timing",
         "text",
-        "The windows of all nodes are learned from their replies, except those of HCP, which cannot be learned.",
+        "The windows of all nodes are learned from their replies, except where a read request carries no checksum.",
         choices=(LEARNED_WORD,),
     ),
     Key("learned", "text", "The file in which learned windows are kept from one run to the next."),

@@ -52,7 +52,7 @@ def process(*arguments: str | Path, given: bytes = b"", encoding: str = "") -> s
 def test_people_see_a_table_with_the_columns_in_which_something_is_said(busmaster: Command, path: Path) -> None:
     shown = busmaster("points", str(path))
     assert (shown.status, shown.err) == (0, "")
-    assert shown.lines[0].split() == ["NODE", "POINT", "ITEM", "UNIT", "FACTOR", "BITS", "ORIGIN"]
+    assert shown.lines[0].split() == ["NODE", "POINT", "ITEM", "UNIT", "FACTOR", "BITS", "ALARM_IF_SET", "ORIGIN"]
     assert shown.lines[1].split() == ["w", "position", "axis0.position", "°C", "0.001"]
     temperature = next(line for line in shown.lines if "temperature" in line)
     assert temperature.split() == ["d6-7", "temperature", "temperature", "°C", "microflex"]

@@ -36,7 +36,7 @@ GROUP = '\n[groups.g]  # fast\nperiod = 0.5\npoints = "w/a,b"'
 ALL_KEYS = """
 [nodes.w.points]
 a = { item = "10", unit = "°C", factor = 0.1, offset = -40, minimum = -40.0, max_step = 1e-05 }
-b = { item = "11", writable = false, bits = { READY = 0, "FAULT-2" = 3 }, deadband = 0, heartbeat = 60, maximum = 1e16 }
+b = { item = "11", writable = false, bits = { READY = 0, "FAULT-2" = 3 }, alarm_if_set = ["FAULT-2"], alarm_if_clear = ["READY"], deadband = 0, heartbeat = 60, maximum = 1e16 }
 c = { item = "12", labels = { -1 = "=1+1", 0 = "off; \\"quoted\\", \\\\", 1 = "é" } }
 d = { item = "13", low = 1, high = 2, hysteresis = 0.1, precision = 1, unit = "=cmd|' /C calc'!A0" }
 "+e" = { item = "14", unit = "'" }
