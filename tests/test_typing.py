@@ -38,7 +38,7 @@ from tests.stories import on_a_bus
 def test_the_value_of_a_sample_has_the_type_of_its_point() -> None:
     async def story(bus: Bus) -> None:
         drive = MicroFlexDrive(bus, 7)
-        text: Point[str] = Point(drive.node, "text", hcp2.Read(1), decode=str)
+        text: Point[str] = Point(drive.node, "text", hcp2.Read(239), decode=str)
         points: list[Point[Any]] = [drive.speed_measured, drive.status_word, text]
         group = bus.poll_group("g", period=0.1, points=points)
         async for snapshot in group:

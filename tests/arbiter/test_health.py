@@ -21,7 +21,7 @@ from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.protocols.mentor import codec as mentor
 from tests.arbiter.bench import FIVE, NAK, READ_1_OF_NODE_1, WRITE_5, Bench, dead, heard
 
-UNKNOWN, UP, SUSPECT, DOWN = Health
+UNKNOWN, UP, SUSPECT, DOWN, _ = Health
 
 
 def node() -> NodeRecord:

@@ -28,7 +28,7 @@ from busmaster.protocols.mentor import codec as mentor
 from busmaster.protocols.msc import codec as msc
 from tests.arbiter.bench import LATENESS, NAK, READ_1_OF_NODE_1, TAU, Bench, dead, request_of, up
 
-UNKNOWN, UP, SUSPECT, DOWN = Health
+UNKNOWN, UP, SUSPECT, DOWN, _ = Health
 PROBE_COST = 0.150
 REQUEST = 8 * TAU
 

@@ -36,7 +36,8 @@ GROUP = '\n[groups.g]  # fast\nperiod = 0.5\npoints = "w/a,b"'
 ALL_KEYS = """
 [nodes.w.points]
 a = { item = "10", unit = "°C", factor = 0.1, offset = -40, minimum = -40.0, max_step = 1e-05 }
-b = { item = "11", writable = false, bits = { READY = 0, "FAULT-2" = 3 }, alarm_if_set = ["FAULT-2"], alarm_if_clear = ["READY"], deadband = 0, heartbeat = 60, maximum = 1e16 }
+b = { item = "11", writable = false, bits = { READY = 0, "FAULT-2" = 3 }, deadband = 0, heartbeat = 60, maximum = 1e16 }
+i = { item = "19", bits = { A = 0, "F-2" = 3 }, alarm_if_set = ["F-2"], alarm_if_clear = ["A"] }
 c = { item = "12", labels = { -1 = "=1+1", 0 = "off; \\"quoted\\", \\\\", 1 = "é" } }
 d = { item = "13", low = 1, high = 2, hysteresis = 0.1, precision = 1, unit = "=cmd|' /C calc'!A0" }
 "+e" = { item = "14", unit = "'" }
@@ -115,7 +116,7 @@ def test_what_goes_out_gives_the_same_points_to_a_file_without_any() -> None:
     back = taken(bare, "points.csv", points_csv(held))
     again = read(Source("line.toml", back.text))
     assert again.nodes == held.nodes
-    assert len(back.changes) == len(held.nodes["w"].points) == 10
+    assert len(back.changes) == len(held.nodes["w"].points) == 11
     assert back.text.startswith(HEAD)
 
 
@@ -162,8 +163,8 @@ def test_every_key_of_a_point_is_a_column() -> None:
 
 def test_no_text_is_a_formula_a_date_or_another_number_to_a_spreadsheet() -> None:
     told = cells(points_csv(file(ALL_KEYS.replace("two\\nlines", "m"), "")))
-    assert [row["point"] for row in told] == ["a", "b", "c", "d", "'+e", "'@f", "g", "'4-8", "20", 'a"b']
-    assert [row["unit"] for row in told][3:7] == ["'=cmd|' /C calc'!A0", "''", "'1.20", "'"]
+    assert [row["point"] for row in told] == ["a", "b", "i", "c", "d", "'+e", "'@f", "g", "'4-8", "20", 'a"b']
+    assert [row["unit"] for row in told][4:8] == ["'=cmd|' /C calc'!A0", "''", "'1.20", "'"]
 
 
 @pytest.mark.parametrize(
