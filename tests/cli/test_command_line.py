@@ -16,7 +16,7 @@ from tests.cli.conftest import Command, serve
 
 PROMISED = {
     "demo": "[--seconds S] [--plain]",
-    "read": "PORT --protocol P [--node N] ITEM... [--json]",
+    "read": "PORT|LINE.toml [--protocol P] [--node N] ITEM... [--json]",
     "write": "PORT|LINE.toml [--protocol P] [--node N] ITEM=VALUE[,VALUE...]... [--verify] [--json] [--decimals N]",
     "poll": "PORT --protocol P [--nodes N-M,K] --items ITEM,ITEM... --period S [--seconds S] [--json] [--plain]",
     "scan": "PORT --protocol P [--nodes N-M,K] [--json]",
