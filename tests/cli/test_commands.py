@@ -97,7 +97,8 @@ def test_a_bad_assignment_is_status_2_and_nothing_is_sent(busmaster: Command, as
     ("arguments", "complaint"),
     [
         (("raed", "PORT"), "did you mean 'read'?"),
-        (("read", "PORT", "1"), "missing option '--protocol'"),
+        (("read", "PORT", "1"), "say what is spoken there: --protocol P, or a LINE.toml"),
+        (("scan", "PORT"), "missing option '--protocol'"),
         (("read", "PORT", "--protocol", "hcp3", "1"), "no such protocol 'hcp3'; did you mean 'hcp'?"),
         (("read", "PORT", *HCP2, "1"), "hcp2 needs a node: one of 0-255"),
         (("read", "PORT", *HCP2, "--node", "256", "1"), "256"),
