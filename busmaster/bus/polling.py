@@ -289,8 +289,11 @@ class PollGroup(Cycles):
                 continue
             for point, _ in transaction.tag.points:
                 sample = self._samples[point]
-                fine = sample.quality in (Quality.GOOD, Quality.LATE)
-                if fine and sample.started is not None and self._line.is_stale(point, sample.started):
+                if (
+                    sample.quality.is_current
+                    and sample.started is not None
+                    and self._line.is_stale(point, sample.started)
+                ):
                     self._qualities[sample.quality] -= 1
                     self._qualities[Quality.STALE] += 1
                     self._samples[point] = sample._replace(quality=Quality.STALE)

@@ -12,12 +12,19 @@ T = TypeVar("T")
 
 
 class Quality(enum.Enum):
-    """GOOD; LATE: begun after the nominal reply time; STALE: older than a write to it; BAD: no value."""
+    """GOOD; LATE: begun after the nominal reply time; STALE: older than a write to it; BAD: no value; OVERHEARD: taken
+    from another master's exchange, of which a listener may have missed a part."""
 
     GOOD = "good"
     LATE = "late"
+    OVERHEARD = "overheard"
     STALE = "stale"
     BAD = "bad"
+
+    @property
+    def is_current(self) -> bool:
+        """The value was read by this line's own master, and nothing is known that would have changed it since."""
+        return self in (Quality.GOOD, Quality.LATE)
 
 
 class Sample(NamedTuple, Generic[T]):

@@ -106,8 +106,7 @@ class SharedLine:
         condition = self.condition
         if condition.is_lost:
             return sample._replace(value=None, error=condition.error, quality=Quality.BAD)
-        fine = sample.quality in (Quality.GOOD, Quality.LATE)
-        if fine and sample.started is not None and self.is_stale(point, sample.started):
+        if sample.quality.is_current and sample.started is not None and self.is_stale(point, sample.started):
             return sample._replace(quality=Quality.STALE)
         return sample
 

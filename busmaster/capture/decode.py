@@ -104,6 +104,7 @@ class Decoder:
 
     def _timed(self, frame: Frame) -> Frame:
         frame.time = self._started
+        frame.ended = self._heard
         frame.joined = self._joined
         if frame.answers:
             frame.delay = self._started - self._spoken
@@ -127,7 +128,15 @@ class Decoder:
         self._rejected.clear()
         fault = f"cut short after {len(raw)} bytes" if raw[0] in self._dialect.starts and len(raw) > 1 else "no frame"
         frames.append(
-            Frame(Kind.NOISE, self._sender, raw, fault=fault, joined=self._rejected_joined, time=self._rejected_at)
+            Frame(
+                Kind.NOISE,
+                self._sender,
+                raw,
+                fault=fault,
+                joined=self._rejected_joined,
+                time=self._rejected_at,
+                ended=self._heard,
+            )
         )
 
 

@@ -57,6 +57,10 @@ class Frame:
     """It came in one piece with the end of the frame before."""
     time: float = 0.0
     """Seconds, when its first byte was heard, on the clock of whoever heard it."""
+    ended: float = 0.0
+    """Seconds, when its last byte was heard, likewise."""
+    earlier: float = 0.0
+    """Seconds by which its first byte may have come before `time`, as the listener stood still."""
     delay: float | None = None
     """Of an answer: seconds since the last byte of what it answers was heard."""
 

@@ -22,7 +22,7 @@ from busmaster.cli.capturing import capture_option, capturing
 from busmaster.cli.ending import until_ended
 from busmaster.cli.lines import is_line_file, load
 from busmaster.cli.output import Level, emit, emit_all, json_line, note, value_text
-from busmaster.cli.overheard import Overheard, feed, only_protocol, silent
+from busmaster.cli.overheard import Clock, Overheard, feed, only_protocol, silent
 from busmaster.cli.parsing import Whole
 from busmaster.cli.protocols import protocol_option
 from busmaster.cli.run import output_text
@@ -32,6 +32,8 @@ from busmaster.outputs.values import cycle_fields, utc
 from busmaster.registry import find
 from busmaster.transport.endpoints import Endpoint
 
+BEAT = 0.05
+"""Seconds from one look at the clock to the next. Two that are further apart tell that the program stood still."""
 ARROWS = {Direction.HOST: "->", Direction.NODE: "<-", Direction.UNKNOWN: "??"}
 
 
@@ -48,7 +50,8 @@ def command(port: str, protocol: str | None, baud: int | None, as_json: bool, ca
     apart by what they say: a silence only ends one that was cut short.
 
     With a LINE.toml, its points and outputs are fed from what its line's own master asks: a line for each value that
-    passed, or, with --json, for each group and period.
+    passed, or, with --json, for each group and period. The quality of these values is "overheard", never good: a
+    reply carries no address, and a listener that misses two frames can take it for another node's.
     """
     if is_line_file(port):
         if protocol is not None or baud is not None:
@@ -73,7 +76,8 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
     kind = find(protocol)
     line = ConfiguredLine(silent(file), tell=note, asks=False)  # never entered: its bus opens no port
     points = {point for group in file.groups for point in line.members(group)}
-    overheard = Overheard(kind.protocol, points)
+    clock = wall_clock()
+    overheard = Overheard(kind.protocol, points, clock)
 
     def show(snapshot: Snapshot) -> None:
         fields = {**cycle_fields(snapshot, snapshot.wall_at), "time": utc(snapshot.wall_at(snapshot.finished))}
@@ -88,12 +92,14 @@ def monitor_file(file: LineFile, as_json: bool, capture: str | None) -> None:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(feed, line, overheard, show)
             tasks.start_soon(tell, line.bus.events())
-            await listen(file.port, Decoder(kind.protocol.dialect()), overheard.heard, recorder)
+            await listen(file.port, Decoder(kind.protocol.dialect()), overheard.heard, recorder, clock)
 
     with capturing(capture, port=file.port.name, protocol=protocol) as recorder:
         try:
             until_ended(run, recorder)
         finally:
+            if overheard.doubted:
+                note(f"{overheard.doubted} replies could have been those to earlier requests, and were no values")
             for counts in line.outputs.statistics():
                 note(output_text(counts))
 
@@ -106,31 +112,63 @@ def plain_values(snapshot: Snapshot) -> list[str]:
     ]
 
 
-class Listener(asyncio.Protocol):
-    """Decodes what comes and tells each frame, with the time of day; a frame that is not finished waits for silence."""
+def wall_clock() -> Clock:
+    """Return the time of day as it is set now: a clock that is set later moves no frame."""
+    offset = time.time() - time.monotonic()
+    return lambda: time.monotonic() + offset
 
-    def __init__(self, decoder: Decoder, tell: Callable[[Frame], None], recorder: Recorder | None = None) -> None:
+
+class Listener(asyncio.Protocol):
+    """Decodes what comes and tells each frame, with the time of day; a frame that is not finished waits for silence.
+
+    Bytes that waited while the program stood still came at an unknown time: after it was last seen running.
+    """
+
+    def __init__(
+        self,
+        decoder: Decoder,
+        tell: Callable[[Frame], None],
+        recorder: Recorder | None = None,
+        clock: Clock | None = None,
+    ) -> None:
         self._decoder = decoder
         self._tell = tell
         self._recorder = recorder
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
-        self._offset = time.time() - time.monotonic()  # once: a clock that is set moves no frame
+        self._clock = clock or wall_clock()
+        self._beats = (self._clock(),) * 2
+        """When the program was last seen running, and the time before."""
+        self._beating = self._loop.call_later(BEAT, self._beat)
+        self._earlier = 0.0
         self.lost: asyncio.Future[None] = self._loop.create_future()
+
+    def _beat(self) -> None:
+        self._beats = (self._clock(), self._beats[0])
+        self._beating = self._loop.call_later(BEAT, self._beat)
+
+    def _unwatched(self, now: float) -> float:
+        """Return how long ago bytes that are read now may have come."""
+        last, before = self._beats
+        # What came in the midst of a standstill may take several reads: the beat behind it does not end it.
+        since = before if now - last > 2 * BEAT or last - before > 2 * BEAT else now
+        return now - since
 
     def data_received(self, data: bytes) -> None:
         """Decode these bytes and tell the frames; a frame that is not finished waits for silence."""
-        now = time.monotonic()
+        now = self._clock()
         if self._recorder is not None:
-            self._recorder.overheard(now, data)
+            self._recorder.overheard(time.monotonic(), data)
         if self._timer is not None:
             self._timer.cancel()
-        self._pass(self._decoder.feed(data, now + self._offset))
+        self._earlier = max(self._unwatched(now), self._earlier if self._decoder.unfinished else 0.0)
+        self._pass(self._decoder.feed(data, now))
         if self._decoder.unfinished:
             self._timer = self._loop.call_later(DEFAULT_GAP, self._rest)
 
     def connection_lost(self, cause: Exception | None) -> None:
         """Tell the last frame, and end `lost` with LineDown."""
+        self._beating.cancel()
         self._rest()
         if not self.lost.done():
             what = cause_text(cause, "the line was closed")
@@ -146,6 +184,7 @@ class Listener(asyncio.Protocol):
         """
         try:
             for frame in frames:
+                frame.earlier = self._earlier
                 self._tell(frame)
         except OSError as error:
             if not self.lost.done():
@@ -153,10 +192,14 @@ class Listener(asyncio.Protocol):
 
 
 async def listen(
-    endpoint: Endpoint, decoder: Decoder, tell: Callable[[Frame], None], recorder: Recorder | None = None
+    endpoint: Endpoint,
+    decoder: Decoder,
+    tell: Callable[[Frame], None],
+    recorder: Recorder | None = None,
+    clock: Clock | None = None,
 ) -> None:
     """Listen until the line is lost. Raises LineDown then, and the OSError of a frame that could not be told."""
-    listener = Listener(decoder, tell, recorder)
+    listener = Listener(decoder, tell, recorder, clock)
     transport = await endpoint.open(lambda: listener)
     try:
         await listener.lost

@@ -1,4 +1,11 @@
-"""The points of a file, fed from what its line's own master asks and its nodes answer, without a word of ours."""
+"""The points of a file, fed from what its line's own master asks and its nodes answer, without a word of ours.
+
+Replies carry neither an address nor a number, and another master keeps rules of its own: it may repeat a request before
+the reply to the first one can no longer come, or go on to the next node. So a request stays *open* until its reply was
+heard for certain, or its node's maximum reply delay is over, and a reply that an open request could have caused is no
+value. A listener can still miss two frames in a row and take one node's reply for another's: what it hears is never
+good, it is overheard.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +13,8 @@ import asyncio
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from math import inf
 from typing import Any
 
 import anyio
@@ -27,6 +35,10 @@ from busmaster.registry import Protocol, find
 
 Question = tuple[int, Command[Any]]
 """The address of a node, and what it is asked."""
+Clock = Callable[[], float]
+"""Tells the time, in seconds."""
+MOST_OPEN = 1000
+"""More requests than fit into the longest maximum reply delay; the oldest goes."""
 
 
 def silent(file: LineFile) -> LineFile:
@@ -91,14 +103,33 @@ class HeardGroup:
             consumer.close()
 
 
+@dataclass(frozen=True, slots=True)
+class OpenRequest:
+    """A request whose reply may still come, and would begin with one of `answers` (none: with anything)."""
+
+    request: bytes
+    answers: frozenset[bytes]
+    until: float
+    """From then on no reply to it can begin, on the clock of the frames."""
+
+
 class Overheard:
     """Makes samples of frames: of reads, and of writes that were confirmed, each of which may tell several points.
 
-    An answer counts only where the reader of its request takes it, as in a master.
+    An answer counts only where the reader of its request takes it, as in a master, and where it can be no open
+    request's. `clock` is the one by which the frames are timed.
     """
 
-    def __init__(self, protocol: Protocol, points: Iterable[Point[Any]]) -> None:
+    def __init__(self, protocol: Protocol, points: Iterable[Point[Any]], clock: Clock) -> None:
         self.groups: list[HeardGroup] = []
+        self.doubted = 0
+        """Replies that were no values, as they could have been another request's."""
+        self._clock = clock
+        self._open: list[OpenRequest] = []
+        self._request_ended = -inf
+        self._lateness = 0.0
+        self._unread = False
+        """The request that is open is none of ours: nobody knows how its reply begins."""
         self._profile = protocol.profile
         self._dialect = protocol.dialect()
         self._nodes: dict[int, Node] = {}
@@ -118,35 +149,70 @@ class Overheard:
         if from_host and frame.kind in (Kind.READ, Kind.WRITE):  # a short command reads one more parameter
             self._ask(frame)
         elif from_host:
-            self._driver = None  # in the midst of an exchange, it has given that up
+            self._give_up()  # in the midst of an exchange, it has given that up
         elif self._driver is not None:
             self._answer(self._driver, frame)
+        elif self._unread and frame.answers and not frame.fault:
+            self._unread = bool(self._still_open(frame))
+        elif frame.fault and frame.sender is Direction.UNKNOWN:  # perhaps a request
+            self._request_ended, self._lateness, self._unread = frame.ended, self._longest(), True
 
     def _ask(self, frame: Frame) -> None:
-        """Begin an exchange; a new request ends the exchange before."""
-        self._driver = None
+        """Begin an exchange; what the request before asked for may still come."""
+        self._give_up()
         address = frame.node if self._profile.addressed else self._profile.addresses[0]
         node = None if address is None else self._nodes.get(address)
-        if frame.fault or node is None:
+        self._request_ended, self._lateness, self._unread = frame.ended, self._longest(), True
+        if frame.fault or address is None:
             return
         with suppress(InvalidCommand, KeyError, ValueError):
             command = self._dialect.command(frame, ())
-            exchange = command.open(node.address, node.timings)
-            self._asked = node, command
+            timings = self._profile.timings if node is None else node.timings
+            exchange = command.open(address, timings)
+            self._lateness = exchange.timing.lateness + (timings.packet.lateness if exchange.later else 0.0)
             self._driver = Driver(exchange, noise_tolerant=self._profile.noise_tolerant)
+            self._asked = None if node is None else (node, command)  # a reply to a node that is in no group
+            self._unread = False
 
     def _answer(self, driver: Driver, frame: Frame) -> None:
         timing, delay = driver.timing, frame.delay or 0.0
         if frame.fault or frame.sender is not Direction.NODE or delay > timing.lateness:
-            self._driver = None  # whatever still comes may be anybody's
+            self._give_up()  # whatever still comes may be anybody's
             return
         driver.feed(frame.raw)
         if driver.ending is None:
             return
+        answers = frozenset(driver.exchange.answers)
+        # any request can be refused, whatever its good replies begin with
+        refused = not driver.ending.delivered
+        possible = [one for one in self._still_open(frame) if refused or not one.answers or answers & one.answers]
+        doubtful = any(one.request != driver.exchange.request for one in possible)
+        self.doubted += doubtful
+        if not (refused or doubtful) and self._asked is not None:
+            self._deliver(self._found(*self._asked, driver.ending.value), frame.time - frame.earlier)
+        if possible:
+            self._give_up()  # its own reply may be the one that still comes
         self._driver = None
-        if driver.ending.delivered and self._asked is not None:
-            quality = Quality.LATE if delay > timing.nominal else Quality.GOOD
-            self._deliver(self._found(*self._asked, driver.ending.value), quality)
+
+    def _give_up(self) -> None:
+        """Leave the exchange, whose reply may still come."""
+        driver, self._driver = self._driver, None
+        if self._unread or (driver is not None and driver.exchange.answered):
+            request, owed = (b"", ()) if driver is None else (driver.exchange.request, driver.exchange.owed)
+            self._open.append(OpenRequest(request, frozenset(owed), self._request_ended + self._lateness))
+            del self._open[:-MOST_OPEN]
+        self._unread = False
+
+    def _still_open(self, reply: Frame) -> list[OpenRequest]:
+        """Return the earlier requests to which this could be the reply, as far as time tells."""
+        came = reply.time - reply.earlier
+        self._open = [request for request in self._open if request.until > came]
+        return self._open
+
+    def _longest(self) -> float:
+        """Return the maximum reply delay of whatever node it was that was asked."""
+        timings = (self._profile.timings, *(node.timings for node in self._nodes.values()))
+        return max(max(each.read.lateness, each.write.lateness) + each.packet.lateness for each in timings)
 
     def _found(self, node: Node, command: Command[Any], value: Any) -> dict[Point[Any], Any]:
         """Return what each point would have read, of all that the exchange tells."""
@@ -163,12 +229,14 @@ class Overheard:
                     found.setdefault(point, point.command.shown(told))
         return found
 
-    def _deliver(self, found: Mapping[Point[Any], Any], quality: Quality) -> None:
-        now, wall = time.monotonic(), time.time()
-        timeline = Timeline(now, now, now, now, 1, 0, 0.0)
+    def _deliver(self, found: Mapping[Point[Any], Any], came: float) -> None:
+        """Hand on values whose reply began at `came`, by the clock of the frames."""
+        age = max(0.0, self._clock() - came)
+        at, wall = time.monotonic() - age, time.time() - age
+        timeline = Timeline(at, at, at, at, 1, 0, 0.0)
         for point, raw in found.items():
             with suppress(BusError):  # it stands for no value of the point
-                sample = Sample(point.value_of(raw), None, now, now, now, quality, timeline, wall)
+                sample = Sample(point.value_of(raw), None, at, at, at, Quality.OVERHEARD, timeline, wall)
                 for group in self.groups:
                     group.take(point, sample)
 

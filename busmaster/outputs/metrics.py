@@ -19,7 +19,6 @@ from busmaster.arbiter.health import Health
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
-from busmaster.bus.samples import Quality
 from busmaster.outputs.base import Output, OutputStatistics, check_extra
 from busmaster.outputs.scrapes import listening, page, serve
 from busmaster.outputs.settings import MetricsSettings
@@ -236,7 +235,7 @@ class MetricsOutput(Output):
                     values.add_metric(place, number)
                 if read_at is not None:
                     times.add_metric(place, micros(read_at))
-                good.add_metric(place, float(now.quality in (Quality.GOOD, Quality.LATE)))
+                good.add_metric(place, float(now.quality.is_current))
         alarms = GaugeMetricFamily(
             "busmaster_alarm", "1 while a value is above its high, -1 below its low, else 0", labels=["node", "item"]
         )

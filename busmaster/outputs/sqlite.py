@@ -35,7 +35,7 @@ create table if not exists samples (
     time real not null,       -- seconds since 1970
     point integer not null references points (id),
     value,                    -- a number; JSON for several; null where there is an error
-    quality text not null,    -- good, late, stale or bad
+    quality text not null,    -- good, late, overheard, stale or bad
     error text
 );
 create index if not exists samples_of_point on samples (point, time);

@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from busmaster.bus.samples import Quality, Sample
 from busmaster.capture.decode import Decoder
 from busmaster.capture.frames import Direction
 from busmaster.cli import main
@@ -38,6 +40,9 @@ protocol = "hcp2"
 address = 2
 [nodes.winder.points]
 tension = {{ item = "1", unit = "N", factor = 0.1, high = 0.4 }}
+[nodes.spare]
+protocol = "hcp2"
+address = 3
 [groups.fast]
 period = 0.1
 points = ["winder/tension"]
@@ -149,7 +154,7 @@ def heard(folder: Path, *pieces: bytes, apart: float = 0.03) -> list[object]:
     """The values of the point that these pieces of the line, each some seconds behind the one before, stand for."""
     line = ConfiguredLine(load(written(folder)), outputs=False)
     points = line.members("fast")
-    overheard = Overheard(find("hcp2").protocol, points)
+    overheard = Overheard(find("hcp2").protocol, points, lambda: 0.0)
     overheard.groups.append(HeardGroup("fast", 0.1, points, 0.0))
     decoder = Decoder(find("hcp2").protocol.dialect())
     found: list[object] = []
@@ -194,3 +199,98 @@ def test_what_is_missing_or_too_much_is_said(tmp_path: Path, capsys: pytest.Capt
     assert "leave out --protocol" in capsys.readouterr().err
     assert main(["monitor", "/dev/null"]) == 2
     assert "--protocol P, or a LINE.toml" in capsys.readouterr().err
+
+
+NAK = b"\x15"
+
+
+def asked(node: int, element: int = 1) -> bytes:
+    return hcp2.Read(element).open(node, hcp2.PROFILE.timings).request
+
+
+def overheard_of(folder: Path, *pieces: tuple[float, bytes], earlier: float = 0.0) -> list[Sample[Any]]:
+    """The samples of the point that these bytes, each at its time, stand for; the last came `earlier`."""
+    line = ConfiguredLine(load(written(folder)), outputs=False)
+    points = line.members("fast")
+    now = [0.0]
+    overheard = Overheard(find("hcp2").protocol, points, lambda: now[0])
+    overheard.groups.append(HeardGroup("fast", 0.1, points, 0.0))
+    decoder = Decoder(find("hcp2").protocol.dialect())
+    found: list[Sample[Any]] = []
+    for at, piece in pieces:
+        now[0] = at
+        for frame in decoder.feed(piece, at, Direction.UNKNOWN):
+            frame.earlier = earlier if at == pieces[-1][0] else 0.0
+            overheard.heard(frame)
+            snapshot = overheard.groups[0].turn(at, 0.0)
+            found += snapshot.samples.values() if snapshot else []
+    return found
+
+
+MAX_REPLY_DELAY = hcp2.PROFILE.timings.read.lateness
+
+
+@pytest.mark.parametrize(
+    ("pieces", "values"),
+    [
+        pytest.param([(0, asked(3)), (0.03, asked(2)), (0.04, REPLY)], [], id="gone on to the next node"),
+        pytest.param(
+            [(0, asked(3)), (0.03, asked(3)), (0.04, REPLY), (0.05, asked(2)), (0.06, REPLY)], [], id="repeated"
+        ),
+        pytest.param([(0, asked(2)), (0.03, asked(2)), (0.04, REPLY), (0.05, REPLY)], [0.5], id="repeated to itself"),
+        pytest.param(
+            [(0, asked(3)), (0.03, asked(3)), (0.04, REPLY), (0.05, asked(2, 4)), (0.06, asked(2)), (0.07, REPLY)],
+            [],
+            id="open requests outlive what is asked in between",
+        ),
+        pytest.param([(0, asked(3, 4)), (0.03, asked(2)), (0.04, REPLY)], [0.5], id="its reply would begin otherwise"),
+        pytest.param([(0, asked(3)), (0.03, asked(3)), (0.04, NAK), (0.05, asked(2)), (0.06, REPLY)], [], id="a NAK"),
+        pytest.param([(0, asked(9)), (0.03, asked(2)), (0.04, REPLY)], [], id="of a node that is not in the file"),
+        pytest.param([(0, b"\x07\x46\x46"), (0.15, asked(2)), (0.16, REPLY)], [], id="perhaps a damaged request"),
+        pytest.param(
+            [(0, asked(3)), (0.06 + MAX_REPLY_DELAY, asked(2)), (0.07 + MAX_REPLY_DELAY, REPLY)], [0.5], id="it is over"
+        ),
+    ],
+)
+def test_a_reply_that_an_open_request_could_have_caused_is_no_value(
+    tmp_path: Path, pieces: list[tuple[float, bytes]], values: list[float]
+) -> None:
+    assert [sample.value for sample in overheard_of(tmp_path, *pieces)] == values
+
+
+def test_a_request_is_open_while_its_reply_may_have_come_before_it_was_read(tmp_path: Path) -> None:
+    late = MAX_REPLY_DELAY + 0.06
+    pieces = [(0.0, asked(3)), (late, asked(2)), (late + 0.01, REPLY)]
+    assert [sample.value for sample in overheard_of(tmp_path, *pieces, earlier=0.0)] == [0.5]
+    assert overheard_of(tmp_path, *pieces, earlier=0.05 + late - MAX_REPLY_DELAY) == []
+
+
+def test_what_is_overheard_is_never_good_and_as_old_as_its_first_byte_may_be(tmp_path: Path) -> None:
+    before = time.monotonic()
+    (sample,) = overheard_of(tmp_path, (5.0, asked(2)), (5.02, REPLY), earlier=3.0)
+    assert sample.quality is Quality.OVERHEARD
+    assert not sample.quality.is_current
+    assert before - 3.1 < sample.finished <= time.monotonic() - 3.0
+    assert sample.age(time.monotonic()) >= 3.0
+
+
+def test_a_listener_that_stood_still_tells_no_old_value_as_new(tmp_path: Path) -> None:
+    with create_server(("127.0.0.1", 0)) as server:
+        path = written(tmp_path, server.getsockname()[1])
+        with started("monitor", str(path), "--json") as process:
+            line, _ = server.accept()
+            with line:
+                assert process.stdout is not None
+                line.sendall(REQUEST + REPLY)
+                json.loads(process.stdout.readline())
+                process.send_signal(signal.SIGSTOP)
+                line.sendall(REQUEST + REPLY)
+                said = time.time()
+                time.sleep(1.0)  # how old the bytes become
+                process.send_signal(signal.SIGCONT)
+                json.loads(process.stdout.readline())
+                process.send_signal(signal.SIGINT)
+                process.communicate()
+    moments = rows(tmp_path / "line.sqlite", "select time, quality from samples order by rowid")
+    assert moments[-1][0] < said + 0.5
+    assert {quality for _, quality in moments} == {"overheard"}

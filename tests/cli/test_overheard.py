@@ -60,7 +60,7 @@ def heard(kind: str, options: str, a: str, b: str, master: Master) -> dict[str, 
     file = read(Source("line.toml", FILE.format(kind=kind, options=options, a=a, b=b)))
     listener = ConfiguredLine(file, outputs=False)
     points = listener.members("all")
-    overheard = Overheard(find(kind).protocol, points)
+    overheard = Overheard(find(kind).protocol, points, lambda: 0.0)
     overheard.groups.append(HeardGroup("all", 3600, points, 0.0))
 
     async def story() -> None:
