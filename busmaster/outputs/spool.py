@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from busmaster.errors import InvalidCommand
 from busmaster.files import MODE, open_file
+from busmaster.outputs.damaged import is_damaged, move_aside
 
 PIECE = 1_000
 """Records that are forgotten at once."""
@@ -46,14 +47,10 @@ class Spool:
         try:
             try:
                 self._database = _opened(path, kind, mode)
-            # Not damaged, but held by another process, say: to move it aside would take it from there.
-            except sqlite3.OperationalError:
-                raise
             except sqlite3.DatabaseError as error:
-                aside = f"{path}.damaged"
-                for part in ("", "-wal", "-shm"):  # what a crash left beside it must not be played into the new one
-                    if os.path.exists(path + part):
-                        os.replace(path + part, aside + part)
+                if not is_damaged(error):  # but held by another process, say
+                    raise
+                aside = move_aside(path)
                 say(f"{path}: {error}: it is kept as {aside}, and begun anew")
                 self._database = _opened(path, kind, mode)
             self.values: int = self._database.execute("select coalesce(sum(count), 0) from waiting").fetchone()[0]

@@ -17,6 +17,7 @@ from busmaster.files import open_file
 from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import Happening, Item, check_folder
 from busmaster.outputs.batches import BatchOutput
+from busmaster.outputs.damaged import is_damaged, move_aside
 from busmaster.outputs.growing_file import is_at
 from busmaster.outputs.retention import Retention
 from busmaster.outputs.settings import SqliteSettings
@@ -135,6 +136,17 @@ class SqliteOutput(BatchOutput[Rows]):
         return Rows(samples)
 
     def commit(self, batch: list[Rows]) -> None:
+        try:
+            self._write(batch)
+        except sqlite3.DatabaseError as error:
+            if not is_damaged(error):
+                raise
+            self.shut()
+            aside = move_aside(self._path)
+            self._tell(f"{self._path} is damaged ({error}): it was moved to {aside}, and a new one is begun")
+            self._write(batch)
+
+    def _write(self, batch: list[Rows]) -> None:
         if self._file is not None and not is_at(self._path, self._file):
             self._tell(f"{self._path} was moved or removed: another is begun")
             self._leave()

@@ -331,3 +331,37 @@ def test_a_database_that_was_removed_is_begun_anew(tmp_path: Path) -> None:
         until(lambda: settled(output))
     assert query(path, "select value from samples") == [(2.0,)]
     assert query(path, "pragma integrity_check") == [("ok",)]
+
+
+def test_a_damaged_database_is_moved_aside_and_a_new_one_begun(tmp_path: Path) -> None:
+    """First where its header is not one, at the start; then in its midst, while it is written."""
+    path = tmp_path / "x.db"
+    said: list[str] = []
+    with recording(path) as output:
+        output.offer(cycle(1, 1.0))
+    with path.open("r+b") as file:  # as a loss of power leaves it
+        file.write(bytes(4096))
+    output = SqliteOutput("sqlite", SqliteSettings(path=str(path)), said.append)
+    output._retry = 0.01
+    output.start()
+    try:
+        output.offer(cycle(2, 2.0))
+        until(lambda: settled(output))
+        assert (tmp_path / "x.db.damaged").read_bytes().startswith(bytes(4096))
+        with closing(sqlite3.connect(path)) as database:
+            database.execute("pragma wal_checkpoint(truncate)").fetchall()
+        with path.open("r+b") as file:
+            file.seek(4096)
+            file.write(b"\xff" * (path.stat().st_size - 4096))
+        output.reopen()
+        output.offer(cycle(3, 3.0))
+        until(lambda: len(said) == 2)
+        output.offer(cycle(4, 4.0))
+        until(lambda: settled(output))
+    finally:
+        output.close(PATIENCE)
+    assert output.statistics().dropped == 0
+    assert [value for (value,) in query(path, "select value from samples order by rowid")] == [3.0, 4.0]
+    assert said[0].endswith(f"it was moved to {path}.damaged, and a new one is begun")
+    assert said[1].endswith(f"it was moved to {path}.damaged-2, and a new one is begun")
+    assert (tmp_path / "x.db.damaged").read_bytes().startswith(bytes(4096))
