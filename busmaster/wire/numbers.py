@@ -28,6 +28,8 @@ def format_number(value: SupportsFloat) -> str:
     The fifth decimal rounds half away from zero, on the decimal text that Python shows for the value. Raises
     InvalidCommand for NaN, infinity, what is no number, and what takes more than 20 characters.
     """
+    if isinstance(value, bool):  # a mistyped call or message; it would go out as 1 or 0
+        raise InvalidCommand(f"{value!r} is not a number: write {int(value)} if that is meant")
     if not hasattr(value, "__float__"):  # text has none: float() would take it
         raise InvalidCommand(f"{value!r} is not a number")
     number = int(value) if isinstance(value, int) else float(value)

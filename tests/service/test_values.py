@@ -15,7 +15,7 @@ from busmaster.emulator.line import Line
 from busmaster.registry import find, make_device
 from busmaster.service.messages import encoded, value_of
 from tests.patience import PATIENCE
-from tests.service.lines import Served, on_a_served_line
+from tests.service.lines import Served, on_a_served_line, raw
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,8 @@ def test_what_cannot_be_said_is_refused() -> None:
     [
         ("hcp2", "10", [1, 0], [True, False]),
         ("microflex", "command_word", [1], [True]),
-        ("modbus", "holding:5", [1], [True]),
+        ("modbus", "holding:5", [1], [True, [True]]),
+        ("modbus", "holding:5:2", [[1, 0]], [[True, 0], [1, False], [[True], 0]]),
         ("modbus", "coil:5", [True, 1, False, 0], [2, 0.5, "true"]),
         ("modbus", "coil:5:2", [[True, False], [1, 0]], [[True, 2], True]),
         ("msc", "flag:5", [True, 1, False, 0], [2, -1]),
@@ -76,9 +77,15 @@ def test_a_truth_that_is_refused_says_which_number_to_write_and_is_on_record(tmp
     async def story(line: Served, remote: RemoteBus) -> None:
         line.bus.poll_group("axes", period=1.0, points=[Hcp2Controller(line.bus, 5).point("10")])
         view = await remote.overview(lambda *_: None)
-        for value, said in ((True, "true: write 1"), (False, "false: write 0")):
-            with pytest.raises(InvalidCommand, match=f"node 5: 10 is a number, not {said}"):
+        for value, said in ((True, "True is not a number: write 1"), (False, "False is not a number: write 0")):
+            with pytest.raises(InvalidCommand, match=said):
                 await view.write("axes", "5/10", value)
         assert line.audit() == [("5/10", "refused")] * 2
+        async with raw(line) as client:  # a raw command: `[true]` was written as 1
+            await client.ask("node", protocol="hcp2", address=5)
+            command = {"command": "write", "element": 10, "values": [True]}
+            answer = await client.ask("request", protocol="hcp2", address=5, command=command)
+            assert "True is not a number: write 1" in answer["error"]["message"]
+        assert await Hcp2Controller(remote, 5).read(10) == 0
 
     on_a_served_line(tmp_path, story)

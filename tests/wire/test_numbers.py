@@ -24,7 +24,6 @@ from busmaster.wire.numbers import LONGEST_NUMBER, format_list, format_number, p
         (100.0, "100"),
         (0.5, ".5"),
         (-0.0001, "-.0001"),
-        (True, "1"),
         (16777217, "16777217"),
         (1e16, "10000000000000000"),
         (10**20 - 1, "99999999999999999999"),
@@ -108,3 +107,9 @@ def test_no_field_raises_anything_but_a_frame_error(field: bytes) -> None:
     except FrameError:
         return
     assert value - value == 0
+
+
+def test_a_truth_is_not_a_number_and_the_error_says_what_to_write() -> None:
+    for value, number in ((True, 1), (False, 0)):
+        with pytest.raises(InvalidCommand, match=f"{value} is not a number: write {number} if that is meant"):
+            format_number(value)
