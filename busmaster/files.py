@@ -1,8 +1,12 @@
-"""The files that busmaster makes: who may read them is said here, and nowhere else."""
+"""How files are read and made: what may be read, how much of it, and who may read what is made."""
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
+
+from busmaster.bounds import LONGEST_FILE
 
 MODE = 0o640
 """Of a new file: its owner may write, its group may read. The process's umask narrows it, as it does every mode."""
@@ -15,3 +19,27 @@ def open_file(path: str, flags: int, mode: int = MODE) -> int:
     `flags` are those of os.open. Programs that are started do not inherit the descriptor. Raises OSError.
     """
     return os.open(path, flags | os.O_CREAT | os.O_CLOEXEC, mode)
+
+
+def read_file(path: str | os.PathLike[str], most: int = LONGEST_FILE) -> bytes:
+    """Return the content of a regular file of at most `most` bytes. Never waits for another program.
+
+    Raises OSError for a file that cannot be read, that is larger, or that is a FIFO or a device: opening a FIFO waits
+    for a program that writes to it, and a device may have no end.
+    """
+    name = os.fspath(path)
+    descriptor = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    with open(descriptor, "rb") as file:
+        check_regular(os.fstat(descriptor), name)
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"it has more than {most} bytes, which is the bound for such a file", name)
+    return data
+
+
+def check_regular(found: os.stat_result, name: str) -> None:
+    """Raise OSError for what is not a regular file."""
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), name)
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "it is a FIFO, a socket or a device: name a regular file", name)

@@ -11,6 +11,7 @@ from busmaster.arbiter.clients import LineClient
 from busmaster.arbiter.health import DOWN, UNKNOWN, NodeRecord
 from busmaster.arbiter.histogram import Histogram
 from busmaster.arbiter.learned import AGAIN, AT_FIRST, AT_LAST, NEVER
+from busmaster.bounds import LONGEST_PERIOD, SHORTEST_PERIOD
 from busmaster.contract.exchange import Command
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusError, InvalidCommand
@@ -247,8 +248,9 @@ class Poll:
     )
 
     def __init__(self, name: str, period: float, *, phase: float | None = None, cost: float = 0.0) -> None:
-        if not 0.001 <= period < inf:
-            raise InvalidCommand(f"poll group {name!r}: a period is at least 0.001 s, not {period!r}")
+        if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
+            bounds = f"{SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g} s"
+            raise InvalidCommand(f"poll group {name!r}: a period is {bounds}, not {period!r}")
         if phase is not None and not 0 <= phase < period:
             raise InvalidCommand(f"poll group {name!r}: a phase is at least 0 s and below the period, not {phase!r}")
         self.name = name

@@ -7,6 +7,7 @@ from collections.abc import Hashable, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, TypeVar, Unpack
 
+from busmaster.bounds import LONGEST_HOLD
 from busmaster.bus.limits import Limit
 from busmaster.bus.requester import CommandOptions, Requester
 from busmaster.bus.samples import Sample
@@ -17,8 +18,6 @@ from busmaster.errors import Addressed, HoldEnded, InvalidCommand
 from busmaster.planning.merging import Merge
 
 T = TypeVar("T")
-LONGEST_HOLD = 5.0
-"""Seconds for which a line may be held for one sequence: nobody else is asked anything meanwhile."""
 
 
 def checked_hold(max_hold: float, label: str) -> float:

@@ -15,6 +15,7 @@ from busmaster.arbiter.counters import NodeStatistics
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.learned import LearnedTimes
 from busmaster.arbiter.transaction import LEFT, Priority, Timeline, Transaction
+from busmaster.bounds import LONGEST_SUSPENSION
 from busmaster.bus.exclusive import HeldNode, checked_hold, hold_ended
 from busmaster.bus.limiter import Limiter
 from busmaster.bus.limits import Limit
@@ -442,8 +443,13 @@ class Node:
         return True
 
     def suspend(self, for_: float) -> None:
-        """Let it rest for maintenance: no polls, and NodeDown for requests, for so many seconds; 0 ends that now."""
-        self.shared.suspend(self.record, seconds(for_, f"{self.label}: a suspension"))
+        """Let it rest for maintenance: no polls, and NodeDown for requests, for so many seconds; 0 ends that now.
+
+        A day at most: raises InvalidCommand for more.
+        """
+        if seconds(for_, f"{self.label}: a suspension") > LONGEST_SUSPENSION:
+            raise InvalidCommand(f"{self.label}: a suspension lasts {LONGEST_SUSPENSION:g} s at most, not {for_!r}")
+        self.shared.suspend(self.record, for_)
 
     @property
     def suspended(self) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypedDict, TypeVar, Unpack, cast
 
 from busmaster.arbiter.transaction import COMMAND, Priority
+from busmaster.bounds import MOST_RETRIES
 from busmaster.bus.limits import Limit
 from busmaster.bus.samples import Sample
 from busmaster.contract.arguments import seconds, whole_number
@@ -33,7 +34,6 @@ __all__ = [
 ]
 
 T = TypeVar("T")
-MOST_RETRIES = 100
 
 
 def checked_priority(value: Priority | int) -> Priority:

@@ -6,16 +6,18 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 
 import click
 
+from busmaster.bounds import LONGEST_FILE
 from busmaster.cli.app import OK, WRONG_USAGE
 from busmaster.cli.lines import file_argument, load
 from busmaster.cli.output import Level, columns, emit, note
 from busmaster.config import LineFile
 from busmaster.config.points_table import COLUMNS, ITEM, LIMITED_BY, NODE, ORIGIN, POINT, points_csv, rows, said_text
 from busmaster.config.points_taking import BadRows, taken, write_beside
+from busmaster.errors import InvalidCommand
+from busmaster.files import read_file
 
 
 @click.command(short_help="Show the points of a file as a table, or take them from one.")
@@ -43,7 +45,7 @@ def command(path: str, as_csv: bool, table: str | None) -> int:
         raise click.UsageError("--csv and --from exclude each other: one is out, the other in")
     if table is not None:
         # read to its end first: whoever edits it in a pipe may edit the file too
-        data = sys.stdin.buffer.read() if table == "-" else Path(table).read_bytes()
+        data = _standard_input() if table == "-" else read_file(table)
         return take(load(path), path, "standard input" if table == "-" else table, data)
     file = load(path)
     if as_csv:
@@ -51,6 +53,13 @@ def command(path: str, as_csv: bool, table: str | None) -> int:
     else:
         emit(*page(file))
     return OK
+
+
+def _standard_input() -> bytes:
+    data = sys.stdin.buffer.read(LONGEST_FILE + 1)
+    if len(data) > LONGEST_FILE:
+        raise InvalidCommand(f"standard input: a table of points has {LONGEST_FILE} bytes at most")
+    return data
 
 
 def page(file: LineFile) -> Iterator[str]:

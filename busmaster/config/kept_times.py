@@ -21,7 +21,7 @@ import anyio
 from busmaster.arbiter.learned import LearnedTimes
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
-from busmaster.files import open_file
+from busmaster.files import open_file, read_file
 
 VERSION = 1
 """Of the file's form. Another one is started anew."""
@@ -121,8 +121,7 @@ class KeptTimes:
 
     def _read(self, path: str) -> None:
         try:
-            with open(path, encoding="utf-8") as file:
-                said = json.load(file)
+            said = json.loads(read_file(path))
             if said["version"] != VERSION:
                 raise ValueError("of another version")
             for node in said["nodes"].values():

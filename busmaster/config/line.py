@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from operator import is_
 from types import TracebackType
 from typing import Any, Unpack
 
 from busmaster.arbiter.tap import Tap
+from busmaster.bounds import MOST_MEMBERS
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle, Send
 from busmaster.bus.limits import Limit
@@ -18,7 +20,7 @@ from busmaster.bus.polling import PollGroup
 from busmaster.bus.requester import NodeSource, WriteOptions
 from busmaster.config.access import access_of
 from busmaster.config.kept_times import KeptTimes
-from busmaster.config.names import expanded, listed
+from busmaster.config.names import SHOWN, expanded, listed
 from busmaster.config.point_section import PointSection, check_suits, sort_of
 from busmaster.config.points import NamedPoint, Scale
 from busmaster.config.recording import check_takes
@@ -65,7 +67,7 @@ class ConfiguredLine:
         self.groups: dict[str, PollGroup] = {}
         self._points: dict[str, NamedPoint] = {}
         self._limits = list(self._held_limits())
-        self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
+        self._wanted = self._members_of_groups()
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         self.gate = Gate(self.bus, read_only=read_only, access=access_of(file.service, self))
         self.gate.safe_state = self.safe_state
@@ -115,7 +117,7 @@ class ConfiguredLine:
         held, self._limits = self._limits, list(self._held_limits())
         for node, limit in held:
             node.lift(limit)
-        self._wanted = {group.name: tuple(self._members(group)) for group in file.groups.values()}
+        self._wanted = self._members_of_groups()
         self.safe_state = SafeState(file.safe.within, tuple(self._safe_writes()))
         self.gate.safe_state = self.safe_state
         self.gate.access = access_of(file.service, self, self.gate.access.secrets)
@@ -254,6 +256,17 @@ class ConfiguredLine:
                         )
                         yield Node.of(point), limit
 
+    def _members_of_groups(self) -> dict[str, tuple[NamedPoint, ...]]:
+        """Return the points of each group. Raises FileError where a group names more than are left for it."""
+        wanted: dict[str, tuple[NamedPoint, ...]] = {}
+        left = MOST_MEMBERS
+        for group in self.file.groups.values():
+            wanted[group.name] = members = tuple(islice(self._members(group), left + 1))
+            if len(members) > left:
+                raise group.table.error(f"the groups of a line have {MOST_MEMBERS} points at most", "points")
+            left -= len(members)
+        return wanted
+
     def _members(self, group: GroupSection) -> Iterator[NamedPoint]:
         for number, text in enumerate(group.points):
             with group.table.at("points", number):
@@ -271,6 +284,7 @@ class ConfiguredLine:
         nodes, slash, items = text.partition("/")
         if not slash:
             raise InvalidCommand(f"a point is written NODE/ITEM, not {text!r}")
+        count = 0
         for node in (name for part in listed(nodes) for name in expanded(part, self.nodes)):
             if node not in self.nodes:
                 raise InvalidCommand(f"no such node {node!r}; {meant(node, self.nodes)}")
@@ -279,6 +293,9 @@ class ConfiguredLine:
             # a1-3 may be a name, and then is no range
             known = {*section.points, *section.options.get("symbols", ()), *bits}
             for item in (name for part in listed(items) for name in expanded(part, known)):
+                count += 1
+                if count > MOST_MEMBERS:
+                    raise InvalidCommand(f"{text[:SHOWN]!r} stands for more than {MOST_MEMBERS} points")
                 yield node, item
 
     def _point(self, where: str, name: str) -> NamedPoint:

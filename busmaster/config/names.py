@@ -4,34 +4,46 @@ from __future__ import annotations
 
 import re
 from collections.abc import Container, Iterator
+from itertools import product
+from math import prod
 
+from busmaster.bounds import MOST_NAMES
+from busmaster.contract.arguments import MOST_DIGITS
 from busmaster.errors import InvalidCommand
 
 RANGE = re.compile(r"(\d+)-(\d+)")
 NODE_NAME = re.compile(r"[\w.-]+")
 POINT_NAME = re.compile(r"[^\s/,]+")
-MOST = 1000
-"""Names that one range may stand for."""
+SHOWN = 40
+"""Characters of a name that a message shows."""
 
 
 def expanded(name: str, known: Container[str] = ()) -> Iterator[str]:
     """Yield the names that `name` stands for; one that is `known` as it is stands for itself.
 
-    Raises InvalidCommand for a range that goes downwards or is too long.
+    Raises InvalidCommand for a range that goes downwards, and for more than MOST_NAMES names.
     """
-    found = None if name in known else RANGE.search(name)
-    if found is None:
-        yield name
-        return
-    first, last = int(found[1]), int(found[2])
-    if not first <= last < first + MOST:
-        raise InvalidCommand(
-            f"a range goes upwards: {last}-{first}, not {found[0]}" if last < first else f"{found[0]} are too many"
-        )
-    width = len(found[1]) if found[1].startswith("0") else 0
-    for number in range(first, last + 1):
-        for rest in expanded(name[found.end() :]):
-            yield f"{name[: found.start()]}{number:0{width}d}{rest}"
+    found = [] if name in known else list(RANGE.finditer(name))
+    ranges = [_numbers(one[1], one[2]) for one in found]
+    if prod(map(len, ranges)) > MOST_NAMES:
+        raise InvalidCommand(f"{name[:SHOWN]!r} stands for more than {MOST_NAMES} names: use shorter ranges")
+    ends = [0, *(one.end() for one in found)]
+    before = [name[end : one.start()] for end, one in zip(ends, found, strict=False)]
+    for numbers in product(*ranges):
+        yield "".join(map("".join, zip(before, numbers, strict=True))) + name[ends[-1] :]
+
+
+def _numbers(first: str, last: str) -> list[str]:
+    """Return the numbers of a range as texts. Raises InvalidCommand."""
+    if max(len(first), len(last)) > MOST_DIGITS:
+        raise InvalidCommand(f"a number in a range has {MOST_DIGITS} digits at most")
+    lowest, highest = int(first), int(last)
+    if highest < lowest:
+        raise InvalidCommand(f"a range goes upwards: {highest}-{lowest}, not {first}-{last}")
+    if highest - lowest >= MOST_NAMES:
+        raise InvalidCommand(f"{first}-{last} are too many: a name stands for {MOST_NAMES} at most")
+    width = len(first) if first.startswith("0") else 0
+    return [f"{number:0{width}d}" for number in range(lowest, highest + 1)]
 
 
 def listed(text: str) -> list[str]:

@@ -9,6 +9,7 @@ from busmaster.config.names import expanded
 from busmaster.config.table import Table
 from busmaster.emulator.device import Delay
 from busmaster.errors import InvalidCommand
+from busmaster.files import read_file
 from busmaster.registry import NodeKind, Option, kinds
 
 HIGHEST_ADDRESS = 0xFFFF_FFFF
@@ -63,7 +64,7 @@ def _addresses(table: Table, option: Option) -> Mapping[str, int]:
     path = table.source.beside(table.text(option.name))
     with table.at(option.name):
         try:
-            text = path.read_text(encoding="latin-1")  # from a computer of then: any byte is some character
+            text = read_file(path).decode("latin-1")  # from a computer of then: any byte is some character
         except OSError as error:
             raise InvalidCommand(f"{path} cannot be read: {error.strerror or error}") from None
         try:

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import partial
 from typing import TypeAlias
 
+from busmaster.bounds import LONGEST_TOPIC
 from busmaster.config.table import Readers, Table
 from busmaster.contract.arguments import meant
 from busmaster.outputs.settings import (
@@ -16,8 +17,6 @@ from busmaster.outputs.settings import (
     SqliteSettings,
 )
 
-LONGEST_TOPIC = 65535 // 3
-"""Bytes: the most that a topic has, were each of them written as three."""
 Outputs: TypeAlias = dict[str, Settings]
 """Those that are enabled, by their kind."""
 

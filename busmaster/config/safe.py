@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import anyio
 
+from busmaster.bounds import LONGEST_SAFE_STATE
 from busmaster.bus.bus import Bus
 from busmaster.bus.handle import Handle, Send
 from busmaster.bus.node import Node
@@ -30,7 +31,6 @@ from busmaster.gate.permission import Permission
 from busmaster.gate.record import Outcome
 
 WITHIN = 2.0
-LONGEST = 60.0
 LOOK_AGAIN = 0.05
 """Seconds from a failure to the next try at the same node."""
 KEYS = (
@@ -47,7 +47,7 @@ KEYS = (
         f"{WITHIN:g}",
         "s",
         least=0,
-        most=LONGEST,
+        most=LONGEST_SAFE_STATE,
     ),
     Key(
         "repeatable",
@@ -73,8 +73,8 @@ def read_safe(table: Table) -> SafeSection:
     """Read `[safe]`. Raises FileError, naming line and key, for what is wrong in it."""
     table.only(*names_of(KEYS))
     within = table.number("within", WITHIN)
-    if not 0 < within <= LONGEST:
-        raise table.error(f"must be more than 0 and at most {LONGEST:g} seconds, not {within}", "within")
+    if not 0 < within <= LONGEST_SAFE_STATE:
+        raise table.error(f"must be more than 0 and at most {LONGEST_SAFE_STATE:g} seconds, not {within}", "within")
     values = table.table("writes")
     writes = {name: _one(values, name) for name in values.data}
     if table.data and not writes:
@@ -133,7 +133,7 @@ class SafeWrite:
             )
             return send
 
-        prepare(LONGEST)  # what would be refused at the end is refused when the file is read
+        prepare(LONGEST_SAFE_STATE)  # what would be refused at the end is refused when the file is read
         return cls(point, value, node, command, prepare)
 
 

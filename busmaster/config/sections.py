@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from busmaster.arbiter.transaction import Poll, Priority
+from busmaster.bounds import LONGEST_PERIOD, LONGEST_TIMING, LONGEST_TITLE, MOST_RETRIES, SHORTEST_PERIOD
 from busmaster.bus.suitability import check_company
 from busmaster.config.emulator import EmulatorSection, read_emulator
 from busmaster.config.keys import REQUIRED, Key, names_of
@@ -33,7 +34,6 @@ from busmaster.transport.serial_port import SerialPort
 from busmaster.transport.tcp import TcpPort
 
 PRIORITIES = {"poll": Priority.POLL, "background": Priority.BACKGROUND}
-MOST_RETRIES = 100
 KEYS = (
     Key("title", "text", "What the line is called: in lists, views and pages. The file's name by default."),
     Key(
@@ -73,7 +73,14 @@ SHARED_KEYS = (
         least=0,
         most=MOST_RETRIES,
     ),
-    Key("reply_time", "seconds", "From a request to its reply, where it is known, for `plan`.", unit="s", least=0),
+    Key(
+        "reply_time",
+        "seconds",
+        "From a request to its reply, where it is known, for `plan`.",
+        unit="s",
+        least=0,
+        most=LONGEST_TIMING,
+    ),
     Key("probe", "text", "The item that is read to find out whether a node replies. The protocol's by default."),
     Key(
         "sync_reads",
@@ -92,7 +99,7 @@ NODE_KEYS = (
 )
 """What every node's table may say; its kind's options come to it."""
 GROUP_KEYS = (
-    Key("period", "seconds", "From one cycle to the next.", REQUIRED, "s", least=0.001),
+    Key("period", "seconds", "From one cycle to the next.", REQUIRED, "s", least=SHORTEST_PERIOD, most=LONGEST_PERIOD),
     Key("points", "texts", 'What is read: `"drive4-7/speed_measured,current"` is eight points.', REQUIRED),
     Key(
         "phase",
@@ -100,6 +107,7 @@ GROUP_KEYS = (
         "When in its period, and before its end, it begins. By itself it keeps out of the others' way.",
         unit="s",
         least=0,
+        most=LONGEST_PERIOD,
     ),
     Key("priority", "text", "`background`: only in what time the others leave.", '"poll"', choices=tuple(PRIORITIES)),
 )
@@ -178,7 +186,7 @@ def read(source: Source) -> LineFile:
     groups = {table.name: _group(table) for table in top.tables("groups")}
     file = LineFile(
         path=source.name,
-        title=top.text("title", os.path.basename(source.name)),
+        title=_title(top),
         strict=top.flag("strict", False),
         learned=_learned(top, nodes.values()),
         port=read_port(top, [node.profile for node in nodes.values()]),
@@ -193,6 +201,13 @@ def read(source: Source) -> LineFile:
     if not nodes:
         raise top.error("there are no nodes: describe each in a table of its own, [nodes.NAME]")
     return file
+
+
+def _title(top: Table) -> str:
+    title = top.text("title", os.path.basename(top.source.name))
+    if len(title) > LONGEST_TITLE:
+        raise top.error(f"a title has {LONGEST_TITLE} characters at most, not {len(title)}", "title")
+    return title
 
 
 def _learned(top: Table, nodes: Iterable[NodeSection]) -> str | None:
@@ -261,7 +276,9 @@ def _several(table: Table, defaults: Mapping[str, Table], learned: bool) -> Iter
             profile.check_learnable()
     timings = Learned(document) if is_learned else None if document == profile.timings else document
     retries = table.whole("retries", default.whole("retries", None, most=MOST_RETRIES), most=MOST_RETRIES)
-    reply_time = table.seconds("reply_time", default.seconds("reply_time", None))
+    reply_time = table.seconds(
+        "reply_time", default.seconds("reply_time", None, most=LONGEST_TIMING), most=LONGEST_TIMING
+    )
     probe = table.text("probe", default.text("probe", None))
     sync_reads = (table if "sync_reads" in table else default).texts("sync_reads", ())
     if len(sync_reads) == 1:
@@ -315,7 +332,8 @@ def _no_address(text: str) -> int:
 
 def _group(table: Table) -> GroupSection:
     table.only(*names_of(GROUP_KEYS))
-    period, phase = table.seconds("period"), table.seconds("phase", None)
+    period = table.seconds("period", most=LONGEST_PERIOD)
+    phase = table.seconds("phase", None, most=LONGEST_PERIOD)
     with table.at("period"):
         Poll(table.name, period)  # made for its complaints alone, which have the line here
     with table.at("phase"):

@@ -5,23 +5,22 @@ from __future__ import annotations
 import grp
 import os
 import pwd
-import stat
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE
+from busmaster.bounds import LONGEST_FILE, SHORTEST_TOKEN
 from busmaster.config.keys import REQUIRED, Key, names_of
 from busmaster.config.names import NODE_NAME
 from busmaster.config.recording import read_mode
 from busmaster.config.table import Table
 from busmaster.contract.arguments import host_and_port
 from busmaster.errors import InvalidCommand
+from busmaster.files import check_regular
 from busmaster.gate.permission import digest_of
 from busmaster.service.tcp import check_listening
 
 MODE = 0o600
-SHORTEST = 16
-"""Characters of a token: what is shorter may be guessed."""
 ROLES = ("read", "write")
 KEYS = (
     Key("enabled", "flag", "Whether other programs may come at all.", "true"),
@@ -195,9 +194,9 @@ def _tokens(path: str) -> Iterator[tuple[str, bytes]]:
         name = words[0]
         if len(words) != 2 or not NODE_NAME.fullmatch(name):
             raise InvalidCommand(f"{path}:{number}: a line is a name and its token")
-        if len(words[1]) < SHORTEST:
+        if len(words[1]) < SHORTEST_TOKEN:
             raise InvalidCommand(
-                f"{path}:{number}: the token of {name} has less than {SHORTEST} characters: "
+                f"{path}:{number}: the token of {name} has less than {SHORTEST_TOKEN} characters: "
                 "make one with openssl rand -hex 32"
             )
         if name in known:
@@ -209,19 +208,20 @@ def _tokens(path: str) -> Iterator[tuple[str, bytes]]:
 def _private_text(path: str) -> str:
     """Return what is in a file. Raises InvalidCommand where others may read it, or write it."""
     try:
-        with open(path, encoding="utf-8", opener=_no_device) as file:
+        with open(path, "rb", opener=_without_waiting) as file:
             found = os.fstat(file.fileno())
-            if not stat.S_ISREG(found.st_mode):
-                raise InvalidCommand(f"{path} is no file")
+            check_regular(found, path)
             # A group may read it: so may that of a credential that systemd hands over.
             if found.st_mode & 0o027 or found.st_uid not in (0, os.getuid()):
                 raise InvalidCommand(f"others may read {path}, or change it: chmod 600 {path}, as its only user")
-            return file.read()
+            if found.st_size > LONGEST_FILE:
+                raise InvalidCommand(f"{path} has more than {LONGEST_FILE} bytes: it is no list of tokens")
+            return file.read(LONGEST_FILE).decode()
     except OSError as error:
         raise InvalidCommand(f"{path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise InvalidCommand(f"{path} is no text") from None
 
 
-def _no_device(path: str, flags: int) -> int:
+def _without_waiting(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC)

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from busmaster.bounds import LONGEST_TEXT, LONGEST_WORD, MOST_NESTED
 from busmaster.errors import InvalidCommand
+from busmaster.files import read_file
 
 Key: TypeAlias = tuple[str | int, ...]
 """The way to a value: names of tables and keys, numbers of array elements."""
@@ -43,6 +45,7 @@ class Source:
         """Read a TOML text. Raises FileError, with the line, for what is no TOML."""
         self.name = name
         self.text = text
+        check_bounds(name, text)
         try:
             self.data: dict[str, Any] = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
@@ -57,7 +60,7 @@ class Source:
         """Read a file. Raises OSError where it cannot be read, and FileError for what is no TOML."""
         name = os.fspath(path)
         try:
-            return cls(name, Path(path).read_bytes().decode())
+            return cls(name, read_file(path).decode())
         except UnicodeDecodeError as error:
             line = error.object[: error.start].count(b"\n") + 1
             raise FileError(f"{name}:{line}: this is no TOML: it is not written in UTF-8") from None
@@ -76,6 +79,29 @@ class Source:
         """Return an error of what is wrong at `key`, with its place: "line.toml:12: nodes.winder.address: ..."."""
         shown = "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in key).lstrip(".")
         return FileError(f"{self.name}:{self.line(key)}: {shown}: {text}" if key else f"{self.name}: {text}")
+
+
+def check_bounds(name: str, text: str) -> None:
+    """Raise FileError, with the line, for texts and numbers that are too long, and for brackets or names that are
+    nested too deeply.
+
+    This is done before the standard library's reader sees the text: that one calls itself for each bracket, copies a
+    dotted key once for each of its names, and refuses a long number with an error that names no line.
+    """
+    line, brackets, names = 1, 0, 1
+    for match in TOKEN.finditer(text):
+        kind, token = match.lastgroup, match[0]
+        if kind == "string" and len(token) > LONGEST_TEXT:
+            raise FileError(f"{name}:{line}: a text has {LONGEST_TEXT} characters at most, not {len(token)}")
+        if kind == "bare" and len(token) > LONGEST_WORD:
+            raise FileError(f"{name}:{line}: a number or a key has {LONGEST_WORD} characters at most, not {len(token)}")
+        if kind == "mark":
+            brackets += {"[": 1, "{": 1, "]": -1, "}": -1}.get(token, 0)
+        if kind in ("mark", "newline"):
+            names = names + 1 if token == "." else 1
+        if max(brackets, names) > MOST_NESTED:
+            raise FileError(f"{name}:{line}: this is nested more than {MOST_NESTED} levels deep: no key needs that")
+        line += token.count("\n")
 
 
 def places(text: str) -> dict[Key, int]:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
 
+from busmaster.bounds import LARGEST_WHOLE
 from busmaster.config.source import FileError, Key, Source
 from busmaster.contract.arguments import meant
 from busmaster.errors import InvalidCommand
@@ -22,7 +23,6 @@ class _Required:
 
 
 REQUIRED: Final = _Required()
-MILLION = 1_000_000
 
 
 class Table:
@@ -72,7 +72,9 @@ class Table:
         value: bool = self._take(key, bool, default, "true or false")
         return value
 
-    def whole(self, key: str, default: T | _Required = REQUIRED, *, least: int = 0, most: int = MILLION) -> int | T:
+    def whole(
+        self, key: str, default: T | _Required = REQUIRED, *, least: int = 0, most: int = LARGEST_WHOLE
+    ) -> int | T:
         """Read a whole number, `least` to `most`."""
         value: int | T = self._take(key, int, default, "a whole number")
         if key in self.data and isinstance(value, int) and not least <= value <= most:
@@ -86,11 +88,11 @@ class Table:
             raise self.error(f"must be finite, not {value}", key)
         return value
 
-    def seconds(self, key: str, default: T | _Required = REQUIRED) -> float | T:
-        """Read a number of seconds, 0 or more."""
+    def seconds(self, key: str, default: T | _Required = REQUIRED, *, most: float) -> float | T:
+        """Read a number of seconds, 0 to `most`."""
         value: float | T = self._take(key, (int, float), default, "a number of seconds")
-        if isinstance(value, int | float) and not 0 <= value < math.inf:
-            raise self.error(f"must be a number of seconds, 0 or more, not {value}", key)
+        if isinstance(value, int | float) and not 0 <= value <= most:
+            raise self.error(f"must be a number of seconds, 0 to {most:g}, not {value}", key)
         return value
 
     def positive(self, key: str) -> float:
@@ -127,7 +129,7 @@ class Table:
                 raise self.error(f"must be a text in quotes, not {value!r}", key, number)
         return tuple(values)
 
-    def wholes(self, key: str, *, most: int = MILLION) -> tuple[int, ...]:
+    def wholes(self, key: str, *, most: int = LARGEST_WHOLE) -> tuple[int, ...]:
         """Read a list of whole numbers, 0 to `most`."""
         values = self._take(key, list, REQUIRED, "a list of whole numbers")
         for number, value in enumerate(values):

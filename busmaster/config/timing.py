@@ -7,19 +7,19 @@ timing = "learned"                                 # from the replies; { learned
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
+from busmaster.bounds import LONGEST_TIMING
 from busmaster.config.keys import Key, names_of
 from busmaster.config.table import Table
 from busmaster.contract.timing import ReplyTiming, Timings
 
-LONGEST = 10.0
-"""Seconds: whoever writes more means milliseconds."""
 LEARNED_WORD = "learned"
 
 
 def _time(name: str, about: str) -> Key:
-    return Key(name, "seconds", f"{about} The protocol's by default.", unit="s", least=0, most=LONGEST)
+    return Key(name, "seconds", f"{about} The protocol's by default.", unit="s", least=0, most=LONGEST_TIMING)
 
 
 TIME_KEYS = (
@@ -75,10 +75,12 @@ def reads_learned(table: Table, base: bool) -> bool:
 def _changed(table: Table, timing: ReplyTiming, leg: bool = False) -> ReplyTiming:
     if leg:
         table.only(*TIMES)
-    given = {name: table.seconds(name) for name in TIMES if name in table}
+    given = {name: table.seconds(name, most=math.inf) for name in TIMES if name in table}
     for name, time in given.items():
-        if time > LONGEST:
-            raise table.error(f"times are in seconds, {LONGEST:g} at most: for {time:g} ms write {time / 1000:g}", name)
+        if time > LONGEST_TIMING:
+            raise table.error(
+                f"times are in seconds, {LONGEST_TIMING:g} at most: for {time:g} ms write {time / 1000:g}", name
+            )
     window = given.get("window", timing.window)
     moved = {"nominal": min(timing.nominal, window), "lateness": max(timing.lateness, window)}
     with table.at():

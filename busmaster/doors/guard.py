@@ -20,6 +20,9 @@ HEADERS = (
 """Of every answer: nothing from elsewhere runs in the page, and no other page holds it in a frame."""
 
 
+BOTH_LENGTHS = "a request has a Content-Length or a Transfer-Encoding, not both"
+
+
 class Guard:
     """What is let through at an address: by Host and Origin, and by tokens where there are some.
 
@@ -46,6 +49,9 @@ class Guard:
         A page whose name leads here only by its own doing, or that is another site's, says so in Host or Origin. A
         program that is no browser says no Origin.
         """
+        if "transfer-encoding" in headers and "content-length" in headers:
+            # Two servers in a row may not agree where such a request ends (RFC 9112, 6.3): no client of ours sends it.
+            return BOTH_LENGTHS
         host = headers.get("host", "")
         if not self._is_our_name(host):
             return f"no such host: {host[:60]!r}"
@@ -90,10 +96,11 @@ class Guarded:
             await send(message)
 
         refusal = self._guard.refusal(_headers(scope))
+        closing = {"connection": "close"} if refusal == BOTH_LENGTHS else {}
         if refusal and scope["type"] == "websocket":
             await send({"type": "websocket.close"})  # before it was accepted: it is refused with 403
         elif refusal:
-            await PlainTextResponse(f"{refusal}\n", 403)(scope, receive, send_with_headers)
+            await PlainTextResponse(f"{refusal}\n", 400 if closing else 403, closing)(scope, receive, send_with_headers)
         else:
             await self._application(scope, receive, send_with_headers)
 

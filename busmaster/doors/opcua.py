@@ -17,6 +17,7 @@ from asyncua.crypto.permission_rules import User
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
+from busmaster.bounds import MOST_SHOWN_POINTS
 from busmaster.bus.snapshots import Snapshot
 from busmaster.doors.following import Following
 from busmaster.doors.opcua_access import Rules, guard
@@ -24,6 +25,7 @@ from busmaster.doors.opcua_health import Health
 from busmaster.doors.opcua_space import Space, Variable
 from busmaster.doors.opcua_terms import CODES, DOUBTFUL, GOOD, range_of, status_of_sample, status_of_write, type_of
 from busmaster.errors import BusError, InvalidCommand, LineDown
+from busmaster.files import read_file
 from busmaster.gate.record import cut
 from busmaster.service.picture import Row
 from busmaster.service.remote import RemoteBus
@@ -39,8 +41,6 @@ ASK_AGAIN = 5.0
 AT_ONCE = 50
 """Values that are put before clients have their turn."""
 URI = "urn:busmaster:opcua"
-MOST_POINTS = 20_000
-"""Points that are shown, with those that the line no longer has: clients may have subscribed to them."""
 NOT_WRITABLE: int = CODES.BadNotWritable
 NO_SUCH_WRITE: int = CODES.BadWriteNotSupported
 ACCESS_DENIED: int = CODES.BadUserAccessDenied
@@ -171,7 +171,7 @@ class LineServer:
         details = await self._line.details(row.group, row.key)
         shown = self._points.get(identity)
         if shown is None:
-            if len(self._points) >= MOST_POINTS:
+            if len(self._points) >= MOST_SHOWN_POINTS:
                 return
             key = self._key_of(row, identity)
             node = await self._health.node(row.protocol, row.address, row.node)
@@ -383,7 +383,7 @@ def read_trusted(folder: str) -> frozenset[bytes]:
     """
     found = set()
     for path in sorted(Path(folder).iterdir()):
-        text = path.read_bytes()
+        text = read_file(path)
         try:
             load = x509.load_pem_x509_certificate if b"-----BEGIN" in text else x509.load_der_x509_certificate
             found.add(load(text).public_bytes(Encoding.DER))

@@ -12,6 +12,7 @@ from asyncua.common.utils import ServiceError
 from asyncua.crypto.permission_rules import SimpleRoleRuleset, User, UserRole
 from asyncua.server.address_space import AddressSpace, AttributeService
 
+from busmaster.bounds import MOST_CONNECTIONS, MOST_SUBSCRIPTIONS
 from busmaster.doors.opcua_terms import CODES
 from busmaster.gate.permission import Access
 
@@ -26,9 +27,6 @@ ENCRYPTED = [
     ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
     ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
 ]
-
-MOST_CONNECTIONS = 100
-MOST_SUBSCRIPTIONS = 500
 
 
 @dataclass(frozen=True, kw_only=True)

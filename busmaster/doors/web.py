@@ -19,6 +19,7 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from busmaster.bounds import LONGEST_COMMAND, LONGEST_PAGE_MESSAGE, MOST_PAGES
 from busmaster.doors.audience import Audience, Seat
 from busmaster.doors.following import Following, Lost
 from busmaster.doors.guard import Guard, Guarded
@@ -38,10 +39,6 @@ from busmaster.service.picture import Row
 from busmaster.service.tcp import HostPort, listening
 
 PAGE = Path(__file__).parent / "page"
-LONGEST_BODY = 4096
-"""Bytes of a request's body: it holds one value."""
-LONGEST_MESSAGE = 1024
-MOST_PAGES = 64
 CLOSE_WITHIN = 1
 """Seconds in which pages are let go at the end."""
 STATUS: tuple[tuple[type[Exception], int], ...] = (
@@ -213,8 +210,8 @@ async def _value(request: Request) -> float | str:
     body = b""
     async for part in request.stream():
         body += part
-        if len(body) > LONGEST_BODY:
-            raise HTTPException(413, f"the body has {LONGEST_BODY} bytes at most")
+        if len(body) > LONGEST_COMMAND:
+            raise HTTPException(413, f"the body has {LONGEST_COMMAND} bytes at most")
     try:
         said = json.loads(body)
     except (ValueError, RecursionError):
@@ -262,7 +259,7 @@ async def serving(application: Any, listen: HostPort) -> AsyncIterator[str]:
             server_header=False,
             timeout_graceful_shutdown=CLOSE_WITHIN,
             ws="websockets-sansio",
-            ws_max_size=LONGEST_MESSAGE,
+            ws_max_size=LONGEST_PAGE_MESSAGE,
             ws_per_message_deflate=False,  # it takes as long as all else that is done for a page
         )
         server = _Server(config)

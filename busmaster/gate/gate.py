@@ -11,6 +11,7 @@ from math import inf
 from types import TracebackType
 from typing import Any, Protocol, TypeAlias
 
+from busmaster.bounds import MOST_AT_ONCE
 from busmaster.bus.bus import Bus
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
@@ -30,8 +31,6 @@ from busmaster.gate.record import Outcome, WriteRecord, cut, this_user
 
 FRESH = 1.0
 """Seconds for which a command may wait that does not say until when it is meant."""
-MOST_AT_ONCE = 16
-"""Commands of one door that may be on their way to their nodes."""
 LARGEST_KEPT = 1e100
 """Of what is kept as a number; beyond it nobody means one, and its text is kept."""
 NEVER_SENT = (ArithmeticError, TypeError, ValueError, RecursionError)

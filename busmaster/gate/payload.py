@@ -5,13 +5,9 @@ from __future__ import annotations
 import json
 from typing import Any, NamedTuple, TypeGuard
 
+from busmaster.bounds import LARGEST_VALUE, LONGEST_COMMAND, LONGEST_ID
 from busmaster.errors import InvalidCommand
 
-LONGEST = 4096
-"""Bytes of a command."""
-LONGEST_ID = 100
-LARGEST = 1e15
-"""Beyond it no quantity is meant, and no protocol has a way to send it."""
 LATEST = 1e11
 """Seconds since 1970: what is said to be later, some thousand years from now, is in milliseconds."""
 
@@ -35,8 +31,8 @@ class NoCommand(InvalidCommand):
 def read_payload(payload: object) -> Payload:
     """Read `12.5`, `[1, 2]`, or `{"value": 12.5, "id": "a1", "expires": 1767225600}`. Raises NoCommand."""
     raw = payload if isinstance(payload, bytes | bytearray) else str(payload).encode()
-    if len(raw) > LONGEST:
-        raise NoCommand(f"{len(raw)} bytes are no command: it has {LONGEST} at most", "")
+    if len(raw) > LONGEST_COMMAND:
+        raise NoCommand(f"{len(raw)} bytes are no command: it has {LONGEST_COMMAND} at most", "")
     text = bytes(raw).decode(errors="replace")
     try:
         said = json.loads(text, parse_constant=lambda name: name)
@@ -71,8 +67,8 @@ def _numbers(value: Any, text: str) -> Any:
     numbers = value if isinstance(value, list) else [value]
     if not numbers or not all(map(_is_number, numbers)):
         raise InvalidCommand(f"{text[:40]!r} is neither a number nor a list of numbers")
-    if any(abs(number) > LARGEST for number in numbers):
-        raise InvalidCommand(f"{text[:40]!r} is beyond {LARGEST:g}: nobody means that much")
+    if any(abs(number) > LARGEST_VALUE for number in numbers):
+        raise InvalidCommand(f"{text[:40]!r} is beyond {LARGEST_VALUE:g}: nobody means that much")
     return value
 
 

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import anyio
 
+from busmaster.bounds import LONGEST_COMMAND, LONGEST_NAME, LONGEST_SENDER, MOST_AT_ONCE, MOST_COMMANDS
 from busmaster.bus.points import Point
 from busmaster.errors import InvalidCommand
-from busmaster.gate.gate import MOST_AT_ONCE, Gate, Wish
-from busmaster.gate.payload import LONGEST, NoCommand, read_payload
+from busmaster.gate.gate import Gate, Wish
+from busmaster.gate.payload import NoCommand, read_payload
 from busmaster.gate.record import WriteRecord
 
 if TYPE_CHECKING:
@@ -26,21 +27,16 @@ LOOK = 0.02
 """Seconds between two looks at the clock, and at what has come and is not read yet."""
 LEAST = 5
 """Bytes of a message beside its topic and its payload, at least."""
-MOST_WAITING = 100
-"""Commands that may wait for their turn, and refusals that may wait to be answered. What is more is counted alone."""
 BREATH = 0.005
 """Seconds between two refusals that are answered: a flood of them costs the line nothing."""
 TOLD_EVERY = 10.0
 """Seconds, at least, between two lines that tell how many refusals were counted alone."""
-LONGEST_NAME = 256
-"""Characters of a point's name; a longer one is answered without it."""
 EXPIRY = "MessageExpiryInterval"
 PROPERTIES = "UserProperty"
 SENDER = "by"
 """The user property in which a sender may say who it is: no broker tells a subscriber, and nobody checks it."""
 BEGINNING = 100
 """Bytes of a command that are kept where it is too long to be read."""
-LONGEST_SENDER = 100
 
 
 class Answer(NamedTuple):
@@ -110,7 +106,7 @@ class Commands:
             return
         name = topic.removeprefix(self._asked)
         point = self._points.get(name)
-        if point is None and len(self._answers) >= MOST_WAITING:
+        if point is None and len(self._answers) >= MOST_COMMANDS:
             self._count_alone()  # before anything is made of it: what is in a flood is to cost nothing
             return
         shown = name if len(name) <= LONGEST_NAME else ""
@@ -128,8 +124,8 @@ class Commands:
                 raise InvalidCommand(self._gate.refusal(wish))
             if message.retain:
                 raise InvalidCommand("a retained command is not obeyed: nobody knows how old it is")
-            if len(self.queued) >= MOST_WAITING:
-                raise InvalidCommand(f"{MOST_WAITING} commands are waiting already")
+            if len(self.queued) >= MOST_COMMANDS:
+                raise InvalidCommand(f"{MOST_COMMANDS} commands are waiting already")
         except NoCommand as error:
             self._refuse(replace(wish, id=error.id), shown, str(error))
         except InvalidCommand as error:
@@ -147,7 +143,7 @@ class Commands:
         return replace(wish, value=said.value, expires=min(ends, default=None), id=said.id)
 
     def _refuse(self, wish: Wish, name: str, error: str) -> None:
-        if len(self._answers) < MOST_WAITING:
+        if len(self._answers) < MOST_COMMANDS:
             self.refused += 1
             self._answers.append((wish, Answer(name, False, error, wish.id)))
         else:
@@ -249,7 +245,7 @@ class Commands:
 
 def _as_it_came(payload: bytes | bytearray) -> str:
     """Return a command as it is kept until it is read; of one that is too long to be read its beginning."""
-    if len(payload) <= LONGEST:
+    if len(payload) <= LONGEST_COMMAND:
         return bytes(payload).decode(errors="replace")
     return f"{bytes(payload[:BEGINNING]).decode(errors='replace')}... ({len(payload)} bytes)"
 

@@ -16,16 +16,13 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from busmaster.bounds import LONGEST_SCRAPE, MOST_ASKING, MOST_SILENT
+
 if TYPE_CHECKING:
     from prometheus_client.core import CollectorRegistry
 
-MOST_SILENT = 256
-"""Connections that have not asked yet; the oldest makes room for the next."""
-MOST_ASKING = 400
-"""Those that are being answered; more are told to come later."""
 PATIENCE = 5.0
 """Seconds for a whole request, and for a whole answer to be taken."""
-LONGEST_REQUEST = 8_192
 BACKLOG = 128
 TICK = 0.05
 BUSY = "503 Service Unavailable"
@@ -52,7 +49,7 @@ async def serve(listener: socket.socket, make: Callable[[str], Page], stop: thre
     """Answer scrapes until `stop` is set."""
     with ThreadPoolExecutor(1, "busmaster scrape") as maker:
         server = _Server(make, maker)
-        serving = await asyncio.start_server(server.answer, sock=listener, limit=LONGEST_REQUEST)
+        serving = await asyncio.start_server(server.answer, sock=listener, limit=LONGEST_SCRAPE)
         while not stop.is_set():  # noqa: ASYNC110  # another thread sets it
             await asyncio.sleep(TICK)
         serving.close()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Annotated, Literal
 
+from busmaster.bounds import MOST_BUFFERED, MOST_SPILLED
 from busmaster.contract.arguments import Between
 from busmaster.errors import InvalidCommand
 from busmaster.files import MODE
@@ -16,8 +17,6 @@ BUFFER = 50_000
 DATE_FIELD = re.compile("%(-?.?)", re.DOTALL)
 DATE_FIELDS = frozenset("YCyGgmbBhdejaAuwUWVHIklMSspPFTRrXzZ")
 """What may stand behind a % in the path of a file, or behind %-: what makes slashes or ends of lines is none of it."""
-MOST_BUFFERED = 1_000_000
-MOST_SPILLED = 100_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

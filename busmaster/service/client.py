@@ -8,6 +8,7 @@ from typing import Any
 from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.health import NodeRecord
 from busmaster.arbiter.transaction import Priority
+from busmaster.bounds import MOST_CHECKED, MOST_HOLDS, MOST_NODES, MOST_POLLED, MOST_POLLED_POINTS, MOST_STREAMS
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
 from busmaster.bus.polling import PollGroup
@@ -18,19 +19,7 @@ from busmaster.gate.permission import Permission
 from busmaster.service.errands import Errand, Writing, errand_of
 from busmaster.service.failures import REFUSED, refusal_of, said_error
 from busmaster.service.line import ServedLine
-from busmaster.service.messages import (
-    MOST_CHECKED,
-    MOST_HOLDS,
-    MOST_NODES,
-    MOST_POINTS,
-    MOST_POLLED,
-    MOST_STREAMS,
-    NO_METHOD,
-    Malformed,
-    answered,
-    timings_of,
-    written,
-)
+from busmaster.service.messages import NO_METHOD, Malformed, answered, timings_of, written
 from busmaster.service.outbox import Outbox
 from busmaster.service.overview import said_details
 from busmaster.service.peers import Peer
@@ -340,8 +329,8 @@ class Client:
         if stream not in self._gathered and len(self._gathered) >= MOST_POLLED:
             raise InvalidCommand(f"one program has {MOST_POLLED} poll groups at most")
         known = self._gathered.get(stream, [])
-        if not isinstance(points, list) or len(known) + len(points) > MOST_POINTS:
-            raise InvalidCommand(f"a poll group of a program has {MOST_POINTS} points at most")
+        if not isinstance(points, list) or len(known) + len(points) > MOST_POLLED_POINTS:
+            raise InvalidCommand(f"a poll group of a program has {MOST_POLLED_POINTS} points at most")
         read = [point_of(point, self.node) for point in points]
         if any(point.command.writes for point in read):
             raise InvalidCommand("a poll group reads: it writes nothing")

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
+from busmaster.bounds import SEND_WITHIN
 from busmaster.errors import InvalidCommand
 from busmaster.service.frames import NO_MASK, look_at, new_key, text_frame
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
 PING_EVERY = 20.0
 """Seconds between two pings. One that says nothing at all between two of them is let go."""
-SEND_WITHIN = 20.0
-"""Seconds in which the other end has to take a message: one that stands still is let go."""
 CLOSE_WITHIN = 1.0
 """Seconds that the other end has to hear the last of it."""
 NORMAL, GOING_AWAY, NO_TEXT, POLICY = 1000, 1001, 1007, 1008

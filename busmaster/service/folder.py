@@ -18,7 +18,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 
+from busmaster.bounds import LONGEST_LINE_RECORD
 from busmaster.errors import InvalidCommand, LineDown
+from busmaster.files import read_file
 
 SYSTEM = Path("/run/busmaster")
 """Where the lines are that systemd runs."""
@@ -226,9 +228,13 @@ class ServedSocket:
 
 def _read(path: Path) -> Owner | None:
     try:
-        said = json.loads(path.read_text())
-        return Owner(**said)
-    except (OSError, ValueError, TypeError):
+        said = json.loads(read_file(path, LONGEST_LINE_RECORD))
+        owner = Owner(**said)
+        # Another program of this user may have made the file: what is not as we write it is not a line's.
+        texts = [said[name] for name in ("name", "port", "socket")]
+        fits = all(isinstance(text, str) and "\0" not in text for text in texts) and type(said["pid"]) is int
+        return owner if fits else None
+    except (OSError, ValueError, TypeError, RecursionError):
         return None
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from typing import Any
 
+from busmaster.bounds import LONGEST_ANSWER
 from busmaster.contract.arguments import host_and_port
 from busmaster.contract.exchange import Command
 from busmaster.errors import (
@@ -23,7 +24,7 @@ from busmaster.errors import (
 from busmaster.service.connection import AskingConnection
 from busmaster.service.failures import error_of
 from busmaster.service.folder import socket_path
-from busmaster.service.messages import LONGEST_ANSWER, VERSIONS, numbered, read, words, written
+from busmaster.service.messages import VERSIONS, numbered, read, words, written
 
 GRACE = 0.25
 """Seconds beyond `finish_within` in which the line's owner, who knows more, may say what became of a request."""

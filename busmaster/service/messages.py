@@ -8,47 +8,14 @@ from collections.abc import Set as AbstractSet
 from math import inf, isnan
 from typing import Any
 
+from busmaster.bounds import LONGEST_REPLY, MOST_PARTS
 from busmaster.contract.learning import Learned
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
 
 VERSIONS = (2,)
 """Of what is said. The first message of a client says which ones it knows, and the highest that both know holds."""
-LONGEST_REQUEST = 1 << 16
-"""Bytes of one message of a client: what it takes to understand one holds up the line."""
-MOST_PARTS = 1 << 13
-"""Values in one message of a client: of as many bytes, those of many small ones take longest to understand."""
-LONGEST_ANSWER = 1 << 20
-"""Bytes of one message to a client."""
-MOST_CLIENTS = 64
-MOST_STRANGERS = 64
-"""Connections of which no first message has come: one more costs the oldest of them."""
-MOST_REQUESTS = 256
-"""Requests of one client that have not been answered."""
-MOST_URGENT = 16
-"""Urgent ones that are taken beyond those."""
-MOST_UNDER_WAY = MOST_REQUESTS // 2
-"""Requests of one client, none of them urgent, that it has said and that are not answered: the others wait there. As
-many again may have been given up by it, and be known to the owner still."""
-MOST_HOLDS = 32
-"""Sequences of one client that are not over."""
-MOST_UNREAD = 256
-"""Messages of streams that one client has not read: beyond it the oldest is dropped, and counted."""
-MOST_WAITING = MOST_UNREAD + 2 * MOST_REQUESTS
-"""Messages for one client that are not sent yet, beyond which nothing more is taken from it."""
-MOST_CHECKED = 64
-"""Writes of one question whether the line would take them."""
-MOST_NODES = 1024
-MOST_STREAMS = 256
-"""Streams of one client: a door follows all groups of a line, each by its own."""
-MOST_POLLED = 32
-"""Poll groups of one client."""
-MOST_POINTS = 1000
-HELLO_WITHIN = 10.0
-"""Seconds in which a client's first message has to come."""
 
-LONGEST_REPLY = 5.0
-"""Seconds for which a program may have the line wait for a reply: nothing else is sent meanwhile."""
 
 BEFORE_NUMBER = ',"id":'
 PLAIN = frozenset((int, float, bool, str, type(None)))

@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from busmaster.arbiter.counters import LineStatistics
+from busmaster.bounds import MOST_CHECKED
 from busmaster.bus.alarms import BusEvent
 from busmaster.bus.points import Point
 from busmaster.bus.requester import Priority
@@ -23,7 +24,7 @@ from busmaster.contract.profile import Profile
 from busmaster.contract.timing import Timings
 from busmaster.errors import BusClosed, BusError, InvalidCommand
 from busmaster.service.link import TCP, Link
-from busmaster.service.messages import MOST_CHECKED, said_timings
+from busmaster.service.messages import said_timings
 from busmaster.service.remote_exchanges import RemoteExchanges
 from busmaster.service.remote_group import RemoteGroup
 from busmaster.service.remote_node import RemoteNode

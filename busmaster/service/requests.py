@@ -8,12 +8,13 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+from busmaster.bounds import MOST_REQUESTS, MOST_URGENT
 from busmaster.bus.requester import Priority
 from busmaster.errors import BacklogFull, BusClosed, BusError, InvalidCommand, WriteUnconfirmed
 from busmaster.service.errands import Asker, Errand, Writing, errand_of
 from busmaster.service.failures import REFUSED, refusal_of
 from busmaster.service.line import ServedLine
-from busmaster.service.messages import MOST_REQUESTS, MOST_URGENT, Malformed
+from busmaster.service.messages import Malformed
 from busmaster.service.reads import PlainRead
 
 

@@ -8,12 +8,12 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, Protocol, TypeVar, Unpack
 
+from busmaster.bounds import MOST_UNDER_WAY
 from busmaster.bus.exclusive import HeldNode
 from busmaster.bus.requester import CommandOptions, Requester, RequestOptions
 from busmaster.contract.exchange import Command
 from busmaster.errors import NotStarted
 from busmaster.service.link import Link
-from busmaster.service.messages import MOST_UNDER_WAY
 
 T = TypeVar("T")
 

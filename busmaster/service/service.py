@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from busmaster.arbiter.clients import LEAST_SHARE, MOST_SHARE
 from busmaster.arbiter.health import NodeRecord
+from busmaster.bounds import MOST_CLIENTS, MOST_STRANGERS
 from busmaster.bus.bus import Bus
 from busmaster.errors import InvalidCommand
 from busmaster.gate.gate import Gate
@@ -22,14 +23,7 @@ from busmaster.service.client import Client
 from busmaster.service.connection import CLOSE_WITHIN, check_installed
 from busmaster.service.folder import Owner, ServedSocket, checked_name, line_name, runtime_folder
 from busmaster.service.line import ServedLine
-from busmaster.service.messages import (
-    INVALID_PARAMS,
-    MOST_CLIENTS,
-    MOST_STRANGERS,
-    VERSIONS,
-    Malformed,
-    written,
-)
+from busmaster.service.messages import INVALID_PARAMS, VERSIONS, Malformed, written
 from busmaster.service.outbox import Outbox
 from busmaster.service.overview import state_text
 from busmaster.service.peers import Peer, find_name, process_of

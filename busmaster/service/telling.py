@@ -20,6 +20,7 @@ from busmaster.arbiter.events import (
 )
 from busmaster.arbiter.health import Health, NodeRecord
 from busmaster.arbiter.transaction import Timeline
+from busmaster.bounds import MOST_SYNC_READS
 from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.points import Point
 from busmaster.bus.requester import Requester
@@ -31,9 +32,6 @@ from busmaster.registry import Protocol as BusProtocol
 from busmaster.registry import protocols
 from busmaster.service.failures import bus_error_of, error_data
 from busmaster.service.messages import value_of
-
-MOST_SYNC_READS = 64
-"""More than any kind of node needs."""
 
 
 class FindNode(Protocol):

@@ -8,17 +8,10 @@ from collections import deque
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
+from busmaster.bounds import HELLO_WITHIN, LONGEST_REQUEST
 from busmaster.service.client import Client
 from busmaster.service.connection import GOING_AWAY, POLICY, ServedConnection
-from busmaster.service.messages import (
-    HELLO_WITHIN,
-    INTERNAL,
-    INVALID_PARAMS,
-    LONGEST_REQUEST,
-    Malformed,
-    read_request,
-    written,
-)
+from busmaster.service.messages import INTERNAL, INVALID_PARAMS, Malformed, read_request, written
 from busmaster.service.peers import Peer
 from busmaster.service.reads import plain_read_of
 

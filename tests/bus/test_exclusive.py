@@ -9,8 +9,8 @@ import pytest
 
 from busmaster.arbiter.state import LineState
 from busmaster.arbiter.transaction import Priority
+from busmaster.bounds import LONGEST_HOLD
 from busmaster.bus.bus import Bus
-from busmaster.bus.exclusive import LONGEST_HOLD
 from busmaster.errors import BusClosed, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols._comms.mint import EmulatedMint
 from busmaster.protocols.hcp2 import codec as hcp2

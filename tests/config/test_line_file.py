@@ -279,7 +279,10 @@ def test_behind_a_tcp_port_the_emulated_line_is_the_protocols_at_the_ports_baud_
         (f"{HEAD}[groups.g]\nperiod = true\npoints = []", "groups.g.period: must be a number of seconds, not true"),
         (f"{HEAD}[groups.g]\nperiod = 1\npoints = [\n'a/1', 2]", "line.toml:5: groups.g.points[2]: must be a text"),
         (f"{HEAD}[groups.g]\nperiod = 1\npriority = 'high'\npoints = []", "no such priority 'high'; there are poll, b"),
-        (f"{HEAD}[groups.g]\npoints = []\nperiod = 0", "line.toml:4: groups.g.period: poll group 'g': a period is at"),
+        (
+            f"{HEAD}[groups.g]\npoints = []\nperiod = 0",
+            "line.toml:4: groups.g.period: poll group 'g': a period is 0.001 to 86400 s, not 0",
+        ),
         (
             f"{HEAD}[groups.g]\nperiod = 1\nphase = 1\npoints = []",
             "line.toml:4: groups.g.phase: poll group 'g': a phase",

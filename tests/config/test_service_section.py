@@ -167,7 +167,7 @@ def test_a_token_of_which_the_section_speaks_has_to_be_in_the_file(tmp_path: Pat
         tokens(tmp_path, HMI, roles='tokens.hmi.role = "write"\ntokens.logger.role = "read"')
     with pytest.raises(FileError, match="cannot be read: No such file"):
         parse(f'{TEXT}[service]\nlisten = "[::1]:7420"\ntoken_file = "{tmp_path}/none"\n').service.secrets()
-    with pytest.raises(FileError, match="is no file"):
+    with pytest.raises(FileError, match="it is a FIFO, a socket or a device"):
         parse(f'{TEXT}[service]\nlisten = "[::1]:7420"\ntoken_file = "/dev/null"\n').service.secrets()
 
 

@@ -5,13 +5,16 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import re
 import tomllib
 from collections.abc import Iterator
 from importlib import import_module
+from itertools import pairwise
 
 import busmaster
+import busmaster.bounds
 from busmaster.config.keys import REQUIRED, Key
 from busmaster.config.schema import tables
 from tests.docs.command_line import manual, page
@@ -83,6 +86,34 @@ def _default(key: Key) -> str:
     return f"`{key.default}`" if key.default else ""
 
 
+def bounds() -> str:
+    """The reference of the bounds, in Markdown, from the module that declares them."""
+    return "\n".join(_bounds())
+
+
+def _bounds() -> Iterator[str]:
+    yield """# Bounds
+
+The bounds of everything that a file or a client can say. What goes beyond a bound is refused, and the refusal names the
+bound. They are not settings: a line and its views are tested with these. Each is declared once, in
+`busmaster/bounds.py`, from which this page is made. Times are in seconds.
+"""
+    text = (ROOT / "busmaster" / "bounds.py").read_text()
+    titles = {number: line[2:] for number, line in enumerate(text.splitlines(), 1) if line.startswith("# ")}
+    body = ast.parse(text).body
+    for node, about in pairwise(body):
+        if not isinstance(node, ast.Assign):
+            continue
+        while titles and min(titles) < node.lineno:
+            yield f"\n## {titles.pop(min(titles))}\n\n| bound | value | meaning |\n|---|---|---|"
+        [name] = (target.id for target in node.targets if isinstance(target, ast.Name))
+        assert isinstance(about, ast.Expr), f"{name} has no text"
+        assert isinstance(about.value, ast.Constant), f"{name} has no text"
+        value = getattr(busmaster.bounds, name)
+        shown = f"{int(value):_d}".replace("_", " ") if value == int(value) and value < 1e9 else f"{value:g}"
+        yield f"| `{name}` | {shown} | {' '.join(str(about.value.value).split())} |"
+
+
 def api() -> str:
     """The reference of the API, in Markdown: the site puts in what the docstrings say."""
     return "\n".join(_api())
@@ -118,6 +149,7 @@ def files() -> dict[str, str]:
     return {
         "docs/reference/line-toml.md": line_toml(),
         "docs/reference/command-line.md": page(),
+        "docs/reference/bounds.md": bounds() + "\n",
         "docs/reference/api.md": api(),
         "share/man/man1/busmaster.1": manual(version),
     }

@@ -15,13 +15,15 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from busmaster import Hcp2Controller
+from busmaster.bounds import LONGEST_COMMAND
 from busmaster.bus.limits import Limit
 from busmaster.doors import following
 from busmaster.doors.audience import MOST_EXCHANGES, Seat
-from busmaster.doors.web import LONGEST_BODY, PAGE, serving
+from busmaster.doors.web import PAGE, serving
 from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Access, Permission, digest_of
 from tests.doors.lines import HERE, ONE, READS, Page, assert_goes_on_alone, page, poll, shows
+from tests.patience import PATIENCE
 from tests.service.lines import Served, served, until
 
 NETWORK = ("192.0.2.7", 8420)
@@ -125,9 +127,9 @@ async def test_of_nonsense_only_the_beginning_is_told(tmp_path: Path) -> None:
         (b'{"value": [1]}', "application/json", 400),
         (b'{"value": 1, "also": 2}', "application/json", 400),
         (b"{", "application/json", 400),
-        (b"[" * LONGEST_BODY, "application/json", 400),
+        (b"[" * LONGEST_COMMAND, "application/json", 400),
         (b"\xff", "application/json", 400),
-        (b" " * (LONGEST_BODY + 1), "application/json", 413),
+        (b" " * (LONGEST_COMMAND + 1), "application/json", 413),
         (b'{"value": 1}', "text/plain", 415),
         (b'{"value": 1}', "application/x-www-form-urlencoded", 415),
     ],
@@ -410,3 +412,21 @@ async def test_a_role_of_the_line_holds_for_its_page(tmp_path: Path) -> None:
         status, said = await put(of, 1)
         assert (status, "may read this line and not write" in said["what"]) == (400, True)
         assert line.audit() == [("5/10", "refused")]
+
+
+@pytest.mark.asyncio
+async def test_a_request_with_two_lengths_is_refused_and_its_connection_closed(tmp_path: Path) -> None:
+    """A server before this one may take what follows for another request."""
+    async with page(tmp_path) as of:
+        host = of.url.removeprefix("http://").strip("/")
+        reader, writer = await asyncio.open_connection(*host.split(":"))
+        lengths = "Content-Length: 5\r\nTransfer-Encoding: chunked\r\n"
+        smuggled = f"GET /openapi.json HTTP/1.1\r\nHost: {host}\r\n\r\n"
+        writer.write(f"PUT {ONE} HTTP/1.1\r\nHost: {host}\r\n{lengths}\r\n0\r\n\r\n{smuggled}".encode())
+        async with asyncio.timeout(PATIENCE):
+            answer = (await reader.read()).decode()
+        writer.close()
+        assert answer.startswith("HTTP/1.1 400 ")
+        assert "connection: close" in answer.lower()
+        assert answer.count("HTTP/1.1") == 1
+        assert "not both" in answer

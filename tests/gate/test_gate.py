@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import pytest
 
+from busmaster.bounds import MOST_AT_ONCE
 from busmaster.bus.bus import Bus
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.emulator.line import Line
@@ -31,7 +32,7 @@ from busmaster.errors import (
     VerifyFailed,
     WriteUnconfirmed,
 )
-from busmaster.gate.gate import FRESH, MOST_AT_ONCE, Gate, Wish, outcome_of
+from busmaster.gate.gate import FRESH, Gate, Wish, outcome_of
 from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.protocols.hcp2.handle import Hcp2Controller
 from busmaster.protocols.modbus.handle import ModbusUnit

@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from busmaster.bounds import MOST_AT_ONCE, MOST_COMMANDS
 from busmaster.bus.bus import Bus
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryPort
 from busmaster.errors import BusError
-from busmaster.gate.gate import MOST_AT_ONCE, Gate, Wish
+from busmaster.gate.gate import Gate, Wish
 from busmaster.gate.record import Outcome, WriteRecord
 from busmaster.outputs import mqtt, mqtt_commands, mqtt_forbidden
 from busmaster.outputs.mqtt import MqttOutput
-from busmaster.outputs.mqtt_commands import LEAST, MOST_WAITING, Commands
+from busmaster.outputs.mqtt_commands import LEAST, Commands
 from busmaster.outputs.mqtt_connection import unread
 from busmaster.outputs.mqtt_forbidden import Forbidden
 from busmaster.outputs.settings import MqttSettings
@@ -427,7 +428,7 @@ async def test_refusals_that_were_counted_alone_are_told(monkeypatch: pytest.Mon
     gate = Gate(bus)
     said: asyncio.Queue[str] = asyncio.Queue()
     commands = Commands("line", gate, {}, lambda: 0.0, said.put_nowait)
-    for _ in range(MOST_WAITING + 7):
+    for _ in range(MOST_COMMANDS + 7):
         commands.arrive(cast("Message", Arrived(b"1")))
     answers: asyncio.Queue[object] = asyncio.Queue()
     serving = asyncio.ensure_future(commands.serve(gate.write, gate.refuse, answers.put, lambda: 0))
@@ -471,7 +472,7 @@ async def test_what_waits_when_the_connection_ends_is_on_record_each_once() -> N
 def test_of_a_flood_that_nobody_is_told_of_nothing_is_read() -> None:
     bus = Bus(MemoryPort(Line(Hcp2Controller.profile.line)))
     commands = Commands("line", Gate(bus), {}, lambda: 0.0)
-    for _ in range(MOST_WAITING):
+    for _ in range(MOST_COMMANDS):
         commands.arrive(cast("Message", Arrived(b"1")))
 
     class Unread(bytes):
@@ -479,4 +480,4 @@ def test_of_a_flood_that_nobody_is_told_of_nothing_is_read() -> None:
             raise AssertionError("it was read")
 
     commands.arrive(cast("Message", Arrived(Unread(b"1"))))
-    assert (commands.refused, commands.unanswered) == (MOST_WAITING + 1, 1)
+    assert (commands.refused, commands.unanswered) == (MOST_COMMANDS + 1, 1)

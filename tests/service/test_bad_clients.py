@@ -17,7 +17,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import Frame, Opcode
 
-from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, Service, connect
+from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, Service, bounds, connect
 from busmaster.emulator.line import Line
 from busmaster.errors import BacklogFull, InvalidCommand
 from busmaster.gate.gate import Gate
@@ -309,7 +309,7 @@ def test_a_program_that_does_not_read_loses_its_own_news_and_nothing_else() -> N
     outbox = Outbox(way, dropped.append)
     outbox.put("first")
     way.full = True
-    for number in range(messages.MOST_UNREAD + 2):
+    for number in range(bounds.MOST_UNREAD + 2):
         outbox.put_news(7, f"news {number}")
     outbox.put("an answer")
     for number in range(3):
@@ -320,7 +320,7 @@ def test_a_program_that_does_not_read_loses_its_own_news_and_nothing_else() -> N
     outbox.flush()
     assert way.said[:2] == ["first", "news 2"]
     assert way.said[-2:] == ["an answer", "stops 2"]
-    assert len(way.said) == messages.MOST_UNREAD + 3
+    assert len(way.said) == bounds.MOST_UNREAD + 3
     assert dropped == [7, 7]
 
 

@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from busmaster import Hcp2Controller, RemoteBus, connect
+from busmaster import Hcp2Controller, RemoteBus, bounds, connect
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import InvalidCommand
-from busmaster.service import messages
 from busmaster.service.client import Client
 from busmaster.service.folder import Owner, ServedSocket
 from busmaster.service.outbox import Outbox
@@ -29,9 +28,9 @@ def test_news_that_were_dropped_take_no_memory() -> None:
     outbox = Outbox(way, lambda _: None)
     way.full = True
     outbox.put("an answer that is not read")
-    for number in range(10 * messages.MOST_UNREAD):
+    for number in range(10 * bounds.MOST_UNREAD):
         outbox.put_news(7, f"news {number}")
-    assert outbox.waiting == messages.MOST_UNREAD + 1
+    assert outbox.waiting == bounds.MOST_UNREAD + 1
 
 
 def test_a_write_that_is_given_up_before_its_first_step_is_on_record_and_leaves_nothing(tmp_path: Path) -> None:
@@ -81,7 +80,7 @@ def test_only_what_stops_passes_the_limits_as_a_stop(tmp_path: Path) -> None:
 
 def test_a_program_cannot_have_the_line_wait_as_long_as_it_likes(tmp_path: Path) -> None:
     async def story(line: Served, remote: RemoteBus) -> None:
-        long = Timings.uniform(ReplyTiming(0.01, 0.01, messages.LONGEST_REPLY + 1, 0.01))
+        long = Timings.uniform(ReplyTiming(0.01, 0.01, bounds.LONGEST_REPLY + 1, 0.01))
         with pytest.raises(InvalidCommand, match="may have the line wait 5 s"):
             await Hcp2Controller(remote, ABSENT, timings=long).read(1)
         assert line.bus.nodes == ()
@@ -183,14 +182,14 @@ def test_a_poll_group_of_a_thousand_points_comes_in_messages_that_hold_up_nobody
         handles = [Hcp2Controller(remote, 5 + number % 2) for number in range(10)]
         points = [handles[n % 10].point(f"{n % 99 + 1}") for n in range(198)]
         scaled = [replace(point, item=f"{point.item} {n}") for n in range(6) for point in points]
-        cycles = (await remote.poll_group("many", period=60, points=scaled[: messages.MOST_POINTS])).subscribe()
+        cycles = (await remote.poll_group("many", period=60, points=scaled[: bounds.MOST_POLLED_POINTS])).subscribe()
         line.bus.groups[0].demand()
         snapshot = await anext(cycles)
-        assert len(snapshot) == messages.MOST_POINTS
+        assert len(snapshot) == bounds.MOST_POLLED_POINTS
         assert all(sample.value == 0 for sample in snapshot.samples.values())
-        assert max(lengths) < messages.LONGEST_REQUEST / 2
+        assert max(lengths) < bounds.LONGEST_REQUEST / 2
         with pytest.raises(InvalidCommand, match="1000 points at most"):
-            await remote.poll_group("more", period=60, points=scaled[: messages.MOST_POINTS + 1])
+            await remote.poll_group("more", period=60, points=scaled[: bounds.MOST_POLLED_POINTS + 1])
 
     on_a_served_line(tmp_path, story)
 
@@ -279,7 +278,7 @@ def test_it_runs_on_uvloop_too(tmp_path: Path) -> None:
             await controller.write(1, 1.5)
             assert await asyncio.gather(*(controller.read(number) for number in (1, 2))) == [1.5, 0]
             async with raw(line) as client:
-                await client.connection.send("[" * (messages.LONGEST_REQUEST + 100))
+                await client.connection.send("[" * (bounds.LONGEST_REQUEST + 100))
                 with pytest.raises(ConnectionClosed, match="1009"):
                     await client.hear()
 

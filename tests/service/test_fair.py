@@ -14,9 +14,9 @@ from busmaster.arbiter.choice import MOST_BEFORE
 from busmaster.arbiter.clients import Hold, LineClient
 from busmaster.arbiter.transaction import Transaction
 from busmaster.arbiter.turns import PASSED_BY_EACH
+from busmaster.bounds import MOST_HOLDS, MOST_REQUESTS, MOST_UNDER_WAY
 from busmaster.errors import BusError, HoldEnded, InvalidCommand, NotStarted
 from busmaster.protocols.hcp2 import codec as hcp2
-from busmaster.service.messages import MOST_HOLDS, MOST_REQUESTS, MOST_UNDER_WAY
 from tests.service.lines import ABSENT, PATIENT, Served, on_a_served_line, raw, until
 
 MANY = MOST_REQUESTS + MOST_REQUESTS // 2

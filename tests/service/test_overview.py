@@ -13,6 +13,7 @@ import pytest
 
 from busmaster import Bus, Hcp2Controller, MemoryPort, RemoteBus, connect
 from busmaster.arbiter.health import Health
+from busmaster.bounds import LONGEST_SUSPENSION
 from busmaster.bus.meaning import Meaning
 from busmaster.bus.node import Node
 from busmaster.bus.points import Point
@@ -142,6 +143,9 @@ def test_a_pause_and_a_suspension_are_for_all_and_say_whose_wish_they_were(tmp_p
             await view.demand("axes")
             await until(lambda: line.bus.groups[0].statistics().cycles > cycle)
             await view.pause("axes", False)
+            for too_long in (1e308, LONGEST_SUSPENSION + 1):
+                with pytest.raises(InvalidCommand, match="node 5: a suspension lasts 86400 s at most"):
+                    await view.suspend("hcp2", 5, too_long)
             await view.suspend("hcp2", 5, 60.0)
             await until(lambda: other.nodes and other.nodes["hcp2", 5].health == "suspended")
             await until(lambda: other.rows[0].error == "suspended for maintenance")

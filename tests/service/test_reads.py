@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 
 from busmaster import RemoteBus
+from busmaster.bounds import MOST_REQUESTS
 from busmaster.protocols.hcp2 import PROTOCOL
 from busmaster.protocols.hcp2.codec import PROFILE, Read
 from busmaster.service.connection import Connection
-from busmaster.service.messages import MOST_REQUESTS, Malformed, numbered
+from busmaster.service.messages import Malformed, numbered
 from busmaster.service.reads import SHORT, PlainRead, plain_read_of, words_of
 from tests.service.lines import Served, on_a_line, on_a_served_line, raw
 

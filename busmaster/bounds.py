@@ -1,0 +1,138 @@
+"""The bounds of everything that a file or a client can say: what goes beyond one is refused, and the refusal names it.
+
+Each bound is declared here and nowhere else. The page docs/reference/bounds.md is made of this module: a line
+`# Title` begins a section of that page, and the text below a name is its row. Times are in seconds.
+"""
+
+from __future__ import annotations
+
+# Files
+
+LONGEST_FILE = 4 << 20
+"""Bytes of a file that is read whole: a LINE.toml, a template, a list of symbols, a table of points, a token file, a
+file of learned reply times, a certificate. A LINE.toml with 20 000 named points has about half of it."""
+LONGEST_LINE_RECORD = 1 << 14
+"""Bytes of a `NAME.line` file in the folder of the sockets."""
+MOST_NESTED = 16
+"""Brackets within brackets of a TOML file, and names in one dotted key. The reader needs a call for each level, so
+without a bound a file could exhaust the stack of the program that reads it."""
+LONGEST_TEXT = 1 << 15
+"""Characters of one text in a TOML file: more than the longest MQTT topic."""
+LONGEST_WORD = 200
+"""Characters of one number, or of one key without quotes, in a TOML file."""
+LONGEST_TITLE = 200
+"""Characters of a line's `title`: it is shown in every view and list."""
+LONGEST_TOPIC = 65535 // 3
+"""Characters of an MQTT topic: the most that it can have where each of them takes three bytes."""
+LARGEST_WHOLE = 1_000_000
+"""The largest whole number, where the key has no other range."""
+MOST_NAMES = 1000
+"""Names that one name with ranges may stand for, all its ranges together: `a1-10b1-10` stands for 100."""
+MOST_MEMBERS = 20_000
+"""Points of all poll groups of a line, each as often as it is named; and those of any other list of points."""
+SHORTEST_PERIOD = 0.001
+"""Seconds from one cycle of a poll group to the next, at least."""
+LONGEST_PERIOD = 86_400.0
+"""Seconds from one cycle of a poll group to the next, at most: a day."""
+LONGEST_TIMING = 10.0
+"""Seconds of each reply time that a file may set: a larger number is meant in milliseconds."""
+LONGEST_SAFE_STATE = 60.0
+"""Seconds in which the writes of `[safe]` must be sent and confirmed."""
+MOST_RETRIES = 100
+"""Times that a request is sent again after a failure."""
+MOST_BUFFERED = 1_000_000
+"""Values that wait for an output in memory."""
+MOST_SPILLED = 100_000_000
+"""Values that wait for an output on disk."""
+SHORTEST_TOKEN = 16
+"""Characters of a token, at least: a shorter one can be guessed."""
+
+# Clients of the service
+
+LONGEST_REQUEST = 1 << 16
+"""Bytes of one message of a client: what it takes to understand one holds up the line."""
+MOST_PARTS = 1 << 13
+"""Values in one message of a client: of as many bytes, those of many small ones take longest to understand."""
+LONGEST_ANSWER = 1 << 20
+"""Bytes of one message to a client."""
+HELLO_WITHIN = 10.0
+"""Seconds in which the first message of a client must arrive."""
+SEND_WITHIN = 20.0
+"""Seconds in which the other end must take a message: a connection that does not is closed."""
+MOST_CLIENTS = 64
+"""Clients at a time."""
+MOST_STRANGERS = 64
+"""Connections from which no first message has arrived: one more closes the oldest of them."""
+MOST_REQUESTS = 256
+"""Requests of one client that have not been answered."""
+MOST_URGENT = 16
+"""Urgent requests that are taken beyond those."""
+MOST_UNDER_WAY = MOST_REQUESTS // 2
+"""Requests of one client, none of them urgent, that it has sent and that are not answered: the others wait in the
+client. As many again may have been given up by it, and still be known to the owner."""
+MOST_HOLDS = 32
+"""Exclusive sequences of one client that are not over."""
+LONGEST_HOLD = 5.0
+"""Seconds for which a line may be held for one sequence: no other request is sent meanwhile."""
+MOST_UNREAD = 256
+"""Messages of streams that one client has not read: beyond it the oldest is dropped, and counted."""
+MOST_WAITING = MOST_UNREAD + 2 * MOST_REQUESTS
+"""Messages for one client that are not sent yet: beyond it nothing more is read from the client."""
+MOST_CHECKED = 64
+"""Writes of one question whether the line would take them."""
+MOST_NODES = 1024
+"""Nodes that one client names."""
+MOST_SYNC_READS = 64
+"""Sync reads that a client names for one node: more than any kind of node needs."""
+MOST_STREAMS = 256
+"""Streams of one client: an interface follows each poll group of a line by a stream of its own."""
+MOST_POLLED = 32
+"""Poll groups of one client."""
+MOST_POLLED_POINTS = 1000
+"""Points of one poll group of a client."""
+LONGEST_REPLY = 5.0
+"""Seconds for which a client may have the line wait for a reply: nothing else is sent meanwhile."""
+LONGEST_SUSPENSION = 86_400.0
+"""Seconds for which a node can be suspended: a day. A suspension does not end with the program that asked for it."""
+
+# Commands, by whatever interface
+
+LONGEST_COMMAND = 4096
+"""Bytes of a command as text, and of the body of a request to `busmaster web`: it holds one value, or a few."""
+LONGEST_ID = 100
+"""Characters of a command's id."""
+LARGEST_VALUE = 1e15
+"""The largest value: no quantity is larger, and no protocol can send more."""
+MOST_AT_ONCE = 16
+"""Commands of one interface that are being written at a time."""
+MOST_COMMANDS = 100
+"""MQTT commands that wait for their turn, and refusals that wait to be answered: more are only counted."""
+LONGEST_NAME = 256
+"""Characters of a point's name in the answer to an MQTT command: a longer one is answered without it."""
+LONGEST_SENDER = 100
+"""Characters of the name that the sender of an MQTT command gives itself."""
+
+# `busmaster web`
+
+LONGEST_PAGE_MESSAGE = 1024
+"""Bytes of one message of a page."""
+MOST_PAGES = 64
+"""Pages that follow the line at a time."""
+
+# Metrics
+
+LONGEST_SCRAPE = 8192
+"""Bytes of the head of a request for the metrics."""
+MOST_SILENT = 256
+"""Connections without a whole request: one more closes the oldest of them."""
+MOST_ASKING = 400
+"""Requests that are answered at a time: more are answered with 503."""
+
+# `busmaster opcua`
+
+MOST_CONNECTIONS = 100
+"""Connections at a time."""
+MOST_SUBSCRIPTIONS = 500
+"""Subscriptions at a time, of all clients together."""
+MOST_SHOWN_POINTS = 20_000
+"""Points that are shown, with those that the line no longer has: clients may have subscribed to them."""
