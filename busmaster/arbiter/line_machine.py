@@ -379,9 +379,8 @@ class LineMachine:
         else:
             if transaction.overdue:
                 unasked.answered()  # what came late and is wrong may be noise: it makes no node slower
-            elif error.heard:
-                unasked.blame(now)
             if error.heard:
+                unasked.came(now)
                 unasked.run[:] = error.heard
         spared = error.whole and not self._in_step.is_overdue(
             now

@@ -96,7 +96,11 @@ class Trust:
             return None
         paid = self._in_step.heard(run, now)
         node = None if paid is None else paid.node
-        if paid is not None and node is not None and node.learning is not None and paid.awaited is not None:
+        if paid is None or node is None or len(paid.key) < 2:
+            return node  # a lone byte may be noise, and makes no node slower
+        if node.learning is None or paid.awaited is None:
+            unasked.blame_straggler(node, paid.asked)
+        else:
             node.unheard = 0  # heard, if late: whatever else it owes, it is asked for itself
             first_byte = unasked.last_byte - (len(run) - 1) * wire.leg.byte_time - wire.leg.latency
             if first_byte - paid.asked > LATE_SHARE * paid.awaited.window:

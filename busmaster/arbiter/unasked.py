@@ -45,6 +45,8 @@ class UnaskedBytes:
         self._listening = False
         self.unanswered_one: tuple[NodeRecord, float, float] | None = None
         """The request that was not answered: its node, when it was out, its lateness. What comes may be its reply."""
+        self._straggler: tuple[tuple[NodeRecord, float, float], float, float, float] | None = None
+        """What came first behind that request: the request, when it came, and how well that is known."""
 
     def note(self, data: bytes, now: float, quiet: float) -> None:
         """Count these bytes; `quiet` is the silence, in seconds, after which a run of noise is over."""
@@ -55,7 +57,7 @@ class UnaskedBytes:
         if now - self.last_byte > quiet or self._noise_since == inf:
             self._noise_since = now
         self.last_byte = now
-        self.blame(now)
+        self.came(now)
 
     def babbling(self, now: float) -> bool:
         """Return whether unasked bytes have not paused for so long (NOISY_AFTER) that nothing can be sent."""
@@ -66,6 +68,8 @@ class UnaskedBytes:
         self._noise_since = inf
         run = bytes(self.run)
         self.run.clear()
+        if not run:
+            self._straggler = None
         return run
 
     # stragglers (R3)
@@ -105,6 +109,20 @@ class UnaskedBytes:
         if age > timing.window and age > TOLD_AGAIN * node.told_late:
             node.told_late = age
             self._events.append(RepliesLate(node, age, timing.window))
+
+    def came(self, now: float) -> None:
+        """Note that bytes came. If the unanswered request's reply is among them, it began now."""
+        if self.unanswered_one is not None:
+            self._straggler = (self.unanswered_one, now, self._looked, self._look_at)
+            self.unanswered_one = None
+
+    def blame_straggler(self, node: NodeRecord, asked: float) -> None:
+        """Blame the node whose reply to the unanswered request was found in what came. Bytes that nobody is known to
+        have sent raise nothing: noise would make healthy nodes slow."""
+        straggler, self._straggler = self._straggler, None
+        if straggler is not None and straggler[0][:2] == (node, asked):
+            self.unanswered_one, first_byte, self._looked, self._look_at = straggler
+            self.blame(first_byte)
 
     def blame(self, first_byte: float) -> float:
         """Raise the lateness of a node whose reply came long after its request: it is slower than was believed. Returns

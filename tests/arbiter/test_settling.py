@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from busmaster.arbiter.events import CameUnasked, LatenessRaised, LineChange, LineChanged
 from busmaster.arbiter.state import LineState
+from busmaster.contract.exchange import Command
 from busmaster.contract.timing import ReplyTiming, Timings
 from busmaster.errors import GarbledReply, LineNoisy, Refused
 from busmaster.protocols.hcp2 import codec as hcp2
@@ -25,6 +27,7 @@ from tests.arbiter.bench import (
     TAU,
     WRITE_5,
     Bench,
+    reply_of,
 )
 
 REQUEST = 8 * TAU
@@ -134,7 +137,40 @@ def test_r3_a_straggler_beyond_lateness_is_known_as_one_and_lateness_is_at_most_
     node = bench.node()
     bench.ask(node, retries=0)
     bench.hear(FIVE, after=REQUEST + 0.400)
+    bench.wait(QUIET)
     assert node.lateness == 0.5
+
+
+@pytest.mark.parametrize("noise", ["FF", ACK, NAK, "02", reply_of(80, 5)])
+@pytest.mark.parametrize("command", [hcp2.Read(1), hcp2.Write(1, (2,))], ids=["read", "write"])
+def test_r3_bytes_that_are_no_owed_reply_make_no_node_slower(noise: str, command: Command[Any]) -> None:
+    bench = Bench()
+    node, other = bench.node(), bench.node(2)
+    bench.served(bench.ask(other))
+    bench.ask(node, command, retries=0)
+    bench.until_sent()
+    bench.hear(noise, after=REQUEST + 0.400)
+    bench.wait(1.0)
+    bench.ask(node, command, retries=0)
+    bench.wait(REQUEST + 0.160)
+    bench.ask(other, retries=0)  # what comes in place of its reply is nobody's
+    bench.until_sent()
+    bench.hear(noise, after=0.005)
+    bench.wait(1.0)
+    assert (node.lateness, other.lateness) == (0.150, 0.150)
+    assert not [event for event in bench.events if isinstance(event, LatenessRaised)]
+
+
+def test_r3_a_straggler_that_lay_unread_makes_no_node_slower_than_is_known() -> None:
+    bench = Bench()
+    node = bench.node()
+    bench.ask(node, retries=0)
+    bench.wait(REQUEST + 0.160)
+    bench.now += 0.300  # the program stood still: nobody knows when it came
+    bench.arbiter.data_received(bytes.fromhex(FIVE), bench.now)
+    bench.listen()
+    bench.wait(QUIET)
+    assert node.lateness < 0.300
 
 
 def test_r3_after_opening_the_port_an_earlier_masters_reply_is_waited_out() -> None:

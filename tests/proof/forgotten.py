@@ -184,6 +184,8 @@ def past_stragglers(view: View) -> None:
     one = strays.unanswered_one
     if one is not None and not (view.world.setup.may(setups.RAISED) and not view.past(one[1], STRAGGLER_MEMORY, True)):
         strays.unanswered_one = None
+    if strays._straggler is not None and not strays.run:
+        strays._straggler = None  # `silent` forgets it, too
     if strays.unanswered_one is None:
         strays._looked = strays._look_at = -inf
 
