@@ -69,7 +69,8 @@ class Choice:
         else:
             alike.count = 0
         alike.node = node
-        in_step.before, in_step.last = last, answers
+        in_step.last = answers
+        in_step.recent.append(answers)
         return transaction, exchange
 
     def _carefully(self, first: Chosen, now: float, last_byte: float, too_many: bool = False) -> Chosen | float:
@@ -114,7 +115,8 @@ class Choice:
             if chosen[1].answers != in_step.last:
                 self._alike.count = 0
             self._alike.node = chosen[0].node
-            in_step.before, in_step.last = in_step.last, chosen[1].answers
+            in_step.last = chosen[1].answers
+            in_step.recent.append(in_step.last)
         return chosen
 
     def _instead_of(self, first: Chosen, now: float) -> Chosen | float:

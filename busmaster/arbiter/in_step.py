@@ -24,7 +24,7 @@ the next frame, to whichever node, for that rest, and replies with a NAK (or an 
 delay later. So after the line came up, no NAK is trusted, and every ACK is held, until that time has passed behind the
 first frame.
 
-What nobody owed and yet came, though it looks like a reply, was said twice. Then answers like those heard lately are
+What nobody owed and yet came, though it looks like a late reply, was said twice. Then answers like those heard lately are
 doubted for a while, and neighbours that could be confused are not asked one after the other where there is a choice.
 """
 
@@ -49,6 +49,8 @@ DOUBT_PERIOD = 30.0
 """Seconds after something was said twice in which answers like those heard lately are doubted."""
 SAID_MEMORY = 0.5
 """Seconds for which what was said may be said again."""
+RECENT = 128
+"""Exchanges of which a reply may be said a second time: about so many fit into the longest maximum reply delay."""
 MOST_UNHEARD = 4
 """Learned windows in a row that may bring nothing before a node is taken to be silent."""
 MOST_DEBTS = 400
@@ -100,10 +102,10 @@ class InStep:
         "_forgiven",
         "_said",
         "alert",
-        "before",
         "debts",
         "last",
         "lone_bytes_until",
+        "recent",
     )
 
     def __init__(self, strict: bool = False) -> None:
@@ -113,8 +115,8 @@ class InStep:
         self.debts: list[Debt] = []
         self.last: Sequence[bytes] = ()
         """What would answer the exchange that was begun last."""
-        self.before: Sequence[bytes] = ()
-        """What would answer the one before that."""
+        self.recent: deque[Sequence[bytes]] = deque(maxlen=RECENT)
+        """What would answer that one and those before it: what nobody owes and is like one of these was said twice."""
         self._doubted: list[tuple[bytes, float]] = []
         self._forgiven: list[tuple[bytes, float]] = []
         self.lone_bytes_until = -inf
@@ -226,7 +228,13 @@ class InStep:
         if not payers and any(until > now and _is(run, key) for key, until in (*self._doubted, *self._forgiven)):
             self._doubted = [entry for entry in self._doubted if not _is(run, entry[0])]
             self._forgiven = [entry for entry in self._forgiven if not _is(run, entry[0])]
-        elif not payers and any(_is(run, key) for key in (*self.last, *self.before)):
+            return None
+        recent = {key for answers in self.recent for key in answers}
+        if any(len(key) > 1 and key in rest for key in recent):
+            self.said_twice(now)
+            if payers or not any(_is(rest, key) for key in recent):
+                self.owe((ANY_BYTE,), None, now, now)
+        elif not payers and any(_is(rest, key) for key in recent):
             self.said_twice(now)
         else:
             self.owe((ANY_BYTE,), None, now, now)

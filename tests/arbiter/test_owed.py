@@ -33,9 +33,30 @@ def living(address: int = 1, profile: Profile = hcp2.PROFILE) -> NodeRecord:
 )
 def test_r15_acks_that_nobody_owes_were_said_twice_and_nothing_else_was(heard: str, twice: bool) -> None:
     in_step = InStep()
-    in_step.last = (b"\x06",)
+    in_step.recent += [(b"\x06",), (ONE,), (ONE,)]
     assert in_step.heard(bytes.fromhex(heard), 1.0) is None
     assert (in_step.doubts(1.0), [debt.key for debt in in_step.debts]) == (twice, [] if twice else [ANY_BYTE])
+
+
+@pytest.mark.parametrize(
+    ("heard", "twice"),
+    [
+        (reply_of(2, 5), True),
+        (reply_of(2, 5) + " " + reply_of(1, 7), True),
+        ("06 " + reply_of(2, 5), True),
+        (reply_of(3, 5), False),
+        (reply_of(3, 5) + " " + reply_of(1, 7), False),
+    ],
+)
+def test_r15_a_reply_like_one_of_the_last_exchanges_was_said_twice_also_beside_an_overdue_one(
+    heard: str, twice: bool
+) -> None:
+    in_step = InStep()
+    in_step.recent += [(bytes.fromhex(reply_of(2, 5))[:3],), *[(ONE,)] * 20]
+    if reply_of(1, 7) in heard:
+        in_step.owe((ONE,), living(), asked=0.0, over=0.150)
+    in_step.heard(bytes.fromhex(heard), 1.0)
+    assert in_step.doubts(1.0) is twice
 
 
 def test_r15_a_reply_that_may_have_begun_in_time_is_awaited_until_the_silence_behind_it() -> None:
@@ -105,7 +126,7 @@ def test_r15_a_forgiven_reply_that_comes_after_all_was_not_said_twice_and_is_hel
     in_step = InStep()
     in_step.owe((b"\x06",), living(), asked=1.0, over=1.150)
     in_step.forgive((b"\x06",))
-    in_step.last = (b"\x06",)
+    in_step.recent.append((b"\x06",))
     assert in_step.heard(b"\x06", 2.0) is None
     assert (in_step.doubts(2.0), in_step.debts) == (False, [])
     assert not in_step.is_to_be_held((b"\x06",), 2.0)
@@ -113,7 +134,7 @@ def test_r15_a_forgiven_reply_that_comes_after_all_was_not_said_twice_and_is_hel
 
 def test_r15_what_is_unlike_the_last_answers_was_not_said_twice() -> None:
     in_step = InStep()
-    in_step.last = (bytes.fromhex(reply_of(1, 5)),)
+    in_step.recent.append((bytes.fromhex(reply_of(1, 5)),))
     assert in_step.heard(bytes.fromhex(reply_of(2, 7)), 1.0) is None
     assert len(in_step.debts) == 1, "more of it may come"
 

@@ -176,6 +176,7 @@ def set_aside(setup: Setup) -> Iterator[None]:
     put(Turns, "begin_runs", _counts_nothing)
     put(Turns, "shortest_run", _any_run)
     put(in_step, "LAPSE", setup.lapse)
+    put(in_step, "RECENT", 2)
     put(in_step, "DOUBT_PERIOD", setup.doubt)
     put(in_step, "SAID_MEMORY", setup.said_memory)
     put(alike, "LONGEST_ALIKE", setup.alike)
