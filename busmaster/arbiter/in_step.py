@@ -24,8 +24,9 @@ the next frame, to whichever node, for that rest, and replies with a NAK (or an 
 delay later. So after the line came up, no NAK is trusted, and every ACK is held, until that time has passed behind the
 first frame.
 
-What nobody owed and yet came, though it looks like a late reply, was said twice. Then answers like those heard lately are
-doubted for a while, and neighbours that could be confused are not asked one after the other where there is a choice.
+What nobody owed and yet came, though it is like a reply of the last exchanges, was said twice. Then answers like those
+heard lately are doubted for a while, and neighbours that could be confused are not asked one after the other where there
+is a choice.
 """
 
 from __future__ import annotations

@@ -317,10 +317,11 @@ class LineMachine:
         assert transaction is not None
         assert exchange is not None
         answered, rest = wire.answered, step.rest
-        if self._in_step.lone_bytes_until == inf:
+        alert = self._in_step.alert
+        if alert and self._in_step.lone_bytes_until == inf:
             self._first_frame_ended()
         if answered:
-            if self._in_step.alert or rest:
+            if alert or rest:
                 verdict = self._trust.weigh(wire, step, now)
                 if isinstance(verdict, str):
                     self._disbelieve(verdict, step, now)  # before what follows: it proves not that its request left
