@@ -25,8 +25,8 @@ delay later. So after the line came up, no NAK is trusted, and every ACK is held
 first frame.
 
 What nobody owed and yet came, though it is like a reply of the last exchanges, was said twice. Then answers like those
-heard lately are doubted for a while, and neighbours that could be confused are not asked one after the other where there
-is a choice.
+heard lately are doubted for a while, and neighbours that could be confused are not asked one after the other where
+there is a choice.
 """
 
 from __future__ import annotations
