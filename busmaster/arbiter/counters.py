@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 from busmaster.arbiter.histogram import Histogram
@@ -107,6 +108,30 @@ class LineStatistics:
     def utilisation(self) -> float:
         """The share of the time in which the line was in use, settling included."""
         return min(1.0, (self.busy + self.settling) / self.elapsed) if self.elapsed > 0 else 0.0
+
+
+class RecentUtilisation:
+    """The share of the last `window` seconds in which a line was in use, settling included.
+
+    It knows the line only by the statistics that it is given: the window begins with the youngest of them that is at
+    least `window` seconds old, or with the oldest that it has.
+    """
+
+    def __init__(self, window: float) -> None:
+        self._window = window
+        self._used: deque[tuple[float, float]] = deque()
+        """When statistics were given, and the seconds for which the line had been in use by then."""
+
+    def note(self, now: float, line: LineStatistics) -> float:
+        """Take the statistics of this moment, and return the share up to it. Until there are two: since the reset."""
+        used, seen = line.busy + line.settling, self._used
+        if seen and used < seen[-1][1]:  # the statistics were reset
+            seen.clear()
+        seen.append((now, used))
+        while len(seen) > 2 and seen[1][0] <= now - self._window:
+            seen.popleft()
+        since, used_then = seen[0]
+        return min(1.0, (used - used_then) / (now - since)) if now > since else line.utilisation
 
 
 class NodeCounters:

@@ -14,7 +14,7 @@ from functools import partial
 from itertools import accumulate
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
-from busmaster.arbiter.counters import NodeStatistics
+from busmaster.arbiter.counters import LineStatistics, NodeStatistics, RecentUtilisation
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.transaction import Priority
 from busmaster.bus.bus import Bus
@@ -33,6 +33,10 @@ EDGES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """Of the latency histogram's buckets, in seconds."""
 PATIENCE = 2.0
 """Seconds for which a scrape waits for a loop that is busy."""
+UTILISATION_WINDOW = 5.0
+"""Seconds before a scrape over which the utilisation of the line is taken."""
+NOTED_EVERY = 1.0
+"""Seconds between two looks at it, so that it does not depend on who scrapes, and how often."""
 OUTCOMES = ("ok", "no_reply", "garbled", "refused")
 COUNTS = {
     "attempts": "Exchanges with this node that have ended",
@@ -88,10 +92,19 @@ class MetricsOutput(Output):
         self._bus = bus
         self._others = outputs
         self._owner: asyncio.AbstractEventLoop | None = None
+        self._utilisation = RecentUtilisation(UTILISATION_WINDOW)
 
     def start(self) -> None:
         self._owner = asyncio.get_running_loop()
+        self._note_utilisation()
         super().start()
+
+    def _note_utilisation(self) -> None:
+        """Look at how busy the line is, now and again and again until the output is closed. Runs on the loop."""
+        assert self._owner is not None
+        if not self._stop.is_set() and self._bus.running:
+            self._utilisation.note(self._bus.now(), self._bus.statistics())
+            self._owner.call_later(NOTED_EVERY, self._note_utilisation)
 
     def offer(self, item: object) -> None:
         """Ignore the item: nothing waits here, and what is asked for is read then."""
@@ -141,14 +154,16 @@ class MetricsOutput(Output):
     def _of_line(self) -> Iterator[Metric]:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-        line = self._ask(self._bus.statistics)
+        line, utilisation = self._ask(self._line_and_utilisation)
         lost = self._ask(lambda: self._bus.condition.is_lost)
         yield GaugeMetricFamily("busmaster_line_up", "1 while the port is there, 0 while it is lost", value=not lost)
         yield CounterMetricFamily(
             "busmaster_line_lost_seconds", "Time for which the port was lost", value=self._ask(self._lost_seconds)
         )
         yield GaugeMetricFamily(
-            "busmaster_line_utilisation_ratio", "Share of the time in which the line was busy", value=line.utilisation
+            "busmaster_line_utilisation_ratio",
+            f"Share of the last {UTILISATION_WINDOW:g} s in which the line was busy or settling",
+            value=utilisation,
         )
         yield CounterMetricFamily("busmaster_line_busy_seconds", "Time in exchanges", value=line.busy)
         yield CounterMetricFamily("busmaster_line_settling_seconds", "Time spent settling", value=line.settling)
@@ -163,6 +178,10 @@ class MetricsOutput(Output):
         for priority in Priority:
             waits.add_metric([priority.name.lower()], line.waits[priority].p99)
         yield waits
+
+    def _line_and_utilisation(self) -> tuple[LineStatistics, float]:
+        line = self._bus.statistics()
+        return line, self._utilisation.note(self._bus.now(), line)
 
     def _lost_seconds(self) -> float:
         return self._bus.lost_seconds

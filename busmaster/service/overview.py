@@ -13,6 +13,7 @@ from itertools import islice
 from operator import is_
 from typing import Any
 
+from busmaster.arbiter.counters import RecentUtilisation
 from busmaster.arbiter.health import Health
 from busmaster.arbiter.state import LineState
 from busmaster.bus.alarms import AlarmChanged
@@ -41,6 +42,7 @@ MOST_COUNTED = 2_000
 """Nodes, and groups, of a picture."""
 KEPT_EVENTS = 20
 UTILISATION_WINDOW = 1.0
+"""Seconds."""
 STATES = {LineState.OFFLINE: "offline", LineState.SETTLING: "settling"}
 """What is worth a word: a line in use is ready."""
 
@@ -127,7 +129,7 @@ class Overview(Broadcast):
         self._left_out = 0
         self._counted_at = -COUNTED_EVERY
         self._counts: dict[tuple[str, int], str] = {}
-        self._loads: deque[tuple[float, float]] = deque()
+        self._utilisation = RecentUtilisation(UTILISATION_WINDOW)
 
     def join(self, reader: Any, stream: int) -> None:
         """Have this client told all, and from then on what changes."""
@@ -221,7 +223,7 @@ class Overview(Broadcast):
             "state": state_text(self._bus),
             "why": condition.reason,
             "since": condition.since if condition.is_lost else None,
-            "utilisation": self._utilisation(now, statistics.busy + statistics.settling),
+            "utilisation": self._utilisation.note(now, statistics),
             "backlog": statistics.backlog,
             "losses": statistics.losses,
             "groups": min(len(self._bus.groups), MOST_COUNTED),
@@ -230,15 +232,6 @@ class Overview(Broadcast):
             "left_out": self._left_out,
             "events": list(self._journal.entries),
         }
-
-    def _utilisation(self, now: float, busy: float) -> float:
-        self._loads.append((now, busy))
-        while len(self._loads) > 2 and self._loads[1][0] <= now - UTILISATION_WINDOW:
-            self._loads.popleft()
-        since, busy_then = self._loads[0]
-        if now == since:
-            return self._bus.statistics().utilisation
-        return max(0.0, min(1.0, (busy - busy_then) / (now - since)))
 
 
 def state_text(bus: Bus) -> str:

@@ -102,6 +102,35 @@ async def count_and_scrape() -> None:
     assert of(metrics, "output_up", output="sqlite") == 0
 
 
+def test_the_utilisation_of_the_line_is_of_the_last_seconds() -> None:
+    run_in_virtual_time(poll_and_pause())
+
+
+async def poll_and_pause() -> None:
+    bus = Bus(MemoryPort(Line(hcp2.PROFILE.line, [make_device("hcp2", 5)])))
+    output = MetricsOutput("metrics", MetricsSettings(port=0), bus)
+    async with bus:
+        output.start()
+        await asyncio.to_thread(until, lambda: output.port != 0)
+        group = bus.poll_group("axes", period=0.02, points=[Hcp2Controller(bus, 5).point("1")])
+        await asyncio.sleep(60)
+        busy = await asyncio.to_thread(scraped, output.port)
+        group.pause()
+        await asyncio.sleep(metrics_module.UTILISATION_WINDOW + 1)
+        idle = await asyncio.to_thread(scraped, output.port)
+        bus.reset_statistics()
+        group.resume()
+        await asyncio.sleep(metrics_module.UTILISATION_WINDOW + 1)
+        again = await asyncio.to_thread(scraped, output.port)
+        await asyncio.to_thread(output.close, PATIENCE)
+    share = of(busy, "line_busy_seconds_total") / 60
+    assert share > 0.1
+    assert of(busy, "line_utilisation_ratio") == pytest.approx(share, rel=0.02)
+    assert of(idle, "line_utilisation_ratio") == 0
+    assert of(idle, "line_busy_seconds_total") == pytest.approx(share * 60, rel=0.01)
+    assert of(again, "line_utilisation_ratio") == pytest.approx(share, rel=0.02)
+
+
 @pytest.mark.asyncio
 async def test_a_scrape_has_the_drivers_counts_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -> None:
     found: DriverErrors | None = None
