@@ -27,6 +27,7 @@ SCENARIOS = (
     "simulation",
     "peers",
     "loop_stalls",
+    "gone_port",
     "service",
 )
 

@@ -85,10 +85,9 @@ class KernelTimer:
     """A timerfd, which a loop reads like a port. Raises OSError where the system has none."""
 
     def __init__(self) -> None:
-        self._library = ctypes.CDLL(None, use_errno=True)
-        self.descriptor: int = self._call("timerfd_create", CLOCK_MONOTONIC, TFD_NONBLOCK | TFD_CLOEXEC)
+        self.descriptor = call_system("timerfd_create", CLOCK_MONOTONIC, TFD_NONBLOCK | TFD_CLOEXEC)
         self._when = ItimerSpec()
-        self._settime = self._library.timerfd_settime
+        self._settime = ctypes.CDLL(None).timerfd_settime
         self._settime.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.POINTER(ItimerSpec), ctypes.c_void_p)
         self._pointer = ctypes.pointer(self._when)
 
@@ -113,16 +112,6 @@ class KernelTimer:
         """Give the descriptor back."""
         os.close(self.descriptor)
 
-    def _call(self, name: str, *arguments: int) -> int:
-        try:
-            result = int(getattr(self._library, name)(*arguments))
-        except AttributeError as error:
-            raise OSError(f"this system has no {name}") from error
-        if result < 0:
-            number = ctypes.get_errno()
-            raise OSError(number, os.strerror(number))
-        return result
-
 
 class ItimerSpec(ctypes.Structure):
     """What the system calls `struct itimerspec`: an interval, which stays 0, and the first expiration."""
@@ -133,6 +122,18 @@ class ItimerSpec(ctypes.Structure):
         ("seconds", ctypes.c_long),
         ("nanoseconds", ctypes.c_long),
     )
+
+
+def call_system(name: str, *arguments: int | bytes) -> int:
+    """Call a function of the C library that Python does not have. Raises OSError where it fails, or does not exist."""
+    try:
+        result = int(getattr(ctypes.CDLL(None, use_errno=True), name)(*arguments))
+    except AttributeError as error:
+        raise OSError(f"this system has no {name}") from error
+    if result < 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+    return result
 
 
 def kernel_timer(loop: asyncio.AbstractEventLoop, on_expiry: Callable[[], None]) -> KernelTimer | None:

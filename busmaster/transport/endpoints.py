@@ -49,7 +49,9 @@ class Endpoint(Protocol):
     def presence(self) -> Hashable | None:
         """Return what is seen of the device without opening it: it changes when one comes. None: nothing is seen.
 
-        It is asked several times a second while the line is down, on the loop, and returns at once.
+        It is asked several times a second while the line is down, on the loop, and returns at once. An endpoint may
+        have a method `folders()` too, which returns the folders in which an entry comes, or its rights change, when the
+        device comes back: then they are watched, and it is asked when something happens there.
         """
         ...
 

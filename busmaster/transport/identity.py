@@ -8,9 +8,10 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -18,11 +19,18 @@ from busmaster.errors import LineDown
 
 SYS = Path("/sys")
 """Where the kernel describes its devices."""
+DEV = Path("/dev")
+"""Where the nodes of the devices are."""
 LINKS = Path("/dev/serial")
 """Where udev keeps lasting names: by-id, by-path."""
 USB = "usb:"
 """Begins a name that is a serial number, and perhaps an interface: usb:A500ABC, usb:A500ABC:1."""
 
+MOST_LINKS = 40
+"""Symbolic links on one way, as many as the kernel follows."""
+LEVELS = "", "/..", "/../..", "/../../.."
+"""From what the kernel calls a tty's device up to the USB interface that it is a part of: CDC adapters have the tty at
+the interface, all others one level below, those behind another driver (HID) two or more."""
 UNIX98_PTYS = range(136, 144)
 BSD_PTYS = 3
 """The major device numbers of Linux's pseudo-terminals (Documentation/admin-guide/devices.txt)."""
@@ -151,7 +159,19 @@ class TtyIdentity:
         return os.fstat(descriptor).st_rdev == self.number
 
 
-def resolve(name: str) -> str:
+class Scan:
+    """The USB serial ports that are plugged in, read at most once, when they are first needed.
+
+    One attempt to open a port asks for them several times. Each reading opens eight files per adapter.
+    """
+
+    @cached_property
+    def devices(self) -> list[UsbDevice]:
+        """All of them, in the order of their names."""
+        return usb_devices()
+
+
+def resolve(name: str, scan: Scan | None = None) -> str:
     """Return the path of the device that a port's name stands for now.
 
     That is the name itself, unless it is usb:SERIAL or usb:SERIAL:INTERFACE. Raises LineDown, saying what is there.
@@ -159,7 +179,8 @@ def resolve(name: str) -> str:
     if not name.startswith(USB):
         return name
     wanted = name.removeprefix(USB)
-    there = usb_devices()
+    scan = scan or Scan()
+    there = scan.devices
     serial, _, interface = wanted.rpartition(":")  # a serial number may have colons of its own
     numbered = (serial, int(interface)) if interface.isdecimal() else None
     found = [device for device in there if device.serial == wanted] or [
@@ -169,18 +190,19 @@ def resolve(name: str) -> str:
         case [device]:
             return device.path
         case []:
-            others = f"there is {_listed(there)}" if there else "there is no USB serial port at all"
+            others = f"there is {_listed(there, scan)}" if there else "there is no USB serial port at all"
             raise LineDown(f"{name} is not plugged in: {others}", hint="plug it in, or use one that is there")
         case _:
-            raise LineDown(f"{name} could be any of {_listed(found)}", hint="say which, by one of these names")
+            raise LineDown(f"{name} could be any of {_listed(found, scan)}", hint="say which, by one of these names")
 
 
-def identify(path: str) -> Identity:
+def identify(path: str, scan: Scan | None = None) -> Identity:
     """Return which device has this name now. Raises OSError where there is none, or it goes away meanwhile."""
     status = os.stat(path)
     device = usb_device(status.st_rdev)
     if device is not None:
-        return UsbIdentity(device, alone=not any(_is_double(device, other) for other in usb_devices()))
+        there = (scan or Scan()).devices
+        return UsbIdentity(device, alone=not any(_is_double(device, other) for other in there))
     if is_pty(path):
         return PtyIdentity(path)
     # Where the kernel describes devices at all, one that it does not describe has just gone.
@@ -189,9 +211,9 @@ def identify(path: str) -> Identity:
     return TtyIdentity(os.path.realpath(path), status.st_rdev)
 
 
-def lasting_name(device: UsbDevice) -> str:
+def lasting_name(device: UsbDevice, scan: Scan | None = None) -> str:
     """Return a name that stays this adapter's whatever else is plugged in; "" where it can have none."""
-    alike = [other for other in usb_devices() if other.serial == device.serial]
+    alike = [other for other in (scan or Scan()).devices if other.serial == device.serial]
     if device.serial and len(alike) == 1:
         return f"{USB}{device.serial}"
     if device.serial and sum(other.interface == device.interface for other in alike) == 1:
@@ -202,7 +224,7 @@ def lasting_name(device: UsbDevice) -> str:
 
 def usb_device(number: int) -> UsbDevice | None:
     """Return the USB serial port with this device number; None if that is no such port. Raises OSError as it goes."""
-    return _described(entry(number))
+    return _described(str(entry(number)))
 
 
 def usb_devices() -> list[UsbDevice]:
@@ -211,7 +233,47 @@ def usb_devices() -> list[UsbDevice]:
         names = sorted(os.listdir(SYS / "class/tty"))
     except OSError:
         return []
-    return [device for name in names if (device := _described_if_there(SYS / "class/tty" / name)) is not None]
+    return [device for name in names if (device := _described_if_there(f"{SYS}/class/tty/{name}")) is not None]
+
+
+def all_ttys() -> Hashable | None:
+    """Return what is seen of all ttys without reading of any device: it changes when one comes, or its rights change.
+
+    The kernel describes an adapter before its node exists, and udev gives the node its group later still. A program
+    without root's rights can open it only then. None where the kernel describes no ttys.
+    """
+    try:
+        names = sorted(os.listdir(SYS / "class/tty"))
+    except OSError:
+        return None
+    return tuple((name, node_at(f"{DEV}/{name.replace('!', '/')}")) for name in names)
+
+
+def node_at(path: str) -> Hashable | None:
+    """Return what tells the node that this path leads to from the next one; None where there is none."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino, status.st_rdev, status.st_ctime_ns
+
+
+def folders_to(path: str) -> tuple[str, ...]:
+    """Return the folders in which something changes when a device comes to this path, by way of symbolic links or not.
+
+    In place of a folder that does not exist it is the nearest one above: udev removes /dev/serial with its last link.
+    """
+    found: list[str] = []
+    while len(found) < MOST_LINKS:
+        folder = os.path.realpath(os.path.dirname(path))
+        while not os.path.isdir(folder):
+            folder = os.path.dirname(folder)
+        found.append(folder)
+        try:
+            path = os.path.join(os.path.dirname(path), os.readlink(path))
+        except OSError:
+            break
+    return tuple(dict.fromkeys(found))
 
 
 def is_pty(device: int | str) -> bool:
@@ -225,37 +287,46 @@ def entry(number: int) -> Path:
     return SYS / f"dev/char/{os.major(number)}:{os.minor(number)}"
 
 
-def _described(tty: Path) -> UsbDevice | None:
-    port = (tty / "device").resolve()
-    interface = next((place for place in (port, *port.parents) if (place / "bInterfaceNumber").exists()), None)
+def _described(tty: str) -> UsbDevice | None:
+    """Return the USB serial port that is described in this folder; None for a tty that is none.
+
+    Paths are text here, and the kernel follows the links in them: pathlib and realpath took half of the time of a scan.
+    """
+    port = f"{tty}/device"
+    interface = next((f"{port}{up}" for up in LEVELS if os.path.exists(f"{port}{up}/bInterfaceNumber")), None)
     if interface is None:
         return None
-    adapter = interface.parent
-    settings = dict(line.split("=", 1) for line in (tty / "uevent").read_text().splitlines())
-    maker = _optional(adapter / "manufacturer") or _optional(adapter / "product")
-    serial, number = _optional(adapter / "serial"), _optional(port / "port_number")
-    kind = ":".join((adapter / name).read_text().strip() for name in ("idVendor", "idProduct"))
+    adapter = f"{interface}/.."
+    settings = dict(line.split("=", 1) for line in _read(f"{tty}/uevent").splitlines())
+    maker = _optional(f"{adapter}/manufacturer") or _optional(f"{adapter}/product")
+    serial, number = _optional(f"{adapter}/serial"), _optional(f"{port}/port_number")
+    kind = ":".join(_read(f"{adapter}/{name}") for name in ("idVendor", "idProduct"))
     return UsbDevice(  # what must be there was read last: had the adapter gone, this would not be reached
-        path=f"/dev/{settings['DEVNAME']}",
+        path=f"{DEV}/{settings['DEVNAME']}",
         maker=maker or kind,
         kind=kind,
         serial=serial,
-        interface=int((interface / "bInterfaceNumber").read_text(), 16),
+        interface=int(_read(f"{interface}/bInterfaceNumber"), 16),
         number=int(number or 0),
-        place=adapter.name,
+        place=os.path.basename(os.path.realpath(adapter, strict=True)),
     )
 
 
-def _described_if_there(tty: Path) -> UsbDevice | None:
+def _described_if_there(tty: str) -> UsbDevice | None:
     try:
         return _described(tty)
     except OSError:
         return None
 
 
-def _optional(attribute: Path) -> str:
+def _read(attribute: str) -> str:
+    with open(attribute, errors="replace") as file:
+        return file.read().strip()
+
+
+def _optional(attribute: str) -> str:
     try:
-        return attribute.read_text(errors="replace").strip()
+        return _read(attribute)
     except FileNotFoundError:
         return ""
 
@@ -269,8 +340,9 @@ def _is_double(device: UsbDevice, other: UsbDevice) -> bool:
     return (device.kind, device.serial) == (other.kind, other.serial) and device.place != other.place
 
 
-def _listed(devices: list[UsbDevice]) -> str:
-    return ", ".join(f"{lasting_name(device) or 'one without a lasting name'} ({device.path})" for device in devices)
+def _listed(devices: list[UsbDevice], scan: Scan) -> str:
+    named = ((lasting_name(device, scan) or "one without a lasting name", device.path) for device in devices)
+    return ", ".join(f"{name} ({path})" for name, path in named)
 
 
 def _link(path: str, folder: str) -> str:

@@ -9,6 +9,7 @@ from typing import cast
 
 from busmaster.errors import LineDown, cause_text
 from busmaster.transport.endpoints import Endpoint
+from busmaster.transport.folder_watch import FolderWatch, watch_folders
 from busmaster.transport.identity import Identity
 from busmaster.transport.marks import taker_of_marked_bytes
 
@@ -16,7 +17,12 @@ FIRST_DELAY = 0.1
 LONGEST_DELAY = 5.0
 CLOSE_DEADLINE = 1.0
 LOOK_EVERY = 0.2
-"""Seconds between two looks at whether the device is back."""
+"""Seconds between two looks at whether the device is back, where no folder tells it."""
+LOOK_ANYWAY = 1.0
+"""Seconds between two looks where the folders are watched. In a container the kernel may describe a device whose node
+was there all the time, and a folder of another machine's file system tells nothing."""
+LOOK_PAUSE = 0.02
+"""Seconds between two looks at least, however much happens in the folders."""
 
 
 class Connection:
@@ -54,6 +60,9 @@ class Connection:
         self._seen: Hashable | None = None
         self._told: dict[str, str] = {}
         self._closing = asyncio.Event()
+        self._stirred = asyncio.Event()
+        """There may be something to see: look now."""
+        self._watch: FolderWatch | None = None
 
     async def open(self) -> None:
         """Open it once, now. Raises LineDown."""
@@ -77,22 +86,28 @@ class Connection:
     def accept_device(self) -> None:
         """Take whatever device has the port's name at the next opening, which comes soon."""
         self._device = self._seen = None
+        self._stirred.set()
 
     async def run(self) -> None:
         """Stay connected, opening as often as it takes, until `close` is called or this is cancelled."""
         delay = self._first_delay
-        while True:
-            lasted = await self._stay()
-            if self._closing.is_set():
-                return
-            if lasted > self._longest_delay:  # a port that opens and is lost at once is not hammered
-                delay = self._first_delay
-            returned = await self._wait(delay)
-            delay = self._first_delay if returned else min(2 * delay, self._longest_delay)
+        try:
+            while True:
+                lasted = await self._stay()
+                if self._closing.is_set():
+                    return
+                if lasted > self._longest_delay:  # a port that opens and is lost at once is not hammered
+                    delay = self._first_delay
+                self._follow_folders()
+                returned = await self._wait(delay)
+                delay = self._first_delay if returned else min(2 * delay, self._longest_delay)
+        finally:
+            self._leave_folders()
 
     async def close(self) -> None:
         """Close it and return when that is done, within CLOSE_DEADLINE whatever the driver or the network does."""
         self._closing.set()
+        self._stirred.set()
         link = self._link
         if link is None or link.transport is None or link.lost.is_set():
             return
@@ -115,6 +130,7 @@ class Connection:
             await self.try_open()
         if self._link is None:
             return 0.0
+        self._leave_folders()
         await self._link.lost.wait()
         self._link = None
         return loop.time() - since
@@ -126,13 +142,32 @@ class Connection:
         until = loop.time() + delay * self._jitter.uniform(0.75, 1.25)
         while (left := until - loop.time()) > 0:
             try:
-                async with asyncio.timeout(min(left, LOOK_EVERY)):
-                    await self._closing.wait()
-                return False
+                async with asyncio.timeout(min(left, LOOK_EVERY if self._watch is None else LOOK_ANYWAY)):
+                    await self._stirred.wait()
             except TimeoutError:
-                if self._came_back():
-                    return True
+                pass
+            if self._closing.is_set():
+                return False
+            stirred = self._stirred.is_set()
+            self._stirred.clear()
+            if stirred and self._watch is not None:
+                self._follow_folders()  # before the look: what comes after it stirs again
+            if self._came_back():
+                return True
+            if stirred:
+                await asyncio.sleep(min(left, LOOK_PAUSE))
         return False
+
+    def _follow_folders(self) -> None:
+        """Watch the folders that now lead to the device, if this endpoint tells them and this system watches any."""
+        folders = getattr(self.endpoint, "folders", None)
+        if folders is not None:
+            self._watch = watch_folders(self._watch, folders, self._stirred.set)
+
+    def _leave_folders(self) -> None:
+        if self._watch is not None:
+            self._watch.close()
+            self._watch = None
 
     def _came_back(self) -> bool:
         """Return whether a device has come since the last look."""

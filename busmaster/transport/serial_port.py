@@ -115,15 +115,17 @@ class SerialPort:
     def presence(self) -> Hashable | None:
         """Tell what is seen of the node that the path (perhaps a symlink) leads to now.
 
-        It is what is seen of all ports where the path is a serial number.
+        It is what is seen of all ttys where the path is a serial number.
         """
-        try:
-            if self.path.startswith(identity.USB):
-                return tuple(sorted(os.listdir(identity.SYS / "class/tty")))
-            status = os.stat(self.path)
-        except OSError:
-            return None
-        return status.st_dev, status.st_ino, status.st_rdev, status.st_ctime_ns
+        return identity.all_ttys() if self._by_serial else identity.node_at(self.path)
+
+    def folders(self) -> tuple[str, ...]:
+        """Return the folders in which an entry comes, or its rights change, when the device comes back."""
+        return (str(identity.DEV),) if self._by_serial else identity.folders_to(self.path)
+
+    @property
+    def _by_serial(self) -> bool:
+        return self.path.startswith(identity.USB)
 
     async def open(
         self, protocol_factory: Callable[[], asyncio.Protocol], only: Identity | None = None
@@ -301,8 +303,9 @@ def _names_pty(path: str) -> bool:
 
 def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool, Identity]:
     """Open and configure the device; also says whether it is paced, and which it is. Blocks. Raises LineDown."""
-    port = replace(port, path=resolve(port.path))
-    found = _found(port, only)
+    scan = identity.Scan()
+    port = replace(port, path=resolve(port.path, scan))
+    found = _found(port, only, scan)
     device = MarkingSerial()
     device.port = port.path
     device.baudrate, device.stopbits = port.baudrate, port.stopbits
@@ -328,10 +331,10 @@ def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool,
         raise
 
 
-def _found(port: SerialPort, only: Identity | None) -> Identity:
+def _found(port: SerialPort, only: Identity | None, scan: identity.Scan) -> Identity:
     """Return which device has the name now. Raises LineDown, before it is touched, if that is another than `only`."""
     try:
-        found = identify(port.path)
+        found = identify(port.path, scan)
     except OSError as error:
         raise _refusal(port, error) from None
     if only is not None and not only.accepts(found):

@@ -12,7 +12,7 @@ import pytest
 from busmaster.errors import LineDown
 from busmaster.transport import identity
 from busmaster.transport.identity import Identity, identify, lasting_name, resolve, usb_devices
-from tests.transport.fakes import PtyMaster, plugged, plugged_high, with_the_number_of
+from tests.transport.fakes import PtyMaster, closed, opened, plugged, plugged_high, with_the_number_of
 from tests.transport.usb import UsbTree
 
 CH340 = "1a86:7523"
@@ -129,6 +129,58 @@ def test_a_serial_number_that_is_not_there_says_what_is(usb: UsbTree, one: PtyMa
             resolve(name)
         assert f"usb:A500XYZ ({one.path})" in caught.value.what
         assert f"one without a lasting name ({two.path})" in caught.value.what
+
+
+@pytest.mark.asyncio
+async def test_an_attempt_to_open_asks_once_what_is_plugged_in_whether_it_fails_or_not(
+    usb: UsbTree, one: PtyMaster, two: PtyMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each scan of seven adapters reads fifty files: a port that was gone once took a tenth of a core for that."""
+    usb.plug(one.path, "A500ABC", place="1-1")
+    usb.plug(two.path, "A500XYZ", place="1-2")
+    scans: list[object] = []
+    really_list = os.listdir
+
+    def listdir(path: str | Path) -> list[str]:
+        scans.extend([path] * (str(path) == str(usb.root / "class/tty")))
+        return really_list(path)
+
+    monkeypatch.setattr(os, "listdir", listdir)
+    with pytest.raises(LineDown, match=r"usb:A500 is not plugged in: there is usb:A500.* usb:A500"):
+        await opened("usb:A500")
+    assert len(scans) == 1
+    transport, recorder = await opened("usb:A500ABC")
+    assert len(scans) == 2
+    await closed(transport, recorder)
+
+
+def test_a_tty_that_is_no_usb_adapter_is_asked_nothing_but_that(usb: UsbTree, one: PtyMaster) -> None:
+    usb.plug(one.path, "A500ABC")
+    console, uart = usb.root / "devices/virtual/tty1", usb.root / "devices/platform/serial8250"
+    console.mkdir(parents=True)
+    (uart / "tty/ttyS0").mkdir(parents=True)
+    (uart / "tty/ttyS0/device").symlink_to("../..")
+    for tty in (console, uart / "tty/ttyS0"):
+        (usb.root / "class/tty" / tty.name).symlink_to(tty)
+        (tty / "uevent").mkdir()  # reading it fails, and would drop a USB port
+        with pytest.raises(IsADirectoryError):
+            (tty / "uevent").read_text()
+        assert identity._described(str(tty)) is None
+    assert [device.path for device in usb_devices()] == [one.path]
+
+
+@pytest.mark.parametrize("below", ["", "/ttyUSB0", "/0003:10C4:EA90.0001/ttyX0", "/0003:10C4:EA90.0001/i2c-7/7-004d"])
+def test_an_adapter_is_found_however_deep_below_its_interface_the_tty_is(
+    usb: UsbTree, one: PtyMaster, below: str
+) -> None:
+    usb.plug(one.path, "A500ABC", place="1-1.4")
+    tty = usb.root / "class/tty" / one.path.removeprefix("/dev/").replace("/", "!")
+    device = usb.root / f"devices/1-1.4/1-1.4:1.0{below}"
+    device.mkdir(parents=True, exist_ok=True)
+    (tty / "device").unlink()
+    (tty / "device").symlink_to(device)
+    [found] = usb_devices()
+    assert (found.path, found.serial, found.interface, found.place) == (one.path, "A500ABC", 0, "1-1.4")
 
 
 def test_an_adapter_with_several_interfaces_wants_one_of_them_named(

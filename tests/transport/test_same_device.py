@@ -225,7 +225,7 @@ async def test_what_was_opened_is_looked_at_too_not_only_the_name(
     ends: list[PtyMaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The name may go to another device between the look and the opening."""
-    monkeypatch.setattr(serial_port, "identify", lambda _: identify(ends[1].path))
+    monkeypatch.setattr(serial_port, "identify", lambda *_: identify(ends[1].path))
     with pytest.raises(LineDown, match=f"{ends[0].path} became another device while it was opened; try again"):
         await opened(ends[0].path)
     monkeypatch.undo()
