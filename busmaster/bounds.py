@@ -118,6 +118,11 @@ LONGEST_PAGE_MESSAGE = 1024
 """Bytes of one message of a page."""
 MOST_PAGES = 64
 """Pages that follow the line at a time."""
+MOST_PAGE_CONNECTIONS = 512
+"""Connections at a time; fewer where the process may have fewer descriptors (`ulimit -n`, less 128). One more closes
+the connection that has waited longest without a whole request, and that is reported once a minute."""
+REQUEST_WITHIN = 10.0
+"""Seconds in which a connection must send a whole request, with its body, from its beginning or from its last reply."""
 
 # Metrics
 

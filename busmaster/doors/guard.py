@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from starlette.responses import PlainTextResponse
@@ -26,11 +26,13 @@ BOTH_LENGTHS = "a request has a Content-Length or a Transfer-Encoding, not both"
 class Guard:
     """What is let through at an address: by Host and Origin, and by tokens where there are some.
 
-    Off this machine nobody writes without a token. `secrets` are the digests of tokens by name.
+    Off this machine nobody writes without a token. `secrets` are the digests of tokens by name. `hosts` are the names
+    under which a proxy passes requests on: whoever can reach the proxy comes with them, so a write needs a token then.
     """
 
-    def __init__(self, listen: HostPort, secrets: Mapping[str, bytes]) -> None:
+    def __init__(self, listen: HostPort, secrets: Mapping[str, bytes], hosts: Iterable[str] = ()) -> None:
         self._listen = listen
+        self._hosts = frozenset(host.lower() for host in hosts)
         self._access = Access(secrets=secrets)
 
     @property
@@ -41,7 +43,7 @@ class Guard:
     @property
     def lets_write(self) -> bool:
         """Return whether anybody may write here, with a token or without."""
-        return self.wants_token or is_loopback(self._listen[0])
+        return self.wants_token or (is_loopback(self._listen[0]) and not self._hosts)
 
     def refusal(self, headers: Mapping[str, str]) -> str:
         """Return why a request is refused, "" if it is not: a name of ours is asked for, and no other site's page asks.
@@ -53,8 +55,8 @@ class Guard:
             # Two servers in a row may not agree where such a request ends (RFC 9112, 6.3): no client of ours sends it.
             return BOTH_LENGTHS
         host = headers.get("host", "")
-        if not self._is_our_name(host):
-            return f"no such host: {host[:60]!r}"
+        if not (host.partition(":")[0].lower() in self._hosts or self._is_our_name(host)):
+            return f"no such host: {host[:60]!r}; of a proxy, name it with --host"
         origin = headers.get("origin")
         if origin is not None and origin.partition("://")[2] != host:
             return f"another site's page may not come here: {origin[:60]!r}"

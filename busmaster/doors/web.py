@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import uvicorn
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
@@ -21,6 +21,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from busmaster.bounds import LONGEST_COMMAND, LONGEST_PAGE_MESSAGE, MOST_PAGES
 from busmaster.doors.audience import Audience, Seat
+from busmaster.doors.connections import Crowd
 from busmaster.doors.following import Following, Lost
 from busmaster.doors.guard import Guard, Guarded
 from busmaster.errors import (
@@ -208,10 +209,13 @@ async def _value(request: Request) -> float | str:
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
         raise HTTPException(415, 'the body is JSON: {"value": NUMBER}, as application/json')
     body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > LONGEST_COMMAND:
-            raise HTTPException(413, f"the body has {LONGEST_COMMAND} bytes at most")
+    try:
+        async for part in request.stream():
+            body += part
+            if len(body) > LONGEST_COMMAND:
+                raise HTTPException(413, f"the body has {LONGEST_COMMAND} bytes at most")
+    except ClientDisconnect:
+        raise HTTPException(400, "the connection ended before the body did") from None
     try:
         said = json.loads(body)
     except (ValueError, RecursionError):
@@ -246,8 +250,11 @@ def application(line: Following, guard: Guard, tell: Told = lambda _: None) -> G
 
 
 @contextlib.asynccontextmanager
-async def serving(application: Any, listen: HostPort) -> AsyncIterator[str]:
-    """Serve an application at an address, and yield its URL. Raises InvalidCommand where nothing can listen there."""
+async def serving(application: Any, listen: HostPort, tell: Told = lambda _: None) -> AsyncIterator[str]:
+    """Serve an application at an address, and yield its URL. `tell` is told of connections that are closed.
+
+    Raises InvalidCommand where nothing can listen there.
+    """
     opened = await asyncio.to_thread(listening, listen)
     with opened:
         config = uvicorn.Config(
@@ -258,7 +265,7 @@ async def serving(application: Any, listen: HostPort) -> AsyncIterator[str]:
             proxy_headers=False,
             server_header=False,
             timeout_graceful_shutdown=CLOSE_WITHIN,
-            ws="websockets-sansio",
+            **Crowd(tell).protocols(),
             ws_max_size=LONGEST_PAGE_MESSAGE,
             ws_per_message_deflate=False,  # it takes as long as all else that is done for a page
         )
@@ -281,13 +288,19 @@ class _Server(uvicorn.Server):
 
 
 async def serve(
-    line: Following, listen: HostPort, secrets: Mapping[str, bytes], opened: Told, tell: Told = lambda _: None
+    line: Following,
+    listen: HostPort,
+    secrets: Mapping[str, bytes],
+    hosts: Sequence[str],
+    opened: Told,
+    tell: Told = lambda _: None,
 ) -> None:
-    """Follow a line and serve its page until cancelled. `opened` is told the page's URL.
+    """Follow a line and serve its page until cancelled. `opened` is told the page's URL, `hosts` are further names of
+    it.
 
     Raises InvalidCommand where nothing can listen there.
     """
-    async with serving(application(line, Guard(listen, secrets), tell), listen) as url:
+    async with serving(application(line, Guard(listen, secrets, hosts), tell), listen, tell) as url:
         opened(url)
         await line.follow()
 

@@ -50,7 +50,7 @@ BESIDE = {
     "monitor": f"{CAPTURE} [--baud N]",
     "doctor": f"{CAPTURE} {LINE}",
     "serve": f"{CAPTURE} [--port PORT] [--seconds S]",
-    "web": "[--token-file FILE]",
+    "web": "[--token-file FILE] [--host NAME]",
     "opcua": "[--allow POINT] [--token-file FILE] [--certificate FILE] [--key FILE] [--trusted FOLDER]",
     "safe": f"{CAPTURE} [--port PORT]",
     "discover": f"{CAPTURE} [--protocol P] [--nodes N-M,K]",

@@ -1,0 +1,143 @@
+"""The connections of the page's server: how many there may be, and how long each may keep the server waiting.
+
+The server's library bounds neither: a connection that sends nothing, half a request, or half a body, or that does not
+read its reply, stays open for as long as its client likes, and each costs a descriptor.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import resource
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import h11
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+from busmaster.bounds import MOST_PAGE_CONNECTIONS, REQUEST_WITHIN, SEND_WITHIN
+
+RESERVED = 128
+"""Descriptors that connections leave: for those that are accepted before others are closed, for files and sockets."""
+FEWEST = 16
+REPORT_EVERY = 60.0
+"""Seconds from one report of closed connections to the next."""
+WAITING = (h11.IDLE, h11.SEND_BODY)
+"""States of a client that has not sent a whole request."""
+
+Told = Callable[[str], None]
+
+
+def most_connections() -> int:
+    """Return how many connections are held at a time: below the number of descriptors that this process may have."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return MOST_PAGE_CONNECTIONS if soft == resource.RLIM_INFINITY else min(MOST_PAGE_CONNECTIONS, soft - RESERVED)
+
+
+class Crowd:
+    """All connections of one server. Beyond the bound, the one that has waited longest without a request is closed."""
+
+    def __init__(self, tell: Told) -> None:
+        self.most = max(FEWEST, most_connections())
+        self._tell = tell
+        self._waiting: dict[HttpConnection, None] = {}
+        """Connections without a whole request; the one that has waited longest first."""
+        self._closed = 0
+        self._report: asyncio.TimerHandle | None = None
+
+    def protocols(self) -> dict[str, Any]:
+        """Return what the server's settings take: the classes of its connections."""
+        return {"http": partial(HttpConnection, crowd=self), "ws": PageConnection}
+
+    def note_waiting(self, connection: HttpConnection, count: int) -> None:
+        """Note a connection that has no whole request; `count` connections are open with it."""
+        self._waiting[connection] = None
+        if count > self.most:
+            oldest = next(iter(self._waiting))
+            self.note_busy(oldest)
+            oldest.transport.abort()
+            self._closed += 1
+            if self._report is None:
+                self._tell_closed()
+
+    def note_busy(self, connection: HttpConnection) -> None:
+        """Note a connection that has a whole request, or that is over."""
+        self._waiting.pop(connection, None)
+
+    def _tell_closed(self) -> None:
+        """Report connections that were closed since the last report, until there are none."""
+        self._report = None
+        if self._closed:
+            many = f"{self._closed} that had sent no whole request {'was' if self._closed == 1 else 'were'} closed"
+            self._tell(f"there are {self.most} connections to the page, and no more are held: {many}")
+            self._closed = 0
+            self._report = asyncio.get_running_loop().call_later(REPORT_EVERY, self._tell_closed)
+
+
+class _Taken:
+    """A connection whose client must read what it is sent: one that reads nothing for SEND_WITHIN is closed."""
+
+    transport: Any
+    _reading: asyncio.TimerHandle | None = None
+
+    def pause_writing(self) -> None:
+        super().pause_writing()  # type: ignore[misc]
+        if self._reading is None:
+            self._reading = asyncio.get_running_loop().call_later(SEND_WITHIN, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()  # type: ignore[misc]
+        self._read()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._read()
+        super().connection_lost(exc)  # type: ignore[misc]
+
+    def _read(self) -> None:
+        if self._reading is not None:
+            self._reading.cancel()
+            self._reading = None
+
+
+class HttpConnection(_Taken, H11Protocol):
+    """A connection whose client must send each request whole within REQUEST_WITHIN."""
+
+    def __init__(self, *args: Any, crowd: Crowd, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._crowd = crowd
+        self._request: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._look()
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        self._look()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._look()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._have_request()
+        super().connection_lost(exc)
+
+    def _look(self) -> None:
+        """Begin to wait for a request, or have one."""
+        if self.conn.their_state not in WAITING or self.transport.is_closing():
+            self._have_request()
+        elif self._request is None:
+            self._request = self.loop.call_later(REQUEST_WITHIN, self.transport.abort)
+            self._crowd.note_waiting(self, len(self.connections))
+
+    def _have_request(self) -> None:
+        self._crowd.note_busy(self)
+        if self._request is not None:
+            self._request.cancel()
+            self._request = None
+
+
+class PageConnection(_Taken, WebSocketsSansIOProtocol):
+    """A page that follows the line. The library sends pings, and closes one that does not answer them."""
