@@ -12,6 +12,7 @@ import anyio
 import click
 
 from busmaster.bus.bus import Bus
+from busmaster.bus.points import Point
 from busmaster.cli.arguments import View, plain_option, seconds_option
 from busmaster.cli.demo_line import CONTROLLERS, DRIVES, SETTINGS
 from busmaster.cli.ending import until_ended
@@ -36,7 +37,8 @@ def command(seconds: float | None, plain: bool) -> int:
     """Emulate a line with eight drives in a process of its own, poll it live and command it meanwhile.
 
     Controllers (nodes 1 to 3) move their axes, MicroFlex drives (4 to 8) get a new speed reference now and then, and
-    one of them loses its wire for some seconds. Nothing is connected or listened to. Ctrl-C ends it.
+    node 7 loses its wire for some seconds: for about a second, until it is known to be down, cycles are missed.
+    Nothing is connected or listened to. Ctrl-C ends it.
     """
     view = View(seconds=seconds, plain=plain)
     with ExitStack() as lines:  # a terminal that is taken is kept: else the next one would be the same
@@ -77,14 +79,20 @@ async def demo(path: str, view: View) -> int:
     Raises LineDown if that port cannot be opened.
     """
     bus = Bus(SerialPort(path, baudrate=SETTINGS.baudrate))
-    axes = [Hcp2Controller(bus, address).axis(0) for address in CONTROLLERS]
-    drives = [MicroFlexDrive(bus, address) for address in DRIVES]
-    points = [point for axis in axes for point in (axis.position, axis.velocity)]
-    points += [point for drive in drives for point in (drive.speed_measured, drive.torque_demand)]
+    drives, points = devices(bus)
     async with bus:
         watch = Watch(bus, "busmaster demo", view)
         watch.add(bus.poll_group("drives", period=PERIOD, points=points))
         return await follow(watch, lambda: command_drives(watch, drives))
+
+
+def devices(bus: Bus) -> tuple[list[MicroFlexDrive], list[Point[float]]]:
+    """Return the drives of the line, and what is polled of these and of the controllers."""
+    axes = [Hcp2Controller(bus, address).axis(0) for address in CONTROLLERS]
+    drives = [MicroFlexDrive(bus, address) for address in DRIVES]
+    points = [point for axis in axes for point in (axis.position, axis.velocity)]
+    points += [point for drive in drives for point in (drive.speed_measured, drive.torque_demand)]
+    return drives, points
 
 
 async def command_drives(watch: Watch, drives: list[MicroFlexDrive]) -> None:

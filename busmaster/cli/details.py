@@ -50,7 +50,7 @@ def _facts(
         state = "offline" if frame and frame.state == "offline" else node.health
         times = f"p50 {node.p50 * 1000:.1f}, p99 {node.p99 * 1000:.1f} ms"
         counts = f"{node.requests} requests, {node.failed} failed, {node.late} late, {times}"
-        yield "node", f"{node.protocol} {node.address}, {state}: {counts}"
+        yield "node", f"{node.kind or node.protocol} {node.address}, {state}: {counts}"
     if group is not None:
         yield "group", f"{group.name}, every {group.period * 1000:g} ms{', paused' if group.paused else ''}"
     if told.get("gone"):

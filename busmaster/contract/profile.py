@@ -93,8 +93,15 @@ class Profile:
     exchange_limit: float | None = None
     checked_requests: bool = True
     listen: Callable[[], Listener] | None = field(default=None, compare=False)
+    kind: str = field(default="", compare=False)
+    """What this kind of device is called as a protocol, where that is not `name`: "microflex" speaks hcp2."""
     # Compared apart: a second handle that leaves it open asks for the same node (Node.check_shared).
     merge: Callable[[Sequence[Command[Any]]], Sequence[Batch]] | None = field(default=None, compare=False)
+
+    @property
+    def kind_name(self) -> str:
+        """Return the name by which LINE.toml and the command line know this kind of device."""
+        return self.kind or self.name
 
     def label(self, address: int) -> str:
         """Return how messages name a node: "node 5", or "the drive" where the protocol has no address."""

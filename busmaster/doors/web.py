@@ -91,7 +91,7 @@ class Api:
 
     async def nodes(self, _: Request) -> Response:
         """Answer health and counts of all nodes."""
-        return _json([asdict(node) for node in self._line.picture.nodes.values()])
+        return _json([_as_in_the_file(asdict(node)) for node in self._line.picture.nodes.values()])
 
     async def groups(self, _: Request) -> Response:
         """Answer all poll groups."""
@@ -189,9 +189,27 @@ class Api:
         raise HTTPException(404, f"there is no point {key!r} in a poll group {group!r}")
 
     def _point(self, row: Row) -> dict[str, Any]:
-        named = ("group", "key", "node", "protocol", "address", "item", "unit", "precision", "writable", "value")
+        named = (
+            "group",
+            "key",
+            "node",
+            "protocol",
+            "kind",
+            "address",
+            "item",
+            "unit",
+            "precision",
+            "writable",
+            "value",
+        )
         said = {name: getattr(row, name) for name in (*named, "quality", "error", "alarm")}
-        return said | {"time": None if row.asked is None else self._wall(row.asked)}
+        return _as_in_the_file(said) | {"time": None if row.asked is None else self._wall(row.asked)}
+
+
+def _as_in_the_file(said: dict[str, Any]) -> dict[str, Any]:
+    """Return what is said of a node or a point with its protocol as LINE.toml has it: `microflex`, not `hcp2`."""
+    kind = said.pop("kind")
+    return said | {"protocol": kind or said["protocol"]}
 
 
 WISHES = {'{"exchanges":true}': True, '{"exchanges":false}': False}

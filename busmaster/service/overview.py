@@ -256,6 +256,7 @@ def _said_point(group: PollGroup, point: Point[Any]) -> dict[str, Any]:
         "key": point.key,
         "node": point.node.label,
         "protocol": point.node.profile.name,
+        "kind": point.node.profile.kind_name,
         "address": point.node.address,
         "item": point.item,
         "unit": point.unit,
@@ -326,6 +327,7 @@ def _said_node(node: Node) -> dict[str, Any]:
     return {
         "label": node.label,
         "protocol": node.profile.name,
+        "kind": node.profile.kind_name,
         "address": node.address,
         "health": health_text(node),
         "requests": counts.attempts,

@@ -37,6 +37,8 @@ class Row:
     precision: int | None = None
     writable: bool = False
     value: float | str | None = None
+    kind: str = ""
+    """What LINE.toml calls its protocol: a "microflex" speaks hcp2. "" where an older owner does not say."""
     quality: str = ""
     asked: float | None = None
     error: str = ""
@@ -95,6 +97,8 @@ class Node:
     late: int = 0
     p50: float = 0.0
     p99: float = 0.0
+    kind: str = ""
+    """As of a Row."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from jsonschema import Draft202012Validator
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from busmaster import Hcp2Controller
+from busmaster import Hcp2Controller, MicroFlexDrive
 from busmaster.bounds import LONGEST_COMMAND
 from busmaster.bus.limits import Limit
 from busmaster.doors import following
@@ -22,6 +22,7 @@ from busmaster.doors.audience import MOST_EXCHANGES, Seat
 from busmaster.doors.web import PAGE, serving
 from busmaster.errors import InvalidCommand
 from busmaster.gate.permission import Access, Permission, digest_of
+from busmaster.registry import kinds
 from tests.doors.lines import HERE, ONE, READS, Page, assert_goes_on_alone, page, poll, shows
 from tests.patience import PATIENCE
 from tests.service.lines import Served, served, until
@@ -70,6 +71,22 @@ async def test_all_that_it_answers_is_as_its_schema_says(tmp_path: Path) -> None
         answer = await of.client.get("/api/points/axes/5/11")
         assert answer.status_code == 404
         check("/api/points/{group}/{key}", "get", 404, answer.json())
+
+
+@pytest.mark.asyncio
+async def test_a_microflex_is_called_by_the_protocol_that_its_file_has(tmp_path: Path) -> None:
+    async with served(tmp_path) as line, page(tmp_path) as of:
+        poll(line, MicroFlexDrive(line.bus, 7).point("speed_measured"))
+        await shows(of.line)
+        for path in ("nodes", "points"):
+            said = (await of.client.get(f"/api/{path}")).json()
+            check(f"/api/{path}", "get", 200, said)
+            assert {(one["address"], one["protocol"]) for one in said} == {(5, "hcp2"), (7, "microflex")}
+
+
+def test_each_kind_of_node_is_called_by_its_own_name() -> None:
+    for name, kind in kinds().items():
+        assert kind.profile.kind_name == name
 
 
 @pytest.mark.asyncio

@@ -40,6 +40,7 @@ def row(node: int = 5, item: str = "outputs", value: Any = 0, **said: Any) -> tu
         "key": f"{node}/{item}",
         "node": f"node {node}",
         "protocol": "hcp2",
+        "kind": "hcp2",
         "address": node,
         "item": item,
         "unit": "",
@@ -50,7 +51,7 @@ def row(node: int = 5, item: str = "outputs", value: Any = 0, **said: Any) -> tu
 
 
 def node(number: int, health: str = "up", **said: Any) -> dict[str, Any]:
-    known = {"label": f"node {number}", "protocol": "hcp2", "address": number, "health": health}
+    known = {"label": f"node {number}", "protocol": "hcp2", "kind": "hcp2", "address": number, "health": health}
     return known | {"requests": 10, "failed": 0, "late": 0, "p50": 0.0031, "p99": 0.004} | said
 
 

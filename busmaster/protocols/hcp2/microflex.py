@@ -109,6 +109,7 @@ ITEMS = tuple(element.item for element in ELEMENTS.values())
 
 PROFILE = replace(
     hcp2.PROFILE,
+    kind="microflex",
     probe=hcp2.Read(STATUS_WORD.number),
     checks=tuple(
         hcp2.Read(element.number)
