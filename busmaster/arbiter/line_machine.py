@@ -77,6 +77,7 @@ class LineMachine:
         self.dispatcher.fault = self._offline
         self.events = self.dispatcher.events
         self._cause = "not open yet"
+        self._hint: str | None = None
         self._closed = False
         # the exchange on the wire
         self._leg = Leg(ReplyTiming(0.0, 0.0, UNKNOWN_LATENESS, QUIET), receive_latency, byte_time)
@@ -112,12 +113,17 @@ class LineMachine:
         if self.state is OFFLINE:
             return
         self._counters.losses += 1
-        self._cause = cause
+        self._cause, self._hint = cause, None
         self.events.append(LineChanged(LineChange.DOWN, cause))
         if not self._closed:
             self.dispatcher.fault = self._offline
         self._go_offline(now)
         self.dispatcher.fail_all(now)
+
+    def still_down(self, cause: str, hint: str) -> None:
+        """Note why the port does not come back: a request that fails says that, which is news, and not the loss."""
+        if self.state is OFFLINE:
+            self._cause, self._hint = cause, hint
 
     def data_received(self, data: bytes, now: float) -> None:
         """Take bytes as they come: an echo, a reply, or what nobody asked for."""
@@ -552,4 +558,4 @@ class LineMachine:
         self.state = state
 
     def _offline(self) -> BusError:
-        return LineDown(f"the line is down: {self._cause}")
+        return LineDown(f"the line is down: {self._cause}", hint=self._hint)

@@ -455,6 +455,7 @@ class Bus:
                 stream.put(event)
 
     def _on_failed(self, cause: LineDown) -> None:
+        self._arbiter.still_down(cause.what, cause.hint)
         self._on_event(PortFailed(cause.what, cause.hint, cause.__cause__))
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:

@@ -41,16 +41,27 @@ class Finding:
     advice: str = ""
 
 
-def inspect(name: str, *, proc: Path = PROC) -> tuple[Finding, ...]:
-    """Say everything that can be said without opening it of the port at a path, or of usb:SERIAL. May block."""
+def inspect(name: str, *, low_latency: bool | None = None, proc: Path = PROC) -> tuple[Finding, ...]:
+    """Say everything that can be said without opening it of the port at a path, or of usb:SERIAL. May block.
+
+    If `low_latency` is to be set when it is opened, its latency timer is not looked at before: see `opened_latency`.
+    """
+    scan = identity.Scan()
     try:
-        path = identity.resolve(name)
+        path = identity.resolve(name, scan)
     except LineDown as error:
         return (Finding("port", False, error.what, error.hint),)
     found = [_existence(path)]
     if found[0].ok:
-        found += [*_name(name, path), _permission(path), _holders(path, proc), *_driver(path), *_latency_timer(path)]
+        found += [*_name(name, path, scan), _permission(path), _holders(path, proc), *_driver(path)]
+        if not low_latency:
+            found += _latency(path, f"add ?low_latency=1 to the port (low_latency=True in Python), or {_by_root(path)}")
     return tuple(found)
+
+
+def opened_latency(path: str) -> Iterator[Finding]:
+    """Say what an FTDI adapter's latency timer is in a port that was opened with `low_latency`. May block."""
+    yield from _latency(path, f"low_latency=1 did not shorten it: {_by_root(path)}")
 
 
 def latency_timer(path: str) -> int | None:
@@ -106,14 +117,14 @@ def _existence(path: str) -> Finding:
     return Finding("port", True, f"{path} is {os.path.realpath(path)}" if os.path.islink(path) else f"{path} exists")
 
 
-def _name(name: str, path: str) -> Iterator[Finding]:
+def _name(name: str, path: str, scan: identity.Scan) -> Iterator[Finding]:
     """Say which USB adapter it is, and by what name that is found again."""
     with contextlib.suppress(OSError):  # it has just gone, which opening it will say
         device = identity.usb_device(os.stat(path).st_rdev)
         if device is None:
             return
-        lasting = identity.lasting_name(device)
-        what = f"{path} is {identity.identify(path)}"
+        lasting = identity.lasting_name(device, scan)
+        what = f"{path} is {identity.identify(path, scan)}"
         by_id, by_path = f"{identity.LINKS}/by-id/", f"{identity.LINKS}/by-path/"
         if name.startswith((identity.USB, by_path)) or (name.startswith(by_id) and lasting.startswith(by_id)):
             yield Finding("name", True, f"{what}, which {name} finds again")
@@ -154,7 +165,8 @@ def _driver(path: str) -> Iterator[Finding]:
         yield Finding("driver", True, f"its driver is {driver.resolve().name}")
 
 
-def _latency_timer(path: str) -> Iterator[Finding]:
+def _latency(path: str, advice: str) -> Iterator[Finding]:
+    """Say how long the adapter gathers bytes; `advice` is for one that gathers for too long."""
     timer = latency_timer(path)
     if timer is None:
         return
@@ -162,9 +174,11 @@ def _latency_timer(path: str) -> Iterator[Finding]:
     if timer <= SLOW_LATENCY_TIMER:
         yield Finding("latency", True, what)
     else:
-        file = _device(path) / "latency_timer"
-        advice = f"add ?low_latency=1 to the port (low_latency=True in Python), or write 1 to {file} as root"
         yield Finding("latency", False, what, advice)
+
+
+def _by_root(path: str) -> str:
+    return f"write 1 to {_device(path) / 'latency_timer'} as root"
 
 
 def _device(path: str) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -98,7 +99,8 @@ async def examine(patient: Patient, tell: Tell, tap: Tap | None = None) -> None:
     """Tell all findings, in this order; one that makes the rest pointless is the last."""
     where = patient.endpoint
     if isinstance(where, SerialPort):
-        found = await anyio.to_thread.run_sync(adapters.inspect, where.path)
+        inspect = functools.partial(adapters.inspect, where.path, low_latency=where.low_latency)
+        found = await anyio.to_thread.run_sync(inspect)
         for finding in found:
             tell(finding)
         if not all(finding.ok for finding in found if finding.topic in ("port", "permission", "holders")):
@@ -111,9 +113,17 @@ async def examine(patient: Patient, tell: Tell, tap: Tap | None = None) -> None:
         async with opened(where, tap) as wire:
             for finding in opening(patient, wire):
                 tell(finding)
+            if isinstance(where, SerialPort) and where.low_latency:
+                for finding in await anyio.to_thread.run_sync(_opened_latency, wire):
+                    tell(finding)
             await examine_line(patient, wire, tell)
     except LineDown as error:
         tell(Finding("port", False, error.what, error.hint))
+
+
+def _opened_latency(wire: Wire) -> list[Finding]:
+    assert wire.transport is not None
+    return list(adapters.opened_latency(wire.transport.get_extra_info("serial").port))
 
 
 def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
@@ -131,7 +141,7 @@ def opening(patient: Patient, wire: Wire) -> Iterator[Finding]:
     device = wire.transport.get_extra_info("serial")
     if device is not None:
         yield from rate(device.fileno(), where.settings.baudrate)
-        yield from driver(device.fileno())
+        yield from driver(device.fileno(), where.low_latency if isinstance(where, SerialPort) else None)
 
 
 def rate(descriptor: int, baudrate: int) -> Iterator[Finding]:
@@ -144,15 +154,18 @@ def rate(descriptor: int, baudrate: int) -> Iterator[Finding]:
         )
 
 
-def driver(descriptor: int) -> Iterator[Finding]:
-    """Say what the driver of an open serial port does."""
+def driver(descriptor: int, wanted: bool | None = None) -> Iterator[Finding]:
+    """Say what the driver of an open serial port does. `wanted` is the low-latency flag that it was opened with."""
     match adapters.low_latency(descriptor):
         case None:
             yield Finding("driver", True, "it has no low-latency flag")
         case True:
             yield Finding("driver", True, "its low-latency flag is set")
+        case False if wanted:
+            yield Finding("driver", True, "its low-latency flag is not set, though low_latency=1 asked for it")
         case False:
-            yield Finding("driver", True, "its low-latency flag is not set", "?low_latency=1 may bring replies sooner")
+            advice = "?low_latency=1 may bring replies sooner" if wanted is None else ""
+            yield Finding("driver", True, "its low-latency flag is not set", advice)
     match adapters.rs485_mode(descriptor):
         case None:
             yield Finding("rs485", True, "the driver has no RS-485 mode: the adapter switches by itself, or is RS-232")

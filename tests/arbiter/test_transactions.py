@@ -493,3 +493,24 @@ def test_submitting_says_whether_there_is_something_to_pump() -> None:
     assert bench.arbiter.submit(Transaction(node, write(5)), bench.now), "a write may overtake others"
     assert not submit()
     assert submit(), "the backlog is full: it has ended"
+
+
+def test_while_the_line_is_down_a_request_fails_with_the_latest_reason_and_what_to_do_about_it() -> None:
+    bench = Bench()
+    node = bench.node()
+
+    def error() -> str:
+        asked = bench.ask(node)
+        assert isinstance(asked.error, LineDown)
+        return str(asked.error)
+
+    bench.arbiter.still_down("another has its name", "name it")  # it is up, so that says nothing
+    bench.arbiter.line_down("unplugged", bench.now)
+    usual = LineDown.hint
+    assert error() == f"node 1: the line is down: unplugged (read element 1); {usual}".removesuffix("; ")
+    for reason in ("it does not exist", "another has its name"):
+        bench.arbiter.still_down(reason, f"mend that {reason}")
+        assert error() == f"node 1: the line is down: {reason} (read element 1); mend that {reason}"
+    bench.arbiter.line_up(bench.now)
+    bench.arbiter.line_down("unplugged", bench.now)
+    assert error() == f"node 1: the line is down: unplugged (read element 1); {usual}".removesuffix("; ")

@@ -19,10 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import serial
 
 from busmaster.capture.pcapng import read_packets
 from busmaster.contract.profile import LineSettings
-from busmaster.doctor import diagnosis, examination
+from busmaster.doctor import adapters, diagnosis, examination
 from busmaster.doctor.adapters import Finding
 from busmaster.doctor.examination import HARMLESS, Patient, examine, other_settings
 from busmaster.doctor.probing import Outcome, Prober, opened
@@ -343,6 +344,43 @@ def test_an_adapter_is_examined_by_its_serial_number_and_by_its_path_that_name_i
     assert (value.status, value.out) == (0, "1 0\n")
     assert absent.status == 1
     assert f"usb:A500XYZ is not plugged in: there is usb:A500ABC ({server.path})" in absent.out
+
+
+@pytest.mark.usefixtures("hasty")
+@pytest.mark.parametrize("obeys", [True, False])
+def test_where_low_latency_is_asked_for_the_latency_timer_is_judged_as_the_opening_leaves_it(
+    busmaster: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, obeys: bool
+) -> None:
+    monkeypatch.setattr(identity, "SYS", tmp_path / "sys")
+    usb = UsbTree(tmp_path / "sys")
+    timer = tmp_path / "sys/devices/1-1/1-1:1.0/ttyUSB0/latency_timer"
+
+    def set_flag(port: serial.Serial, flag: bool) -> None:
+        assert timer.read_text() == "16\n"
+        if flag and obeys:
+            timer.write_text("1\n")
+
+    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", set_flag)
+    monkeypatch.setattr(adapters, "low_latency", lambda _: timer.read_text() == "1\n")
+    with serve_pty(line_of("hcp2", [hcp2(1)], paced=False)) as server:
+        usb.plug(server.path, "A500ABC")
+        device = tmp_path / "sys/class/tty" / os.path.basename(server.path)
+        device.mkdir()  # by the last part of its path, as of a node in /dev
+        (device / "device").symlink_to(timer.parent)
+        timer.write_text("16\n")
+        plain = busmaster("doctor", "usb:A500ABC")
+        asked = busmaster("doctor", "usb:A500ABC?low_latency=1")
+    [before] = [line for line in plain.lines if " latency " in line]
+    assert "16 ms" in before
+    assert "add ?low_latency=1" in plain.out
+    assert "?low_latency=1 may" in plain.out
+    assert "?low_latency=1" not in asked.out
+    assert f"its low-latency flag is {'set' if obeys else 'not set, though low_latency=1 asked for it'}\n" in asked.out
+    [after] = [line for line in asked.lines if " latency " in line]
+    assert ("1 ms" if obeys else "16 ms") in after
+    assert after.startswith("ok" if obeys else "MEND")
+    assert ("low_latency=1 did not shorten it: write 1 to" in asked.out) is not obeys
+    assert asked.out.count("gathers received bytes") == 1
 
 
 @pytest.mark.usefixtures("hasty")

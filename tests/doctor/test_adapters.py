@@ -191,7 +191,7 @@ def test_a_pty_has_no_low_latency_flag_and_a_driver_tells_its_own(
 def test_the_low_latency_flag_is_told_with_how_to_set_it(
     monkeypatch: pytest.MonkeyPatch, pty_master: PtyMaster
 ) -> None:
-    def told(flags: int | None) -> tuple[str, str]:
+    def told(flags: int | None, wanted: bool | None = None) -> tuple[str, str]:
         def ioctl(_descriptor: int, request: int, settings: Any) -> int:
             if flags is None or request != termios.TIOCGSERIAL:
                 raise OSError("no such flag")
@@ -199,13 +199,16 @@ def test_the_low_latency_flag_is_told_with_how_to_set_it(
             return 0
 
         monkeypatch.setattr(fcntl, "ioctl", ioctl)
-        [finding] = [finding for finding in driver(pty_master.fd) if finding.topic == "driver"]
+        [finding] = [finding for finding in driver(pty_master.fd, wanted) if finding.topic == "driver"]
         assert finding.ok
         return finding.what, finding.advice
 
     assert told(1 << 13) == ("its low-latency flag is set", "")
     assert told(0) == ("its low-latency flag is not set", "?low_latency=1 may bring replies sooner")
     assert told(None) == ("it has no low-latency flag", "")
+    assert told(1 << 13, wanted=True) == ("its low-latency flag is set", "")
+    assert told(0, wanted=True) == ("its low-latency flag is not set, though low_latency=1 asked for it", "")
+    assert told(0, wanted=False) == ("its low-latency flag is not set", "")
 
 
 def test_a_rate_that_a_uart_cannot_make_is_told_where_its_driver_tells_what_it_divides(

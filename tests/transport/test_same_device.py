@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import serial
 
+from busmaster import Hcp2Controller
 from busmaster.arbiter.events import LineChange, LineChanged, PortFailed
 from busmaster.bus.bus import Bus
 from busmaster.errors import LineDown
@@ -290,6 +291,36 @@ async def test_a_port_that_another_program_took_meanwhile_is_told_once_with_its_
         give(name, ends[2])
         ends[1].unplug()
         await recorder.connected(3)
+
+
+@pytest.mark.asyncio
+async def test_while_another_device_has_the_name_every_request_says_so_and_what_to_do(
+    usb: UsbTree, name: Path, ends: list[PtyMaster]
+) -> None:
+    ours, other = ends[:2]
+    usb.plug(ours.path, "A500ABC")
+    usb.plug(other.path, "A500XYZ", place="1-2")
+    give(name, ours)
+    async with Bus(SerialPort(str(name), baudrate=57600)) as bus, asyncio.timeout(PATIENCE):
+        axis, events = Hcp2Controller(bus, 1), bus.events()
+        ours.unplug()
+        while not isinstance(event := await anext(events), PortFailed) or "does not exist" not in event.cause:
+            pass
+        for request in (axis.read(1), axis.write(1, 5)):
+            with pytest.raises(LineDown, match=rf"the line is down: {name} does not exist: .*; plug it in, or see"):
+                await request
+        give(name, other)
+        while not isinstance(event := await anext(events), PortFailed) or "is now" not in event.cause:
+            pass
+        for request in (axis.read(1), axis.write(1, 5)):
+            with pytest.raises(LineDown) as caught:
+                await request
+            assert str(caught.value).endswith(
+                f"the line is down: {name} is now FTDI A500XYZ, the line was opened on FTDI A500ABC "
+                f"({caught.value.command}); name it usb:A500ABC, which finds it wherever it is, or restart to go on "
+                "with the other"
+            )
+            assert caught.value.attempts == 0
 
 
 @pytest.mark.asyncio
