@@ -122,8 +122,7 @@ class LineMachine:
 
     def still_down(self, cause: str, hint: str) -> None:
         """Note why the port does not come back: a request that fails says that, which is news, and not the loss."""
-        if self.state is OFFLINE:
-            self._cause, self._hint = cause, hint
+        self._cause, self._hint = cause, hint
 
     def data_received(self, data: bytes, now: float) -> None:
         """Take bytes as they come: an echo, a reply, or what nobody asked for."""

@@ -18,9 +18,11 @@ import functools
 import math
 import os
 import termios
+import threading
+import time
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import serial
@@ -59,6 +61,11 @@ OPEN_DEADLINE = 10.0
 """Seconds after which an opening that does not come back is given up."""
 CLOSE_DEADLINE = 0.5
 """Seconds for which `close` waits for the driver before it reports the port closed all the same."""
+CLOSING_PATIENCE = 5.0
+"""Seconds for which an opening waits until this program's own earlier closing of the device is over. A driver that
+holds unsent bytes may take half a minute over it; it is waited for again at the next attempt."""
+IN_USE = errno.EBUSY, errno.EAGAIN
+"""The driver's flag, the lock."""
 READ_SIZE = 448
 """Bytes of one read, more than any frame has. Python serves up to 512, its own header included, from a pool of its own;
 what is larger costs a call of malloc, and another to cut it to what came."""
@@ -137,6 +144,9 @@ class SerialPort:
                 device, paced, found = await asyncio.wrap_future(opening)
         except TimeoutError:
             opening.add_done_callback(_drop)
+            # some drivers let no opening return before the closing is over
+            if any(closing.name == self.path for closing in tuple(_closings)):
+                raise _still_closing(self.path) from None
             raise LineDown(f"{self.path} did not open within {OPEN_DEADLINE:g} s", hint="replug the adapter") from None
         except asyncio.CancelledError:
             opening.add_done_callback(_drop)
@@ -282,7 +292,16 @@ class PortTransport(_SerialTransport):
         self._remove_reader()
         self._remove_writer()
         self._write_buffer.clear()
-        release = functools.partial(_release, self._serial, self._port.exclusive)
+        closing = _Closing(self._port.path, os.fstat(self._fd).st_rdev)
+        _closings.add(closing)  # before the thread runs, which takes it out
+
+        def release() -> None:
+            try:
+                _release(self._serial, self._port.exclusive)
+            finally:
+                _closings.discard(closing)
+                closing.over.set()
+
         return in_own_thread(release, f"close {self._port.path}")
 
     def _report(self, cause: LineDown | None) -> None:
@@ -291,6 +310,34 @@ class PortTransport(_SerialTransport):
         if not self._lost:
             self._lost = True
             self._protocol.connection_lost(cause)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Closing:
+    """A closing of ours that may outlive CLOSE_DEADLINE: the device with this number is locked until it is over."""
+
+    name: str
+    number: int
+    over: threading.Event = field(default_factory=threading.Event)
+
+
+_closings: set[_Closing] = set()
+"""Of all ports of this program. Changed by the loop and by the threads that close: by single operations alone."""
+
+
+def _still_closing(path: str) -> LineDown:
+    return LineDown(
+        f"this program is still closing {path}: its driver does not let go of what was not sent",
+        hint="it can be opened when that is over; if it never is, check CTS, replug the adapter",
+    )
+
+
+def _own_closing(path: str) -> _Closing | None:
+    """Return our closing of the device that this path leads to, if it is not over."""
+    with contextlib.suppress(OSError):
+        number = os.stat(path).st_rdev
+        return next((closing for closing in tuple(_closings) if closing.number == number), None)
+    return None
 
 
 def _names_pty(path: str) -> bool:
@@ -316,8 +363,10 @@ def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool,
     device.timeout = device.write_timeout = 0
     device.inter_byte_timeout = 0  # sets VMIN to 1, so that an empty read means a hang-up and nothing else
     try:
-        device.open()
+        _open_device(device, port.path)
     except (OSError, ValueError, termios.error) as error:
+        if isinstance(error, LineDown):
+            raise
         raise _refusal(port, error) from None
     try:
         if not found.is_behind(device.fileno()):
@@ -329,6 +378,21 @@ def _open(port: SerialPort, only: Identity | None) -> tuple[MarkingSerial, bool,
         if isinstance(error, OSError | termios.error) and not isinstance(error, LineDown):
             raise _refusal(port, error) from None
         raise
+
+
+def _open_device(device: MarkingSerial, path: str) -> None:
+    """Open it, and again where only a closing of ours was in the way. Raises LineDown, and what pyserial raises."""
+    until = time.monotonic() + CLOSING_PATIENCE
+    while True:
+        closing = _own_closing(path)  # before: one that ends while this fails leaves the device free
+        try:
+            device.open()
+            return
+        except (OSError, termios.error) as error:
+            if closing is None or _code(error) not in IN_USE:
+                raise
+        if not closing.over.wait(until - time.monotonic()):
+            raise _still_closing(path)
 
 
 def _found(port: SerialPort, only: Identity | None, scan: identity.Scan) -> Identity:
@@ -379,7 +443,7 @@ def _tune(port: SerialPort, device: serial.Serial, settings: LineSettings) -> No
 def _refusal(port: SerialPort, error: Exception) -> LineDown:
     """Return why it did not open, in words, and what to try."""
     path, code = port.path, _code(error)
-    if code in (errno.EBUSY, errno.EAGAIN):  # the driver's flag, the lock
+    if code in IN_USE:
         owner = holders.lock_owner(path) or next(iter(holders.holders(path)), "another program")
         return LineDown(
             f"{path} is in use by {owner}", hint="end that first: two masters on one line garble each other"

@@ -22,6 +22,7 @@ from serial.rs485 import RS485Settings
 
 from busmaster.errors import LineDown
 from busmaster.transport import serial_port
+from busmaster.transport.reconnect import Connection
 from busmaster.transport.serial_port import SerialPort
 from tests.patience import PATIENCE
 from tests.transport.fakes import PtyMaster, Recorder, closed, opened, plugged
@@ -205,6 +206,100 @@ async def test_a_second_opening_says_that_this_program_has_it(pty_master: PtyMas
         await opened(pty_master.path)
     await closed(transport, recorder)
     await closed(*await opened(pty_master.path))
+
+
+@pytest.fixture
+def holding_driver(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+    """A driver that does not let go of unsent bytes before this event, so that no closing is over."""
+    lets_go = threading.Event()
+    really_flush = termios.tcflush
+
+    def flush(descriptor: int, queue: int) -> None:
+        if queue == termios.TCOFLUSH:
+            assert lets_go.wait(PATIENCE)
+        really_flush(descriptor, queue)
+
+    monkeypatch.setattr(termios, "tcflush", flush)
+    monkeypatch.setattr(serial_port, "CLOSE_DEADLINE", 0.001)
+    yield lets_go
+    lets_go.set()
+
+
+@pytest.mark.asyncio
+async def test_a_port_that_this_program_is_still_closing_is_said_to_be_and_opens_when_that_is_over(
+    pty_master: PtyMaster, holding_driver: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serial_port, "CLOSING_PATIENCE", 0.001)
+    transport, recorder = await opened(pty_master.path)
+    transport.close()
+    await recorder.lost()
+    with pytest.raises(LineDown) as caught:
+        await opened(pty_master.path)
+    assert str(caught.value) == (
+        f"this program is still closing {pty_master.path}: its driver does not let go of what was not sent; "
+        "it can be opened when that is over; if it never is, check CTS, replug the adapter"
+    )
+    monkeypatch.setattr(serial_port, "CLOSING_PATIENCE", 2 * PATIENCE)
+    opening = asyncio.ensure_future(opened(pty_master.path))
+    await asyncio.sleep(0.05)
+    assert not opening.done()
+    holding_driver.set()
+    transport, recorder = await asyncio.wait_for(opening, PATIENCE)
+    with pytest.raises(LineDown, match="is in use by this program; "):
+        await opened(pty_master.path)  # which closes nothing now
+    await closed(transport, recorder)
+
+
+@pytest.mark.asyncio
+async def test_while_one_port_is_being_closed_another_is_in_use_by_whoever_has_it(
+    pty_master: PtyMaster, holding_driver: threading.Event
+) -> None:
+    with plugged() as other_master:
+        transport, recorder = await opened(pty_master.path)
+        other, of_other = await opened(other_master.path)
+        transport.close()
+        await recorder.lost()
+        with pytest.raises(LineDown, match=f"{other_master.path} is in use by this program"):
+            await opened(other_master.path)
+        holding_driver.set()
+        await closed(other, of_other)
+
+
+@pytest.mark.asyncio
+async def test_an_opening_for_which_the_kernel_waits_until_our_closing_is_over_says_that(
+    pty_master: PtyMaster, holding_driver: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    transport, recorder = await opened(pty_master.path)
+    transport.abort()
+    await recorder.lost()
+    monkeypatch.setattr(serial_port, "OPEN_DEADLINE", 0.02)
+    with pytest.raises(LineDown, match=f"this program is still closing {pty_master.path}"):
+        await opened(pty_master.path)
+
+
+@pytest.mark.asyncio
+async def test_a_connection_whose_output_was_held_is_back_when_the_driver_has_let_go(
+    pty_master: PtyMaster, holding_driver: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serial_port, "CLOSING_PATIENCE", 0.01)
+    recorder, told = Recorder(), asyncio.Event()
+    causes: list[str] = []
+
+    def hear(cause: LineDown) -> None:
+        causes.append(cause.what)
+        told.set()
+
+    connection = Connection(SerialPort(pty_master.path, baudrate=57600), recorder, first_delay=0.01, on_failed=hear)
+    await connection.open()
+    running = asyncio.ensure_future(connection.run())
+    assert recorder.transport is not None
+    recorder.transport.abort()
+    await asyncio.wait_for(told.wait(), PATIENCE)
+    holding_driver.set()
+    await recorder.connected(2)
+    assert [cause.partition(":")[0] for cause in causes] == [f"this program is still closing {pty_master.path}"]
+    await connection.close()
+    await running
 
 
 @pytest.fixture
