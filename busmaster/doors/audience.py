@@ -133,4 +133,6 @@ class Audience:
     def _past(self) -> str:
         rows = self._line.picture.rows[:PAST_POINTS]
         past = [list(map(list, list(row.past)[-PAST_VALUES:])) for row in rows]
-        return encoded({"method": "past", "body": {"set": self._set, "past": past}})
+        # in a failure the values that are told have none: a page that comes then shows these
+        last = [[row.value, row.asked] for row in self._line.picture.rows]
+        return encoded({"method": "past", "body": {"set": self._set, "past": past, "last": last}})

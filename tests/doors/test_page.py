@@ -86,7 +86,7 @@ async def test_it_shows_values_nodes_groups_events_and_the_wire_and_complains_of
         await asyncio.to_thread(browser.until, "document.querySelector('#point-rows td.value').textContent === '7'")
         assert await asyncio.to_thread(browser.text, "#state") == "● ready"
         await says(browser, "#node-list", "✓ up")
-        await asyncio.to_thread(browser.until, "document.querySelector('#group-rows td').textContent === 'axes'")
+        await asyncio.to_thread(browser.until, "document.querySelector('#group-rows th').textContent === 'axes'")
         await until(lambda: line.bus.pump.tap is not None)
         assert browser.complaints() == []
 

@@ -3,6 +3,7 @@
 import { shown } from "./line.js";
 import { draw_trend } from "./trend.js";
 
+const LONG_TEXT = 40; // characters that are shown in large letters
 const by = (id) => document.getElementById(id);
 const box = by("point"), form = by("write-form"), field = by("new-value");
 
@@ -67,7 +68,9 @@ export class PointDialog {
     const row = this.row && line ? line.rows.find((one) => one.name === this.row.name) : this.row;
     if (!row || !box.open && line) return;
     this.row = row;
-    by("point-value").textContent = shown(row.value, row.precision);
+    const reading = shown(row.value, row.precision);
+    by("point-value").textContent = reading;
+    by("point-reading").classList.toggle("long", reading.length > LONG_TEXT);
     draw_trend(by("point-trend"), row, { ...this.colours(), bounds: true, precision: row.precision });
     const facts = [["group", row.group], ["protocol", `${row.protocol}, address ${row.address}`]];
     if (this.details) facts.push(["asked as", this.details.command]);

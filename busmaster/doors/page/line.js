@@ -37,12 +37,18 @@ export class Line {
           this.takeValues(body.first);
         }
         break;
-      case "past":
+      case "past": {
+        const { rows } = this;
         body.past.forEach((past, number) => {
-          const row = this.rows[number];
+          const row = rows[number];
           if (row && row.past.length < 2) row.past = past.map(([when, value]) => [when, number_of(value)]);
         });
+        body.last.forEach(([value, asked], number) => {
+          const row = rows[number];
+          if (row && row.asked === null) Object.assign(row, { value: plain(value), asked });
+        });
         break;
+      }
       case "groups":
       case "nodes":
         this[method].set(body.first, body[method]);

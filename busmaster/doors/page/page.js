@@ -8,6 +8,10 @@ import { draw_trend } from "./trend.js";
 const MOST_SHOWN = 1000;
 const OLD_AFTER = 3; // periods after which a value's age is worth a look
 const AGAIN = 1000; // milliseconds before it is tried again to connect
+const FIRST_WAIT = 2000; // milliseconds in which the first picture of the line may be incomplete
+const WIRE_EVERY = 30, VALUES_EVERY = 90; // milliseconds from one drawing to the next
+const OUT_OF_SIGHT_EVERY = 1000; // milliseconds: rows that are scrolled away are kept up to date for a search of the page
+const LONG_TEXT = 14; // characters of a text that fit beside unit and trend
 const by = (id) => document.getElementById(id);
 const line = new Line();
 const wire = new Wire(by("wire-canvas"), by("tip"), by("wire-said"));
@@ -15,6 +19,8 @@ const shown_rows = new Map();
 let may = { read_only: true, wants_token: false };
 let connected = false;
 let stale = true; // something was heard since it was drawn
+let known = false; // the first picture of the line was complete
+let wire_drawn = 0, values_drawn = 0, all_drawn = 0;
 let order = "";
 
 function colours() {
@@ -60,6 +66,20 @@ function allowed() {
 
 // what is drawn
 
+function is_complete() {
+  const { frame } = line;
+  return Boolean(frame) && line.rows.length >= frame.points && line.all_nodes.length >= frame.nodes && line.all_groups.length >= frame.groups;
+}
+
+// Nothing is shown of a picture that is still arriving: each part of it would move the parts below.
+function may_show() {
+  if (!known && (is_complete() || performance.now() > FIRST_WAIT)) {
+    known = true;
+    document.documentElement.dataset.known = "";
+  }
+  return known;
+}
+
 function trouble() {
   if (!connected) return "This page's program does not answer: what is shown is old. It is tried again.";
   if (!line.state.connected) return `The line's program is away: what is shown is old. ${line.state.why}`;
@@ -69,8 +89,8 @@ function trouble() {
 
 function draw_head(wrong) {
   const { frame } = line;
-  const state = !connected ? "no connection" : !line.state.connected ? "owner away" : frame?.state ?? "waiting";
-  by("state").textContent = { ready: "● ready", settling: "◐ settling", offline: "✕ offline" }[state] ?? `✕ ${state}`;
+  const state = !known ? "connecting" : !connected ? "no connection" : !line.state.connected ? "owner away" : frame?.state ?? "waiting";
+  by("state").textContent = { connecting: "connecting", ready: "● ready", settling: "◐ settling", offline: "✕ offline" }[state] ?? `✕ ${state}`;
   by("state").className = `chip ${state === "ready" ? "good" : state === "settling" ? "warn" : "bad"}`;
   by("trouble").hidden = !wrong;
   if (by("trouble").textContent !== wrong) by("trouble").textContent = wrong;
@@ -105,10 +125,21 @@ function draw_nodes() {
   }, "li");
 }
 
+function in_ms(seconds, digits) {
+  return (seconds * 1000).toFixed(digits);
+}
+
 function draw_groups() {
-  replace(by("group-rows"), line.all_groups, (row, group) => {
-    const numbers = [milliseconds(group.period, 0), group.paused ? "paused" : milliseconds(group.achieved), milliseconds(group.jitter, 2), group.cycles, group.missed];
-    row.replaceChildren(element("td", group.name), ...numbers.map((text) => element("td", text, "number")));
+  // Two rows a group: beside its name there is no room for the numbers.
+  replace(by("group-rows"), line.all_groups.flatMap((group) => [group.name, group]), (row, group) => {
+    if (typeof group === "string") {
+      const name = element("th", group);
+      Object.assign(name, { colSpan: 4, scope: "colgroup" });
+      row.replaceChildren(name);
+      return;
+    }
+    const numbers = [in_ms(group.period, 0), group.paused ? "paused" : in_ms(group.achieved, 1), in_ms(group.jitter, 2), `${group.missed} of ${group.cycles}`];
+    row.replaceChildren(...numbers.map((text) => element("td", text, "number")));
   }, "tr");
 }
 
@@ -147,27 +178,77 @@ function draw_points() {
     const made = rows.map((row) => {
       const id = row.place + row.name;
       const cells = before.get(id) ?? make_row();
+      before.delete(id);
+      cells.reason.remove();
       shown_rows.set(id, cells);
       return cells.row;
     });
+    for (const { row } of before.values()) in_sight.unobserve(row);
     by("point-rows").replaceChildren(...made);
   }
   const ink = colours(), periods = new Map(line.all_groups.map((group) => [group.name, group.period]));
-  for (const row of rows) fill_row(shown_rows.get(row.place + row.name), row, ink, periods);
+  const lost = is_lost(), may_write = !allowed().read_only, now = performance.now();
+  const all_due = now - all_drawn > OUT_OF_SIGHT_EVERY;
+  if (all_due) all_drawn = now;
+  const to_draw = [];
+  for (const row of rows) {
+    const cells = shown_rows.get(row.place + row.name);
+    if (!cells.in_sight && cells.fact && !all_due) continue;
+    fill_row(cells, row, periods, lost, may_write);
+    if (cells.in_sight) to_draw.push(cells);
+  }
+  show_reasons(rows, lost);
+  for (const cells of to_draw) draw_row_trend(cells, ink); // after all texts: it needs the width, which the browser calculates only once then
+}
+
+// Why points have no value: below the first of those that follow one another and failed alike. The line's own loss is above the page.
+function show_reasons(rows, lost) {
+  const reason_of = (row) => (lost ? "" : row.error);
+  for (let first = 0, next; first < rows.length; first = next) {
+    const { node } = rows[first], reason = reason_of(rows[first]);
+    for (next = first + 1; next < rows.length && reason && rows[next].node === node && reason_of(rows[next]) === reason; next++);
+    const alike = next - first - 1;
+    show_reason(rows[first], reason && `✕ ${reason}${alike ? ` (the same for the next ${alike === 1 ? "point" : `${alike} points`})` : ""}`);
+    for (let other = first + 1; other < next; other++) show_reason(rows[other], "");
+  }
+}
+
+function show_reason(row, text) {
+  const cells = shown_rows.get(row.place + row.name);
+  if (cells.reason_text === text && cells.reason.isConnected === Boolean(text)) return;
+  cells.reason_text = text;
+  set_text(cells.reason.firstChild, text);
+  cells.row.classList.toggle("failed", Boolean(text));
+  if (text) cells.row.after(cells.reason);
+  else cells.reason.remove();
 }
 
 function make_row() {
-  const row = document.createElement("tr");
-  const cells = { row, name: element("button", "", "name"), write: element("button", "Write"), trend: document.createElement("canvas"), fact: null };
-  const cell = (kind, content) => { const made = element("td", "", kind); if (content) made.append(content); row.append(made); return made; };
-  cell("", cells.name);
-  cells.value = cell("value");
+  const row = element("tr", "", "point"), reason = element("tr", "", "reason");
+  const cells = {
+    row, reason, reason_text: "", name: element("button", "", "name"), value: element("span"), trend: document.createElement("canvas"),
+    write: element("button", "Write"), fact: null, in_sight: false,
+  };
+  const cell = (kind, content, of = row) => {
+    const made = element("td", "", kind);
+    made.setAttribute("role", "cell");
+    if (content) made.append(content);
+    of.append(made);
+    return made;
+  };
+  for (const one of [row, reason]) one.setAttribute("role", "row");
+  cell("", null, reason).colSpan = 7;
+  cell("point", cells.name);
+  cells.value_cell = cell("value", cells.value);
   cells.unit = cell("unit");
-  cell("", cells.trend);
+  cells.trend_cell = cell("trend", cells.trend);
   cells.age = cell("age");
-  cells.remark = cell("remark");
-  cells.last = cell("", cells.write);
+  cells.quality = cell("quality");
+  cell("write", cells.write);
   cells.trend.setAttribute("role", "img");
+  cells.trend.setAttribute("aria-label", "trend");
+  row.cells_of = cells;
+  in_sight.observe(row);
   for (const button of [cells.name, cells.write]) button.addEventListener("click", () => dialog.open(cells.fact, allowed()));
   return cells;
 }
@@ -176,35 +257,83 @@ function set_text(where, text) {
   if (where.textContent !== text) where.textContent = text;
 }
 
-function fill_row(cells, row, ink, periods) {
+const in_sight = new IntersectionObserver((changes) => {
+  for (const { target, isIntersecting } of changes) target.cells_of.in_sight = isIntersecting;
+  stale = true;
+}, { rootMargin: "50%" });
+
+function age_text(seconds) {
+  if (seconds < 1) return "<1 s";
+  if (seconds < 100) return `${Math.floor(seconds)} s`;
+  return seconds < 6000 ? `${Math.floor(seconds / 60)} min` : `${Math.floor(seconds / 3600)} h`;
+}
+
+const ALARMS = { high: "▲ high limit", low: "▼ low limit", set: "▲ bit set", clear: "▼ bit clear" };
+
+function quality_text(row, lost) {
+  if (lost || row.error) return "✕ bad";
+  return ALARMS[row.alarm] ?? (row.quality || "not read yet");
+}
+
+function fill_row(cells, row, periods, lost, may_write) {
   cells.fact = row;
   const age = row.asked === null ? null : Math.max(0, line.now - row.asked);
   const old = age !== null && age > OLD_AFTER * (periods.get(row.group) ?? 1) + 0.5;
-  cells.row.className = row.error ? "bad" : row.alarm ? "alarm" : old ? "old" : "";
-  set_text(cells.name, `${row.node} ${row.item}`);
-  cells.name.title = `${row.key}, group ${row.group}`;
-  set_text(cells.value, shown(row.value, row.precision));
-  set_text(cells.unit, row.unit);
-  set_text(cells.age, age === null ? "" : old ? `${age.toFixed(age < 10 ? 1 : 0)} s` : "");
-  const qualities = { late: "came late", stale: "older than a write" };
-  set_text(cells.remark, row.error ? `✕ ${row.error}` : row.alarm ? `▲ ${row.alarm} limit` : qualities[row.quality] ?? "");
-  cells.write.hidden = !row.writable || allowed().read_only;
-  const last = row.past.at(-1)?.[0];
-  if (cells.drawn !== last || cells.ink !== ink.ink) {
-    cells.drawn = last;
-    cells.ink = ink.ink;
-    draw_trend(cells.trend, row, ink);
-    cells.trend.setAttribute("aria-label", `trend of ${row.past.length} values`);
+  const text = shown(row.value, row.precision), long = typeof row.value === "string" && text.length > LONG_TEXT;
+  const kind = lost || row.error ? "bad" : row.alarm ? "alarm" : old || row.quality === "stale" ? "old" : "";
+  set(cells.row, "className", `point ${kind}${long ? " long" : ""}${cells.reason_text ? " failed" : ""}`);
+  const name = `${row.node} ${row.item}`;
+  if (cells.name.textContent !== name) {
+    cells.name.replaceChildren(...breakable(name));
+    cells.name.title = `${row.key}, group ${row.group}`;
+    cells.write.setAttribute("aria-label", `Write ${name}`);
   }
+  set(cells.value, "className", row.value === null ? "" : "known");
+  set(cells.value, "textContent", long ? `${text.replaceAll(",", ", ")} ${row.unit}` : text);
+  set(cells.value_cell, "colSpan", long ? 3 : 1); // a text has no trend
+  set(cells.unit, "hidden", long);
+  set(cells.trend_cell, "hidden", long);
+  set_text(cells.unit, row.unit);
+  set_text(cells.age, age === null ? "–" : age_text(age));
+  set_text(cells.quality, quality_text(row, lost));
+  set(cells.write, "hidden", !row.writable || !may_write);
+}
+
+// A name, which a line may end in where its parts do.
+function breakable(name) {
+  return name.split(/(?<=[_.:/])/).flatMap((part) => [part, document.createElement("wbr")]);
+}
+
+// Setting what is there already costs the browser a calculation of the layout, too.
+function set(where, property, value) {
+  if (where[property] === value) return false;
+  where[property] = value;
+  return true;
+}
+
+function draw_row_trend(cells, ink) {
+  const row = cells.fact, last = row.past.at(-1)?.[0];
+  if (cells.drawn === last && cells.ink === ink.ink) return;
+  cells.drawn = last;
+  cells.ink = ink.ink;
+  draw_trend(cells.trend, row, ink);
+  cells.trend.setAttribute("aria-label", `trend of ${row.past.length} values`);
 }
 
 function draw() {
   requestAnimationFrame(draw);
-  if (document.hidden) return;
-  wire.draw(line.all_nodes, line.now, line.state.connected ? line.frame?.state ?? "ready" : "offline");
-  if (!stale) return;
+  const now = performance.now();
+  if (document.hidden || now - wire_drawn < WIRE_EVERY) return;
+  const show = may_show();
+  if (show) {
+    wire_drawn = now;
+    wire.draw(line.all_nodes, line.now, line.state.connected ? line.frame?.state ?? "ready" : "offline");
+  }
+  if (!stale || now - values_drawn < VALUES_EVERY) return;
+  values_drawn = now;
   stale = false;
-  draw_head(trouble());
+  draw_head(show ? trouble() : "");
+  if (!show) return;
   draw_nodes();
   draw_groups();
   draw_events();

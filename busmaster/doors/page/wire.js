@@ -90,6 +90,7 @@ export class Wire {
       pen.moveTo(x, SCALE - 3);
       pen.lineTo(x, height);
       pen.stroke();
+      if (number % 2 && width < 500) continue; // the texts would touch
       const text = number === 4 ? (this.held === null ? "now" : "held") : `−${+(this.span - number * step).toFixed(3)} s`;
       pen.fillText(text, number === 4 ? x - pen.measureText(text).width : x + 2, 10);
     }
