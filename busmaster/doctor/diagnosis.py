@@ -213,8 +213,10 @@ def windows(starts: Sequence[float], timing: ReplyTiming) -> Finding:
     if slow > timing.nominal:
         nominal = milliseconds(rounded_up(1.5 * slow))
         return Finding("windows", True, what, f"they are counted late: a nominal time of {nominal} ms would fit")
-    if window < timing.window:
-        advice = f"--timeout {milliseconds(window)} would waste less on dead nodes, but leave room for busy ones"
+    lateness = rounded_up(1.5 * window)
+    if lateness < timing.lateness:
+        times = f"timing = {{ window = {window:g}, lateness = {lateness:g} }}"
+        advice = f"{times} in LINE.toml would waste less on dead nodes, but leave room for busy ones"
         return Finding("windows", True, what, advice)
     return Finding("windows", True, what)
 

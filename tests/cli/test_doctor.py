@@ -270,12 +270,19 @@ def test_what_learned_windows_would_come_to_is_said() -> None:
 
 @pytest.mark.parametrize(
     ("milliseconds", "wrong", "advice"),
-    [(30, False, ""), (70, False, "counted late: a nominal time of 110 ms would fit"), (120, True, "--timeout 365")],
+    [
+        (4, False, "timing = { window = 0.015, lateness = 0.025 } in LINE.toml would waste less on dead nodes"),
+        (30, False, "timing = { window = 0.095, lateness = 0.145 } in LINE.toml would waste less on dead nodes"),
+        (34, False, ""),
+        (70, False, "counted late: a nominal time of 110 ms would fit"),
+        (120, True, "--timeout 365"),
+    ],
 )
 def test_windows_are_suggested_from_what_was_measured(milliseconds: int, wrong: bool, advice: str) -> None:
     findings = examined(line_of("hcp2", [hcp2(5, Delay(milliseconds / 1000))]), (5,))
     assert findings.wrong == ({"windows"} if wrong else set())
-    assert advice in findings.on("windows").advice
+    said = findings.on("windows").advice
+    assert advice in said if advice else not said
 
 
 @pytest.mark.parametrize(
