@@ -52,7 +52,7 @@ class _Exchange:
         """
         if self.attempt is not None and self.request is None:
             return False  # its protocol is not known here: the frames say nothing
-        if frame.fault == UNASKED or self.request is None or self.released:
+        if frame.fault == UNASKED or self.request is None or self.released or self.is_broadcast:
             return True
         last = self.last
         if last is None or self.kind is None or self.judge()[0] is Outcome.NO_REPLY:

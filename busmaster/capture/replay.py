@@ -140,6 +140,9 @@ class _Run:
         """Let the reader hear it, if it still listens."""
         if self._over and not any(heard.exchange):
             return
+        if not self._driver.exchange.answered:
+            self.note(heard)
+            return  # nobody replies to a broadcast: what comes behind it is unasked
         self._told.append(heard)
         self._pause(heard.packet.micros)
         self.note(heard)

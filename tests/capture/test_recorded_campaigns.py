@@ -48,8 +48,7 @@ def recorded(protocol: str, mix: str, seed: int) -> Tape:
     return tape
 
 
-# A replay reads what came behind a broadcast of Modbus as its reply, which the arbiter does not: to be repaired.
-@pytest.mark.parametrize("protocol", [protocol for protocol in KINDS if protocol != "modbus"])
+@pytest.mark.parametrize("protocol", KINDS)
 @pytest.mark.parametrize(
     "mix",
     ["calm", "cancelled", "garbled", "glued-bytewise", "refusals", "echo", "everything", "all stand still", "repeated"],
