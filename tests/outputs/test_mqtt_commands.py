@@ -155,6 +155,8 @@ async def test_the_expiry_of_an_mqtt_message_is_kept(broker: Broker, monkeypatch
         properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]  # paho has no types
         properties.MessageExpiryInterval = int(PATIENCE)
         assert (await there.ask("4", properties=properties))["ok"]  # now it listens, and has looked at the clock
+        both = json.dumps({"value": 5, "expires": time.time() - 0.1})
+        assert "too old" in (await there.ask(both, properties=properties))["error"]  # of two ends the first holds
         there.output._arriving._looked -= PATIENCE + 1
         answer = await there.ask("4", properties=properties)
         assert "too old" in answer["error"]

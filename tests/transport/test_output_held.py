@@ -94,6 +94,8 @@ class Ledger:
 
     def line_up(self, now: float, *, paced: bool) -> None: ...
 
+    def line_down(self, _cause: str, _now: float) -> None: ...
+
     def line_due(self, _now: float) -> bool:
         return self.is_due
 
@@ -196,6 +198,20 @@ def test_output_that_is_given_up_is_discarded_before_its_transport_is_aborted(le
     ledger.time = STUCK_AFTER
     pump._on_time()
     assert ledger.notes[-3:] == [("discarded",), ("aborted",), ("timeout", STUCK_AFTER, False)]
+
+
+def test_a_port_that_comes_back_may_hold_its_output_as_long_as_the_one_before(ledger: Ledger) -> None:
+    pump = pump_on(ledger)
+    ledger.is_due, ledger.has = True, 2
+    pump._on_time()
+    pump.connection_lost(None)
+    ledger.time = STUCK_AFTER
+    pump.connection_made(ledger)  # type: ignore[arg-type]  # it stands for the port
+    pump._on_time()
+    assert ("aborted",) not in ledger.notes
+    ledger.time = 2 * STUCK_AFTER
+    pump._on_time()
+    assert ("aborted",) in ledger.notes
 
 
 # -- a port that holds its output ------------------------------------------------------------------------------------
