@@ -21,6 +21,7 @@ from busmaster.bounds import MOST_SHOWN_POINTS
 from busmaster.bus.snapshots import Snapshot
 from busmaster.doors.following import Following
 from busmaster.doors.opcua_access import Rules, guard
+from busmaster.doors.opcua_connections import OpcuaServer
 from busmaster.doors.opcua_health import Health
 from busmaster.doors.opcua_space import Space, Variable
 from busmaster.doors.opcua_terms import CODES, DOUBTFUL, GOOD, range_of, status_of_sample, status_of_write, type_of
@@ -38,6 +39,8 @@ LOOK_EVERY = 0.25
 """Seconds between two looks for values that are old."""
 ASK_AGAIN = 5.0
 """Seconds after which a poll group is asked for again that its owner tells no more."""
+LISTEN_AFTER = 2.0
+"""Seconds after which clients are accepted although the points of the line are not known yet."""
 AT_ONCE = 50
 """Values that are put before clients have their turn."""
 URI = "urn:busmaster:opcua"
@@ -83,6 +86,8 @@ class LineServer:
         """When the last cycle of each group ended, by the clock of the line."""
         self._touches = Touches()
         self._changed = asyncio.Event()
+        self.has_points = asyncio.Event()
+        """Set when clients can find the points of the line."""
         self._new_rows = True
         self._is_touched = False
         """Whether a write was reported whose values are not doubted yet."""
@@ -146,6 +151,7 @@ class LineServer:
         if self._new_rows and frame is not None and len(rows) == frame.points:
             self._new_rows = False
             await self._take_rows(remote, rows)
+            self.has_points.set()
         if frame is not None and frame.state == "offline":
             await self._put_bad(CODES.BadNoCommunication, frame.now)
         await self._doubt_touched()
@@ -339,7 +345,7 @@ async def serving(
     `certificate` names the files of the server's certificate and its key (PEM or DER): with them all that is said is
     signed or encrypted. Raises OSError if it cannot listen there, InvalidCommand for files that are something else.
     """
-    server = Server()
+    server = OpcuaServer()
     await server.init()
     server.set_server_name("busmaster")
     await server.set_application_uri(URI)
@@ -354,8 +360,13 @@ async def serving(
     try:
         async with asyncio.TaskGroup() as tasks:
             running = [tasks.create_task(shown.run()), tasks.create_task(line.follow())]
-            assert server.bserver is not None
-            yield f"opc.tcp://{host}:{server.bserver.port}/"
+            # A client that comes back after this program was restarted subscribes once: what it does not find then,
+            # it never has again.
+            with suppress(TimeoutError):
+                async with asyncio.timeout(LISTEN_AFTER):
+                    await shown.has_points.wait()
+            await server.acceptor.listen()
+            yield f"opc.tcp://{host}:{server.acceptor.port}/"
             for task in running:
                 task.cancel()
     finally:

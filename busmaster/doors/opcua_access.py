@@ -13,6 +13,7 @@ from asyncua.crypto.permission_rules import SimpleRoleRuleset, User, UserRole
 from asyncua.server.address_space import AddressSpace, AttributeService
 
 from busmaster.bounds import MOST_CONNECTIONS, MOST_SUBSCRIPTIONS
+from busmaster.doors.opcua_sessions import use_sessions
 from busmaster.doors.opcua_terms import CODES
 from busmaster.gate.permission import Access
 
@@ -100,7 +101,7 @@ class Writes(AttributeService):  # type: ignore[misc]  # it is untyped
 
 
 def _nobody(token: Any) -> None:
-    """Find no session: who has lost a connection makes a new one."""
+    """Find no session: a client that has lost its connection creates a new one."""
 
 
 def _refuse(*arguments: Any) -> None:
@@ -112,6 +113,7 @@ def guard(server: Server, rules: Rules, write: Write) -> None:
     """Have a server let in and through what the rules say, with encryption where it has a certificate."""
     iserver = server.iserver
     iserver.user_manager = Users(rules)
+    use_sessions(iserver)
     iserver.attribute_service = Writes(iserver.aspace, write)
     iserver.max_connections = MOST_CONNECTIONS
     iserver.max_subscriptions = MOST_SUBSCRIPTIONS
