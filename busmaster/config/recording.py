@@ -114,5 +114,5 @@ READERS: Readers = {
     "prefix": _topic,
 }
 """What is more than its type."""
-WITHOUT = {"metrics": ("buffer",)}
-"""What an output that is asked for its values cannot be told."""
+WITHOUT = {"metrics": ("buffer",), "csv": ("audit",)}
+"""Keys of its class that an output does not have: metrics hold no values, and CSV no audit entries."""

@@ -73,6 +73,7 @@ OUTPUTS = {
     "spill": "The file for what waits while the output is down, and over a restart. Best on another disk.",
     "spill_values": "The most values that wait in that file.",
     "sync_every": "After so long at most what was written survives a loss of power, too; 0: after each batch.",
+    "audit": "`strict`: a write is acknowledged to its client only after its audit entry is on the disk.",
     "keep_days": "What is older is deleted. More than 0; all is kept by default.",
     "keep_mb": "The oldest is deleted where the database is larger. More than 0; all is kept by default.",
     "host": "The broker; of metrics, where they are served.",

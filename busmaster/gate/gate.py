@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, replace
 from math import inf
 from types import TracebackType
@@ -58,7 +58,9 @@ class Wish:
     permission: Permission = EVERYTHING
 
 
-Keep: TypeAlias = Callable[[Wish, Outcome, str, Any, float], WriteRecord]
+Durable: TypeAlias = Awaitable[str] | None
+"""What is done when an audit entry is on the disk: "", or the reason why it is not. None where that is not awaited."""
+Keep: TypeAlias = Callable[[Wish, Outcome, str, Any, float], tuple[WriteRecord, Durable]]
 """Keeps a record: of what was wished, what became of it and why, the value before, and the seconds that it took."""
 
 
@@ -85,6 +87,7 @@ class Passage:
     def __init__(self, wish: Wish, now: Callable[[], float], keep: Keep) -> None:
         self.record: WriteRecord | None = None
         """None until it has ended."""
+        self._durable: Durable = None
         self._wish = wish
         self._now = now
         self._keep = keep
@@ -102,7 +105,15 @@ class Passage:
     def end(self, error: BaseException | None) -> None:
         """Keep its record: what it ended with, None for a write that is confirmed."""
         outcome, text = outcome_of(error)
-        self.record = self._keep(self._wish, outcome, text, self._before, self._now() - self._began)
+        took = self._now() - self._began
+        self.record, self._durable = self._keep(self._wish, outcome, text, self._before, took)
+
+    async def not_durable(self) -> str:
+        """Wait until the audit entry of a write is on the disk, where an output must have it there before the write is
+        acknowledged. Return the reason why it is not, "" if it is or nothing is to be awaited.
+        """
+        why = "" if self._durable is None else await self._durable
+        return f"it was written, but its audit entry is not on the disk: {why}" if why else ""
 
 
 def outcome_of(error: BaseException | None) -> tuple[Outcome, str]:
@@ -139,7 +150,7 @@ class Gate:
         """What the line's file calls safe; None of a line without a file."""
         self.on_access: list[Callable[[], None]] = []
         """Called when other roles or tokens hold."""
-        self.record: Callable[[WriteRecord], None] = lambda _: None
+        self.record: Callable[[WriteRecord], Durable] = lambda _: None
         self.bus = bus
         self._log = logging.getLogger("busmaster.audit")
         self._log.addHandler(logging.NullHandler())
@@ -188,6 +199,8 @@ class Gate:
         except (BusError, *NEVER_SENT):
             pass  # it is in the record
         assert passage.record is not None
+        if why := await passage.not_durable():
+            return passage.record._replace(outcome=Outcome.UNCONFIRMED, error=cut(why))
         return passage.record
 
     def begin(self, wish: Wish) -> Passage:
@@ -199,7 +212,7 @@ class Gate:
 
     def refuse(self, wish: Wish, error: str) -> WriteRecord:
         """Keep a record of what was not even tried."""
-        return self._keep(wish, Outcome.REFUSED, error, _before(wish.point), 0.0)
+        return self._keep(wish, Outcome.REFUSED, error, _before(wish.point), 0.0)[0]
 
     async def _pass(self, wish: Wish) -> None:
         assert wish.point is not None
@@ -216,7 +229,7 @@ class Gate:
             return wish.expires - time.time()
         return inf if wish.arrived is None else wish.arrived + FRESH - self.bus.now()
 
-    def _keep(self, wish: Wish, outcome: Outcome, error: str, before: Any, took: float) -> WriteRecord:
+    def _keep(self, wish: Wish, outcome: Outcome, error: str, before: Any, took: float) -> tuple[WriteRecord, Durable]:
         record = WriteRecord(
             time=self.bus.wall_time(),
             door=wish.door,
@@ -234,8 +247,7 @@ class Gate:
         # of one that is unconfirmed somebody has to find out what became of it
         level = logging.WARNING if outcome is Outcome.UNCONFIRMED else logging.INFO
         self._log.log(level, "%s", record.text)
-        self.record(record)
-        return record
+        return record, self.record(record)
 
 
 def _before(point: Point[Any] | None) -> Any:

@@ -44,6 +44,7 @@ class Happening(NamedTuple):
 
 
 Item: TypeAlias = Snapshot | Happening | WriteRecord
+Kept: TypeAlias = Callable[[str], object]
 
 
 def size_of(item: Item) -> int:
@@ -122,6 +123,10 @@ class Output(ABC):
         self.found = 0
         """Values that were on disk when it began: of an earlier process, or of the output that this one replaces."""
         self._capacity = settings.buffer
+        self.is_strict = getattr(settings, "audit", "") == "strict"
+        """Whether a write is acknowledged only after this output has made its audit entry durable."""
+        self._promised: dict[int, tuple[WriteRecord, Kept]] = {}
+        """Audit entries whose durability is awaited, by their identity: loop and thread share it without a lock."""
         self._say = say
         self._waiting: deque[Item] = deque()  # loop and thread share it without a lock: what they do with it is atomic
         self._stop = threading.Event()
@@ -146,6 +151,20 @@ class Output(ABC):
             except IndexError:
                 break  # the rest is in the thread's hands
             self.dropped += size_of(oldest)
+            if isinstance(oldest, WriteRecord):
+                self.settle_entry(oldest, f"{self.kind} dropped it, for too much waits")
+
+    def offer_entry(self, entry: WriteRecord, kept: Kept) -> None:
+        """Hand it an audit entry. `kept` is called once, from any thread: with "" when the entry is durable, and with
+        the reason when it never will be."""
+        self._promised[id(entry)] = entry, kept
+        self.offer(entry)
+
+    def settle_entry(self, entry: WriteRecord, why_not: str = "") -> None:
+        """Report to whom it concerns that an audit entry is durable, or why it never will be."""
+        _, kept = self._promised.pop(id(entry), (None, None))
+        if kept is not None:
+            kept(why_not)
 
     def miss(self, values: int) -> None:
         """Count so many values as lost before they could be offered."""
@@ -196,6 +215,8 @@ class Output(ABC):
         if self._thread.ident is not None:
             self._thread.join(within)
         self.dropped += self._left() - self.spilled
+        for entry, _ in list(self._promised.values()):
+            self.settle_entry(entry, f"{self.kind} ended before it was written")
 
     # on the thread
 

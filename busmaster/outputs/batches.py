@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar
 
 from busmaster.bus.points import Point
 from busmaster.bus.polling import Sample, Snapshot
+from busmaster.gate.record import WriteRecord
 from busmaster.outputs.base import BATCH, PAUSE, TICK, Item, size_of
 from busmaster.outputs.settings import SpillingSettings
 from busmaster.outputs.spilling import SpillingOutput
@@ -35,6 +36,8 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
         self._batch: list[Formatted] = []
         self._sizes: list[int] = []
         """How many values each of the batch holds."""
+        self._entries: list[WriteRecord] = []
+        """The audit entries in the batch."""
 
     @abstractmethod
     def format(self, item: Item) -> Formatted | None:
@@ -94,6 +97,8 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
             else:
                 self._batch.append(formatted)
                 self._sizes.append(size_of(item))
+                if isinstance(item, WriteRecord):
+                    self._entries.append(item)
                 size += size_of(item)
             if not self._stop.is_set():
                 time.sleep(PAUSE)
@@ -107,10 +112,18 @@ class BatchOutput(SpillingOutput, Generic[Formatted]):
                 time.sleep(PAUSE)
 
     def let_go(self) -> int:
-        """Forget the batch, and return how many values were in it."""
+        """Forget the batch, which is written or spilled, and return how many values were in it."""
         size = sum(self._sizes)
+        entries, self._entries = self._entries, []
         self._batch, self._sizes = [], []
+        for entry in entries:
+            self.settle_entry(entry)
         return size
+
+    @property
+    def must_sync(self) -> bool:
+        """Return whether the batch must survive a loss of power once it is written."""
+        return self.is_strict and bool(self._entries)
 
     def unhurried(self, snapshot: Snapshot) -> Iterator[tuple[Point[Any], Sample[Any]]]:
         """Yield the points and samples of a cycle.

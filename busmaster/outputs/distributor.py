@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import anyio
 
 from busmaster.arbiter.events import LatenessRaised, NodeChanged, RepliesLate
+from busmaster.bounds import AUDIT_WITHIN
 from busmaster.bus.alarms import AlarmChanged, BusEvent
 from busmaster.bus.bus import Bus
 from busmaster.bus.points import Point
@@ -129,10 +130,44 @@ class Distributor:
             on_disk = f", {counts.spilled} kept on disk" if counts.spilled else ""
             self.tell(f"{kind} is ended: {counts.written} {counts.what}, {counts.dropped} dropped{on_disk}")
 
-    def record(self, write: WriteRecord) -> None:
-        """Hand a write to all of them."""
+    def record(self, write: WriteRecord) -> asyncio.Future[str] | None:
+        """Hand an audit entry to all of them.
+
+        For a write that succeeded, and outputs with `audit = "strict"`, return what becomes done when all of these have
+        the entry on the disk, or with the reason why one of them has not; else None.
+        """
+        waits = write.ok and any(output.is_strict for output in self._outputs)
+        durable: asyncio.Future[str] | None = asyncio.get_running_loop().create_future() if waits else None
+        missing = {output.kind for output in self._outputs if output.is_strict}
         for output in self._outputs:
-            output.offer(write)
+            if durable is not None and output.is_strict:
+                output.offer_entry(write, partial(self._kept, durable, missing, output.kind))
+            else:
+                output.offer(write)
+        if durable is not None:
+            timer = durable.get_loop().call_later(AUDIT_WITHIN, self._not_kept, durable, missing)
+            durable.add_done_callback(lambda _: timer.cancel())
+        return durable
+
+    def _kept(self, durable: asyncio.Future[str], missing: set[str], kind: str, why_not: str) -> None:
+        """Hear from any thread that an output has an entry on the disk, or why it will never have it."""
+
+        def note() -> None:
+            missing.discard(kind)
+            if not durable.done() and (why_not or not missing):
+                durable.set_result(why_not)
+
+        try:
+            durable.get_loop().call_soon_threadsafe(note)
+        except RuntimeError:
+            pass  # the loop is closed: nobody waits any more
+
+    def _not_kept(self, durable: asyncio.Future[str], missing: set[str]) -> None:
+        """Wait no longer for these outputs."""
+        if not durable.done():
+            down = [f"{output.kind} is down: {output.error}" for output in self._outputs if output.error]
+            slow = f"{' and '.join(sorted(missing))} did not write it within {AUDIT_WITHIN:g} s"
+            durable.set_result("; ".join([slow, *(text for text in down if text.split()[0] in missing)]))
 
     async def close(self) -> None:
         """Close the outputs, once the bus is closed.

@@ -40,7 +40,7 @@ class FileOutput(BatchOutput[bytes]):
         )
 
     def commit(self, batch: list[bytes]) -> None:
-        self._file.append(b"".join(batch))
+        self._file.append(b"".join(batch), sync=self.must_sync)
 
     def pack(self, formatted: bytes) -> str:
         return formatted.decode()

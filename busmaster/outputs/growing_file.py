@@ -38,16 +38,24 @@ class GrowingFile:
         self._path = ""
         self._descriptor: int | None = None
         self._synced = time.monotonic()
+        self._is_named = False
+        """Whether the file's name is on the disk, as far as that was ever made sure of."""
 
-    def append(self, lines: bytes) -> None:
-        """Write whole lines, all of them or none. Raises OSError where that fails."""
+    def append(self, lines: bytes, *, sync: bool = False) -> None:
+        """Write whole lines, all of them or none; with `sync` they are on the disk then.
+
+        Raises OSError where that fails. Lines that could not be brought to the disk may come again.
+        """
         while True:
             descriptor = self._current()
             self._write(descriptor, lines)
             if os.fstat(descriptor).st_nlink:
                 break
             self.close()  # it was removed while it was written: nobody will ever read that
-        if time.monotonic() - self._synced >= self._sync_every:
+        if sync and not self._is_named:
+            sync_folder(os.path.dirname(self._path) or ".")  # a new file is lost with the power if its name is
+            self._is_named = True
+        if sync or time.monotonic() - self._synced >= self._sync_every:
             os.fsync(descriptor)
             self._synced = time.monotonic()
 
@@ -80,6 +88,7 @@ class GrowingFile:
         if folder and "%" in os.path.dirname(self._pattern):
             os.makedirs(folder, FOLDER_MODE, exist_ok=True)
         descriptor = open_file(path, os.O_WRONLY | os.O_APPEND, self._mode)
+        self._is_named = False
         if ends_in_a_half_line(path):
             os.write(descriptor, b"\n")  # else the first new line would be taken for the rest of the half one
             self._tell(f"{path} ended in the middle of a line, which was closed off")
@@ -96,6 +105,17 @@ class GrowingFile:
             # the same lines come again when there is room, and must not follow a half one
             os.ftruncate(descriptor, end)
             raise
+
+
+def sync_folder(path: str) -> None:
+    """Bring the names in a folder to the disk, where its file system can do that."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    except OSError:
+        pass  # of another file system, which brings them there by itself or not at all
+    finally:
+        os.close(descriptor)
 
 
 def is_at(path: str, descriptor: int) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from math import inf
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 from busmaster.bounds import MOST_BUFFERED, MOST_SPILLED
 from busmaster.contract.arguments import Between
@@ -17,6 +17,8 @@ BUFFER = 50_000
 DATE_FIELD = re.compile("%(-?.?)", re.DOTALL)
 DATE_FIELDS = frozenset("YCyGgmbBhdejaAuwUWVHIklMSspPFTRrXzZ")
 """What may stand behind a % in the path of a file, or behind %-: what makes slashes or ends of lines is none of it."""
+
+AuditMode: TypeAlias = Literal["batched", "strict"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +60,7 @@ class FileSettings(SpillingSettings):
 
     path: str
     sync_every: Annotated[float, Between(0)] = 10.0
+    audit: AuditMode = "batched"
 
     @property
     def destination(self) -> str:
@@ -78,6 +81,7 @@ class SqliteSettings(SpillingSettings):
     """What is older than `keep_days` is deleted, and the oldest of more than `keep_mb` megabytes; None keeps all."""
 
     path: str
+    audit: AuditMode = "batched"
     keep_days: float | None = None
     keep_mb: float | None = None
 

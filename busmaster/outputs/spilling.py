@@ -70,6 +70,7 @@ class SpillingOutput(Output):
                 self.kind,
                 lambda text: self._say(f"{self.kind}: {text}"),
                 mode=self._mode,
+                strict=self.is_strict,
             )
         except InvalidCommand as error:
             if os.path.isfile(self._spill) and os.path.getsize(self._spill):

@@ -30,7 +30,8 @@ class Spool:
     """Holds at most `most` values for one kind of output.
 
     Raises InvalidCommand where it cannot be made, where another process has it, and for a file that holds something
-    else. `say` is told when a file was there that is damaged: it is moved aside, not deleted.
+    else. `say` is told when a file was there that is damaged: it is moved aside, not deleted. With `strict`
+    what was put in survives a loss of power at once.
     """
 
     def __init__(
@@ -41,18 +42,19 @@ class Spool:
         say: Callable[[str], None] = lambda _: None,
         *,
         mode: int = MODE,
+        strict: bool = False,
     ) -> None:
         self.path = path
         self._most = most
         try:
             try:
-                self._database = _opened(path, kind, mode)
+                self._database = _opened(path, kind, mode, strict)
             except sqlite3.DatabaseError as error:
                 if not is_damaged(error):  # but held by another process, say
                     raise
                 aside = move_aside(path)
                 say(f"{path}: {error}: it is kept as {aside}, and begun anew")
-                self._database = _opened(path, kind, mode)
+                self._database = _opened(path, kind, mode, strict)
             self.values: int = self._database.execute("select coalesce(sum(count), 0) from waiting").fetchone()[0]
         except sqlite3.OperationalError as error:
             hint = "; does another process use it?" if "locked" in str(error) else ""
@@ -100,12 +102,13 @@ class Spool:
         return gone
 
 
-def _opened(path: str, kind: str, mode: int) -> sqlite3.Connection:
+def _opened(path: str, kind: str, mode: int, strict: bool) -> sqlite3.Connection:
     os.close(open_file(path, os.O_RDWR, mode))  # SQLite would make it with a mode of its own
     database = sqlite3.connect(path, timeout=0.0)  # nothing to wait for: who has it keeps it
     try:
         _check_kind(path, database, kind)
-        for setting in ("locking_mode = exclusive", "journal_mode = wal", "synchronous = normal"):
+        synchronous = f"synchronous = {'full' if strict else 'normal'}"
+        for setting in ("locking_mode = exclusive", "journal_mode = wal", synchronous):
             database.execute(f"pragma {setting}").fetchall()
         with database:
             database.execute("create table if not exists spool (kind text)")

@@ -151,6 +151,8 @@ class SqliteOutput(BatchOutput[Rows]):
             self._tell(f"{self._path} was moved or removed: another is begun")
             self._leave()
         database = self._open()
+        # With "full" the log is on the disk when a transaction ends; with "normal", some time after that.
+        database.execute(f"pragma synchronous = {'full' if self.must_sync else 'normal'}")
         with database:
             self._retention.apply(database, DATED)
             samples = list(self._samples(database, batch))
@@ -207,7 +209,6 @@ class SqliteOutput(BatchOutput[Rows]):
             if version != VERSION and tables:  # an empty file has version 0 as well, and may be filled
                 raise InvalidCommand(f"{self._path} is a database of something else")
             database.execute("pragma journal_mode = wal")  # others may read while it grows
-            database.execute("pragma synchronous = normal")
             history = database.execute("select sql from sqlite_master where name = 'history'").fetchone()
             if history is not None and "label" not in history[0]:
                 database.execute("drop view history")  # of a version before labels

@@ -277,6 +277,9 @@ class Writing:
             passage.end(self._truth(error))
             raise
         passage.end(None)
+        if why := await passage.not_durable():
+            hint = "see why that output is down; the value need not be written again"
+            raise WriteUnconfirmed(why, node=self.node, command=str(self.command), hint=hint)
         return value
 
     def _truth(self, error: BaseException) -> BaseException:
