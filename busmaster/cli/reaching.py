@@ -5,6 +5,7 @@ A PORT that another busmaster owns is reached through that, and so are `unix:PAT
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import socket
 from collections.abc import Hashable, Mapping
@@ -93,10 +94,22 @@ def device_of(name: str, *, by_tcp: bool) -> set[Hashable]:
     try:
         if by_tcp:
             host, port = host_and_port(name)
-            return {found[4][:2] for found in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            return {(plain_address(str(place[0])), place[1]) for *_, place in found}
         return {os.path.realpath(resolve(name))}
     except (InvalidCommand, BusError, OSError):  # it is not there now, or a name of the other kind
         return {name}
+
+
+def plain_address(text: str) -> str:
+    """Return an address in the one spelling that is compared.
+
+    The same server is at ::ffff:192.0.2.7 as at 192.0.2.7; at 0.0.0.0, :: and ::1 it is this machine's.
+    """
+    address = ipaddress.ip_address(text)
+    address = getattr(address, "ipv4_mapped", None) or address
+    is_here = address.is_unspecified or address == ipaddress.IPv6Address(1)
+    return "127.0.0.1" if is_here else str(address)
 
 
 def check_settings(connection: Connection, about: Mapping[str, Any]) -> None:

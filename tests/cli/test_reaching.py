@@ -42,6 +42,12 @@ def test_a_host_is_known_by_its_addresses_and_its_port(owned: list[Owner]) -> No
     owned.append(Owner("line", "127.0.0.1:4001", "/run/line.sock", 1))
     assert owner_of("socket://localhost:4001") == owner_of("socket://127.0.0.1:4001") == "line"
     assert owner_of("socket://localhost:4002") is None
+    for spelling in ("[::ffff:127.0.0.1]", "[::ffff:7f00:1]", "0.0.0.0", "[::1]", "[0:0:0:0:0:0:0:1]", "127.1"):
+        assert owner_of(f"socket://{spelling}:4001") == "line", spelling
+        assert owner_of(f"socket://{spelling}:4002") is None
+    owned[:] = [Owner("line", "[::ffff:192.0.2.7]:4001", "/run/line.sock", 1)]
+    assert owner_of("socket://192.0.2.7:4001") == owner_of("socket://[::ffff:c000:207]:4001") == "line"
+    assert owner_of("socket://192.0.2.8:4001") is None
 
 
 def test_an_adapter_is_known_by_its_serial_number_and_by_its_device(usb: UsbTree, owned: list[Owner]) -> None:

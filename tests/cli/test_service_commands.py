@@ -462,3 +462,13 @@ def test_points_of_a_file_are_written_through_its_lines_owner(
     assert [(row[0], row[1], row[2], row[3]) for row in audit(file.parent)][:1] == [
         ("service", "winder/force", 30.0, "written")
     ]
+
+
+def test_a_second_owner_is_refused_however_it_spells_the_serial_server(busmaster: Command, file: Path) -> None:
+    text = file.read_text()
+    other = file.parent / "other.toml"
+    other.write_text(text.replace("127.0.0.1", "[::ffff:127.0.0.1]").replace("line.sqlite", "other.sqlite"))
+    with owner("serve", str(file)) as (process, _):
+        ran = busmaster("run", str(other))
+    assert ran.status == 1
+    assert f"is owned by process {process.pid}" in ran.err

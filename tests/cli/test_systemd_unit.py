@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -51,10 +53,7 @@ def test_it_leaves_the_program_what_it_needs() -> None:
 
 
 def test_the_device_numbers_are_those_of_this_kernel() -> None:
-    with open("/proc/devices") as file:
-        found = dict(
-            reversed(line.split()) for line in file.read().partition("Block")[0].splitlines() if line[:1] == " "
-        )
+    text = Path("/proc/devices").read_text().partition("Block")[0]
+    found = {name: int(number) for number, name in re.findall(r"^ *(\d+) (\S+)$", text, re.MULTILINE)}
     for name, major in MAJORS.items():
-        if name in found:
-            assert int(found[name]) == major
+        assert found.get(name, major) == major
