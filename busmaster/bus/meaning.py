@@ -171,6 +171,16 @@ class Meaning:
         """Return whether values, or bits of them, have names."""
         return bool(self.bits or self.labels)
 
+    def number_of(self, label: str) -> int:
+        """Return the number that has this label. Raises InvalidCommand, with all labels, if none or several have it."""
+        found = [number for number, name in self.labels.items() if name == label]
+        if len(found) != 1:
+            known = ", ".join(f"{name!r}" for name in self.labels.values())
+            raise InvalidCommand(
+                f"{label!r} is the label of {'no' if not found else 'more than one'} value: use {known}"
+            )
+        return found[0]
+
     def named(self, value: Any) -> Any:
         """Return the value with its names; as it is where it has none, or other ones from its protocol."""
         if not isinstance(value, int | float) or value != value // 1:

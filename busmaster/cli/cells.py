@@ -39,6 +39,8 @@ MARKS = {
     "error": ("!", "bold red"),
     "high": ("↑", "bold magenta"),
     "low": ("↓", "bold magenta"),
+    "set": ("↑", "bold magenta"),
+    "clear": ("↓", "bold magenta"),
     "late": ("~", "magenta"),
     "stale": ("?", "magenta"),
 }

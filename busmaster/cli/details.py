@@ -43,7 +43,10 @@ def _facts(
     age = f", asked for {age_text(frame.now - row.asked)} ago" if frame and row.asked is not None else ""
     yield "value", value + (f", {QUALITIES[row.quality]}" if row.quality in QUALITIES else "") + age
     if row.alarm:
-        yield "alarm", f"it has left its {row.alarm} limit"
+        yield (
+            "alarm",
+            f"the bit is {row.alarm}" if row.alarm in ("set", "clear") else f"it has left its {row.alarm} limit",
+        )
     if row.error:
         yield "error", f"{row.error}; {told['hint']}" if told.get("hint") else row.error
     if node is not None:

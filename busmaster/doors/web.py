@@ -239,11 +239,9 @@ async def _value(request: Request) -> float | str:
     except (ValueError, RecursionError):
         said = None
     match said:
-        case {"value": bool()}:
-            pass
-        case {"value": int() | float() | str() as value, **rest} if not rest:
+        case {"value": bool() | int() | float() | str() as value, **rest} if not rest:
             return value
-    raise HTTPException(400, 'the body is {"value": NUMBER} or {"value": "TEXT"}')
+    raise HTTPException(400, 'the body is {"value": NUMBER}, {"value": true}, {"value": false} or {"value": "TEXT"}')
 
 
 def application(line: Following, guard: Guard, tell: Told = lambda _: None) -> Guarded:

@@ -94,6 +94,8 @@ class Task(NamedTuple):
         value = value_of(params["value"])
         assert isinstance(point.node, Node)
         try:
+            if isinstance(value, str) and point.meaning.labels:
+                value = point.meaning.number_of(value)
             return cls(point.node, _encoded(point, value), point.command, value, point)
         except NEVER_SENT as error:
             by, permission = str(asker.peer), asker.permission
@@ -346,11 +348,17 @@ def _left(options: CommandOptions, age: float) -> CommandOptions:
 def _encoded(point: Point[Any], value: Any) -> Command[Any]:
     """Return the write of a value. Raises InvalidCommand for one that cannot be written.
 
-    Where the line carries a number, each codec refuses true and false: a client that means 1 must send 1.
+    Where the line carries a number, each codec refuses true and false: a client that means 1 must send 1. Where it
+    carries a whole number, 7.0 means 7: JSON and OPC UA clients have one type for all numbers.
     """
     if point.encode is None:
         raise InvalidCommand(f"{point.node.label}: {point.item} is read-only")
-    return point.encode(value)
+    try:
+        return point.encode(value)
+    except InvalidCommand:
+        if isinstance(value, float) and value.is_integer():
+            return point.encode(int(value))
+        raise
 
 
 def _check_stop(node: Node, command: Command[Any]) -> bool:

@@ -268,7 +268,7 @@ def _said_point(group: PollGroup, point: Point[Any]) -> dict[str, Any]:
 def _said_value(
     bus: Bus, point: Point[Any], sample: Sample[Any] | None, alarm: AlarmChanged | None = None
 ) -> list[Any] | None:
-    """Return value, quality, when it was asked for, what went wrong, and the limit that it has left ("" for none).
+    """Return value, quality, when it was asked for, what went wrong, and its alarm ("" for none).
 
     All is as it is now, not as it was when it was read. None where the cycle did not have the point.
     """
@@ -277,7 +277,16 @@ def _said_value(
     sample = bus.as_of_now(point, sample)
     asked = sample.finished if sample.started is None else sample.started
     error = "" if sample.error is None else sample.error.what
-    return [shown(point, sample.value), sample.quality.value, asked, error, "" if alarm is None else alarm.limit]
+    return [shown(point, sample.value), sample.quality.value, asked, error, alarm_text(alarm)]
+
+
+def alarm_text(alarm: AlarmChanged | None) -> str:
+    """Return the limit that a value has left, low or high; of a bit its state that is an alarm: set or clear."""
+    if alarm is None:
+        return ""
+    if isinstance(alarm.bound, bool):
+        return "set" if alarm.limit == "high" else "clear"
+    return alarm.limit
 
 
 def shown(point: Point[Any], value: Any) -> Any:
@@ -300,6 +309,7 @@ def said_details(bus: Bus, group: PollGroup, point: Point[Any]) -> dict[str, Any
         "due": None if sample is None else sample.due,
         "low": meaning.low,
         "high": meaning.high,
+        "labels": {str(number): label for number, label in meaning.labels.items()},
         "limits": [
             {name: getattr(limit, name) for name in ("name", "minimum", "maximum", "max_step", "writable")}
             for limit in (() if node is None else node.limits)

@@ -44,7 +44,7 @@ class Row:
     error: str = ""
     """What went wrong in the last cycle."""
     alarm: str = ""
-    """The limit that it has left: low or high."""
+    """The limit that it has left, low or high; of a bit that is an alarm set or clear."""
     past: deque[tuple[float, float | None]] = field(default_factory=lambda: deque(maxlen=KEPT_VALUES))
     """When it was asked for, and the number; None for no value."""
     number: int = 0

@@ -18,6 +18,16 @@ SIZES = ((360, 740), (768, 1024), (1280, 800), (1366, 768), (1440, 900), (1920, 
 PHONE = 500
 TEXTS = "return [...document.querySelectorAll(`#point-rows ${given[0]}`)].map((one) => one.innerText)"
 OVERFLOW = Path(__file__).with_name("overflow.js").read_text()
+LARGEST_SHIFT = 0.1
+SHIFTED = """
+const entries = await new Promise((done) => {
+  const told = (list) => done(list.getEntries());
+  new PerformanceObserver(told).observe({ type: "layout-shift", buffered: true });
+  setTimeout(() => done([]), 500); // nothing is told where nothing has moved
+});
+return entries.reduce((sum, one) => sum + one.value, 0);
+"""
+"""How much of the page has moved since it was opened, as browsers calculate it: 1 is all of it by its own height."""
 ACCESSIBILITY = """
 const { violations } = await axe.run({ resultTypes: ["violations"] });
 return violations.flatMap(({ id, help, nodes }) => nodes.map((node) => `${id}: ${help}: ${node.html.slice(0, 120)}: ${
@@ -63,6 +73,8 @@ def test_nothing_is_cut_or_needs_scrolling_to_the_side(
     bad = [quality for quality in qualities if "bad" in quality]
     if situation == CALM:
         assert (bad, reasons) == ([], [])
+        assert qualities.count("▲ bit set") == qualities.count("▼ bit clear") == 1
+        assert window.run(SHIFTED) < LARGEST_SHIFT
     elif situation == NODE_DOWN:
         assert len(bad) == 3, f"of {DEAD_DRIVE} alone"
         [reason] = reasons  # once for the three, and not in the table's columns

@@ -140,7 +140,7 @@ async def test_of_nonsense_only_the_beginning_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("body", "kind", "status"),
     [
-        (b'{"value": true}', "application/json", 400),
+        (b'{"value": null}', "application/json", 400),
         (b'{"value": [1]}', "application/json", 400),
         (b'{"value": 1, "also": 2}', "application/json", 400),
         (b"{", "application/json", 400),

@@ -60,6 +60,7 @@ export class PointDialog {
     if (this.row !== row || !said.details) return;
     this.details = said.details;
     by("write-limits").textContent = limits_text(said.details, row.unit);
+    field.inputMode = Object.keys(said.details.labels ?? {}).length ? "text" : "decimal";
     this.draw();
   }
 
@@ -74,7 +75,7 @@ export class PointDialog {
     draw_trend(by("point-trend"), row, { ...this.colours(), bounds: true, precision: row.precision });
     const facts = [["group", row.group], ["protocol", `${row.protocol}, address ${row.address}`]];
     if (this.details) facts.push(["asked as", this.details.command]);
-    if (this.details && (this.details.low !== null || this.details.high !== null)) facts.push(["alarms", `below ${bound(this.details.low)}, above ${bound(this.details.high)}`]);
+    if (this.details && (this.details.low !== null || this.details.high !== null)) facts.push(["alarms", alarms_text(this.details, row)]);
     if (row.error) facts.push(["last cycle", row.error + (this.details?.hint ? `; ${this.details.hint}` : "")]);
     const text = JSON.stringify(facts);
     if (text === this.told) return;
@@ -142,12 +143,20 @@ function typed(text) {
   return /^[-+]?(\d+[.,]?\d*|[.,]\d+)(e[-+]?\d+)?$/i.test(said) ? Number(said.replace(",", ".")) : said;
 }
 
+// Numbers have limits. What is shown as a text and has a limit all the same is a bit.
+function alarms_text({ low, high }, row) {
+  if (typeof row.value === "string") return high === null ? "while it is clear" : "while it is set";
+  return `below ${bound(low)}, above ${bound(high)}`;
+}
+
 function bound(value) {
   return value === null || value === undefined ? "–" : value;
 }
 
 function limits_text(details, unit) {
-  return details.limits.map((limit) => {
+  const labels = Object.values(details.labels ?? {});
+  const names = labels.length ? `Values: ${labels.join(", ")}. ` : "";
+  return names + details.limits.map((limit) => {
     const parts = [];
     if (!limit.writable) parts.push("not to be written");
     if (limit.minimum !== null) parts.push(`at least ${limit.minimum} ${unit}`);

@@ -9,7 +9,7 @@ const MOST_SHOWN = 1000;
 const OLD_AFTER = 3; // periods after which a value's age is worth a look
 const AGAIN = 1000; // milliseconds before it is tried again to connect
 const FIRST_WAIT = 2000; // milliseconds in which the first picture of the line may be incomplete
-const WIRE_EVERY = 30, VALUES_EVERY = 90; // milliseconds from one drawing to the next
+const WIRE_EVERY = 50, VALUES_EVERY = 150; // milliseconds from one drawing to the next
 const OUT_OF_SIGHT_EVERY = 1000; // milliseconds: rows that are scrolled away are kept up to date for a search of the page
 const LONG_TEXT = 14; // characters of a text that fit beside unit and trend
 const by = (id) => document.getElementById(id);
@@ -20,7 +20,8 @@ let may = { read_only: true, wants_token: false };
 let connected = false;
 let stale = true; // something was heard since it was drawn
 let known = false; // the first picture of the line was complete
-let wire_drawn = 0, values_drawn = 0, all_drawn = 0;
+let wire_in_sight = true;
+let wire_drawn = -WIRE_EVERY, values_drawn = -VALUES_EVERY, all_drawn = 0; // when, in milliseconds
 let order = "";
 
 function colours() {
@@ -262,6 +263,8 @@ const in_sight = new IntersectionObserver((changes) => {
   stale = true;
 }, { rootMargin: "50%" });
 
+new IntersectionObserver((changes) => { wire_in_sight = changes.at(-1).isIntersecting; }).observe(by("wire-canvas"));
+
 function age_text(seconds) {
   if (seconds < 1) return "<1 s";
   if (seconds < 100) return `${Math.floor(seconds)} s`;
@@ -290,7 +293,7 @@ function fill_row(cells, row, periods, lost, may_write) {
   }
   set(cells.value, "className", row.value === null ? "" : "known");
   set(cells.value, "textContent", long ? `${text.replaceAll(",", ", ")} ${row.unit}` : text);
-  set(cells.value_cell, "colSpan", long ? 3 : 1); // a text has no trend
+  set(cells.value_cell, "ariaColSpan", long ? "3" : "1"); // a text has no trend
   set(cells.unit, "hidden", long);
   set(cells.trend_cell, "hidden", long);
   set_text(cells.unit, row.unit);
@@ -323,9 +326,10 @@ function draw_row_trend(cells, ink) {
 function draw() {
   requestAnimationFrame(draw);
   const now = performance.now();
-  if (document.hidden || now - wire_drawn < WIRE_EVERY) return;
-  const show = may_show();
-  if (show) {
+  if (document.hidden || now - wire_drawn < WIRE_EVERY && now - values_drawn < VALUES_EVERY) return;
+  const before = known, show = may_show();
+  if (show && !before) values_drawn = -VALUES_EVERY; // all of it in one frame: what came later would move what is there
+  if (show && wire_in_sight && now - wire_drawn >= WIRE_EVERY) {
     wire_drawn = now;
     wire.draw(line.all_nodes, line.now, line.state.connected ? line.frame?.state ?? "ready" : "offline");
   }

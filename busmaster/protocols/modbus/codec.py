@@ -269,8 +269,9 @@ class WriteCoils:
     writes: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if any(value not in (0, 1) for value in self.values):
-            raise InvalidCommand(f"a coil is written 1 or 0, not {self.values!r}")
+        wrong = [value for value in self.values if value not in (0, 1)]
+        if wrong:
+            raise InvalidCommand(f"a coil is written 1 or 0, not {wrong[0]!r}")
         object.__setattr__(self, "values", tuple(map(bool, self.values)))
         _check_span(self.first, len(self.values), MOST_BITS_WRITTEN)
 
