@@ -82,6 +82,8 @@ class Dispatcher:
         self.counters = counters
         self.fault: Callable[[], BusError] | None = None
         """Makes the error with which everything fails while the line cannot be used."""
+        self.is_held: Callable[[], bool] = lambda: False
+        """Says whether the port had not sent all of the request on the wire when it was asked last."""
         self._deadlines = deadlines
         self.probes = Probes(deadlines, self.nodes, now)
         self._capacity = capacity
@@ -335,11 +337,11 @@ class Dispatcher:
             if transaction.phase is ON_WIRE:
                 transaction.wanted = False
                 self.counters.cancelled += 1
-                self.events.append(Overdue(transaction, too_late(transaction, now)))
+                self.events.append(Overdue(transaction, too_late(transaction, now, held=self.is_held())))
                 continue
             if transaction.phase is QUEUED:
                 self.backlog.discard(transaction, PARKED)
-            self._end(transaction, now, too_late(transaction, now))
+            self._end(transaction, now, too_late(transaction, now, held=self.is_held()))
 
     # polls
 

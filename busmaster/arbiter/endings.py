@@ -8,6 +8,8 @@ from busmaster.errors import BusError, HoldEnded, NoReply, NotStarted, WriteUnco
 
 TOO_LATE = "allow more time, or see bus.statistics(), or busmaster plan, for what holds it up"
 
+HELD = "flow control holds the port or the adapter is stuck; check CTS, replug"
+
 
 def make_error(kind: type[BusError], what: str, transaction: Transaction, hint: str | None = None) -> BusError:
     """Return the error of this kind for a transaction, with the hint of the kind if none is given."""
@@ -22,15 +24,20 @@ def name_error(error: BusError, transaction: Transaction) -> BusError:
     return error
 
 
-def too_late(transaction: Transaction, now: float) -> BusError:
-    """Return the error of a transaction whose caller's time is over: whether it was sent is what the error says."""
+def too_late(transaction: Transaction, now: float, *, held: bool = False) -> BusError:
+    """Return the error of a transaction whose caller's time is over: whether it was sent is what the error says.
+
+    `held`: the port has not sent all that it was handed, this request or the one before it, and may still do.
+    """
     waited = (now - transaction.queued) * 1000
     if not transaction.attempts:
-        return make_error(NotStarted, f"not sent within its time: it waited {waited:.0f} ms for the line", transaction)
+        what = f"not sent within its time: it waited {waited:.0f} ms for the line"
+        return make_error(NotStarted, what, transaction, HELD if held else None)
     kind = WriteUnconfirmed if transaction.writes else NoReply
-    error = make_error(kind, f"sent, but not answered within its time: {waited:.0f} ms", transaction)
+    what = "the port did not send it within its time" if held else "sent, but not answered within its time"
+    error = make_error(kind, f"{what}: {waited:.0f} ms", transaction)
     if kind is NoReply:
-        error.hint = TOO_LATE
+        error.hint = HELD if held else TOO_LATE
     return error
 
 

@@ -40,6 +40,7 @@ from busmaster.arbiter.counters import LineCounters
 from busmaster.arbiter.deadlines import Deadlines
 from busmaster.arbiter.dispatcher import Dispatcher
 from busmaster.arbiter.echo import Echo
+from busmaster.arbiter.endings import HELD
 from busmaster.arbiter.events import CameUnasked, LineChange, LineChanged
 from busmaster.arbiter.health import DOWN
 from busmaster.arbiter.in_step import InStep
@@ -86,6 +87,7 @@ class LineMachine:
         self._wire = OnWire(
             self._leg, self._echo, self._deadlines, self._in_step, dispatcher.urgent_waits, dispatcher.is_wanted
         )
+        self.dispatcher.is_held = lambda: self._wire.output.held
         self._choice = Choice(self.dispatcher, self._in_step, self._wire)
         self._trust = Trust(self._in_step)
         # the line
@@ -175,9 +177,12 @@ class LineMachine:
 
     def unsent(self, count: int, now: float) -> None:
         """Note that so many of the bytes said have not left: until they have, nothing runs out, nothing else is said
-        and nothing is their answer. The caller tells it again, then, before the bytes that come."""
+        and nothing is their answer. The caller tells it again, then, before the bytes that come.
+
+        A line that is being closed does not wait for them: that they have not left is noted, for the error.
+        """
         again = self._wire.output.unsent(count, now)
-        if again is not None:
+        if again is not None and (again == inf or not self._closed):
             self._deadlines.line = self._due_anew(now) if again == inf else again
 
     def _due_anew(self, now: float) -> float:
@@ -373,7 +378,9 @@ class LineMachine:
     ) -> None:
         transaction, leg, unasked = self._wire.transaction, self._leg, self._unasked
         assert transaction is not None
-        if no_reply:
+        if no_reply and self._wire.output.held:
+            error.what, error.hint = "the port had not sent it when the bus was closed", HELD
+        elif no_reply:
             unasked.unanswered(transaction.node, leg.end, leg.timing.lateness)
             if error.what == NO_REPLY:
                 timing = leg.timing

@@ -28,6 +28,8 @@ TCP_INFO_TIMES = struct.Struct("68xII")
 TIOCGICOUNT = 0x545D
 FRAME, OVERRUN, PARITY, BRK, BUF_OVERRUN = range(6, 11)
 """struct serial_icounter_struct (linux/serial.h): where its counts are, in ints."""
+DAMAGE = FRAME, PARITY, BRK
+"""Those of them that a tty marks."""
 ICOUNTER_SIZE = 20
 WRAP = 0xFFFFFFFF
 
@@ -60,6 +62,10 @@ class OpenPort:
     def errors(self) -> DriverErrors | None:
         """Return what its driver has counted since it was opened or reset; None where there is none that counts."""
         return None
+
+    def is_break(self) -> bool:
+        """Return whether what a tty marks as a break, and hands over now, was one, as far as the driver tells."""
+        return True
 
     def reset(self) -> None:
         """Start the driver's counts again."""
@@ -94,6 +100,7 @@ class Tty(_Descriptor):
     def __init__(self, transport: asyncio.Transport, descriptor: int, flow_controlled: bool = False) -> None:
         super().__init__(transport, descriptor)
         self.flow_controlled = flow_controlled
+        self._opened = self._counted()
         self.reset()
 
     def unsent(self, waited: float) -> int | None:
@@ -109,8 +116,24 @@ class Tty(_Descriptor):
         )
         return DriverErrors(framing, parity, breaks, overruns, lost)
 
+    def is_break(self) -> bool:
+        """Return whether the driver has counted a break that was not marked yet.
+
+        A tty marks a break by the same bytes as a damaged byte 00, and on a line at a wrong rate there are many of
+        those. The marks of a driver that has counted nothing at all are believed.
+        """
+        now = self._counted()
+        if now is None or self._opened is None or not any(now[field] != self._opened[field] for field in DAMAGE):
+            return True
+        if not (now[BRK] - self._breaks) & WRAP:
+            return False
+        self._breaks += 1
+        return True
+
     def reset(self) -> None:
         self._before = self._counted()
+        self._breaks = 0 if self._before is None else self._before[BRK]
+        """The driver's count of breaks up to the last one that was marked."""
 
     def _counted(self) -> array.array[int] | None:
         """Return the driver's counts since it was loaded; None where it keeps none, as for a pty."""

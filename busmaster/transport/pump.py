@@ -210,6 +210,8 @@ class Pump(asyncio.Protocol):
     def byte_marked(self, byte: bytes, mark: Mark) -> None:
         """Take a byte that the UART found damaged."""
         now = self.clock()
+        if mark is Mark.BREAK and self._port is not None and not self._port.is_break():
+            mark = Mark.DAMAGED
         if self.tap is not None:
             self.tap.received(now, byte, self.arbiter.attempt)
         self.arbiter.byte_marked(mark, now)
@@ -262,10 +264,11 @@ class Pump(asyncio.Protocol):
         if self._port is not None:
             # The kernel is asked only now, and before anything runs out: a blocked loop may run timers before it reads.
             line_due = self.arbiter.line_due(now)
-            if line_due or self.arbiter.answer_counts(now):
+            caller_due = self.arbiter.answer_counts(now)
+            if line_due or caller_due:
                 unread = self._port.unread()
-            if line_due and not self._all_has_left:
-                self._check_output(now)
+            if (line_due or caller_due) and not self._all_has_left:
+                self._check_output(now)  # what is held is said to be, whoever's time is over
         self.arbiter.handle_timeout(now, unread=unread)
         self.turn()
 
@@ -286,8 +289,8 @@ class Pump(asyncio.Protocol):
             self._arm(due)
 
     def _check_output(self, now: float) -> None:
-        """Tell the arbiter how much has not left yet. On a bus that closes, nothing waits for that any more."""
-        if self._port is None or self._run_out is not None:
+        """Tell the arbiter how much has not left yet, and give the port up where that is so for too long."""
+        if self._port is None:
             return
         count = self._port.unsent(now - self._written)
         if count is None:

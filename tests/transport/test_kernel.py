@@ -21,6 +21,7 @@ from busmaster.transport.kernel import DELAYED_ACK, TIOCGICOUNT, Socket, open_po
 from busmaster.transport.tcp import TcpPort
 from tests.patience import PATIENCE
 from tests.transport.fakes import PtyMaster, Recorder, closed, opened, plugged, standing_still
+from tests.transport.test_marks import set_input_flags
 
 Runner = Callable[[Coroutine[Any, Any, None]], None]
 LATER = 60.0
@@ -112,6 +113,46 @@ async def test_the_drivers_counts_begin_again_where_the_buss_statistics_are_rese
         assert bus.statistics().driver == DriverErrors(framing=1, parity=0, breaks=0, overruns=0, buffer_overruns=0)
         bus.reset_statistics()
         assert bus.statistics().driver == DriverErrors(0, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("counted", "told"),
+    [
+        ({9: 3}, (90, 3)),
+        ({6: 93, 9: 3}, (90, 3)),
+        ({6: 93}, (93, 0)),
+        ({9: 93}, (0, 93)),
+        ({}, (0, 93)),  # a driver that does not count, though it can be asked
+        ({7: 5, 10: 5}, (0, 93)),
+        (None, (0, 93)),  # one that cannot be asked
+    ],
+)
+@pytest.mark.asyncio
+async def test_marks_of_damaged_zeros_are_no_breaks_where_the_driver_counts_those(
+    pty_master: PtyMaster, driver: Driver, counted: dict[int, int] | None, told: tuple[int, int]
+) -> None:
+    before = {6: 10, 7: 20, 8: 30, 9: 2**31 - 2, 10: 50}
+    driver.counts = None if counted is None else dict(before)
+    async with Bus(SerialPort(pty_master.path, baudrate=57600)) as bus, asyncio.timeout(PATIENCE):
+
+        async def heard(marks: int) -> tuple[int, int]:
+            pty_master.write(b"\xff\x00\x00" * marks)
+            while (found := bus.statistics()).damaged + found.breaks < marks:  # noqa: ASYNC110  # nothing tells
+                await asyncio.sleep(0.001)
+            return found.damaged, found.breaks
+
+        transport: Any = bus.pump._transport
+        set_input_flags(transport._fd, 0)
+        if counted is not None:
+            driver.counts = {n: _wrapped(before[n] + counted.get(n, 0)) for n in before}
+        assert await heard(93) == told
+        bus.reset_statistics()
+        assert await heard(2) == ((2, 0) if counted and not counted.keys() <= {7, 10} else (0, 2))
+
+
+def _wrapped(count: int) -> int:
+    """As an int of 32 bits, which the kernel's counts are."""
+    return (count + 2**31) % 2**32 - 2**31
 
 
 @pytest.mark.asyncio

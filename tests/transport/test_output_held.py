@@ -5,14 +5,25 @@ from __future__ import annotations
 import asyncio
 import socket
 import termios
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from math import inf
 from random import Random
 from typing import Any
 
 import pytest
 
-from busmaster import Bus, Hcp2Controller, LineDown, MemoryPort, NoReply, SerialPort, TcpPort, WriteUnconfirmed
+from busmaster import (
+    Bus,
+    BusError,
+    Hcp2Controller,
+    LineDown,
+    MemoryPort,
+    NoReply,
+    NotStarted,
+    SerialPort,
+    TcpPort,
+    WriteUnconfirmed,
+)
 from busmaster.arbiter.arbiter import Arbiter
 from busmaster.arbiter.events import LineChange, LineChanged
 from busmaster.arbiter.state import LineState
@@ -20,6 +31,7 @@ from busmaster.bus.node import Node
 from busmaster.emulator.device import Delay
 from busmaster.emulator.line import Line
 from busmaster.emulator.memory import MemoryTransport
+from busmaster.emulator.serve import serve_pty
 from busmaster.protocols.hcp2 import codec as hcp2
 from busmaster.registry import make_device
 from busmaster.testing.virtual_time import run_in_virtual_time
@@ -168,7 +180,7 @@ def test_what_lies_unread_is_looked_for_when_a_callers_time_is_over(ledger: Ledg
     pump._on_time()
     ledger.is_over = True
     pump._on_time()
-    assert ledger.notes == [("timeout", 0.0, False), ("timeout", 0.0, True)]
+    assert ledger.notes == [("timeout", 0.0, False), ("unsent", 0, 0.0), ("timeout", 0.0, True)]
 
 
 def test_a_write_that_the_port_did_not_take_is_told_at_once_and_so_is_its_leaving(ledger: Ledger) -> None:
@@ -212,6 +224,12 @@ def test_a_port_that_comes_back_may_hold_its_output_as_long_as_the_one_before(le
     ledger.time = 2 * STUCK_AFTER
     pump._on_time()
     assert ("aborted",) in ledger.notes
+
+
+async def in_sync(axis: Hcp2Controller) -> None:
+    """Return when nothing is left of earlier requests, so that the next one goes at once."""
+    await axis.read(1)
+    await asyncio.sleep(1.0)
 
 
 # -- a port that holds its output ------------------------------------------------------------------------------------
@@ -357,18 +375,72 @@ def test_output_is_held_anew_where_the_port_was_lost_meanwhile() -> None:
     run_in_virtual_time(main())
 
 
-def test_closing_does_not_wait_for_output_that_is_held() -> None:
+@pytest.mark.parametrize("held", [0.01, 0.5])
+def test_closing_does_not_wait_for_output_that_is_held_and_says_that_it_was(held: float) -> None:
+    async def main(request: Callable[[Hcp2Controller], Awaitable[object]], error: type[BusError], hint: str) -> None:
+        async with Bus(MemoryPort(line())) as bus:
+            axis = Hcp2Controller(bus, 1)
+            await in_sync(axis)
+            transport_of(bus).hold()
+            waiting = asyncio.ensure_future(request(axis))
+            await asyncio.sleep(held)
+            began = bus.now()
+        assert bus.now() - began < WINDOW + LATENESS
+        with pytest.raises(error) as caught:
+            await waiting
+        assert caught.value.what == "the port had not sent it when the bus was closed"
+        assert caught.value.hint.startswith(hint)
+
+    run_in_virtual_time(main(lambda axis: axis.write(1, 6), WriteUnconfirmed, "read the value back"))
+    run_in_virtual_time(main(lambda axis: axis.read(1, retries=0), NoReply, "flow control holds the port"))
+
+
+def test_on_a_bus_that_closes_a_reply_to_what_has_just_left_still_counts() -> None:
     async def main() -> None:
         async with Bus(MemoryPort(line())) as bus:
             axis = Hcp2Controller(bus, 1)
-            await axis.read(1)
+            await axis.write(1, 6)
+            await in_sync(axis)
             transport_of(bus).hold()
-            writing = asyncio.ensure_future(axis.write(1, 6))
-            await asyncio.sleep(0.5)
-            began = bus.now()
-        assert bus.now() - began < WINDOW + LATENESS
-        with pytest.raises(WriteUnconfirmed):
-            await writing
+            reading = asyncio.ensure_future(axis.read(1))
+            await asyncio.sleep(0.05)
+            asyncio.get_running_loop().call_later(0.0001, transport_of(bus).release)
+        assert await reading == 6
+
+    run_in_virtual_time(main())
+
+
+@pytest.mark.parametrize("time", [0.03, 0.5])  # within the reply window, in which nobody asks the port, and after it
+def test_whoever_runs_out_of_time_while_the_port_holds_output_is_told_so(time: float) -> None:
+    async def failed(waiting: Awaitable[object]) -> tuple[type[BaseException], str, str]:
+        with pytest.raises(BusError) as caught:
+            await waiting
+        return caught.type, caught.value.what, caught.value.hint.partition(":")[0].partition(";")[0]
+
+    async def main() -> None:
+        async with Bus(MemoryPort(line())) as bus:
+            axis = Hcp2Controller(bus, 1)
+            await in_sync(axis)
+            for request, kind, hint in (
+                (axis.write, WriteUnconfirmed, "read the value back before you write again"),
+                (axis.read, NoReply, "flow control holds the port or the adapter is stuck"),
+            ):
+                transport_of(bus).hold()
+                arguments = (1, 6) if kind is WriteUnconfirmed else (1,)
+                first = asyncio.ensure_future(request(*arguments, finish_within=time))
+                await asyncio.sleep(0)
+                second = asyncio.ensure_future(axis.read(2, finish_within=time))
+                milliseconds = f"{time * 1000:.0f} ms"
+                assert await failed(first) == (kind, f"the port did not send it within its time: {milliseconds}", hint)
+                told = await failed(second)
+                assert told[:2] == (NotStarted, f"not sent within its time: it waited {milliseconds} for the line")
+                assert told[2] == "flow control holds the port or the adapter is stuck"
+                transport_of(bus).release()
+                await in_sync(axis)
+            late = asyncio.ensure_future(axis.read(1, finish_within=0.001))
+            assert (await failed(late))[1] == "sent, but not answered within its time: 1 ms"
+
+    run_in_virtual_time(main())
 
     run_in_virtual_time(main())
 
@@ -426,6 +498,26 @@ async def test_a_tty_stopped_for_good_takes_the_line_down_in_words(
         while bus.pump._transport in (None, transport):  # noqa: ASYNC110  # reopened by itself
             await asyncio.sleep(0.001)
         assert pty_master.read(patience=0.01) == b""
+
+
+@pytest.mark.asyncio
+async def test_a_write_that_a_stopped_tty_never_sent_is_unconfirmed_and_says_so_when_the_bus_is_left() -> None:
+    with serve_pty(Line(hcp2.PROFILE.line, [make_device("hcp2", 1)], paced=False)) as server:
+        port = SerialPort(server.path, baudrate=57600)
+        async with Bus(port) as bus:
+            axis = Hcp2Controller(bus, 1)
+            await axis.write(1, 5)
+            transport: Any = bus.pump._transport
+            termios.tcflow(transport._fd, termios.TCOOFF)
+            writing = asyncio.ensure_future(axis.write(1, 6))
+            while transport.get_write_buffer_size() == 0:  # noqa: ASYNC110  # nothing tells
+                await asyncio.sleep(0.001)
+        with pytest.raises(WriteUnconfirmed, match="the port had not sent it when the bus was closed, 1 attempt"):
+            await writing
+        async with Bus(port) as bus:
+            transport = bus.pump._transport
+            termios.tcflow(transport._fd, termios.TCOON)
+            assert await Hcp2Controller(bus, 1).read(1) == 5
 
 
 class Server:
